@@ -1,0 +1,1 @@
+"""The Surrogym client: remote environments, the sampler, training and evaluation."""

@@ -1,0 +1,129 @@
+"""The exception tree of the server; it knows no HTTP. ``api.problems`` maps each leaf to one error code.
+
+SurrogymError
+├── InvalidInput            the caller sent something that can't be used; says what was expected and what came
+│   ├── InvalidSpec         a specification that contradicts itself, or a task the chosen preset can't represent
+│   └── TooLarge            more rows, lanes or bytes than the limit
+├── NotThere
+│   ├── UnknownSurrogate
+│   ├── UnknownQuery
+│   ├── UnknownModel
+│   ├── UnknownSession
+│   └── SessionExpired      it was there; open a new one
+├── Conflict                the request is well formed but does not fit the present state
+│   ├── SpecConflict        the name exists with another specification
+│   ├── IdempotencyConflict the same key with another body
+│   ├── SeqConflict         neither the next seq nor a repeat of the last request; ``expected`` says which
+│   ├── ForeignLease        a lease token that was never given out for this query
+│   ├── LeaseExpired        renewing or failing under a lease that has ended
+│   ├── NotReset            a step before the first reset, or of a finished lane under autoreset disabled
+│   └── NoModel             nothing has been fitted yet
+├── Refused
+│   ├── Unauthenticated
+│   └── Forbidden
+├── Unavailable             storage or engine can't serve this now; try again later
+│   └── Overloaded          a queue or a cap is full; try again later
+└── NumericalFailure        a covariance matrix that no jitter repairs
+"""
+
+from __future__ import annotations
+
+
+class SurrogymError(Exception):
+    """Base of everything the server raises on purpose. ``str(error)`` is one sentence for a person."""
+
+
+class InvalidInput(SurrogymError):
+    """What the caller sent can't be used; nothing was changed."""
+
+
+class InvalidSpec(InvalidInput):
+    """A specification that contradicts itself."""
+
+
+class TooLarge(InvalidInput):
+    """More than a limit allows."""
+
+
+class NotThere(SurrogymError):
+    """Something named in the request does not exist."""
+
+
+class UnknownSurrogate(NotThere):
+    """No surrogate of this name."""
+
+
+class UnknownQuery(NotThere):
+    """No query of this number."""
+
+
+class UnknownModel(NotThere):
+    """No model of this version."""
+
+
+class UnknownSession(NotThere):
+    """No session of this id."""
+
+
+class SessionExpired(NotThere):
+    """The session was idle for too long, or was lost with a crash; open a new one."""
+
+
+class Conflict(SurrogymError):
+    """The request does not fit the present state; nothing was changed."""
+
+
+class SpecConflict(Conflict):
+    """The name exists with another specification."""
+
+
+class IdempotencyConflict(Conflict):
+    """The same idempotency key came with another body."""
+
+
+class SeqConflict(Conflict):
+    """The seq is neither the next one nor a repeat of the last request."""
+
+    def __init__(self, message: str, expected: int) -> None:
+        super().__init__(message)
+        self.expected = expected
+
+
+class ForeignLease(Conflict):
+    """The lease token was never given out for this query."""
+
+
+class LeaseExpired(Conflict):
+    """The lease has ended; claim again."""
+
+
+class NotReset(Conflict):
+    """A lane has to be reset before it can be stepped."""
+
+
+class NoModel(Conflict):
+    """Nothing has been fitted yet."""
+
+
+class Refused(SurrogymError):
+    """The caller may not do this."""
+
+
+class Unauthenticated(Refused):
+    """No token, or an unknown one."""
+
+
+class Forbidden(Refused):
+    """The token's role does not allow this."""
+
+
+class Unavailable(SurrogymError):
+    """Can't be served now; nothing was changed; try again later."""
+
+
+class Overloaded(Unavailable):
+    """A queue or a cap is full; try again later."""
+
+
+class NumericalFailure(SurrogymError):
+    """A covariance matrix that no jitter repairs."""

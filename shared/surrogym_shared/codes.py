@@ -1,0 +1,77 @@
+"""Error codes of the service and the problem body that carries them (RFC 9457)."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+from pydantic import BaseModel, ConfigDict, Field
+
+PROBLEM_MEDIA_TYPE = "application/problem+json"
+
+
+class Code(StrEnum):
+    """What went wrong, one word for one thing. The HTTP status stands beside each code in ``STATUS``."""
+
+    INVALID_REQUEST = "invalid_request"  # malformed body, unknown field, wrong shape or type, NaN, out of bounds
+    INVALID_SPEC = "invalid_spec"  # a specification that contradicts itself
+    UNAUTHENTICATED = "unauthenticated"  # no token, or an unknown one
+    FORBIDDEN = "forbidden"  # a token whose role does not allow this
+    NOT_FOUND = "not_found"  # no such route
+    UNKNOWN_SURROGATE = "unknown_surrogate"
+    UNKNOWN_SESSION = "unknown_session"
+    SESSION_EXPIRED = "session_expired"  # idle for too long, or lost with a crash; open a new one
+    UNKNOWN_QUERY = "unknown_query"
+    UNKNOWN_MODEL = "unknown_model"
+    METHOD_NOT_ALLOWED = "method_not_allowed"
+    SPEC_CONFLICT = "spec_conflict"  # the name exists with another specification
+    IDEMPOTENCY_CONFLICT = "idempotency_conflict"  # the same key with another body
+    SEQ_CONFLICT = "seq_conflict"  # seq is neither the next one nor a repeat of the last request
+    FOREIGN_LEASE = "foreign_lease"  # the lease token was never given out for this query
+    LEASE_EXPIRED = "lease_expired"  # renew or fail under a lease that has ended
+    NOT_RESET = "not_reset"  # a step before the first reset, or of a finished lane under autoreset disabled
+    NO_MODEL = "no_model"  # nothing has been fitted yet
+    TOO_LARGE = "too_large"
+    UNSUPPORTED_MEDIA_TYPE = "unsupported_media_type"
+    TOO_MANY_REQUESTS = "too_many_requests"
+    UNAVAILABLE = "unavailable"
+    INTERNAL = "internal"
+
+
+STATUS: dict[Code, int] = {
+    Code.INVALID_REQUEST: 422,
+    Code.INVALID_SPEC: 422,
+    Code.UNAUTHENTICATED: 401,
+    Code.FORBIDDEN: 403,
+    Code.NOT_FOUND: 404,
+    Code.UNKNOWN_SURROGATE: 404,
+    Code.UNKNOWN_SESSION: 404,
+    Code.SESSION_EXPIRED: 410,
+    Code.UNKNOWN_QUERY: 404,
+    Code.UNKNOWN_MODEL: 404,
+    Code.METHOD_NOT_ALLOWED: 405,
+    Code.SPEC_CONFLICT: 409,
+    Code.IDEMPOTENCY_CONFLICT: 409,
+    Code.SEQ_CONFLICT: 409,
+    Code.FOREIGN_LEASE: 403,
+    Code.LEASE_EXPIRED: 409,
+    Code.NOT_RESET: 409,
+    Code.NO_MODEL: 409,
+    Code.TOO_LARGE: 413,
+    Code.UNSUPPORTED_MEDIA_TYPE: 415,
+    Code.TOO_MANY_REQUESTS: 429,
+    Code.UNAVAILABLE: 503,
+    Code.INTERNAL: 500,
+}
+
+
+class Problem(BaseModel):
+    """A problem body (RFC 9457): every error reply of the service has this form."""
+
+    model_config = ConfigDict(extra="allow")
+
+    type: str = "about:blank"
+    title: str = Field(description="The code in words.")
+    status: int
+    code: Code
+    detail: str = Field(description="What was expected and what came.")
+    expected_seq: int | None = Field(default=None, description="With seq_conflict: the seq the session waits for.")

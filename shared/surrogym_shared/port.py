@@ -1,0 +1,81 @@
+"""SurrogatePort: what a trainer needs of a surrogate, whatever carries it.
+
+HTTP implements it now; the binary stream and the in-process surrogate implement the same laws, and one suite tests all.
+Arrays are numpy: observation (N, D) float32, action (N, F) or (N,), reward (N,) float64, flags (N,) bool.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import OpenSession, SessionView
+
+Floats = NDArray[np.floating[Any]]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.integer[Any]]
+
+
+@dataclass(frozen=True)
+class ResetResult:
+    observation: Floats  # (N, D)
+    model_version: Ints  # (N,)
+
+
+@dataclass(frozen=True)
+class StepResult:
+    observation: Floats  # (N, D)
+    reward: Floats  # (N,), penalised
+    terminated: Bools  # (N,)
+    truncated: Bools  # (N,)
+    final_lanes: Ints  # (K,) lanes that ended and were reset within this step
+    final_observation: Floats  # (K, D)
+    model_version: Ints  # (N,)
+    reward_mean: Floats  # (N,), before the penalty
+    deviation: Floats | None  # (N, O) when asked for
+
+
+@runtime_checkable
+class SurrogatePort(Protocol):
+    """One surrogate, seen by a trainer.
+
+    Laws: a step happens once, however often the transport repeats it; a repeat gives the same reply, bit for bit; results
+    of one session depend on its seed and its requests alone; every error is one of ``surrogym_client.errors``.
+    """
+
+    def spec(self) -> EnvironmentSpec:
+        """The specification of the original environment."""
+        ...
+
+    def open(self, request: OpenSession) -> SessionView:
+        """Open a session of N lanes."""
+        ...
+
+    def reset(
+        self, session: str, *, seed: int | Sequence[int] | None = None, mask: Bools | None = None
+    ) -> ResetResult:
+        """Start new episodes in all lanes, or those of the mask."""
+        ...
+
+    def step(
+        self, session: str, action: Floats | Ints, *, mask: Bools | None = None, deviations: bool = False
+    ) -> StepResult:
+        """Step all lanes, or those of the mask."""
+        ...
+
+    def rollout(self, session: str, actions: Floats | Ints) -> list[StepResult]:
+        """Step T times with actions (T, N, F), in one request."""
+        ...
+
+    def submit_occupancy(self, session: str, checkpoint: str) -> int:
+        """Store the states this session visited under a name, for the design to weigh its queries by."""
+        ...
+
+    def close(self, session: str) -> None:
+        """End the session; closing twice is harmless."""
+        ...

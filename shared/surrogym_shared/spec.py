@@ -1,0 +1,411 @@
+"""EnvironmentSpec: what is known of an original environment before the first query.
+
+Symbols: coordinates ``q`` (n, C), observation ``o`` (n, D), action ``u`` (n, F). A specification is data: adapters make it
+for known environments, people write it as JSON or Python for their own, and no part of it is ever evaluated as code.
+Every contradiction is refused here, with what was expected and what came.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
+
+MAX_DIMENSIONS = 64
+MAX_TERM_PARTS = 64
+MAX_DISCRETE_ACTIONS = 4096
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+REWARD = "reward"
+
+Name = Annotated[str, Field(min_length=1, max_length=64)]
+
+
+class Frozen(BaseModel):
+    """Base of every model here: immutable, and unknown fields are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="null")
+
+
+# Distributions
+
+
+class Uniform(Frozen):
+    """Uniform on [low, high]."""
+
+    kind: Literal["uniform"] = "uniform"
+    low: FiniteFloat
+    high: FiniteFloat
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        _require(self.low < self.high, f"uniform range crosses: expected low < high, got [{self.low}, {self.high}]")
+        return self
+
+
+class Normal(Frozen):
+    """Normal, truncated to [low, high]; without limits it is truncated at three standard deviations."""
+
+    kind: Literal["normal"] = "normal"
+    mean: FiniteFloat
+    std: PositiveFloat
+    low: FiniteFloat | None = None
+    high: FiniteFloat | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        low, high = self.limits
+        _require(low < high, f"truncated range crosses: expected low < high, got [{low}, {high}]")
+        z = max(low - self.mean, self.mean - high) / self.std
+        _require(z < 6, f"truncation [{low}, {high}] lies {z:.1f} standard deviations from the mean {self.mean}")
+        return self
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        low = self.mean - 3 * self.std if self.low is None else self.low
+        high = self.mean + 3 * self.std if self.high is None else self.high
+        return low, high
+
+
+class Fixed(Frozen):
+    """One value; only for the start distribution."""
+
+    kind: Literal["fixed"] = "fixed"
+    value: FiniteFloat
+
+
+SamplingDistribution = Annotated[Uniform | Normal, Field(discriminator="kind")]
+StartDistribution = Annotated[Uniform | Normal | Fixed, Field(discriminator="kind")]
+
+
+def limits(distribution: Uniform | Normal | Fixed) -> tuple[float, float]:
+    """Smallest and largest value a distribution can give."""
+    match distribution:
+        case Uniform():
+            return distribution.low, distribution.high
+        case Normal():
+            return distribution.limits
+        case Fixed():
+            return distribution.value, distribution.value
+
+
+# Coordinates
+
+
+class Bounds(Frozen):
+    """Saturation: the environment clips the coordinate to [low, high].
+
+    ``stops`` names a coordinate that is set to zero when this one runs into the bound (a wall; MountainCar's left end).
+    """
+
+    low: FiniteFloat | None = None
+    high: FiniteFloat | None = None
+    stops: Name | None = None
+
+    @model_validator(mode="after")
+    def _some(self) -> Self:
+        _require(self.low is not None or self.high is not None, "bounds need a low or a high")
+        if self.low is not None and self.high is not None:
+            _require(self.low < self.high, f"bounds cross: expected low < high, got [{self.low}, {self.high}]")
+        return self
+
+
+class Coordinate(Frozen):
+    """One entry of q: part of the state that the original environment is set to.
+
+    ``linear`` and ``angle`` (wrapped to [-pi, pi)) move with the dynamics; ``constant`` is drawn at the start of an episode
+    and stays (Reacher's target). ``sampling`` is the distribution of design queries.
+    """
+
+    name: Name
+    kind: Literal["linear", "angle", "constant"] = "linear"
+    sampling: SamplingDistribution
+    bounds: Bounds | None = None
+    unit: str = ""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.kind != "linear":
+            _require(self.bounds is None, f"coordinate {self.name!r}: only a linear coordinate can have bounds")
+        if self.bounds is not None:
+            low, high = limits(self.sampling)
+            for bound, value, inside in (
+                ("low", self.bounds.low, lambda b: b <= low),
+                ("high", self.bounds.high, lambda b: b >= high),
+            ):
+                _require(
+                    value is None or inside(value),
+                    f"coordinate {self.name!r}: sampling range [{low}, {high}] leaves the {bound} bound {value}",
+                )
+        return self
+
+
+# Terms
+
+
+class Part(Frozen):
+    """coefficient * phi(q), phi one of: ``one`` = 1, ``linear`` = a.q, ``sin`` = sin(a.q), ``cos`` = cos(a.q)."""
+
+    function: Literal["one", "linear", "sin", "cos"]
+    coefficient: FiniteFloat = 1.0
+    weights: dict[Name, FiniteFloat] = Field(default_factory=dict, description="a, by coordinate name")
+
+    @model_validator(mode="after")
+    def _weighted(self) -> Self:
+        if self.function == "one":
+            _require(not self.weights, "a part with function 'one' takes no weights")
+        else:
+            _require(bool(self.weights), f"a part with function {self.function!r} needs weights")
+        return self
+
+
+class Term(Frozen):
+    """A sum of parts, optionally clipped to [low, high]. Terms add with ``+`` and scale with ``*``."""
+
+    parts: tuple[Part, ...] = Field(min_length=1, max_length=MAX_TERM_PARTS)
+    low: FiniteFloat | None = None
+    high: FiniteFloat | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.low is not None and self.high is not None:
+            _require(self.low < self.high, f"term clip crosses: expected low < high, got [{self.low}, {self.high}]")
+        return self
+
+    @classmethod
+    def constant(cls, value: float) -> Term:
+        return cls(parts=(Part(function="one", coefficient=value),))
+
+    @classmethod
+    def linear(cls, **weights: float) -> Term:
+        """``Term.linear(x=1)`` is the coordinate x."""
+        return cls(parts=(Part(function="linear", weights=weights),))
+
+    @classmethod
+    def sin(cls, **weights: float) -> Term:
+        return cls(parts=(Part(function="sin", weights=weights),))
+
+    @classmethod
+    def cos(cls, **weights: float) -> Term:
+        return cls(parts=(Part(function="cos", weights=weights),))
+
+    def clipped(self, low: float | None, high: float | None) -> Term:
+        return self.model_copy(update={"low": low, "high": high})
+
+    def __add__(self, other: Term) -> Term:
+        _require(self.low is None and self.high is None and other.low is None and other.high is None,
+                 "clipped terms can't be added")
+        return Term(parts=self.parts + other.parts)
+
+    def __mul__(self, factor: float) -> Term:
+        _require(self.low is None and self.high is None, "a clipped term can't be scaled")
+        parts = (p.model_copy(update={"coefficient": p.coefficient * factor}) for p in self.parts)
+        return Term(parts=tuple(parts))
+
+    __rmul__ = __mul__
+
+
+class ObservationEntry(Frozen):
+    """One entry of the observation: a name, the term that gives it, and the limits of the observation space."""
+
+    name: Name
+    term: Term
+    low: FiniteFloat | None = None
+    high: FiniteFloat | None = None
+
+
+class Inequality(Frozen):
+    """``term relation value``, for instance height > 1."""
+
+    term: Term
+    relation: Literal["<", "<=", ">", ">="]
+    value: FiniteFloat
+
+
+AllOf = Annotated[tuple[Inequality, ...], Field(min_length=1)]
+
+
+# Actions
+
+
+class BoxAction(Frozen):
+    """A continuous action in [low, high]. ``bins`` offers it to the policy as so many equally spaced discrete values a
+    dimension (the paper's discretised control); the model and the sampler always see the continuous value."""
+
+    kind: Literal["box"] = "box"
+    low: tuple[FiniteFloat, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
+    high: tuple[FiniteFloat, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
+    bins: tuple[Annotated[int, Field(ge=2, le=MAX_DISCRETE_ACTIONS)], ...] | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        _require(len(self.low) == len(self.high),
+                 f"action low and high differ in length: {len(self.low)} and {len(self.high)}")
+        for i, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
+            _require(low < high, f"action {i} crosses: expected low < high, got [{low}, {high}]")
+        if self.bins is not None:
+            _require(len(self.bins) == len(self.low), f"expected {len(self.low)} bins, got {len(self.bins)}")
+        return self
+
+    @property
+    def size(self) -> int:
+        return len(self.low)
+
+
+class DiscreteAction(Frozen):
+    """One of n actions, 0 to n - 1."""
+
+    kind: Literal["discrete"] = "discrete"
+    n: int = Field(ge=2, le=MAX_DISCRETE_ACTIONS)
+
+    @property
+    def size(self) -> int:
+        return 1
+
+
+class MultiDiscreteAction(Frozen):
+    """Several discrete actions at once; entry i is 0 to nvec[i] - 1."""
+
+    kind: Literal["multi_discrete"] = "multi_discrete"
+    nvec: tuple[Annotated[int, Field(ge=2, le=MAX_DISCRETE_ACTIONS)], ...] = Field(
+        min_length=1, max_length=MAX_DIMENSIONS
+    )
+
+    @property
+    def size(self) -> int:
+        return len(self.nvec)
+
+
+Action = Annotated[BoxAction | DiscreteAction | MultiDiscreteAction, Field(discriminator="kind")]
+
+
+# Reward, success, design
+
+
+class Reward(Frozen):
+    """How the reward is learned.
+
+    ``timing``: ``before`` reads (q, u), as Gymnasium's classic control does; ``after`` reads (q', u), as the paper's text says.
+    ``penalty``: k of eq. 14, reward = mean - k * deviation; None takes the preset's (default 0, paper 3).
+    """
+
+    timing: Literal["before", "after"] = "before"
+    penalty: Annotated[float, Field(ge=0, le=100)] | None = None
+
+
+class Success(Frozen):
+    """When an evaluation episode counts as a success. Every criterion given must hold.
+
+    ``hold``: all inequalities hold through the last ``hold_steps`` steps; ``min_steps``: at least so many steps;
+    ``max_steps``: at most; ``terminated``: the episode ended (or did not end) by termination; ``min_return``.
+    """
+
+    hold: tuple[Inequality, ...] = ()
+    hold_steps: PositiveInt = 1
+    min_steps: PositiveInt | None = None
+    terminated: bool | None = None
+    min_return: FiniteFloat | None = None
+
+
+class Design(Frozen):
+    """The adaptive design of queries: what is chosen before the first one.
+
+    ``preset``: ``default`` or ``paper`` (the method as printed, repaired only where it cannot work). Every None takes the
+    preset's value. ``budget`` counts every real step of the design, initial ones included.
+    """
+
+    preset: Literal["default", "paper"] = "default"
+    budget: Annotated[int, Field(ge=2, le=100_000)] | None = None
+    initial: Annotated[int, Field(ge=2, le=100_000)] | None = None
+    target: Annotated[float, Field(gt=0.5, lt=1)] = 0.999
+    acquisition: Literal["uncertainty_index", "variance", "latin_hypercube"] | None = None
+    monte_carlo: Annotated[int, Field(ge=16, le=100_000)] | None = None
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+
+
+class EnvironmentSpec(Frozen):
+    """One original environment: coordinates, observation, action, start, termination, limits and the design of queries."""
+
+    environment: str = Field(default="", max_length=256, description="Gymnasium id, or free text for one's own")
+    coordinates: tuple[Coordinate, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
+    observation: tuple[ObservationEntry, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
+    action: Action
+    start: dict[Name, StartDistribution]
+    termination: tuple[AllOf, ...] = Field(default=(), description="ends when any of these all-of groups holds at q'")
+    time_limit: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
+    reward: Reward = Reward()
+    tolerances: dict[Name, PositiveFloat] = Field(
+        default_factory=dict, description="by moving coordinate, or 'reward', in the output's own unit"
+    )
+    success: Success | None = None
+    design: Design = Design()
+
+    @property
+    def coordinate_names(self) -> tuple[str, ...]:
+        return tuple(c.name for c in self.coordinates)
+
+    @property
+    def observation_names(self) -> tuple[str, ...]:
+        return tuple(o.name for o in self.observation)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        names = self.coordinate_names
+        _require_unique("coordinate", names)
+        _require_unique("observation", self.observation_names)
+        _require(REWARD not in names, f"no coordinate may be called {REWARD!r}")
+        _require_known("start", self.start, names)
+        missing = [n for n in names if n not in self.start]
+        _require(not missing, f"start distribution lacks {missing}: expected every coordinate of {list(names)}")
+        outputs = [c.name for c in self.coordinates if c.kind != "constant"]
+        _require(bool(outputs), "expected at least one coordinate that moves (linear or angle)")
+        _require_known("tolerances", self.tolerances, (*outputs, REWARD))
+        for c in self.coordinates:
+            if c.bounds is not None:
+                if c.bounds.stops is not None:
+                    _require_known(f"coordinate {c.name!r}: stops", (c.bounds.stops,), outputs)
+                low, high = limits(self.start[c.name])
+                inside = (c.bounds.low is None or low >= c.bounds.low) and (
+                    c.bounds.high is None or high <= c.bounds.high)
+                _require(inside, f"start of {c.name!r}, [{low}, {high}], leaves its bounds "
+                                 f"[{c.bounds.low}, {c.bounds.high}]")
+        for where, term in self._terms():
+            for part in term.parts:
+                _require_known(f"{where}: term", part.weights, names)
+        for entry in self.observation:
+            low = -math.inf if entry.low is None else entry.low
+            high = math.inf if entry.high is None else entry.high
+            _require(low < high, f"observation {entry.name!r} crosses: expected low < high, got [{low}, {high}]")
+        if self.design.budget is not None and self.design.initial is not None:
+            _require(self.design.initial <= self.design.budget,
+                     f"design: initial {self.design.initial} exceeds the budget {self.design.budget}")
+        return self
+
+    def _terms(self) -> Iterable[tuple[str, Term]]:
+        for entry in self.observation:
+            yield f"observation {entry.name!r}", entry.term
+        for group in self.termination:
+            for inequality in group:
+                yield "termination", inequality.term
+        if self.success is not None:
+            for inequality in self.success.hold:
+                yield "success", inequality.term
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ValueError(message)
+
+
+def _require_unique(what: str, names: Iterable[str]) -> None:
+    seen: set[str] = set()
+    for name in names:
+        _require(name not in seen, f"{what} {name!r} is given twice")
+        seen.add(name)
+
+
+def _require_known(where: str, given: Iterable[str], known: Iterable[str]) -> None:
+    known = list(known)
+    unknown = [name for name in given if name not in known]
+    _require(not unknown, f"{where} names unknown {unknown}: expected some of {known}")
