@@ -1,0 +1,1 @@
+"""Storage: the port, and adapters for SQLite and PostgreSQL."""

@@ -1,0 +1,300 @@
+"""The storage port: everything Surrogym remembers. Its docstrings are laws that every adapter is tested by.
+
+For all of it:
+- an operation is atomic, and what it changed is durable when it returns;
+- any thread may call, and on PostgreSQL any number of servers;
+- time is the database's clock, and a lease ends by that clock alone, whoever died;
+- an operation on a surrogate that is not there raises ``UnknownSurrogate``;
+- an operation that raises has changed nothing;
+- a repeat with the same idempotency ``key`` and the same arguments changes nothing and returns what the first
+  returned; with other arguments it raises ``IdempotencyConflict``;
+- a database that can't be reached raises ``Unavailable``;
+- events are appended by the operations themselves; their ids grow in the order in which they become visible.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+from surrogym_server.storage.records import (
+    AddedSamples,
+    Array,
+    EventRecord,
+    FitLease,
+    LeasedQuery,
+    LedgerRecord,
+    ModelRecord,
+    NewDesign,
+    NewModel,
+    NewSample,
+    NewSurrogate,
+    OccupancyRecord,
+    Phase,
+    QueryCounts,
+    QueryRecord,
+    QueryStatus,
+    SampleArrays,
+    SampleRecord,
+    SavedSession,
+    SurrogateRecord,
+)
+
+MAX_ATTEMPTS = 3
+
+
+class Surrogates(ABC):
+    """Surrogates by name."""
+
+    @abstractmethod
+    def create(self, new: NewSurrogate) -> tuple[SurrogateRecord, bool]:
+        """Create a surrogate in phase ``collecting`` with its initial queries; says whether it is new.
+
+        The same name and spec again returns what is there, unchanged, and False.
+
+        Raises:
+            SpecConflict: the name exists with another spec.
+        """
+
+    @abstractmethod
+    def get(self, name: str) -> SurrogateRecord: ...
+
+    @abstractmethod
+    def list(self) -> list[SurrogateRecord]:
+        """All of them, oldest first."""
+
+    @abstractmethod
+    def change(
+        self, name: str, *, paused: bool | None = None, budget: int | None = None, target: float | None = None
+    ) -> SurrogateRecord:
+        """Change what is not None. Another budget or target, or resuming a failed design, makes a fit due."""
+
+    @abstractmethod
+    def set_phase(self, name: str, phase: Phase, error: str | None = None) -> None: ...
+
+    @abstractmethod
+    def delete(self, name: str) -> None:
+        """Remove the surrogate and all that belongs to it."""
+
+
+class Designs(ABC):
+    """The right to fit: at any time at most one server fits a surrogate."""
+
+    @abstractmethod
+    def ask(
+        self, name: str, queries: int, *, checkpoint: str | None = None, key: str | None = None
+    ) -> SurrogateRecord:
+        """Ask the next fit for ``queries`` more, whatever its verdict; a fit becomes due.
+
+        The budget is raised to hold them, beside the samples, the open queries and what was asked before.
+        """
+
+    @abstractmethod
+    def due(self) -> list[str]:
+        """Names of the surrogates to fit now, oldest first.
+
+        Such a one has samples, no pending or leased query, something new since its last fit (a sample, a query set
+        aside, an ask, another budget or target), is not paused, and nobody holds the right to fit it.
+        """
+
+    @abstractmethod
+    def begin(self, name: str, owner: str, seconds: float) -> FitLease | None:
+        """Take the right to fit; the phase becomes ``fitting``. None when another holds it, or when paused."""
+
+    @abstractmethod
+    def renew(self, lease: FitLease, seconds: float) -> FitLease:
+        """Hold the right until ``seconds`` from now.
+
+        Raises:
+            LeaseExpired: another has taken it since. One that ended unnoticed comes back to life.
+        """
+
+    @abstractmethod
+    def commit(self, lease: FitLease, design: NewDesign) -> int:
+        """Store model, state, phase and next queries together, and end the right; returns the model's version.
+
+        The error is cleared. Queries get the new round and purpose ``adaptive``. What came in since ``begin`` makes
+        the next fit due.
+
+        Raises:
+            LeaseExpired: another has taken the right since.
+        """
+
+    @abstractmethod
+    def abort(self, lease: FitLease, error: str | None) -> None:
+        """End the right without a model; harmless when it is gone.
+
+        With an error the phase becomes ``failed``, and the next fit is due when something new comes. Without one
+        (a shutdown) the fit stays due.
+        """
+
+
+class Queries(ABC):
+    """The queue of queries and their leases.
+
+    A query is pending, leased, answered or set_aside. A lease that fails or expires makes it pending again,
+    and the last of ``MAX_ATTEMPTS`` sets it aside.
+    """
+
+    @abstractmethod
+    def enqueue(self, name: str, coordinates: Array, action: Array, *, key: str | None = None) -> list[int]:
+        """Queue queries by hand: coordinates (m, C), action (m, F), purpose ``manual``; returns their ids."""
+
+    @abstractmethod
+    def claim(self, name: str, sampler: str, limit: int, seconds: float) -> list[LeasedQuery]:
+        """Lease up to ``limit`` pending queries for ``seconds``, oldest first, each to one caller only.
+
+        Expired leases are swept first. A paused surrogate hands out nothing.
+        """
+
+    @abstractmethod
+    def renew(self, name: str, query_id: int, token: str, seconds: float) -> float:
+        """Let the lease end ``seconds`` from now; returns when.
+
+        Raises:
+            UnknownQuery, ForeignLease: as the class says.
+            LeaseExpired: the lease has ended, by its time, an answer or a failure.
+        """
+
+    @abstractmethod
+    def fail(self, name: str, query_id: int, token: str, error: str) -> QueryRecord:
+        """End the lease with an error; the query goes to the next one or is set aside. A repeat is harmless.
+
+        Raises:
+            UnknownQuery: no such query.
+            ForeignLease: the token was never given out for this query.
+            LeaseExpired: the lease ended by its time or an answer.
+        """
+
+    @abstractmethod
+    def get(self, name: str, query_id: int) -> QueryRecord:
+        """Raises ``UnknownQuery`` when there is none."""
+
+    @abstractmethod
+    def list(self, name: str, statuses: Sequence[QueryStatus] = (), limit: int = 10_000) -> list[QueryRecord]:
+        """The queries of these statuses (none: all), oldest first."""
+
+    @abstractmethod
+    def counts(self, name: str) -> QueryCounts: ...
+
+    @abstractmethod
+    def sweep_expired(self) -> int:
+        """End the leases whose time has come, of all surrogates; returns how many."""
+
+
+class Samples(ABC):
+    """Samples: never changed, never lost once acknowledged."""
+
+    @abstractmethod
+    def add(
+        self, name: str, sampler: str, samples: Sequence[NewSample], *, key: str | None = None
+    ) -> AddedSamples:
+        """Store a batch, all or nothing, and answer the queries it names; committed when it returns.
+
+        A sample takes the purpose of its query, or ``manual``. Under a lease that has ended (by its time or a
+        failure) it is kept and flagged late; it still answers the query unless another lease of it is live. Under
+        one lease there is one sample: the same again is a duplicate and gets the same id.
+
+        Raises:
+            UnknownQuery: no such query.
+            ForeignLease: a lease token that was never given out for the query, or none.
+            IdempotencyConflict: the same lease token, or key, with another sample.
+        """
+
+    @abstractmethod
+    def arrays(self, name: str) -> SampleArrays:
+        """All samples, in order of arrival."""
+
+    @abstractmethod
+    def page(self, name: str, after: int, limit: int) -> list[SampleRecord]:
+        """Up to ``limit`` samples with an id above ``after``, in order."""
+
+    @abstractmethod
+    def count(self, name: str) -> int: ...
+
+
+class Ledger(ABC):
+    """Real steps by purpose."""
+
+    @abstractmethod
+    def report(self, name: str, steps: int, *, key: str, episodes: int = 0, note: str = "") -> LedgerRecord:
+        """Count evaluation steps, once per key; returns the ledger as it is now."""
+
+    @abstractmethod
+    def read(self, name: str) -> LedgerRecord: ...
+
+
+class Models(ABC):
+    """Models by version: 1, 2, ... of each surrogate. ``None`` is the latest."""
+
+    @abstractmethod
+    def list(self, name: str) -> list[ModelRecord]:
+        """All of them, oldest first."""
+
+    @abstractmethod
+    def get(self, name: str, version: int | None = None) -> ModelRecord:
+        """Raises ``UnknownModel`` for a version that is not there, ``NoModel`` when there is none at all."""
+
+    @abstractmethod
+    def blob(self, name: str, version: int | None = None) -> bytes:
+        """The model itself, as it was given. Raises as ``get``."""
+
+    @abstractmethod
+    def add(self, name: str, model: NewModel) -> int:
+        """Import a model as the newest version; returns it. The design is not touched."""
+
+
+class Occupancy(ABC):
+    """States that policies visited, by checkpoint."""
+
+    @abstractmethod
+    def put(self, name: str, checkpoint: str, states: Array) -> None:
+        """Store states (m, C) under a name; the same name again replaces them and makes them the latest."""
+
+    @abstractmethod
+    def get(self, name: str, checkpoint: str) -> OccupancyRecord | None: ...
+
+    @abstractmethod
+    def latest(self, name: str) -> OccupancyRecord | None: ...
+
+
+class Sessions(ABC):
+    """Sessions that a clean shutdown saves for the next start."""
+
+    @abstractmethod
+    def save(self, sessions: Sequence[SavedSession]) -> None:
+        """Store them; the same id again replaces."""
+
+    @abstractmethod
+    def take(self) -> list[SavedSession]:
+        """Return and remove them: each is given out once."""
+
+
+class Events(ABC):
+    """What happened to a surrogate."""
+
+    @abstractmethod
+    def list(self, name: str, after: int = 0, limit: int = 1_000) -> list[EventRecord]:
+        """Up to ``limit`` events with an id above ``after``, in order."""
+
+
+class Storage(ABC):
+    """All of it. ``open_storage`` makes one."""
+
+    surrogates: Surrogates
+    designs: Designs
+    queries: Queries
+    samples: Samples
+    ledger: Ledger
+    models: Models
+    occupancy: Occupancy
+    sessions: Sessions
+    events: Events
+
+    @abstractmethod
+    def ping(self) -> None:
+        """Return when the database answers; raises ``Unavailable`` when it does not."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Give up connections and locks; closing twice is harmless."""

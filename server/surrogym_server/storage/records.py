@@ -1,0 +1,248 @@
+"""What storage gives and takes: frozen records, free of any database and of the wire.
+
+Shapes: C coordinates, F action entries, D observation entries. Times are seconds since 1970, on the database's
+clock. ``JSON`` is what ``json.dumps`` takes and gives back unchanged.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+JSON = dict[str, Any]
+Vector = tuple[float, ...]
+Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "failed"]
+Purpose = Literal["initial", "adaptive", "manual"]
+QueryStatus = Literal["pending", "leased", "answered", "set_aside"]
+EventKind = Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger"]
+
+OPEN_STATUSES: tuple[QueryStatus, ...] = ("pending", "leased")
+
+
+def no_rows() -> Array:
+    return np.zeros((0, 0))
+
+
+# Surrogates and their design
+
+
+@dataclass(frozen=True)
+class NewSurrogate:
+    """A surrogate to create, with the queries of its first round."""
+
+    name: str
+    spec: JSON
+    budget: int
+    target: float
+    state: JSON = field(default_factory=dict)  # of the design
+    query_coordinates: Array = field(default_factory=no_rows)  # (m, C)
+    query_action: Array = field(default_factory=no_rows)  # (m, F)
+
+
+@dataclass(frozen=True)
+class SurrogateRecord:
+    name: str
+    spec: JSON
+    budget: int
+    target: float
+    phase: Phase
+    paused: bool
+    round: int  # designs committed so far
+    state: JSON  # of the design
+    error: str | None
+    extra_queries: int  # asked for by ``Designs.ask`` and not yet chosen
+    checkpoint: str | None  # the occupancy the last ask named
+    created_at: float
+
+
+@dataclass(frozen=True)
+class FitLease:
+    """The right to fit one surrogate, until it expires. Given back whole to renew, commit or abort."""
+
+    surrogate: str
+    token: str
+    revision: int  # what the surrogate had seen when the fit began
+    extra_queries: int  # to be chosen by this fit whatever its verdict
+    checkpoint: str | None
+    expires: float
+
+
+@dataclass(frozen=True)
+class NewModel:
+    samples: int
+    data_hash: str
+    fidelity: JSON
+    description: JSON
+    fit_seconds: float
+    blob: bytes = field(repr=False)
+
+
+@dataclass(frozen=True)
+class ModelRecord:
+    """A model without its bytes."""
+
+    version: int  # 1, 2, ... per surrogate
+    created_at: float
+    samples: int
+    data_hash: str
+    fidelity: JSON
+    description: JSON
+    fit_seconds: float
+
+
+@dataclass(frozen=True)
+class NewDesign:
+    """What one fit gives: a model, the design's new state and phase, and the next queries."""
+
+    model: NewModel
+    state: JSON
+    phase: Phase
+    query_coordinates: Array = field(default_factory=no_rows)  # (m, C)
+    query_action: Array = field(default_factory=no_rows)  # (m, F)
+
+
+# Queries and samples
+
+
+@dataclass(frozen=True)
+class QueryRecord:
+    id: int
+    purpose: Purpose
+    status: QueryStatus
+    round: int
+    coordinates: Vector  # (C,)
+    action: Vector  # (F,)
+    attempts: int  # leases given out so far
+    sampler: str | None  # the last one to claim it
+    error: str | None  # of the last attempt that failed
+
+
+@dataclass(frozen=True)
+class LeasedQuery:
+    id: int
+    purpose: Purpose
+    coordinates: Vector  # (C,)
+    action: Vector  # (F,)
+    attempt: int  # 1 for the first lease of this query
+    token: str
+    expires: float
+
+
+@dataclass(frozen=True)
+class QueryCounts:
+    pending: int = 0
+    leased: int = 0
+    answered: int = 0
+    set_aside: int = 0
+
+    @property
+    def open(self) -> int:
+        return self.pending + self.leased
+
+
+@dataclass(frozen=True)
+class NewSample:
+    """One real step as reported. ``query_id`` and ``lease_token`` come together or not at all."""
+
+    coordinates: Vector  # (C,)
+    action: Vector  # (F,)
+    next_coordinates: Vector  # (C,)
+    reward: float
+    terminated: bool
+    truncated: bool = False
+    observation: Vector | None = None  # (D,)
+    next_observation: Vector | None = None  # (D,)
+    query_id: int | None = None
+    lease_token: str | None = None
+
+
+@dataclass(frozen=True)
+class AddedSamples:
+    """``ids`` are in the order of the batch; ``duplicates`` of them were already there."""
+
+    ids: tuple[int, ...]
+    duplicates: int
+
+
+@dataclass(frozen=True)
+class SampleRecord:
+    id: int
+    purpose: Purpose
+    query_id: int | None
+    sampler: str
+    attempt: int  # 0 without a query
+    late: bool  # answered under a lease that had ended
+    requested_coordinates: Vector | None  # (C,)
+    coordinates: Vector  # (C,)
+    action: Vector  # (F,)
+    next_coordinates: Vector  # (C,)
+    reward: float
+    terminated: bool
+    truncated: bool
+    observation: Vector | None  # (D,)
+    next_observation: Vector | None  # (D,)
+    created_at: float
+
+
+@dataclass(frozen=True)
+class SampleArrays:
+    """All samples of a surrogate in order of arrival; (0, 0) arrays while there are none."""
+
+    coordinates: Array  # (n, C)
+    action: Array  # (n, F)
+    next_coordinates: Array  # (n, C)
+    reward: Array  # (n,)
+    terminated: NDArray[np.bool_]  # (n,)
+
+
+# The rest
+
+
+@dataclass(frozen=True)
+class LedgerRecord:
+    """Acknowledged real steps by purpose; ``unresolved`` are leases that expired without answer or failure."""
+
+    initial: int = 0
+    adaptive: int = 0
+    manual: int = 0
+    evaluation: int = 0
+    unresolved: int = 0
+
+    @property
+    def total(self) -> int:
+        """What the design cost."""
+        return self.initial + self.adaptive + self.manual
+
+
+@dataclass(frozen=True)
+class OccupancyRecord:
+    checkpoint: str
+    round: int  # of the design when it was submitted
+    created_at: float
+    states: Array  # (m, C)
+
+
+@dataclass(frozen=True)
+class SavedSession:
+    id: str
+    surrogate: str
+    data: bytes = field(repr=False)
+
+
+@dataclass(frozen=True)
+class EventRecord:
+    id: int
+    kind: EventKind
+    created_at: float
+    body: JSON
+
+
+def fingerprint(*parts: object) -> str:
+    """Equal for equal bodies: what an idempotency key is compared by."""
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
