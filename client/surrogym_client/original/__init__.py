@@ -1,0 +1,13 @@
+"""The original environment's side: the protocol, adapters for Gymnasium and MuJoCo, and loading one's own.
+
+Example:
+    >>> from surrogym_client import original
+    >>> environment = original.make("Pendulum-v1", budget=30)
+    >>> environment.step_from([3.1, 0.0], [2.0]).reward  # doctest: +ELLIPSIS
+    -9.6...
+"""
+
+from surrogym_client.original.loading import make
+from surrogym_client.original.protocol import OriginalEnvironment, RealStep
+
+__all__ = ["OriginalEnvironment", "RealStep", "make"]

@@ -1,0 +1,30 @@
+"""What can go wrong beside the original environment.
+
+OriginalError
+├── UnknownEnvironment      no adapter, module or factory of this name, or one that can't be expressed; choose another
+└── StepFailed              the environment did not give a step; the query fails, the worker goes on
+    ├── StepTimedOut        it took longer than its limit and was killed; the next step starts a fresh one
+    └── EnvironmentDied     its process ended; the next step starts a fresh one
+"""
+
+from __future__ import annotations
+
+
+class OriginalError(Exception):
+    """Base of this tree. ``str(error)`` is one sentence for a person."""
+
+
+class UnknownEnvironment(OriginalError):
+    """No original environment can be made of this name."""
+
+
+class StepFailed(OriginalError):
+    """The environment raised, or gave something that is no step."""
+
+
+class StepTimedOut(StepFailed):
+    """The environment took longer than its limit."""
+
+
+class EnvironmentDied(StepFailed):
+    """The environment's process ended."""

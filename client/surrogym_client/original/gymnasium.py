@@ -1,0 +1,80 @@
+"""Gymnasium's classic control tasks as original environments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from surrogym_client.original.classic import PAPER_TASKS, TASKS, Task
+from surrogym_client.original.protocol import Array, RealStep
+from surrogym_shared.spec import BoxAction, EnvironmentSpec
+
+
+def task_for(environment: str, preset: str) -> Task:
+    """The task of a known Gymnasium id, as the preset states it.
+
+    Raises:
+        KeyError: no classic control task of this id.
+    """
+    if preset == "paper" and environment in PAPER_TASKS:
+        return PAPER_TASKS[environment]
+    return TASKS[environment]
+
+
+class GymnasiumEnvironment:
+    """A classic control task that is set to given coordinates: its unwrapped environment, without a time limit."""
+
+    def __init__(self, spec: EnvironmentSpec) -> None:
+        import gymnasium
+
+        self._spec = spec
+        self._task = task_for(spec.environment, spec.design.preset)
+        self._env: Any = gymnasium.make(spec.environment).unwrapped
+        self._env.reset(seed=0)
+
+    def spec(self) -> EnvironmentSpec:
+        return self._spec
+
+    def step_from(self, coordinates: Array, action: Array) -> RealStep:
+        """Set the state to coordinates (C,), apply action (F,)."""
+        self._task.write(self._env, coordinates)
+        achieved = wrapped(self._spec, self._task.read(self._env))
+        native = native_action(self._spec, action)
+        observation, reward, terminated, truncated, _ = self._env.step(native)
+        return RealStep(
+            coordinates=achieved,
+            action=np.atleast_1d(np.asarray(native, dtype=np.float64)),
+            next_coordinates=wrapped(self._spec, self._task.read(self._env)),
+            reward=float(reward),
+            terminated=bool(terminated and self._spec.termination),
+            truncated=bool(truncated),
+            next_observation=np.asarray(observation, dtype=np.float64),
+        )
+
+    def close(self) -> None:
+        self._env.close()
+
+
+def native_action(spec: EnvironmentSpec, action: Array) -> Any:
+    """What the environment's own ``step`` takes for an action (F,): an int, or an array of the space's type."""
+    if isinstance(spec.action, BoxAction):
+        return np.asarray(action, dtype=np.float32)
+    numbers = np.asarray(action, dtype=np.int64)
+    return int(numbers[0]) if spec.action.kind == "discrete" else numbers
+
+
+def wrapped(spec: EnvironmentSpec, coordinates: Array) -> Array:
+    """Coordinates (C,) with angles in [-pi, pi) and bounded ones within their bounds.
+
+    Environments that keep a float32 state overshoot their own bounds by a rounding error.
+    """
+    out = np.array(coordinates, dtype=np.float64)
+    for i, coordinate in enumerate(spec.coordinates):
+        if coordinate.kind == "angle":
+            out[i] = (out[i] + np.pi) % (2 * np.pi) - np.pi
+        elif coordinate.bounds is not None:
+            low = -np.inf if coordinate.bounds.low is None else coordinate.bounds.low
+            high = np.inf if coordinate.bounds.high is None else coordinate.bounds.high
+            out[i] = np.clip(out[i], low, high)
+    return out

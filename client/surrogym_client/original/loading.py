@@ -1,0 +1,128 @@
+"""From a name to an original environment: a Gymnasium id, or ``package.module:factory`` for one's own."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from typing import Any, Literal
+
+from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.protocol import OriginalEnvironment
+from surrogym_shared.spec import BoxAction, EnvironmentSpec
+
+Preset = Literal["default", "paper"]
+
+
+def make(
+    name: str,
+    *,
+    spec: EnvironmentSpec | None = None,
+    preset: Preset | None = None,
+    budget: int | None = None,
+    initial: int | None = None,
+    target: float | None = None,
+    seed: int | None = None,
+    bins: int | None = None,
+) -> OriginalEnvironment:
+    """Build an original environment.
+
+    Args:
+        name: a Gymnasium id with a built-in adapter, or ``package.module:factory``.
+        spec: a specification that replaces the adapter's own.
+        preset, budget, initial, target, seed: choices of the design; None keeps the specification's.
+        bins: offer a continuous action to policies as so many discrete values a dimension.
+
+    Raises:
+        UnknownEnvironment: no adapter knows the name, or its module or factory can't be found.
+        ValueError: the options contradict the specification.
+
+    Example:
+        >>> make("CartPole-v1", preset="paper").spec().time_limit
+        200
+    """
+    design = {"preset": preset, "budget": budget, "initial": initial, "target": target, "seed": seed}
+    chosen = {key: value for key, value in design.items() if value is not None}
+    if ":" in name:
+        return _Respecified.of(load_factory(name)(), spec, chosen, bins)
+    return _known(name, spec, chosen, bins)
+
+
+def is_known(name: str) -> bool:
+    """Whether a built-in adapter knows this Gymnasium id; only such names are taken from a server's specification."""
+    from surrogym_client.original import classic, mujoco
+
+    return name in classic.TASKS or mujoco.is_known(name)
+
+
+def with_choices(spec: EnvironmentSpec, design: dict[str, Any], bins: int | None) -> EnvironmentSpec:
+    """The specification with some choices of its design replaced, checked again."""
+    fields = spec.model_dump()
+    fields["design"].update(design)
+    if bins is not None:
+        if not isinstance(spec.action, BoxAction):
+            raise ValueError(f"bins need a continuous action, got a {spec.action.kind} one")
+        fields["action"]["bins"] = (bins,) * spec.action.size
+    return EnvironmentSpec.model_validate(fields)
+
+
+def load_factory(name: str) -> Any:
+    """The factory ``package.module:attribute``; the working directory is searched too."""
+    module_name, _, attribute = name.partition(":")
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    try:
+        factory = getattr(importlib.import_module(module_name), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UnknownEnvironment(f"expected package.module:factory, got {name!r}: {error}") from error
+    if not callable(factory):
+        raise UnknownEnvironment(f"expected {name!r} to be callable, got a {type(factory).__name__}")
+    return factory
+
+
+def _known(
+    name: str, spec: EnvironmentSpec | None, design: dict[str, Any], bins: int | None
+) -> OriginalEnvironment:
+    from surrogym_client.original import classic, mujoco
+    from surrogym_client.original.gymnasium import GymnasiumEnvironment, task_for
+
+    if name in classic.TASKS:
+        base = spec or task_for(name, design.get("preset", "default")).spec()
+        return GymnasiumEnvironment(with_choices(base, design, bins))
+    if mujoco.is_known(name):
+        base = spec or mujoco.specification(name)
+        return mujoco.MujocoEnvironment(name, with_choices(base, design, bins))
+    known = ", ".join((*classic.TASKS, *mujoco.SPECIFICATIONS))
+    raise UnknownEnvironment(
+        f"no adapter knows the environment {name!r}: expected one of {known}, "
+        "a MuJoCo id together with a specification, or package.module:factory"
+    )
+
+
+class _Respecified:
+    """An environment whose specification was replaced on the command line."""
+
+    def __init__(self, environment: OriginalEnvironment, spec: EnvironmentSpec) -> None:
+        self._environment = environment
+        self._spec = spec
+        self.step_from = environment.step_from
+        self.close = environment.close
+
+    def spec(self) -> EnvironmentSpec:
+        return self._spec
+
+    @classmethod
+    def of(
+        cls,
+        environment: OriginalEnvironment,
+        spec: EnvironmentSpec | None,
+        design: dict[str, Any],
+        bins: int | None,
+    ) -> OriginalEnvironment:
+        if not isinstance(environment, OriginalEnvironment):
+            raise UnknownEnvironment(
+                f"expected an object with spec, step_from and close, got a {type(environment).__name__}"
+            )
+        if spec is None and not design and bins is None:
+            return environment
+        return cls(environment, with_choices(spec or environment.spec(), design, bins))
