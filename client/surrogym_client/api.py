@@ -1,0 +1,315 @@
+"""Every route but the sessions', one typed method each."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any, Self, TypeVar
+from urllib.parse import quote
+from uuid import uuid4
+
+from pydantic import BaseModel, ValidationError
+
+from surrogym_client.connection import Connection, Retries, Timeouts
+from surrogym_client.errors import ProtocolMismatch, ServerUnreachable
+from surrogym_shared import wire
+from surrogym_shared.spec import EnvironmentSpec
+
+R = TypeVar("R", bound=wire.Reply)
+
+_EVENT_SILENCE_SECONDS = 60.0
+
+
+class Api:
+    """The service, as a sampler, a dashboard or a person at a prompt uses it.
+
+    Every method raises a ``SurrogymClientError``: ``ServerUnreachable`` after the retry budget, or the
+    subclass of ``ProblemError`` that stands for the server's answer. Calls that must happen once carry an
+    idempotency key, made here where none is given, so a lost reply never doubles them.
+
+    Args:
+        url: the server's address; default ``SURROGYM_URL``, then http://127.0.0.1:8000.
+        token: bearer token; default ``SURROGYM_TOKEN``.
+        timeouts: seconds per kind of request.
+        retries: how long to go on after lost connections, lost replies and 503.
+
+    Example:
+        >>> with Api() as api:
+        ...     api.surrogate("pendulum").phase
+    """
+
+    def __init__(
+        self,
+        url: str | None = None,
+        token: str | None = None,
+        *,
+        timeouts: Timeouts | None = None,
+        retries: Retries | None = None,
+    ) -> None:
+        self.connection = Connection(url, token, timeouts, retries)
+
+    @property
+    def url(self) -> str:
+        return self.connection.url
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self.connection.close()
+
+    # Service
+
+    def health(self) -> wire.Health:
+        """That a Surrogym server of this protocol answers.
+
+        Raises:
+            ProtocolMismatch: it speaks another version.
+        """
+        health = self._get(wire.Health, "/healthz")
+        check_protocol(health.protocol, self.url)
+        return health
+
+    def wait_until_ready(self, seconds: float = 60.0) -> wire.Health:
+        """Wait for the server to come up.
+
+        Raises:
+            ServerUnreachable: it did not within ``seconds``.
+        """
+        content = self.connection.send("GET", "/readyz", retries=Retries(seconds=seconds))
+        _parse(wire.Ready, content, "/readyz")
+        return self.health()
+
+    # Surrogates
+
+    def create_surrogate(self, name: str, spec: EnvironmentSpec) -> wire.SurrogateView:
+        """Register an original environment; the same name with the same specification is harmless."""
+        return self._post(wire.SurrogateView, "/v1/surrogates", wire.CreateSurrogate(name=name, spec=spec))
+
+    def surrogates(self) -> list[wire.SurrogateSummary]:
+        return self._get(wire.SurrogateList, "/v1/surrogates").surrogates
+
+    def surrogate(self, name: str) -> wire.SurrogateView:
+        return self._get(wire.SurrogateView, _surrogate(name))
+
+    def patch_surrogate(
+        self, name: str, *, paused: bool | None = None, budget: int | None = None, target: float | None = None
+    ) -> wire.SurrogateView:
+        """Pause or resume the design, or change its budget or target; None leaves a field as it is."""
+        body = wire.PatchSurrogate(paused=paused, budget=budget, target=target)
+        return self._post(wire.SurrogateView, _surrogate(name), body, method="PATCH")
+
+    def delete_surrogate(self, name: str) -> None:
+        self.connection.send("DELETE", _surrogate(name))
+
+    # Queries
+
+    def claim(
+        self,
+        name: str,
+        sampler: str,
+        *,
+        max_queries: int = 1,
+        wait_seconds: float = 0.0,
+        lease_seconds: float = 60.0,
+    ) -> wire.ClaimedQueries:
+        """Lease queries to answer; waits up to ``wait_seconds`` for some. An empty list is no error.
+
+        A claim whose reply is lost is not sent again: its leases run out, and the queries come back.
+        """
+        body = wire.ClaimQueries(
+            sampler=sampler, max_queries=max_queries, wait_seconds=wait_seconds, lease_seconds=lease_seconds
+        )
+        return self._post(
+            wire.ClaimedQueries,
+            f"{_surrogate(name)}/queries:claim",
+            body,
+            timeout=self.connection.timeouts.request + wait_seconds,
+            repeatable=False,
+        )
+
+    def renew(self, name: str, query_id: int, lease_token: str, *, lease_seconds: float = 60.0) -> None:
+        """Keep a lease alive while the original environment works.
+
+        Raises:
+            LeaseExpired: it has ended; the answer may still be sent.
+        """
+        body = wire.RenewLease(lease_token=lease_token, lease_seconds=lease_seconds)
+        self._send(f"{_surrogate(name)}/queries/{query_id}:renew", body)
+
+    def fail(self, name: str, query_id: int, lease_token: str, error: str) -> None:
+        """Give a query back with the error it caused."""
+        body = wire.FailQuery(lease_token=lease_token, error=error)
+        self._send(f"{_surrogate(name)}/queries/{query_id}:fail", body)
+
+    def ask(
+        self,
+        name: str,
+        coordinates: Sequence[Sequence[float]],
+        action: Sequence[Sequence[float]],
+        *,
+        idempotency_key: str | None = None,
+    ) -> list[wire.QueryView]:
+        """Put queries of one's own into the queue: coordinates (n, C), action (n, F)."""
+        body = wire.AskQueries(
+            coordinates=[list(row) for row in coordinates],
+            action=[list(row) for row in action],
+            idempotency_key=idempotency_key or new_key(),
+        )
+        return self._post(wire.QueryList, f"{_surrogate(name)}/queries", body).queries
+
+    def queries(self, name: str) -> list[wire.QueryView]:
+        return self._get(wire.QueryList, f"{_surrogate(name)}/queries").queries
+
+    # Samples and the ledger
+
+    def add_samples(
+        self,
+        name: str,
+        sampler: str,
+        samples: Sequence[wire.NewSample],
+        *,
+        idempotency_key: str | None = None,
+    ) -> wire.AddedSamples:
+        """Hand in real steps; the answer comes after they are stored for good."""
+        body = wire.AddSamples(
+            sampler=sampler, samples=list(samples), idempotency_key=idempotency_key or new_key()
+        )
+        return self._post(wire.AddedSamples, f"{_surrogate(name)}/add_sample", body)
+
+    def samples(self, name: str) -> Iterator[wire.SampleView]:
+        """All samples in order of arrival, page by page."""
+        after: int | None = 0
+        while after is not None:
+            page = self._get(wire.SamplePage, f"{_surrogate(name)}/samples", after=after)
+            yield from page.samples
+            after = page.next_after
+
+    def report_steps(
+        self, name: str, steps: int, *, episodes: int = 0, note: str = "", idempotency_key: str | None = None
+    ) -> wire.Ledger:
+        """Enter real steps of an evaluation into the ledger."""
+        body = wire.ReportSteps(
+            steps=steps, episodes=episodes, note=note, idempotency_key=idempotency_key or new_key()
+        )
+        return self._post(wire.Ledger, f"{_surrogate(name)}/ledger", body)
+
+    def improve(
+        self, name: str, queries: int, *, checkpoint: str | None = None, idempotency_key: str | None = None
+    ) -> wire.SurrogateView:
+        """Ask the design for more queries, weighted by the occupancy submitted under ``checkpoint``."""
+        body = wire.Improve(
+            queries=queries, checkpoint=checkpoint, idempotency_key=idempotency_key or new_key()
+        )
+        return self._post(wire.SurrogateView, f"{_surrogate(name)}/improve", body)
+
+    # Models
+
+    def query_uncertainty(
+        self,
+        name: str,
+        coordinates: Sequence[Sequence[float]],
+        action: Sequence[Sequence[float]],
+        *,
+        model: int | None = None,
+    ) -> wire.Uncertainty:
+        """Mean, deviation and uncertainty index at coordinates (n, C) and action (n, F)."""
+        return self._post(
+            wire.Uncertainty, f"{_surrogate(name)}/query_uncertainty", _points(coordinates, action, model)
+        )
+
+    def predict(
+        self,
+        name: str,
+        coordinates: Sequence[Sequence[float]],
+        action: Sequence[Sequence[float]],
+        *,
+        model: int | None = None,
+    ) -> wire.Prediction:
+        """One transition each from coordinates (n, C) under action (n, F)."""
+        return self._post(wire.Prediction, f"{_surrogate(name)}/predict", _points(coordinates, action, model))
+
+    def models(self, name: str) -> list[wire.ModelView]:
+        return self._get(wire.ModelList, f"{_surrogate(name)}/models").models
+
+    # Events
+
+    def events(self, name: str, after: int | None = None) -> Iterator[wire.Event]:
+        """Follow what happens to a surrogate, for ever; a broken stream goes on after the last event seen.
+
+        Args:
+            name: the surrogate.
+            after: id of the last event already known; None starts with what happens from now on.
+
+        Raises:
+            ServerUnreachable: the stream stayed broken for the retry budget.
+        """
+        delays: Iterator[float] | None = None
+        while True:
+            try:
+                for event in self._one_stream(name, after):
+                    delays, after = None, event.id
+                    yield event
+            except ServerUnreachable:
+                delays = self.connection.retries.delays() if delays is None else delays
+                pause = next(delays, None)
+                if pause is None:
+                    raise
+                time.sleep(pause)
+
+    def _one_stream(self, name: str, after: int | None) -> Iterator[wire.Event]:
+        path = f"{_surrogate(name)}/events"
+        headers = {"Accept": "text/event-stream"}
+        if after is not None:
+            headers["Last-Event-ID"] = str(after)
+        with self.connection.stream(path, headers, _EVENT_SILENCE_SECONDS) as lines:
+            for line in lines:
+                if line.startswith("data:"):
+                    yield _parse(wire.Event, line.removeprefix("data:").strip().encode(), path)
+        raise ServerUnreachable(f"the server at {self.url} ended the stream of events")
+
+    def _get(self, reply: type[R], path: str, **params: str | int) -> R:
+        return _parse(reply, self.connection.send("GET", path, params=params or None), path)
+
+    def _post(self, reply: type[R], path: str, body: BaseModel, *, method: str = "POST", **options: Any) -> R:
+        return _parse(reply, self._send(path, body, method=method, **options), path)
+
+    def _send(self, path: str, body: BaseModel, *, method: str = "POST", **options: Any) -> bytes:
+        return self.connection.send(method, path, body.model_dump_json().encode(), **options)
+
+
+def new_key() -> str:
+    """A fresh idempotency key."""
+    return uuid4().hex
+
+
+def check_protocol(protocol: int, url: str) -> None:
+    """Refuse a server of another protocol version."""
+    if protocol != wire.PROTOCOL:
+        raise ProtocolMismatch(
+            f"expected protocol {wire.PROTOCOL} at {url}, got {protocol}: upgrade the older side"
+        )
+
+
+def _parse(reply: type[R], content: bytes, path: str) -> R:
+    try:
+        return reply.model_validate_json(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "body"
+        raise ProtocolMismatch(f"unexpected answer of {path}: {where}: {first['msg']}") from error
+
+
+def _surrogate(name: str) -> str:
+    return f"/v1/surrogates/{quote(name, safe='')}"
+
+
+def _points(
+    coordinates: Sequence[Sequence[float]], action: Sequence[Sequence[float]], model: int | None
+) -> wire.Points:
+    return wire.Points(
+        coordinates=[list(row) for row in coordinates], action=[list(row) for row in action], model=model
+    )

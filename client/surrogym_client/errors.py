@@ -1,0 +1,203 @@
+"""What can go wrong between a client and the service.
+
+SurrogymClientError
+├── ServerUnreachable       no answer within the retry budget; the last request may have been carried out
+│   └── RequestTimeout      the server took the request and did not answer in time
+├── ProtocolMismatch        what answered does not speak this version of the protocol
+└── ProblemError            the server refused; ``problem`` is its body, and nothing was changed
+    ├── InvalidInput        the request can't be used: wrong route, field, shape, type or range
+    │   ├── InvalidSpec
+    │   └── TooLarge
+    ├── NotThere
+    │   ├── UnknownSurrogate
+    │   ├── UnknownQuery
+    │   ├── UnknownModel
+    │   └── SessionLost     the environments open a new session and end the running episodes as truncated
+    │       ├── UnknownSession
+    │       └── SessionExpired
+    ├── Conflict            well formed, but it does not fit the present state
+    │   ├── SpecConflict
+    │   ├── IdempotencyConflict
+    │   ├── SeqConflict     ``expected_seq`` is what the session waits for
+    │   ├── ForeignLease
+    │   ├── LeaseExpired
+    │   ├── NotReset
+    │   └── NoModel
+    ├── Refused
+    │   ├── Unauthenticated
+    │   └── Forbidden
+    ├── Unavailable         was tried again until the retry budget ran out
+    │   └── Overloaded
+    └── ServerFailure       a defect of the server
+
+Every error pickles, so that it can cross from a worker process to its parent.
+"""
+
+from __future__ import annotations
+
+from surrogym_shared.codes import STATUS, Code, Problem
+
+
+class SurrogymClientError(Exception):
+    """Base of everything the client raises on purpose. ``str(error)`` is one sentence for a person."""
+
+
+class ServerUnreachable(SurrogymClientError):
+    """No answer within the retry budget. Check the address, and that the server runs."""
+
+
+class RequestTimeout(ServerUnreachable):
+    """The server did not answer in time. The connection was dropped, so a late answer is never read."""
+
+
+class ProtocolMismatch(SurrogymClientError):
+    """What answered is no Surrogym server, or one of another protocol version."""
+
+
+class ProblemError(SurrogymClientError):
+    """The server refused; ``problem`` says why, in words and as a code."""
+
+    def __init__(self, problem: Problem) -> None:
+        super().__init__(problem)
+        self.problem = problem
+
+    def __str__(self) -> str:
+        return self.problem.detail
+
+
+class InvalidInput(ProblemError):
+    """The request can't be used; its detail says what was expected and what came."""
+
+
+class InvalidSpec(InvalidInput):
+    """A specification that contradicts itself."""
+
+
+class TooLarge(InvalidInput):
+    """More than a limit allows."""
+
+
+class NotThere(ProblemError):
+    """Something named in the request does not exist."""
+
+
+class UnknownSurrogate(NotThere):
+    """No surrogate of this name; register it first."""
+
+
+class UnknownQuery(NotThere):
+    """No query of this number."""
+
+
+class UnknownModel(NotThere):
+    """No model of this version."""
+
+
+class SessionLost(NotThere):
+    """The session is gone; its episodes can't go on."""
+
+
+class UnknownSession(SessionLost):
+    """No session of this id."""
+
+
+class SessionExpired(SessionLost):
+    """The session was idle for too long, or was lost with a crash."""
+
+
+class Conflict(ProblemError):
+    """The request does not fit the present state."""
+
+
+class SpecConflict(Conflict):
+    """The name exists with another specification; choose another name."""
+
+
+class IdempotencyConflict(Conflict):
+    """The same idempotency key came with another body."""
+
+
+class SeqConflict(Conflict):
+    """Someone else steps this session, or a step was given up and had been carried out after all."""
+
+    @property
+    def expected_seq(self) -> int | None:
+        return self.problem.expected_seq
+
+
+class ForeignLease(Conflict):
+    """The lease token was never given out for this query."""
+
+
+class LeaseExpired(Conflict):
+    """The lease has ended; claim again."""
+
+
+class NotReset(Conflict):
+    """A lane has to be reset before it can be stepped."""
+
+
+class NoModel(Conflict):
+    """Nothing has been fitted yet; let a sampler answer the first queries."""
+
+
+class Refused(ProblemError):
+    """The caller may not do this."""
+
+
+class Unauthenticated(Refused):
+    """No token, or an unknown one; set SURROGYM_TOKEN."""
+
+
+class Forbidden(Refused):
+    """The token's role does not allow this."""
+
+
+class Unavailable(ProblemError):
+    """The server can't serve this now."""
+
+
+class Overloaded(Unavailable):
+    """A queue or a cap of the server is full."""
+
+
+class ServerFailure(ProblemError):
+    """A defect of the server; its log says more."""
+
+
+BY_CODE: dict[Code, type[ProblemError]] = {
+    Code.INVALID_REQUEST: InvalidInput,
+    Code.INVALID_SPEC: InvalidSpec,
+    Code.UNAUTHENTICATED: Unauthenticated,
+    Code.FORBIDDEN: Forbidden,
+    Code.NOT_FOUND: InvalidInput,
+    Code.UNKNOWN_SURROGATE: UnknownSurrogate,
+    Code.UNKNOWN_SESSION: UnknownSession,
+    Code.SESSION_EXPIRED: SessionExpired,
+    Code.UNKNOWN_QUERY: UnknownQuery,
+    Code.UNKNOWN_MODEL: UnknownModel,
+    Code.METHOD_NOT_ALLOWED: InvalidInput,
+    Code.SPEC_CONFLICT: SpecConflict,
+    Code.IDEMPOTENCY_CONFLICT: IdempotencyConflict,
+    Code.SEQ_CONFLICT: SeqConflict,
+    Code.FOREIGN_LEASE: ForeignLease,
+    Code.LEASE_EXPIRED: LeaseExpired,
+    Code.NOT_RESET: NotReset,
+    Code.NO_MODEL: NoModel,
+    Code.TOO_LARGE: TooLarge,
+    Code.UNSUPPORTED_MEDIA_TYPE: InvalidInput,
+    Code.TOO_MANY_REQUESTS: Overloaded,
+    Code.UNAVAILABLE: Unavailable,
+    Code.INTERNAL: ServerFailure,
+}
+
+
+def error_from_problem(problem: Problem) -> ProblemError:
+    """The exception that stands for a problem body."""
+    return BY_CODE[problem.code](problem)
+
+
+def refused_here(code: Code, detail: str) -> ProblemError:
+    """The exception the server would have caused, for what can't even be sent (NaN has no JSON form)."""
+    title = code.value.replace("_", " ").capitalize()
+    return error_from_problem(Problem(title=title, status=STATUS[code], code=code, detail=detail))
