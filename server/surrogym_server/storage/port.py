@@ -93,13 +93,13 @@ class Designs(ABC):
     def due(self) -> list[str]:
         """Names of the surrogates to fit now, oldest first.
 
-        Such a one has samples, no pending or leased query, something new since its last fit (a sample, a query set
-        aside, an ask, another budget or target), is not paused, and nobody holds the right to fit it.
+        Such a surrogate has samples, no pending or leased query, and something new since its last fit (a sample,
+        a query set aside, an ask, another budget or target); it is not paused, and nobody holds the right.
         """
 
     @abstractmethod
     def begin(self, name: str, owner: str, seconds: float) -> FitLease | None:
-        """Take the right to fit; the phase becomes ``fitting``. None when another holds it, or when paused."""
+        """Take the right to fit; the phase becomes ``fitting``. None when the surrogate is not due."""
 
     @abstractmethod
     def renew(self, lease: FitLease, seconds: float) -> FitLease:
@@ -111,10 +111,10 @@ class Designs(ABC):
 
     @abstractmethod
     def commit(self, lease: FitLease, design: NewDesign) -> int:
-        """Store model, state, phase and next queries together, and end the right; returns the model's version.
+        """Store model, state, phase and next queries together, and end the right; returns the version.
 
-        The error is cleared. Queries get the new round and purpose ``adaptive``. What came in since ``begin`` makes
-        the next fit due.
+        The error is cleared. Queries get the new round and purpose ``adaptive``. What came in since ``begin``
+        makes the next fit due.
 
         Raises:
             LeaseExpired: another has taken the right since.
@@ -124,8 +124,8 @@ class Designs(ABC):
     def abort(self, lease: FitLease, error: str | None) -> None:
         """End the right without a model; harmless when it is gone.
 
-        With an error the phase becomes ``failed``, and the next fit is due when something new comes. Without one
-        (a shutdown) the fit stays due.
+        With an error the phase becomes ``failed``, and the next fit is due when something new comes. Without
+        one (a shutdown) the fit stays due.
         """
 
 
@@ -192,8 +192,8 @@ class Samples(ABC):
         """Store a batch, all or nothing, and answer the queries it names; committed when it returns.
 
         A sample takes the purpose of its query, or ``manual``. Under a lease that has ended (by its time or a
-        failure) it is kept and flagged late; it still answers the query unless another lease of it is live. Under
-        one lease there is one sample: the same again is a duplicate and gets the same id.
+        failure) it is kept and flagged late; it still answers the query unless another lease of it is live.
+        Under one lease there is one sample: the same again is a duplicate and gets the same id.
 
         Raises:
             UnknownQuery: no such query.

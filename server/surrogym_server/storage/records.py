@@ -1,7 +1,7 @@
 """What storage gives and takes: frozen records, free of any database and of the wire.
 
-Shapes: C coordinates, F action entries, D observation entries. Times are seconds since 1970, on the database's
-clock. ``JSON`` is what ``json.dumps`` takes and gives back unchanged.
+Shapes: C coordinates, F action entries, D observation entries. Times are seconds since 1970, on the
+database's clock. ``JSON`` is what ``json.dumps`` takes and gives back unchanged.
 """
 
 from __future__ import annotations
@@ -206,7 +206,7 @@ class SampleArrays:
 
 @dataclass(frozen=True)
 class LedgerRecord:
-    """Acknowledged real steps by purpose; ``unresolved`` are leases that expired without answer or failure."""
+    """Acknowledged real steps by purpose; ``unresolved`` leases that expired, never answered or failed."""
 
     initial: int = 0
     adaptive: int = 0

@@ -1,0 +1,147 @@
+"""The right to fit, and what a fit gives."""
+
+from __future__ import annotations
+
+import secrets
+from dataclasses import replace
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection, Row
+
+from surrogym_server.errors import LeaseExpired, UnknownSurrogate
+from surrogym_server.storage import port
+from surrogym_server.storage.records import (
+    OPEN_STATUSES,
+    FitLease,
+    NewDesign,
+    Phase,
+    SurrogateRecord,
+    fingerprint,
+)
+from surrogym_server.storage.sql import surrogates as stored
+from surrogym_server.storage.sql.database import Database, clock
+from surrogym_server.storage.sql.models import insert_model
+from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, recall, remember, touch
+from surrogym_server.storage.sql.tables import queries, samples, surrogates
+
+NO_RIGHT = {"fit_token": None, "fit_owner": None, "fit_expires": None}
+
+
+class SqlDesigns(port.Designs):
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def ask(
+        self, name: str, queries: int, *, checkpoint: str | None = None, key: str | None = None
+    ) -> SurrogateRecord:
+        body = fingerprint(queries, checkpoint)
+        with self._database.write() as connection:
+            held = hold(connection, name, surrogates.c.budget, surrogates.c.extra_queries)
+            if recall(connection, held, "ask", key, body) is None:
+                extra = held.extra_queries + queries
+                budget = max(held.budget, _spoken_for(connection, held.id) + extra)
+                touch(connection, held, extra_queries=extra, budget=budget, checkpoint=checkpoint)
+                remember(connection, held, "ask", key, body, True)
+            return stored.read(connection, name)
+
+    def due(self) -> list[str]:
+        with self._database.read() as connection:
+            wanted = sa.select(surrogates.c.name).where(_is_due(connection)).order_by(surrogates.c.id)
+            return list(connection.execute(wanted).scalars())
+
+    def begin(self, name: str, owner: str, seconds: float) -> FitLease | None:
+        with self._database.write() as connection:
+            held = hold(connection, name)
+            row = connection.execute(
+                sa.select(surrogates.c.revision, surrogates.c.extra_queries, surrogates.c.checkpoint)
+                .where(surrogates.c.id == held.id)
+                .where(_is_due(connection))
+            ).one_or_none()
+            if row is None:
+                return None
+            lease = FitLease(name, secrets.token_urlsafe(16), *row, expires=held.now + seconds)
+            _update(connection, held, fit_token=lease.token, fit_owner=owner, fit_expires=lease.expires)
+            stored.update_phase(connection, held, "fitting", None)
+            return lease
+
+    def renew(self, lease: FitLease, seconds: float) -> FitLease:
+        with self._database.write() as connection:
+            held = _hold_right(connection, lease)
+            renewed = replace(lease, expires=held.now + seconds)
+            _update(connection, held, fit_expires=renewed.expires)
+            return renewed
+
+    def commit(self, lease: FitLease, design: NewDesign) -> int:
+        with self._database.write() as connection:
+            held = _hold_right(connection, lease)
+            version = insert_model(connection, held, design.model)
+            _finish(connection, held, lease, design)
+            chosen = (design.query_coordinates, design.query_action)
+            insert_queries(connection, held, "adaptive", held.round + 1, *chosen)
+            append_event(connection, held, "phase", phase=design.phase, error=None)
+            return version
+
+    def abort(self, lease: FitLease, error: str | None) -> None:
+        with self._database.write() as connection:
+            try:
+                held = _hold_right(connection, lease)
+            except (LeaseExpired, UnknownSurrogate):
+                return
+            seen = {} if error is None else {"fitted_revision": lease.revision}
+            _update(connection, held, **NO_RIGHT, **seen)
+            stored.update_phase(connection, held, _phase_after(held, error), error)
+
+
+def _is_due(connection: Connection) -> sa.ColumnElement[bool]:
+    """The law of ``Designs.due`` as a condition on a row of surrogates."""
+    own_queries = sa.select(queries.c.id).where(queries.c.surrogate_id == surrogates.c.id)
+    own_samples = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogates.c.id)
+    free = surrogates.c.fit_expires.is_(None) | (surrogates.c.fit_expires <= clock(connection))
+    return sa.and_(
+        surrogates.c.paused.is_(False),
+        surrogates.c.revision > surrogates.c.fitted_revision,
+        free,
+        sa.exists(own_samples),
+        ~sa.exists(own_queries.where(queries.c.status.in_(OPEN_STATUSES))),
+    )
+
+
+def _hold_right(connection: Connection, lease: FitLease) -> Row[Any]:
+    held = hold(connection, lease.surrogate, surrogates.c.fit_token)
+    if held.fit_token != lease.token:
+        raise LeaseExpired(f"the right to fit {lease.surrogate!r} has ended; begin again")
+    return held
+
+
+def _update(connection: Connection, held: Row[Any], **changes: Any) -> None:
+    connection.execute(sa.update(surrogates).where(surrogates.c.id == held.id).values(**changes))
+
+
+def _finish(connection: Connection, held: Row[Any], lease: FitLease, design: NewDesign) -> None:
+    _update(
+        connection,
+        held,
+        **NO_RIGHT,
+        state=design.state,
+        phase=design.phase,
+        error=None,
+        round=held.round + 1,
+        fitted_revision=lease.revision,
+        extra_queries=surrogates.c.extra_queries - lease.extra_queries,
+    )
+
+
+def _phase_after(held: Row[Any], error: str | None) -> Phase:
+    return "failed" if error is not None else stored.resting_phase(held.round)
+
+
+def _spoken_for(connection: Connection, surrogate_id: int) -> int:
+    """Samples there are, and queries that will each become one."""
+    taken = sa.select(sa.func.count()).where(samples.c.surrogate_id == surrogate_id)
+    awaited = sa.select(sa.func.count()).where(
+        queries.c.surrogate_id == surrogate_id, queries.c.status.in_(OPEN_STATUSES)
+    )
+    return int(
+        connection.execute(sa.select(taken.scalar_subquery() + awaited.scalar_subquery())).scalar_one()
+    )

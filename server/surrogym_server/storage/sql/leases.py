@@ -1,0 +1,137 @@
+"""Leases of queries: how they begin and end. The caller holds the surrogate, unless it says otherwise."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Sequence
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection, Row
+
+from surrogym_server.errors import ForeignLease, UnknownQuery
+from surrogym_server.storage.port import MAX_ATTEMPTS
+from surrogym_server.storage.records import LeasedQuery
+from surrogym_server.storage.sql.database import clock
+from surrogym_server.storage.sql.rows import append_event, hold, touch, unknown_surrogate
+from surrogym_server.storage.sql.tables import leases, queries, surrogates
+
+EXPIRED = "no answer before the lease ended"
+
+
+def begin(
+    connection: Connection, held: Row[Any], rows: Sequence[Row[Any]], sampler: str, seconds: float
+) -> list[LeasedQuery]:
+    """Lease the queries of these rows, which the caller has locked."""
+    if not rows:
+        return []
+    leased = [
+        LeasedQuery(
+            id=row.id,
+            purpose=row.purpose,
+            coordinates=row.coordinates,
+            action=row.action,
+            attempt=row.attempts + 1,
+            token=secrets.token_urlsafe(16),
+            expires=held.now + seconds,
+        )
+        for row in rows
+    ]
+    connection.execute(sa.insert(leases), [_new(held, query, sampler) for query in leased])
+    update = sa.update(queries).where(queries.c.id.in_([query.id for query in leased]))
+    connection.execute(update.values(status="leased", attempts=queries.c.attempts + 1, sampler=sampler))
+    return leased
+
+
+def _new(held: Row[Any], query: LeasedQuery, sampler: str) -> dict[str, Any]:
+    return {
+        "surrogate_id": held.id,
+        "query_id": query.id,
+        "token": query.token,
+        "sampler": sampler,
+        "attempt": query.attempt,
+        "begun": held.now,
+        "expires": query.expires,
+        "outcome": "open",
+    }
+
+
+def of_query(connection: Connection, surrogate_id: int, query_id: int, token: str) -> Row[Any]:
+    """The lease of this token: (id, expires, outcome). Nothing needs to be held.
+
+    Raises:
+        UnknownQuery: the surrogate has no such query.
+        ForeignLease: the token was never given out for it.
+    """
+    columns: list[Any] = [leases.c.id, leases.c.expires, leases.c.outcome]
+    given_out = sa.select(*columns).where(
+        leases.c.surrogate_id == surrogate_id, leases.c.query_id == query_id, leases.c.token == token
+    )
+    lease = connection.execute(given_out).one_or_none()
+    if lease is not None:
+        return lease
+    own = sa.select(queries.c.id).where(queries.c.surrogate_id == surrogate_id, queries.c.id == query_id)
+    if connection.execute(own).one_or_none() is None:
+        raise unknown_query(query_id)
+    raise foreign_lease(query_id)
+
+
+def unknown_query(query_id: int) -> UnknownQuery:
+    return UnknownQuery(f"expected a query of this surrogate, got {query_id}, which is not there")
+
+
+def foreign_lease(query_id: int) -> ForeignLease:
+    return ForeignLease(f"expected a lease token that was given out for query {query_id}, got another")
+
+
+def set_outcome(connection: Connection, lease_ids: Sequence[int], outcome: str) -> None:
+    connection.execute(sa.update(leases).where(leases.c.id.in_(lease_ids)).values(outcome=outcome))
+
+
+def share(connection: Connection, name: str) -> Row[Any]:
+    """Keep the surrogate from being deleted, but keep no writer waiting: (id, paused, now)."""
+    columns: list[Any] = [surrogates.c.id, surrogates.c.paused, clock(connection).label("now")]
+    share = sa.select(*columns).where(surrogates.c.name == name).with_for_update(read=True, key_share=True)
+    found = connection.execute(share).one_or_none()
+    if found is None:
+        raise unknown_surrogate(name)
+    return found
+
+
+def sweep_if_needed(connection: Connection, name: str) -> None:
+    """Hold and sweep the surrogate if it has leases to end; one that is not there has none."""
+    own = sa.select(surrogates.c.id).where(surrogates.c.name == name).scalar_subquery()
+    ended = (leases.c.outcome == "open") & (leases.c.expires <= clock(connection))
+    wanted = sa.select(leases.c.id).where(leases.c.surrogate_id == own, ended).limit(1)
+    if connection.execute(wanted).one_or_none() is not None:
+        sweep(connection, hold(connection, name))
+
+
+def sweep(connection: Connection, held: Row[Any]) -> int:
+    """End the surrogate's leases whose time has come; returns how many."""
+    ended = connection.execute(
+        sa.update(leases)
+        .where(leases.c.surrogate_id == held.id, leases.c.outcome == "open", leases.c.expires <= held.now)
+        .values(outcome="expired")
+        .returning(leases.c.query_id)
+    )
+    ids = [int(id) for id in ended.scalars()]
+    if ids:
+        give_back(connection, held, ids, EXPIRED)
+    return len(ids)
+
+
+def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], error: str) -> None:
+    """Make leased queries pending again, or set them aside after their last attempt."""
+    next_status = sa.case((queries.c.attempts >= MAX_ATTEMPTS, "set_aside"), else_="pending")
+    rows = connection.execute(
+        sa.update(queries)
+        .where(queries.c.id.in_(query_ids), queries.c.status == "leased")
+        .values(status=next_status, error=error)
+        .returning(queries.c.id, queries.c.status)
+    )
+    set_aside = sorted(row.id for row in rows if row.status == "set_aside")
+    for query_id in set_aside:
+        append_event(connection, held, "set_aside", query_id=query_id, error=error)
+    if set_aside:
+        touch(connection, held)

@@ -1,0 +1,87 @@
+"""What is kept beside the design: occupancy, saved sessions, events."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import sqlalchemy as sa
+
+from surrogym_server.storage import port
+from surrogym_server.storage.records import Array, EventRecord, OccupancyRecord, SavedSession
+from surrogym_server.storage.sql.database import Database, conflict_insert
+from surrogym_server.storage.sql.rows import find, hold
+from surrogym_server.storage.sql.tables import events, occupancies
+from surrogym_server.storage.sql.tables import sessions as saved
+
+
+class SqlOccupancy(port.Occupancy):
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def put(self, name: str, checkpoint: str, states: Array) -> None:
+        with self._database.write() as connection:
+            held = hold(connection, name)
+            own = (occupancies.c.surrogate_id == held.id, occupancies.c.checkpoint == checkpoint)
+            connection.execute(sa.delete(occupancies).where(*own))
+            connection.execute(
+                sa.insert(occupancies).values(
+                    surrogate_id=held.id,
+                    checkpoint=checkpoint,
+                    round=held.round,
+                    created_at=held.now,
+                    columns=states.shape[1],
+                    states=states.ravel(),
+                )
+            )
+
+    def get(self, name: str, checkpoint: str) -> OccupancyRecord | None:
+        return self._newest(name, occupancies.c.checkpoint == checkpoint)
+
+    def latest(self, name: str) -> OccupancyRecord | None:
+        return self._newest(name, sa.true())
+
+    def _newest(self, name: str, condition: sa.ColumnElement[bool]) -> OccupancyRecord | None:
+        with self._database.read() as connection:
+            own = occupancies.c.surrogate_id == find(connection, name)
+            newest = sa.select(occupancies).where(own, condition).order_by(occupancies.c.id.desc()).limit(1)
+            row = connection.execute(newest).one_or_none()
+        if row is None:
+            return None
+        states = np.array(row.states).reshape(-1, row.columns)
+        return OccupancyRecord(row.checkpoint, row.round, row.created_at, states)
+
+
+class SqlSessions(port.Sessions):
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def save(self, sessions: Sequence[SavedSession]) -> None:
+        rows = [{"id": one.id, "surrogate": one.surrogate, "data": one.data} for one in sessions]
+        if not rows:
+            return
+        with self._database.write() as connection:
+            insert = conflict_insert(connection, saved)
+            given = {"surrogate": insert.excluded.surrogate, "data": insert.excluded.data}
+            connection.execute(insert.on_conflict_do_update(index_elements=["id"], set_=given), rows)
+
+    def take(self) -> list[SavedSession]:
+        with self._database.write() as connection:
+            taken = connection.execute(sa.delete(saved).returning(*saved.c)).all()
+        return [SavedSession(row.id, row.surrogate, bytes(row.data)) for row in taken]
+
+
+class SqlEvents(port.Events):
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def list(self, name: str, after: int = 0, limit: int = 1_000) -> list[EventRecord]:
+        with self._database.read() as connection:
+            own = events.c.surrogate_id == find(connection, name)
+            rows = connection.execute(
+                sa.select(events.c.id, events.c.kind, events.c.created_at, events.c.body)
+                .where(own, events.c.id > after)
+                .order_by(events.c.id)
+                .limit(limit)
+            )
+            return [EventRecord(**row._mapping) for row in rows]

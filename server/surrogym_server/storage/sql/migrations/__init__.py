@@ -1,0 +1,1 @@
+"""Alembic's scripts; ``surrogym_server.storage.sql.migrate`` runs them."""

@@ -1,0 +1,77 @@
+"""Models by version."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection, Row
+
+from surrogym_server.errors import NoModel, UnknownModel
+from surrogym_server.storage import port
+from surrogym_server.storage.records import ModelRecord, NewModel
+from surrogym_server.storage.sql.database import Database
+from surrogym_server.storage.sql.rows import append_event, find, hold
+from surrogym_server.storage.sql.tables import models
+
+COLUMNS = [
+    getattr(models.c, name)
+    for name in ("version", "created_at", "samples", "data_hash", "fidelity", "description", "fit_seconds")
+]
+
+
+class SqlModels(port.Models):
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def list(self, name: str) -> list[ModelRecord]:
+        with self._database.read() as connection:
+            own = models.c.surrogate_id == find(connection, name)
+            rows = connection.execute(sa.select(*COLUMNS).where(own).order_by(models.c.version))
+            return [ModelRecord(**row._mapping) for row in rows]
+
+    def get(self, name: str, version: int | None = None) -> ModelRecord:
+        with self._database.read() as connection:
+            return ModelRecord(**_one(connection, name, version, *COLUMNS)._mapping)
+
+    def blob(self, name: str, version: int | None = None) -> bytes:
+        with self._database.read() as connection:
+            return bytes(_one(connection, name, version, models.c.blob).blob)
+
+    def add(self, name: str, model: NewModel) -> int:
+        with self._database.write() as connection:
+            return insert_model(connection, hold(connection, name), model)
+
+
+def insert_model(connection: Connection, held: Row[Any], model: NewModel) -> int:
+    """Store a model as the newest version; the surrogate is held, so that versions have no gaps."""
+    newest = sa.select(sa.func.max(models.c.version)).where(models.c.surrogate_id == held.id)
+    version = (connection.execute(newest).scalar() or 0) + 1
+    connection.execute(
+        sa.insert(models).values(
+            surrogate_id=held.id,
+            version=version,
+            created_at=held.now,
+            samples=model.samples,
+            data_hash=model.data_hash,
+            fidelity=model.fidelity,
+            description=model.description,
+            fit_seconds=model.fit_seconds,
+            blob=model.blob,
+        )
+    )
+    told = {"samples": model.samples, "fit_seconds": model.fit_seconds, "fidelity": model.fidelity}
+    append_event(connection, held, "fit", version=version, **told)
+    return version
+
+
+def _one(connection: Connection, name: str, version: int | None, *columns: sa.ColumnElement[Any]) -> Row[Any]:
+    wanted = sa.select(*columns).where(models.c.surrogate_id == find(connection, name))
+    if version is not None:
+        wanted = wanted.where(models.c.version == version)
+    row = connection.execute(wanted.order_by(models.c.version.desc()).limit(1)).one_or_none()
+    if row is not None:
+        return row
+    if version is None:
+        raise NoModel(f"expected a model of {name!r}, but nothing has been fitted yet")
+    raise UnknownModel(f"expected a version of {name!r}'s models, got {version}, which is not there")

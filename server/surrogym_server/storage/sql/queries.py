@@ -1,0 +1,136 @@
+"""The queue of queries."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection
+
+from surrogym_server.errors import LeaseExpired, UnknownSurrogate
+from surrogym_server.storage import port
+from surrogym_server.storage.records import (
+    Array,
+    LeasedQuery,
+    QueryCounts,
+    QueryRecord,
+    QueryStatus,
+    fingerprint,
+)
+from surrogym_server.storage.sql import leases as leasing
+from surrogym_server.storage.sql.database import Database, clock
+from surrogym_server.storage.sql.rows import find, hold, insert_queries, recall, remember
+from surrogym_server.storage.sql.tables import leases, queries, surrogates
+
+COLUMNS = [
+    getattr(queries.c, name)
+    for name in (
+        *("id", "purpose", "status", "round", "coordinates", "action"),
+        *("attempts", "sampler", "error"),
+    )
+]
+
+
+class SqlQueries(port.Queries):
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def enqueue(self, name: str, coordinates: Array, action: Array, *, key: str | None = None) -> list[int]:
+        body = fingerprint(coordinates.tolist(), action.tolist())
+        with self._database.write() as connection:
+            held = hold(connection, name)
+            before: list[int] | None = recall(connection, held, "enqueue", key, body)
+            if before is not None:
+                return before
+            ids = insert_queries(connection, held, "manual", held.round, coordinates, action)
+            remember(connection, held, "enqueue", key, body, ids)
+            return ids
+
+    def claim(self, name: str, sampler: str, limit: int, seconds: float) -> list[LeasedQuery]:
+        with self._database.write() as connection:
+            leasing.sweep_if_needed(connection, name)
+            held = leasing.share(connection, name)
+            if held.paused:
+                return []
+            oldest_free = (
+                sa.select(*COLUMNS)
+                .where(queries.c.surrogate_id == held.id, queries.c.status == "pending")
+                .order_by(queries.c.id)
+                .limit(limit)
+                .with_for_update(skip_locked=True)
+            )
+            rows = connection.execute(oldest_free).all()
+            return leasing.begin(connection, held, rows, sampler, seconds)
+
+    def renew(self, name: str, query_id: int, token: str, seconds: float) -> float:
+        with self._database.write() as connection:
+            lease = leasing.of_query(connection, find(connection, name), query_id, token)
+            live = (leases.c.outcome == "open") & (leases.c.expires > clock(connection))
+            renewed = connection.execute(
+                sa.update(leases)
+                .where(leases.c.id == lease.id, live)
+                .values(expires=clock(connection) + seconds)
+                .returning(leases.c.expires)
+            ).scalar()
+            if renewed is None:
+                raise _ended(query_id)
+            return float(renewed)
+
+    def fail(self, name: str, query_id: int, token: str, error: str) -> QueryRecord:
+        with self._database.write() as connection:
+            held = hold(connection, name)
+            lease = leasing.of_query(connection, held.id, query_id, token)
+            if lease.outcome == "open" and lease.expires > held.now:
+                leasing.set_outcome(connection, [lease.id], "failed")
+                leasing.give_back(connection, held, [query_id], error)
+            elif lease.outcome != "failed":
+                raise _ended(query_id)
+            return _read(connection, held.id, query_id)
+
+    def get(self, name: str, query_id: int) -> QueryRecord:
+        with self._database.read() as connection:
+            return _read(connection, find(connection, name), query_id)
+
+    def list(self, name: str, statuses: Sequence[QueryStatus] = (), limit: int = 10_000) -> list[QueryRecord]:
+        with self._database.read() as connection:
+            wanted = sa.select(*COLUMNS).where(queries.c.surrogate_id == find(connection, name))
+            if statuses:
+                wanted = wanted.where(queries.c.status.in_(statuses))
+            rows = connection.execute(wanted.order_by(queries.c.id).limit(limit))
+            return [QueryRecord(**row._mapping) for row in rows]
+
+    def counts(self, name: str) -> QueryCounts:
+        with self._database.read() as connection:
+            wanted = (
+                sa.select(queries.c.status, sa.func.count())
+                .where(queries.c.surrogate_id == find(connection, name))
+                .group_by(queries.c.status)
+            )
+            return QueryCounts(**dict(connection.execute(wanted).all()))
+
+    def sweep_expired(self) -> int:
+        with self._database.read() as connection:
+            ended = (leases.c.outcome == "open") & (leases.c.expires <= clock(connection))
+            owners = sa.select(leases.c.surrogate_id).where(ended).distinct()
+            wanted = sa.select(surrogates.c.name).where(surrogates.c.id.in_(owners))
+            names = list(connection.execute(wanted).scalars())
+        return sum(self._sweep(name) for name in names)
+
+    def _sweep(self, name: str) -> int:
+        try:
+            with self._database.write() as connection:
+                return leasing.sweep(connection, hold(connection, name))
+        except UnknownSurrogate:  # deleted meanwhile
+            return 0
+
+
+def _ended(query_id: int) -> LeaseExpired:
+    return LeaseExpired(f"the lease of query {query_id} has ended; claim again")
+
+
+def _read(connection: Connection, surrogate_id: int, query_id: int) -> QueryRecord:
+    wanted = sa.select(*COLUMNS).where(queries.c.surrogate_id == surrogate_id, queries.c.id == query_id)
+    row = connection.execute(wanted).one_or_none()
+    if row is None:
+        raise leasing.unknown_query(query_id)
+    return QueryRecord(**row._mapping)

@@ -1,0 +1,108 @@
+"""Statements that several stores share: find a surrogate, append an event, remember an idempotency key."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection, Row
+
+from surrogym_server.errors import IdempotencyConflict, InvalidInput, UnknownSurrogate
+from surrogym_server.storage.records import Array, EventKind, Purpose
+from surrogym_server.storage.sql.database import clock
+from surrogym_server.storage.sql.tables import events, queries, requests, surrogates
+
+HELD = (surrogates.c.id, surrogates.c.phase, surrogates.c.paused, surrogates.c.round)
+
+
+def find(connection: Connection, name: str) -> int:
+    """The surrogate's id."""
+    found = connection.execute(sa.select(surrogates.c.id).where(surrogates.c.name == name)).scalar()
+    if found is None:
+        raise unknown_surrogate(name)
+    return int(found)
+
+
+def hold(connection: Connection, name: str, *extra: sa.ColumnElement[Any]) -> Row[Any]:
+    """Lock the surrogate until the transaction ends: (id, phase, paused, round, now, *extra).
+
+    Whoever writes holds it first, so that writers take turns and events get their ids in order.
+    """
+    columns = (*HELD, clock(connection).label("now"), *extra)
+    wanted = sa.select(*columns).where(surrogates.c.name == name).with_for_update(key_share=True)
+    found = connection.execute(wanted).one_or_none()
+    if found is None:
+        raise unknown_surrogate(name)
+    return found
+
+
+def unknown_surrogate(name: str) -> UnknownSurrogate:
+    return UnknownSurrogate(f"expected the name of a surrogate, got {name!r}, which is not there")
+
+
+def append_event(connection: Connection, held: Row[Any], kind: EventKind, **body: Any) -> None:
+    connection.execute(
+        sa.insert(events).values(surrogate_id=held.id, kind=kind, created_at=held.now, body=body)
+    )
+
+
+def touch(connection: Connection, held: Row[Any], **changes: Any) -> None:
+    """Note that there is something new for the design to look at, together with other changes."""
+    update = sa.update(surrogates).where(surrogates.c.id == held.id)
+    connection.execute(update.values(revision=surrogates.c.revision + 1, **changes))
+
+
+def recall(connection: Connection, held: Row[Any], operation: str, key: str | None, body: str) -> Any:
+    """What the operation returned for this key before; None when it is new.
+
+    Raises:
+        IdempotencyConflict: it came with another body.
+    """
+    if key is None:
+        return None
+    found = connection.execute(
+        sa.select(requests.c.fingerprint, requests.c.result)
+        .where(requests.c.surrogate_id == held.id, requests.c.operation == operation)
+        .where(requests.c.key == key)
+    ).one_or_none()
+    if found is None:
+        return None
+    if found.fingerprint != body:
+        raise IdempotencyConflict(f"expected the body that key {key!r} first came with, got another")
+    return found.result
+
+
+def remember(
+    connection: Connection, held: Row[Any], operation: str, key: str | None, body: str, result: Any
+) -> None:
+    """Keep what the operation returned for this key."""
+    if key is not None:
+        connection.execute(
+            sa.insert(requests).values(
+                surrogate_id=held.id, operation=operation, key=key, fingerprint=body, result=result
+            )
+        )
+
+
+def insert_queries(
+    connection: Connection, held: Row[Any], purpose: Purpose, round: int, coordinates: Array, action: Array
+) -> list[int]:
+    """Queue coordinates (m, C) with action (m, F); returns the ids in order.
+
+    Raises:
+        InvalidInput: not as many rows in the one as in the other.
+    """
+    if len(coordinates) != len(action):
+        raise InvalidInput(f"expected one action for each query, got {len(coordinates)} and {len(action)}")
+    if len(coordinates) == 0:
+        return []
+    common = {"surrogate_id": held.id, "purpose": purpose, "round": round, "status": "pending", "attempts": 0}
+    rows = [
+        {**common, "coordinates": q, "action": u}
+        for q, u in zip(np.asarray(coordinates), np.asarray(action), strict=True)
+    ]
+    insert = sa.insert(queries).returning(queries.c.id, sort_by_parameter_order=True)
+    ids = [int(id) for id in connection.execute(insert, rows).scalars()]
+    append_event(connection, held, "queries", count=len(ids), purpose=purpose, round=round)
+    return ids

@@ -1,0 +1,157 @@
+"""Samples: stored once, all or nothing, never changed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection, Row
+
+from surrogym_server.errors import IdempotencyConflict
+from surrogym_server.storage import port
+from surrogym_server.storage.records import (
+    AddedSamples,
+    Array,
+    NewSample,
+    SampleArrays,
+    SampleRecord,
+    fingerprint,
+    no_rows,
+)
+from surrogym_server.storage.sql.answers import Answered, read_answered, settle
+from surrogym_server.storage.sql.database import Database
+from surrogym_server.storage.sql.rows import append_event, find, hold, recall, remember, touch
+from surrogym_server.storage.sql.tables import queries, samples
+
+COLUMNS = [
+    getattr(samples.c, name)
+    for name in (
+        *("id", "purpose", "query_id", "sampler", "attempt", "late", "coordinates", "action"),
+        *("next_coordinates", "reward", "terminated", "truncated", "observation", "next_observation"),
+        "created_at",
+    )
+]
+
+
+class SqlSamples(port.Samples):
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def add(
+        self, name: str, sampler: str, samples: Sequence[NewSample], *, key: str | None = None
+    ) -> AddedSamples:
+        body = fingerprint(sampler, [asdict(sample) for sample in samples])
+        with self._database.write() as connection:
+            held = hold(connection, name)
+            before: list[int] | None = recall(connection, held, "add_samples", key, body)
+            if before is not None:
+                return AddedSamples(tuple(before), len(before))
+            answered = read_answered(connection, held, samples)
+            added = _store(connection, held, sampler, samples, answered)
+            remember(connection, held, "add_samples", key, body, added.ids)
+            return added
+
+    def arrays(self, name: str) -> SampleArrays:
+        with self._database.read() as connection:
+            rows = connection.execute(_raw_arrays(find(connection, name))).all()
+        if not rows:
+            return SampleArrays(no_rows(), no_rows(), no_rows(), np.zeros(0), np.zeros(0, dtype=bool))
+        q, u, q_next, reward, terminated = zip(*rows, strict=True)
+        return SampleArrays(
+            coordinates=_matrix(q),
+            action=_matrix(u),
+            next_coordinates=_matrix(q_next),
+            reward=np.array(reward, dtype=np.float64),
+            terminated=np.array(terminated, dtype=np.bool_),
+        )
+
+    def page(self, name: str, after: int, limit: int) -> list[SampleRecord]:
+        with self._database.read() as connection:
+            own = samples.c.surrogate_id == find(connection, name)
+            rows = connection.execute(
+                sa.select(*COLUMNS, queries.c.coordinates.label("requested_coordinates"))
+                .select_from(samples.outerjoin(queries, samples.c.query_id == queries.c.id))
+                .where(own, samples.c.id > after)
+                .order_by(samples.c.id)
+                .limit(limit)
+            )
+            return [SampleRecord(**row._mapping) for row in rows]
+
+    def count(self, name: str) -> int:
+        with self._database.read() as connection:
+            own = samples.c.surrogate_id == find(connection, name)
+            return int(connection.execute(sa.select(sa.func.count()).where(own)).scalar_one())
+
+
+def _store(
+    connection: Connection,
+    held: Row[Any],
+    sampler: str,
+    batch: Sequence[NewSample],
+    answered: Sequence[Answered | None],
+) -> AddedSamples:
+    """Insert what is new of the batch. What was reported under one lease is one sample."""
+    identities = [lease.lease_id if lease else -1 - place for place, lease in enumerate(answered)]
+    ids = {lease.lease_id: lease.sample_id for lease in answered if lease and lease.sample_id is not None}
+    prints = {lease.lease_id: lease.fingerprint for lease in answered if lease and lease.lease_id in ids}
+    new: dict[int, dict[str, Any]] = {}
+    for identity, sample, lease in zip(identities, batch, answered, strict=True):
+        row = _row(held, sampler, sample, lease)
+        if prints.setdefault(identity, row["fingerprint"]) != row["fingerprint"]:
+            raise IdempotencyConflict(
+                f"expected the sample first reported for query {sample.query_id}, got another"
+            )
+        if identity not in ids:
+            new.setdefault(identity, row)
+    ids |= dict(zip(new, _insert(connection, held, sampler, list(new.values())), strict=True))
+    settle(connection, [lease for lease in answered if lease and lease.lease_id in new])
+    return AddedSamples(tuple(ids[identity] for identity in identities), len(batch) - len(new))
+
+
+def _insert(connection: Connection, held: Row[Any], sampler: str, rows: list[dict[str, Any]]) -> list[int]:
+    if not rows:
+        return []
+    insert = sa.insert(samples).returning(samples.c.id, sort_by_parameter_order=True)
+    ids = [int(id) for id in connection.execute(insert, rows).scalars()]
+    late = sum(row["late"] for row in rows)
+    append_event(connection, held, "sample", sampler=sampler, ids=ids, late=late)
+    touch(connection, held)
+    return ids
+
+
+def _row(held: Row[Any], sampler: str, sample: NewSample, lease: Answered | None) -> dict[str, Any]:
+    return {
+        "surrogate_id": held.id,
+        "query_id": lease.query_id if lease else None,
+        "lease_id": lease.lease_id if lease else None,
+        "purpose": lease.purpose if lease else "manual",
+        "sampler": sampler,
+        "attempt": lease.attempt if lease else 0,
+        "late": lease is not None and not lease.live,
+        "coordinates": sample.coordinates,
+        "action": sample.action,
+        "next_coordinates": sample.next_coordinates,
+        "reward": sample.reward,
+        "terminated": sample.terminated,
+        "truncated": sample.truncated,
+        "observation": sample.observation,
+        "next_observation": sample.next_observation,
+        "fingerprint": fingerprint(asdict(sample)),
+        "created_at": held.now,
+    }
+
+
+def _raw_arrays(surrogate_id: int) -> sa.Select[Any]:
+    """Rows of bytes, reward and flag: a bulk read makes no Python float of a coordinate."""
+    vectors = (samples.c.coordinates, samples.c.action, samples.c.next_coordinates)
+    raw: list[Any] = [sa.type_coerce(column, sa.LargeBinary()) for column in vectors]
+    wanted = sa.select(*raw, samples.c.reward, samples.c.terminated)
+    return wanted.where(samples.c.surrogate_id == surrogate_id).order_by(samples.c.id)
+
+
+def _matrix(rows: Sequence[bytes]) -> Array:
+    """(n, k) of n rows of bytes."""
+    return np.frombuffer(b"".join(rows), dtype="<f8").reshape(len(rows), -1).astype(np.float64)

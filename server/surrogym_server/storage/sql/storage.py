@@ -1,0 +1,60 @@
+"""The stores of one database, put together."""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.sql.database import Database, connect
+from surrogym_server.storage.sql.designs import SqlDesigns
+from surrogym_server.storage.sql.ledger import SqlLedger
+from surrogym_server.storage.sql.memory import SqlEvents, SqlOccupancy, SqlSessions
+from surrogym_server.storage.sql.migrate import migrate
+from surrogym_server.storage.sql.models import SqlModels
+from surrogym_server.storage.sql.queries import SqlQueries
+from surrogym_server.storage.sql.samples import SqlSamples
+from surrogym_server.storage.sql.surrogates import SqlSurrogates
+
+
+class SqlStorage(Storage):
+    """The port on SQLite or PostgreSQL."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self.surrogates = SqlSurrogates(database)
+        self.designs = SqlDesigns(database)
+        self.queries = SqlQueries(database)
+        self.samples = SqlSamples(database)
+        self.ledger = SqlLedger(database)
+        self.models = SqlModels(database)
+        self.occupancy = SqlOccupancy(database)
+        self.sessions = SqlSessions(database)
+        self.events = SqlEvents(database)
+
+    def ping(self) -> None:
+        with self._database.read() as connection:
+            connection.execute(sa.select(1))
+
+    def close(self) -> None:
+        self._database.close()
+
+
+def open_storage(url: str) -> Storage:
+    """Open a database, and bring its schema up to date.
+
+    Args:
+        url: ``sqlite:///path/to/file`` (made if it is not there, for one server at a time) or
+            ``postgresql://user:password@host/name`` (for several).
+
+    Raises:
+        InvalidInput: another kind of address.
+        Unavailable: another server holds the SQLite file, PostgreSQL does not answer, or the database was
+            written by a newer program.
+    """
+    database = connect(url)
+    try:
+        migrate(database)
+    except BaseException:
+        database.close()
+        raise
+    return SqlStorage(database)

@@ -1,0 +1,133 @@
+"""Surrogates by name."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection, Row
+
+from surrogym_server.errors import SpecConflict
+from surrogym_server.storage import port
+from surrogym_server.storage.records import NewSurrogate, Phase, SurrogateRecord
+from surrogym_server.storage.sql.database import Database, clock, conflict_insert
+from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, touch, unknown_surrogate
+from surrogym_server.storage.sql.tables import surrogates
+
+COLUMNS = [
+    getattr(surrogates.c, name)
+    for name in (
+        *("name", "spec", "budget", "target", "phase", "paused", "round", "state", "error"),
+        *("extra_queries", "checkpoint", "created_at"),
+    )
+]
+
+
+class SqlSurrogates(port.Surrogates):
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def create(self, new: NewSurrogate) -> tuple[SurrogateRecord, bool]:
+        with self._database.write() as connection:
+            if not _insert(connection, new):
+                return _same(read(connection, new.name), new), False
+            held = hold(connection, new.name)
+            append_event(connection, held, "created", name=new.name)
+            insert_queries(connection, held, "initial", 0, new.query_coordinates, new.query_action)
+            return read(connection, new.name), True
+
+    def get(self, name: str) -> SurrogateRecord:
+        with self._database.read() as connection:
+            return read(connection, name)
+
+    def list(self) -> list[SurrogateRecord]:
+        with self._database.read() as connection:
+            rows = connection.execute(sa.select(*COLUMNS).order_by(surrogates.c.id))
+            return [_record(row) for row in rows]
+
+    def change(
+        self, name: str, *, paused: bool | None = None, budget: int | None = None, target: float | None = None
+    ) -> SurrogateRecord:
+        asked = {"paused": paused, "budget": budget, "target": target}
+        with self._database.write() as connection:
+            held = hold(connection, name)
+            before = read(connection, name)
+            changes: dict[str, Any] = {
+                field: value
+                for field, value in asked.items()
+                if value is not None and value != getattr(before, field)
+            }
+            if paused is False and before.phase == "failed":
+                changes |= {"phase": resting_phase(before.round), "error": None}
+            if not changes:
+                return before
+            _apply(connection, held, changes)
+            append_event(connection, held, "phase", **{"phase": before.phase, **changes})
+            return read(connection, name)
+
+    def set_phase(self, name: str, phase: Phase, error: str | None = None) -> None:
+        with self._database.write() as connection:
+            held = hold(connection, name)
+            update_phase(connection, held, phase, error)
+
+    def delete(self, name: str) -> None:
+        with self._database.write() as connection:
+            gone = connection.execute(sa.delete(surrogates).where(surrogates.c.name == name))
+            if gone.rowcount == 0:
+                raise unknown_surrogate(name)
+
+
+def read(connection: Connection, name: str) -> SurrogateRecord:
+    row = connection.execute(sa.select(*COLUMNS).where(surrogates.c.name == name)).one_or_none()
+    if row is None:
+        raise unknown_surrogate(name)
+    return _record(row)
+
+
+def update_phase(connection: Connection, held: Row[Any], phase: Phase, error: str | None) -> None:
+    update = sa.update(surrogates).where(surrogates.c.id == held.id)
+    connection.execute(update.values(phase=phase, error=error))
+    append_event(connection, held, "phase", phase=phase, error=error)
+
+
+def resting_phase(round: int) -> Phase:
+    """The phase of a design that waits for samples."""
+    return "sampling" if round else "collecting"
+
+
+def _record(row: Row[Any]) -> SurrogateRecord:
+    return SurrogateRecord(**row._mapping)
+
+
+def _insert(connection: Connection, new: NewSurrogate) -> bool:
+    """Say whether the name was free."""
+    insert = conflict_insert(connection, surrogates).values(
+        name=new.name,
+        spec=new.spec,
+        budget=new.budget,
+        target=new.target,
+        state=new.state,
+        phase="collecting",
+        paused=False,
+        round=0,
+        extra_queries=0,
+        revision=0,
+        fitted_revision=0,
+        created_at=clock(connection),
+    )
+    free = insert.on_conflict_do_nothing(index_elements=["name"]).returning(surrogates.c.id)
+    return connection.execute(free).scalar() is not None
+
+
+def _same(present: SurrogateRecord, new: NewSurrogate) -> SurrogateRecord:
+    if present.spec != json.loads(json.dumps(new.spec)):
+        raise SpecConflict(f"expected the spec that {new.name!r} was created with, got another")
+    return present
+
+
+def _apply(connection: Connection, held: Row[Any], changes: dict[str, Any]) -> None:
+    if changes.keys() - {"paused"}:
+        touch(connection, held, **changes)
+    else:
+        connection.execute(sa.update(surrogates).where(surrogates.c.id == held.id).values(**changes))

@@ -1,0 +1,223 @@
+"""The tables. Vectors are little-endian float64 bytes, so they come back bit for bit; JSON is text.
+
+What belongs to a surrogate goes with it (``ON DELETE CASCADE``). Ids are never used twice.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import sqlalchemy as sa
+from sqlalchemy.engine import Dialect
+
+from surrogym_server.storage.records import Vector
+
+metadata = sa.MetaData(
+    naming_convention={
+        "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+        "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+        "fk": "fk_%(table_name)s_%(column_0_name)s",
+        "pk": "pk_%(table_name)s",
+    }
+)
+
+Id = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
+
+
+class Floats(sa.types.TypeDecorator[Vector]):
+    """A vector of floats."""
+
+    impl = sa.LargeBinary
+    cache_ok = True
+
+    def process_bind_param(
+        self, value: Vector | NDArray[np.float64] | None, dialect: Dialect
+    ) -> bytes | None:
+        return None if value is None else np.asarray(value, dtype="<f8").tobytes()
+
+    def process_result_value(self, value: bytes | None, dialect: Dialect) -> Vector | None:  # noqa: ARG002
+        return None if value is None else tuple(np.frombuffer(value, dtype="<f8").tolist())
+
+
+class Json(sa.types.TypeDecorator[Any]):
+    """Anything that JSON can say."""
+
+    impl = sa.Text
+    cache_ok = True
+
+    def process_bind_param(self, value: Any, dialect: Dialect) -> str:  # noqa: ARG002
+        return json.dumps(value)
+
+    def process_result_value(self, value: str | None, dialect: Dialect) -> Any:  # noqa: ARG002
+        return None if value is None else json.loads(value)
+
+
+def _id() -> sa.Column[int]:
+    return sa.Column("id", Id, primary_key=True, autoincrement=True)
+
+
+def _owner(**options: Any) -> sa.Column[int]:
+    key = sa.ForeignKey("surrogates.id", ondelete="CASCADE")
+    return sa.Column("surrogate_id", Id, key, nullable=False, **options)
+
+
+surrogates = sa.Table(
+    "surrogates",
+    metadata,
+    _id(),
+    sa.Column("name", sa.Text, nullable=False, unique=True),
+    sa.Column("spec", Json, nullable=False),
+    sa.Column("budget", sa.Integer, nullable=False),
+    sa.Column("target", sa.Double, nullable=False),
+    sa.Column("phase", sa.Text, nullable=False),
+    sa.Column("paused", sa.Boolean, nullable=False),
+    sa.Column("round", sa.Integer, nullable=False),
+    sa.Column("state", Json, nullable=False),
+    sa.Column("error", sa.Text),
+    sa.Column("extra_queries", sa.Integer, nullable=False),
+    sa.Column("checkpoint", sa.Text),
+    sa.Column("revision", sa.BigInteger, nullable=False),  # grows with whatever the design has to look at
+    sa.Column("fitted_revision", sa.BigInteger, nullable=False),  # what the last fit has seen
+    sa.Column("fit_token", sa.Text),
+    sa.Column("fit_owner", sa.Text),
+    sa.Column("fit_expires", sa.Double),
+    sa.Column("created_at", sa.Double, nullable=False),
+    sqlite_autoincrement=True,
+)
+
+queries = sa.Table(
+    "queries",
+    metadata,
+    _id(),
+    _owner(),
+    sa.Column("purpose", sa.Text, nullable=False),
+    sa.Column("status", sa.Text, nullable=False),
+    sa.Column("round", sa.Integer, nullable=False),
+    sa.Column("coordinates", Floats, nullable=False),
+    sa.Column("action", Floats, nullable=False),
+    sa.Column("attempts", sa.Integer, nullable=False),
+    sa.Column("sampler", sa.Text),
+    sa.Column("error", sa.Text),
+    sa.Index(None, "surrogate_id", "status", "id"),
+    sqlite_autoincrement=True,
+)
+
+leases = sa.Table(
+    "leases",
+    metadata,
+    _id(),
+    _owner(),
+    sa.Column("query_id", Id, sa.ForeignKey("queries.id", ondelete="CASCADE"), nullable=False, index=True),
+    sa.Column("token", sa.Text, nullable=False, unique=True),
+    sa.Column("sampler", sa.Text, nullable=False),
+    sa.Column("attempt", sa.Integer, nullable=False),
+    sa.Column("begun", sa.Double, nullable=False),
+    sa.Column("expires", sa.Double, nullable=False),
+    sa.Column("outcome", sa.Text, nullable=False),  # open, answered, failed, expired
+    sa.Index(None, "surrogate_id", "outcome", "expires"),
+    sa.Index(  # a query has one open lease at most
+        "uq_leases_open",
+        "query_id",
+        unique=True,
+        sqlite_where=sa.text("outcome = 'open'"),
+        postgresql_where=sa.text("outcome = 'open'"),
+    ),
+    sqlite_autoincrement=True,
+)
+
+samples = sa.Table(
+    "samples",
+    metadata,
+    _id(),
+    _owner(),
+    sa.Column("query_id", Id, sa.ForeignKey("queries.id", ondelete="CASCADE"), index=True),
+    sa.Column("lease_id", Id, sa.ForeignKey("leases.id", ondelete="CASCADE"), unique=True),
+    sa.Column("purpose", sa.Text, nullable=False),
+    sa.Column("sampler", sa.Text, nullable=False),
+    sa.Column("attempt", sa.Integer, nullable=False),
+    sa.Column("late", sa.Boolean, nullable=False),
+    sa.Column("coordinates", Floats, nullable=False),
+    sa.Column("action", Floats, nullable=False),
+    sa.Column("next_coordinates", Floats, nullable=False),
+    sa.Column("reward", sa.Double, nullable=False),
+    sa.Column("terminated", sa.Boolean, nullable=False),
+    sa.Column("truncated", sa.Boolean, nullable=False),
+    sa.Column("observation", Floats),
+    sa.Column("next_observation", Floats),
+    sa.Column("fingerprint", sa.Text, nullable=False),
+    sa.Column("created_at", sa.Double, nullable=False),
+    sa.Index(None, "surrogate_id", "id"),
+    sqlite_autoincrement=True,
+)
+
+evaluations = sa.Table(
+    "evaluations",
+    metadata,
+    _id(),
+    _owner(index=True),
+    sa.Column("steps", sa.BigInteger, nullable=False),
+    sa.Column("episodes", sa.BigInteger, nullable=False),
+    sa.Column("note", sa.Text, nullable=False),
+    sa.Column("created_at", sa.Double, nullable=False),
+    sqlite_autoincrement=True,
+)
+
+requests = sa.Table(  # what an idempotency key was used for, and what it returned
+    "requests",
+    metadata,
+    _owner(primary_key=True),
+    sa.Column("operation", sa.Text, primary_key=True),
+    sa.Column("key", sa.Text, primary_key=True),
+    sa.Column("fingerprint", sa.Text, nullable=False),
+    sa.Column("result", Json, nullable=False),
+)
+
+models = sa.Table(
+    "models",
+    metadata,
+    _owner(primary_key=True),
+    sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("created_at", sa.Double, nullable=False),
+    sa.Column("samples", sa.Integer, nullable=False),
+    sa.Column("data_hash", sa.Text, nullable=False),
+    sa.Column("fidelity", Json, nullable=False),
+    sa.Column("description", Json, nullable=False),
+    sa.Column("fit_seconds", sa.Double, nullable=False),
+    sa.Column("blob", sa.LargeBinary, nullable=False),
+)
+
+occupancies = sa.Table(
+    "occupancies",
+    metadata,
+    _id(),
+    _owner(),
+    sa.Column("checkpoint", sa.Text, nullable=False),
+    sa.Column("round", sa.Integer, nullable=False),
+    sa.Column("created_at", sa.Double, nullable=False),
+    sa.Column("columns", sa.Integer, nullable=False),
+    sa.Column("states", Floats, nullable=False),
+    sa.UniqueConstraint("surrogate_id", "checkpoint"),
+    sqlite_autoincrement=True,
+)
+
+sessions = sa.Table(
+    "sessions",
+    metadata,
+    sa.Column("id", sa.Text, primary_key=True),
+    sa.Column("surrogate", sa.Text, nullable=False),
+    sa.Column("data", sa.LargeBinary, nullable=False),
+)
+
+events = sa.Table(
+    "events",
+    metadata,
+    _id(),
+    _owner(),
+    sa.Column("kind", sa.Text, nullable=False),
+    sa.Column("created_at", sa.Double, nullable=False),
+    sa.Column("body", Json, nullable=False),
+    sa.Index(None, "surrogate_id", "id"),
+    sqlite_autoincrement=True,
+)
