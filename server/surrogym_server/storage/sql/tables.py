@@ -33,7 +33,9 @@ class Floats(sa.types.TypeDecorator[Vector]):
     cache_ok = True
 
     def process_bind_param(
-        self, value: Vector | NDArray[np.float64] | None, dialect: Dialect
+        self,
+        value: Vector | Array | None,
+        dialect: Dialect,  # noqa: ARG002
     ) -> bytes | None:
         return None if value is None else np.asarray(value, dtype="<f8").tobytes()
 
