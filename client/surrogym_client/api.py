@@ -80,7 +80,7 @@ class Api:
             ServerUnreachable: it did not within ``seconds``.
         """
         content = self.connection.send("GET", "/readyz", retries=Retries(seconds=seconds))
-        _parse(wire.Ready, content, "/readyz")
+        parse(wire.Ready, content, "/readyz")
         return self.health()
 
     # Surrogates
@@ -268,14 +268,14 @@ class Api:
         with self.connection.stream(path, headers, _EVENT_SILENCE_SECONDS) as lines:
             for line in lines:
                 if line.startswith("data:"):
-                    yield _parse(wire.Event, line.removeprefix("data:").strip().encode(), path)
+                    yield parse(wire.Event, line.removeprefix("data:").strip().encode(), path)
         raise ServerUnreachable(f"the server at {self.url} ended the stream of events")
 
     def _get(self, reply: type[R], path: str, **params: str | int) -> R:
-        return _parse(reply, self.connection.send("GET", path, params=params or None), path)
+        return parse(reply, self.connection.send("GET", path, params=params or None), path)
 
     def _post(self, reply: type[R], path: str, body: BaseModel, *, method: str = "POST", **options: Any) -> R:
-        return _parse(reply, self._send(path, body, method=method, **options), path)
+        return parse(reply, self._send(path, body, method=method, **options), path)
 
     def _send(self, path: str, body: BaseModel, *, method: str = "POST", **options: Any) -> bytes:
         return self.connection.send(method, path, body.model_dump_json().encode(), **options)
@@ -294,7 +294,12 @@ def check_protocol(protocol: int, url: str) -> None:
         )
 
 
-def _parse(reply: type[R], content: bytes, path: str) -> R:
+def parse(reply: type[R], content: bytes, path: str) -> R:
+    """Read a reply.
+
+    Raises:
+        ProtocolMismatch: it is not of this protocol.
+    """
     try:
         return reply.model_validate_json(content)
     except ValidationError as error:

@@ -1,0 +1,94 @@
+"""RemoteEnv: one lane of a surrogate as a Gymnasium environment."""
+
+from __future__ import annotations
+
+from typing import Any, SupportsFloat
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.lanes import Lanes, session_request
+from surrogym_client.spaces import space
+from surrogym_shared.port import SurrogatePort
+
+LOST = "surrogym_session_lost"
+
+Observation = NDArray[np.float32]
+
+
+class RemoteEnv(gymnasium.Env[Observation, Any]):
+    """A learned virtual environment, stepped like any Gymnasium environment.
+
+    ``reset(seed=s)`` starts episode 0 of the seed, ``reset()`` goes on to the next episode. The time
+    limit is the server's; it shows as ``truncated``. ``info`` carries ``model_version`` and, after a
+    step, ``reward_mean`` (the reward before the penalty) and ``deviation`` (O,) when asked for. When the
+    server has lost the session, the episode ends as truncated with the reason in
+    ``info["surrogym_session_lost"]``, and the next reset begins in a new session.
+
+    Args:
+        port: the surrogate.
+        deviations: ask for the deviation of each model output.
+        render_mode: None; a surrogate has no picture.
+        options: fields of ``OpenSession``: variant, seed, model, time_limit, penalty, ...
+
+    Raises:
+        ValueError: an option that does not exist or is out of range.
+        SurrogymClientError: the session can't be opened.
+
+    Example:
+        >>> env = gymnasium.make("surrogym/Remote-v0", url="http://127.0.0.1:8000", surrogate="pendulum")
+        >>> observation, info = env.reset(seed=0)
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  as gymnasium.Env declares it
+
+    def __init__(
+        self,
+        port: SurrogatePort,
+        *,
+        deviations: bool = False,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        require_no_rendering(render_mode)
+        self.render_mode = None
+        self._lanes = Lanes(port, session_request(1, "disabled", options), deviations=deviations)
+        self.observation_space = space(self._lanes.view.observation_space)
+        self.action_space = space(self._lanes.view.action_space)
+
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,  # noqa: ARG002  a surrogate has none
+    ) -> tuple[Observation, dict[str, Any]]:
+        super().reset(seed=seed)
+        start = self._lanes.reset(seed)
+        info: dict[str, Any] = {"model_version": int(start.model_version[0])}
+        if start.lost is not None:
+            info[LOST] = start.lost
+        return start.observation[0], info
+
+    def step(self, action: Any) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
+        step = self._lanes.step(np.asarray(action)[None])
+        result = step.result
+        info: dict[str, Any] = {
+            "model_version": int(result.model_version[0]),
+            "reward_mean": float(result.reward_mean[0]),
+        }
+        if result.deviation is not None:
+            info["deviation"] = result.deviation[0]
+        if step.lost is not None:
+            info[LOST] = step.lost
+        terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
+        return result.observation[0], float(result.reward[0]), terminated, truncated, info
+
+    def close(self) -> None:
+        self._lanes.close()
+
+
+def require_no_rendering(render_mode: str | None) -> None:
+    """Raises ``ValueError`` for any render mode but None."""
+    if render_mode is not None:
+        raise ValueError(f"a surrogate can't be rendered: expected render_mode None, got {render_mode!r}")

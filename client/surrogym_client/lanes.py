@@ -1,0 +1,208 @@
+"""N lanes of one session, kept going over the loss of the session: what every environment class stands on.
+
+When a server forgets a session (a crash, or idle for too long), the running episodes can't go on. They
+end as truncated at their last known observation, with the reason told, and new episodes start in a new
+session. Nothing is reset silently.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from surrogym_client.errors import SessionLost, SurrogymClientError
+from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult, SurrogatePort
+from surrogym_shared.wire import AutoresetMode, OpenSession
+
+REOPENINGS = 3
+
+
+@dataclass(frozen=True)
+class LaneReset:
+    """``lost`` is why the session was lost just before, None when it was not."""
+
+    observation: Floats  # (N, D)
+    model_version: Ints  # (N,)
+    lost: str | None = None
+
+
+@dataclass(frozen=True)
+class LaneStep:
+    """A step, and what the dialects of the environment classes need beside it."""
+
+    result: StepResult
+    began: Bools  # (N,) lanes whose observation starts an episode and whose action went nowhere (next_step)
+    ended_under: Ints  # (N,) model version the step was computed under
+    cut: Bools  # (N,) lanes whose episode was lost, and is ended by this step
+    lost: str | None = None
+
+
+def session_request(num_envs: int, mode: AutoresetMode, options: dict[str, Any]) -> OpenSession:
+    """The request that opens a session.
+
+    Raises:
+        ValueError: an option does not exist or is out of range.
+    """
+    try:
+        return OpenSession(num_envs=num_envs, autoreset_mode=mode, **options)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        raise ValueError(f"session option {name!r}: {first['msg']}, got {first['input']!r}") from error
+
+
+class Lanes:
+    """N lanes of one session of a surrogate; opened when made.
+
+    Args:
+        port: the surrogate.
+        request: how to open the session.
+        deviations: ask for the deviation of each output with every step.
+    """
+
+    def __init__(self, port: SurrogatePort, request: OpenSession, *, deviations: bool = False) -> None:
+        self.port = port
+        self.view = port.open(request)
+        self._request = request
+        self._deviations = deviations
+        self._seed = self.view.seed
+        self._losses = 0
+        self._reason = ""
+        lanes = request.num_envs
+        self._observation: Floats = np.zeros((lanes, len(self.view.observation_space.low)), dtype=np.float32)
+        self._start = self._observation  # first observations of a new session's episodes
+        self._version: Ints = np.array(self.view.model_version, dtype=np.int64)
+        self._running = _none(lanes)
+        self._cut = _none(lanes)  # lost with a session, and not yet reported as ended
+        self._held = _none(lanes)  # reset in the new session ahead of the step that shows it
+
+    @property
+    def num_envs(self) -> int:
+        return self._request.num_envs
+
+    @property
+    def mode(self) -> AutoresetMode:
+        return self._request.autoreset_mode
+
+    def reset(self, seed: int | Sequence[int | None] | None = None, mask: Bools | None = None) -> LaneReset:
+        """Start new episodes in all lanes, or those of the mask (N,); a None among seeds goes on unseeded."""
+        chosen = np.ones(self.num_envs, dtype=bool) if mask is None else mask
+        try:
+            result, lost = self._seeded(seed, mask), None
+        except SessionLost as error:
+            self._reopen(error)
+            result, lost = self._seeded(seed, mask), self._reason
+        self._observation = np.where(chosen[:, None], result.observation, self._observation)
+        self._version = result.model_version
+        self._running = self._running | chosen
+        self._cut, self._held = self._cut & ~chosen, self._held & ~chosen
+        return LaneReset(self._observation.copy(), self._version.copy(), lost)
+
+    def step(self, action: NDArray[Any]) -> LaneStep:
+        """Step all lanes with actions (N, F) or (N,)."""
+        try:
+            result = self._advance(action)
+        except SessionLost as error:
+            self._reopen(error)
+            result = self._standing()
+        began = _none(self.num_envs) if self.mode == "same_step" else ~self._running
+        cut, self._cut, self._held = self._cut, _none(self.num_envs), _none(self.num_envs)
+        if cut.any():
+            result = self._ended(result, cut)
+        step = LaneStep(result, began, self._version, cut, self._reason if cut.any() else None)
+        self._version = result.model_version
+        self._observation = result.observation
+        self._running = ~(result.terminated | result.truncated) | (self.mode == "same_step")
+        return step
+
+    def close(self) -> None:
+        """End the session. A server that is gone has ended it already."""
+        with suppress(SurrogymClientError):
+            self.port.close(self.view.id)
+
+    def _seeded(self, seed: int | Sequence[int | None] | None, mask: Bools | None) -> ResetResult:
+        if seed is None or isinstance(seed, int | np.integer):
+            return self.port.reset(self.view.id, seed=seed, mask=mask)
+        chosen = np.ones(self.num_envs, dtype=bool) if mask is None else mask
+        given = np.array([s is not None for s in seed], dtype=bool)
+        if (chosen & ~given).any():
+            result = self.port.reset(self.view.id, mask=chosen & ~given)
+        if (chosen & given).any():
+            seeds = [0 if s is None else int(s) for s in seed]
+            result = self.port.reset(self.view.id, seed=seeds, mask=None if given.all() else chosen & given)
+        return result
+
+    def _advance(self, action: NDArray[Any]) -> StepResult:
+        idle = self._cut | self._held
+        if idle.all():
+            return self._standing()
+        mask = ~idle if idle.any() else None
+        return self.port.step(self.view.id, action, mask=mask, deviations=self._deviations)
+
+    def _standing(self) -> StepResult:
+        """What a step of no lane looks like: every lane shows where its episode stands."""
+        lanes, size = self._observation.shape
+        return StepResult(
+            observation=np.where(self._held[:, None], self._start, self._observation),
+            reward=np.zeros(lanes),
+            terminated=_none(lanes),
+            truncated=_none(lanes),
+            final_lanes=np.zeros(0, dtype=np.int64),
+            final_observation=np.zeros((0, size), dtype=np.float32),
+            model_version=np.array(self.view.model_version, dtype=np.int64),
+            reward_mean=np.zeros(lanes),
+            deviation=None,
+        )
+
+    def _ended(self, result: StepResult, cut: Bools) -> StepResult:
+        """End the episodes of the cut lanes as truncated, as the autoreset mode says."""
+        if self.mode == "same_step":
+            lanes = np.concatenate([result.final_lanes, np.flatnonzero(cut)])
+            final = np.concatenate([result.final_observation, self._observation[cut]])
+            order = np.argsort(lanes)
+            shown = self._start
+            result = replace(result, final_lanes=lanes[order], final_observation=final[order])
+        else:
+            shown = self._observation
+        if self.mode == "next_step":
+            self._held = cut
+        return replace(
+            result,
+            observation=np.where(cut[:, None], shown, result.observation),
+            truncated=result.truncated | cut,
+        )
+
+    def _reopen(self, error: SessionLost, attempts: int = REOPENINGS) -> None:
+        """Open a session in place of the lost one, and begin the episodes the caller won't ask for.
+
+        Its seed follows from the first session's and the number of losses: starts are new, and still
+        repeatable.
+        """
+        self._losses += 1
+        seed = _successor(self._seed, self._losses)
+        view = self.port.open(self._request.model_copy(update={"seed": seed, "idempotency_key": None}))
+        if self.mode != "disabled":
+            try:
+                self._start = self.port.reset(view.id).observation
+            except SessionLost as again:
+                if attempts == 1:
+                    raise
+                return self._reopen(again, attempts - 1)
+        self.view, self._reason = view, str(error)
+        self._cut = self._running
+        self._held = ~self._running & (self.mode == "next_step")
+        return None
+
+
+def _none(lanes: int) -> Bools:
+    return np.zeros(lanes, dtype=bool)
+
+
+def _successor(seed: int, losses: int) -> int:
+    return int(np.random.SeedSequence([seed, losses]).generate_state(1, np.uint64)[0] >> np.uint64(1))

@@ -1,0 +1,160 @@
+"""SurrogateVecEnv: the lanes of a session as a Stable-Baselines3 vector environment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Self
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
+
+from surrogym_client.env import LOST
+from surrogym_client.lanes import Lanes, LaneStep, session_request
+from surrogym_client.spaces import space
+from surrogym_client.transport import HttpSurrogate, Retries, Timeouts
+from surrogym_shared.port import SurrogatePort
+
+
+class SurrogateVecEnv(VecEnv):
+    """Many lanes of a learned virtual environment, for any Stable-Baselines3 algorithm.
+
+    Infos have ``TimeLimit.truncated``, at the end of an episode ``terminal_observation``, and
+    ``model_version`` and ``reward_mean``. An episode that ends because the server lost the session is
+    truncated, with the reason in ``surrogym_session_lost``.
+
+    Args:
+        url: the server's address; None takes ``SURROGYM_URL``, then http://127.0.0.1:8000.
+        surrogate: its name.
+        num_envs: N.
+        token: bearer token; default ``SURROGYM_TOKEN``.
+        timeouts: seconds per kind of request.
+        retries: how long to go on after lost connections, lost replies and 503.
+        options: fields of ``OpenSession``: variant, seed, model, time_limit, penalty, occupancy, ...
+
+    Raises:
+        ValueError: an option that does not exist or is out of range.
+        SurrogymClientError: the session can't be opened.
+
+    Example:
+        >>> PPO("MlpPolicy", SurrogateVecEnv("http://127.0.0.1:8000", "pendulum", num_envs=16)).learn(100_000)
+    """
+
+    def __init__(
+        self,
+        url: str | None,
+        surrogate: str,
+        num_envs: int = 16,
+        *,
+        token: str | None = None,
+        timeouts: Timeouts | None = None,
+        retries: Retries | None = None,
+        **options: Any,
+    ) -> None:
+        port = HttpSurrogate(url, surrogate, token, timeouts=timeouts, retries=retries)
+        self._open(port, num_envs, options)
+
+    @classmethod
+    def from_port(cls, port: SurrogatePort, num_envs: int = 16, **options: Any) -> Self:
+        """The same over a ready port, such as one in this process."""
+        env = cls.__new__(cls)
+        env._open(port, num_envs, options)
+        return env
+
+    def _open(self, port: SurrogatePort, num_envs: int, options: dict[str, Any]) -> None:
+        self.port = port
+        self._lanes = Lanes(port, session_request(num_envs, "same_step", options))
+        self._attributes: list[dict[str, Any]] = [{"render_mode": None} for _ in range(num_envs)]
+        view = self._lanes.view
+        super().__init__(num_envs, space(view.observation_space), space(view.action_space))
+        self._actions: NDArray[Any] | None = None
+
+    @property
+    def session(self) -> str:
+        """Id of the session; another one after a loss."""
+        return self._lanes.view.id
+
+    def submit_occupancy(self, checkpoint: str) -> int:
+        """Store the states visited so far under a name, for the design to weigh its queries by."""
+        return self.port.submit_occupancy(self.session, checkpoint)
+
+    def reset(self) -> NDArray[Any]:
+        given = any(seed is not None for seed in self._seeds)
+        start = self._lanes.reset(self._seeds if given else None)
+        self.reset_infos = [{"model_version": int(version)} for version in start.model_version]
+        if start.lost is not None:
+            for info in self.reset_infos:
+                info[LOST] = start.lost
+        self._reset_seeds()
+        self._reset_options()
+        return start.observation
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        self._actions = np.asarray(actions)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        if self._actions is None:
+            raise RuntimeError("step_wait: expected a step_async before it")
+        step, self._actions = self._lanes.step(self._actions), None
+        result = step.result
+        done = result.terminated | result.truncated
+        for lane in result.final_lanes:
+            self.reset_infos[lane] = {"model_version": int(result.model_version[lane])}
+        return result.observation.copy(), result.reward.astype(np.float32), done, _infos(step)
+
+    def close(self) -> None:
+        self._lanes.close()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        return [self._attribute(lane, attr_name) for lane in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        for lane in self._get_indices(indices):
+            self._attributes[lane][attr_name] = value
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        return [
+            self._attribute(lane, method_name)(*method_args, **method_kwargs)
+            for lane in self._get_indices(indices)
+        ]
+
+    def env_is_wrapped(
+        self,
+        wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]],  # noqa: ARG002
+        indices: VecEnvIndices = None,
+    ) -> list[bool]:
+        return [False for _ in self._get_indices(indices)]
+
+    def get_images(self) -> Sequence[NDArray[Any] | None]:
+        return [None] * self.num_envs
+
+    def _attribute(self, lane: int, name: str) -> Any:
+        """A lane has what was set on it, and what all lanes share."""
+        known = self._attributes[lane]
+        if name in known:
+            return known[name]
+        if name in ("observation_space", "action_space", "metadata"):
+            return getattr(self, name)
+        raise AttributeError(f"a lane of a surrogate has no attribute {name!r}")
+
+
+def _infos(step: LaneStep) -> list[dict[str, Any]]:
+    result = step.result
+    infos = [
+        {"TimeLimit.truncated": truncated and not terminated, "model_version": version, "reward_mean": mean}
+        for truncated, terminated, version, mean in zip(
+            result.truncated.tolist(),
+            result.terminated.tolist(),
+            step.ended_under.tolist(),
+            result.reward_mean.tolist(),
+            strict=True,
+        )
+    ]
+    for lane, observation in zip(result.final_lanes.tolist(), result.final_observation, strict=True):
+        infos[lane]["terminal_observation"] = observation
+    for lane in np.flatnonzero(step.cut).tolist():
+        infos[lane][LOST] = step.lost
+    return infos

@@ -1,0 +1,94 @@
+"""RemoteEnv is a Gymnasium environment that loses no information of the surrogate."""
+
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+
+from support.exact_pendulum import MODEL_VERSION, ExactEnv, ExactPendulum
+from surrogym_client.env import RemoteEnv
+from surrogym_client.errors import NotReset
+
+ACTION = np.array([0.5], dtype=np.float32)
+
+
+def test_it_gives_the_trajectory_of_the_environment_behind_it():
+    remote, reference = RemoteEnv(ExactPendulum()), ExactEnv()
+    for seed in (3, None, None):
+        (ours, info), (theirs, _) = remote.reset(seed=seed), reference.reset(seed=seed)
+        np.testing.assert_array_equal(ours, theirs)
+        assert info == {"model_version": MODEL_VERSION}
+        over = False
+        while not over:
+            ours, theirs = remote.step(ACTION), reference.step(ACTION)
+            np.testing.assert_array_equal(ours[0], theirs[0])
+            assert ours[1:] == theirs[1:]
+            over = ours[2] or ours[3]
+
+
+def test_values_have_gymnasiums_types():
+    env = RemoteEnv(ExactPendulum())
+    observation, _ = env.reset(seed=0)
+    assert observation in env.observation_space
+    observation, reward, terminated, truncated, _ = env.step(ACTION)
+    assert observation in env.observation_space
+    assert (type(reward), type(terminated), type(truncated)) == (float, bool, bool)
+
+
+def test_seed_zero_is_a_seed():
+    env = RemoteEnv(ExactPendulum())
+    first, _ = env.reset(seed=0)
+    env.reset()
+    np.testing.assert_array_equal(env.reset(seed=0)[0], first)
+
+
+def test_a_step_after_the_end_is_refused():
+    env = RemoteEnv(ExactPendulum(), time_limit=1)
+    env.reset(seed=0)
+    env.step(ACTION)
+    with pytest.raises(NotReset):
+        env.step(ACTION)
+
+
+def test_options_reach_the_session():
+    port = ExactPendulum()
+    RemoteEnv(port, variant="probabilistic", seed=4, penalty=1.5)
+    request = port.opened[0]
+    assert (request.variant, request.seed, request.penalty, request.num_envs) == ("probabilistic", 4, 1.5, 1)
+    assert request.autoreset_mode == "disabled"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"varaint": "deterministic"}, "'varaint'"), ({"penalty": -1.0}, "'penalty'.*got -1")],
+)
+def test_a_wrong_option_is_named(options: dict[str, object], message: str):
+    with pytest.raises(ValueError, match=message):
+        RemoteEnv(ExactPendulum(), **options)
+
+
+def test_rendering_is_refused():
+    with pytest.raises(ValueError, match=r"can't be rendered.*'human'"):
+        RemoteEnv(ExactPendulum(), render_mode="human")
+
+
+def test_deviation_comes_when_asked_for():
+    env = RemoteEnv(ExactPendulum(), deviations=True)
+    env.reset(seed=0)
+    assert env.step(ACTION)[-1]["deviation"].shape == (3,)
+
+
+def test_it_pickles_and_goes_on_where_it_was():
+    env = RemoteEnv(ExactPendulum())
+    env.reset(seed=1)
+    again = pickle.loads(pickle.dumps(env))
+    np.testing.assert_array_equal(again.step(ACTION)[0], env.step(ACTION)[0])
+
+
+def test_close_ends_the_session():
+    port = ExactPendulum()
+    with RemoteEnv(port) as env:
+        assert isinstance(env, gymnasium.Env)
+        assert port.sessions
+    assert not port.sessions

@@ -1,0 +1,55 @@
+"""The errors of the client cover the codes of the service, and cross process boundaries."""
+
+import pickle
+
+import pytest
+
+from surrogym_client import errors
+from surrogym_shared.codes import STATUS, Code, Problem
+
+
+def problem(code: Code) -> Problem:
+    return Problem(
+        title=code.value, status=STATUS[code], code=code, detail=f"about {code.value}", expected_seq=7
+    )
+
+
+def leaves(cls: type) -> list[type]:
+    return [cls] + [leaf for child in cls.__subclasses__() for leaf in leaves(child)]
+
+
+def test_every_code_has_an_error_of_its_own_kind():
+    assert set(errors.BY_CODE) == set(Code)
+
+
+def test_every_refusal_stands_for_some_code():
+    without_code = {errors.ProblemError, errors.NotThere, errors.SessionLost, errors.Conflict, errors.Refused}
+    assert set(leaves(errors.ProblemError)) - without_code == set(errors.BY_CODE.values())
+
+
+@pytest.mark.parametrize("code", list(Code))
+def test_a_refusal_says_its_detail_and_pickles(code: Code):
+    error = errors.error_from_problem(problem(code))
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is errors.BY_CODE[code]
+    assert str(again) == str(error) == f"about {code.value}"
+    assert again.problem == error.problem
+
+
+@pytest.mark.parametrize("cls", [errors.ServerUnreachable, errors.RequestTimeout, errors.ProtocolMismatch])
+def test_the_other_errors_pickle(cls: type[Exception]):
+    again = pickle.loads(pickle.dumps(cls("why")))
+    assert type(again) is cls
+    assert str(again) == "why"
+
+
+def test_a_seq_conflict_says_what_the_session_waits_for():
+    error = errors.error_from_problem(problem(Code.SEQ_CONFLICT))
+    assert isinstance(error, errors.SeqConflict)
+    assert error.expected_seq == 7
+
+
+def test_the_drawn_tree_is_the_real_one():
+    drawn = [word for line in errors.__doc__.splitlines() if (word := line.strip("│├└─ ").split(" ")[0])]
+    real = [cls.__name__ for cls in leaves(errors.SurrogymClientError)]
+    assert [word for word in drawn if word in real] == real

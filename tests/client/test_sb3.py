@@ -1,0 +1,86 @@
+"""SurrogateVecEnv speaks Stable-Baselines3's dialect: the same as DummyVecEnv on the same trajectory."""
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+
+from support.exact_pendulum import ExactEnv, ExactPendulum
+from surrogym_client.sb3 import SurrogateVecEnv
+
+LANES = 4
+
+
+@pytest.fixture
+def remote() -> SurrogateVecEnv:
+    return SurrogateVecEnv.from_port(ExactPendulum(), LANES)
+
+
+def assert_same_infos(ours: list[dict[str, object]], theirs: list[dict[str, object]]) -> None:
+    for our, their in zip(ours, theirs, strict=True):
+        assert our.keys() == their.keys()
+        for key in our:
+            np.testing.assert_array_equal(our[key], their[key], err_msg=key)
+
+
+def test_a_trajectory_is_dummy_vec_envs(remote: SurrogateVecEnv):
+    reference = DummyVecEnv([ExactEnv] * LANES)
+    assert remote.seed(11) == reference.seed(11)
+    np.testing.assert_array_equal(remote.reset(), reference.reset())
+    assert_same_infos(remote.reset_infos, reference.reset_infos)
+    cut = 0
+    for action in np.random.default_rng(1).uniform(-2, 2, (60, LANES, 1)):
+        ours, theirs = remote.step(action), reference.step(action)
+        for our, their in zip(ours[:3], theirs[:3], strict=True):
+            np.testing.assert_array_equal(our, their)
+            assert our.dtype == their.dtype
+        assert_same_infos(ours[3], theirs[3])
+        assert_same_infos(remote.reset_infos, reference.reset_infos)
+        cut += sum(info["TimeLimit.truncated"] for info in ours[3])
+    assert cut > 3, "expected several episodes to reach the time limit"
+
+
+def test_seeds_are_used_once(remote: SurrogateVecEnv):
+    remote.seed(3)
+    first = remote.reset()
+    assert not np.array_equal(remote.reset(), first)
+    remote.seed(3)
+    np.testing.assert_array_equal(remote.reset(), first)
+
+
+def test_a_lane_has_what_was_set_on_it(remote: SurrogateVecEnv):
+    remote.set_attr("mark", 1, indices=[0, 2])
+    assert remote.get_attr("mark", indices=[0, 2]) == [1, 1]
+    assert not remote.has_attr("mark")
+    assert remote.get_attr("render_mode") == [None] * LANES
+    assert remote.get_attr("action_space", indices=1) == [remote.action_space]
+    with pytest.raises(AttributeError, match="no attribute 'gravity'"):
+        remote.get_attr("gravity")
+
+
+def test_methods_of_the_original_environment_are_not_there(remote: SurrogateVecEnv):
+    with pytest.raises(AttributeError, match="no attribute 'fly'"):
+        remote.env_method("fly")
+
+
+def test_no_lane_is_wrapped(remote: SurrogateVecEnv):
+    assert remote.env_is_wrapped(Monitor) == [False] * LANES
+
+
+def test_a_step_has_to_be_sent_before_it_is_waited_for(remote: SurrogateVecEnv):
+    remote.reset()
+    with pytest.raises(RuntimeError, match="step_async"):
+        remote.step_wait()
+
+
+def test_an_algorithm_learns_on_it(remote: SurrogateVecEnv):
+    envs = VecMonitor(remote)
+    model = PPO("MlpPolicy", envs, n_steps=16, batch_size=32, n_epochs=1, seed=0, device="cpu")
+    model.learn(total_timesteps=128)
+    assert model.num_timesteps == 128
+    assert len(model.ep_info_buffer) > 0
+
+
+def test_occupancy_is_submitted_for_the_session(remote: SurrogateVecEnv):
+    assert remote.submit_occupancy("first") == LANES

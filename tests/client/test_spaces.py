@@ -1,0 +1,18 @@
+"""Spaces of the wire become the Gymnasium spaces a policy is built for."""
+
+import gymnasium
+import numpy as np
+
+from surrogym_client.spaces import space
+from surrogym_shared.wire import BoxSpace, DiscreteSpace, MultiDiscreteSpace
+
+
+def test_a_null_limit_is_unbounded():
+    box = space(BoxSpace(low=[-1.5, None], high=[None, 2.0]))
+    low, high = np.float32([-1.5, -np.inf]), np.float32([np.inf, 2.0])
+    assert box == gymnasium.spaces.Box(low, high, dtype=np.float32)
+
+
+def test_discrete_spaces():
+    assert space(DiscreteSpace(n=3)) == gymnasium.spaces.Discrete(3)
+    assert space(MultiDiscreteSpace(nvec=[2, 5])) == gymnasium.spaces.MultiDiscrete([2, 5])
