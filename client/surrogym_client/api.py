@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from typing import Any, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 from urllib.parse import quote
 from uuid import uuid4
 
@@ -188,6 +188,10 @@ class Api:
             yield from page.samples
             after = page.next_after
 
+    def export_samples(self, name: str, file_format: Literal["csv", "npz"]) -> bytes:
+        """All samples as one file."""
+        return self.connection.send("GET", f"{_surrogate(name)}/samples", params={"format": file_format})
+
     def report_steps(
         self, name: str, steps: int, *, episodes: int = 0, note: str = "", idempotency_key: str | None = None
     ) -> wire.Ledger:
@@ -235,6 +239,16 @@ class Api:
     def models(self, name: str) -> list[wire.ModelView]:
         return self._get(wire.ModelList, f"{_surrogate(name)}/models").models
 
+    def export_model(self, name: str, version: int) -> bytes:
+        """The model itself, complete, as a safetensors file."""
+        route = f"{_surrogate(name)}/models/{version}"
+        return self.connection.send("GET", route, params={"format": "safetensors"})
+
+    def import_model(self, name: str, data: bytes) -> wire.ModelView:
+        """Make an exported model the newest version of a surrogate with the same outputs."""
+        route = f"{_surrogate(name)}/models"
+        return parse(wire.ModelView, self.connection.send("POST", route, data, repeatable=False), route)
+
     # Events
 
     def events(self, name: str, after: int | None = None) -> Iterator[wire.Event]:
@@ -251,8 +265,10 @@ class Api:
         while True:
             try:
                 for event in self._one_stream(name, after):
-                    delays, after = None, event.id
-                    yield event
+                    delays = None
+                    if event is not None:
+                        after = event.id
+                        yield event
             except ServerUnreachable:
                 delays = self.connection.retries.delays() if delays is None else delays
                 pause = next(delays, None)
@@ -260,7 +276,8 @@ class Api:
                     raise
                 time.sleep(pause)
 
-    def _one_stream(self, name: str, after: int | None) -> Iterator[wire.Event]:
+    def _one_stream(self, name: str, after: int | None) -> Iterator[wire.Event | None]:
+        """Events of one connection; None for a sign of life. Ends only by an error."""
         path = f"{_surrogate(name)}/events"
         headers = {"Accept": "text/event-stream"}
         if after is not None:
@@ -269,6 +286,8 @@ class Api:
             for line in lines:
                 if line.startswith("data:"):
                     yield parse(wire.Event, line.removeprefix("data:").strip().encode(), path)
+                elif line.startswith(":"):
+                    yield None
         raise ServerUnreachable(f"the server at {self.url} ended the stream of events")
 
     def _get(self, reply: type[R], path: str, **params: str | int) -> R:

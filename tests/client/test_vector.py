@@ -1,4 +1,4 @@
-"""RemoteVectorEnv speaks Gymnasium's dialect: that of SyncVectorEnv on the same trajectory, infos included."""
+"""RemoteVectorEnv speaks Gymnasium's dialect: that of SyncVectorEnv on the same trajectory, infos too."""
 
 import pickle
 

@@ -1,0 +1,119 @@
+"""Api: keys that make repeats harmless, pages, and events that survive a broken stream. Over real sockets."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from support.scripted_server import ScriptedServer, lost_reply, problem, reply, scripted_server
+from surrogym_client import errors
+from surrogym_client.api import Api
+from surrogym_client.connection import Retries
+from surrogym_shared import wire
+from surrogym_shared.codes import Code
+
+QUICK = Retries(seconds=2.0, first_delay=0.01, longest_delay=0.05)
+SAMPLE = wire.NewSample(coordinates=[0.0], action=[0.0], next_coordinates=[0.1], reward=1.0, terminated=False)
+
+
+@contextmanager
+def api_of(*script) -> Iterator[tuple[Api, ScriptedServer]]:
+    with scripted_server(*script) as server, Api(server.url, retries=QUICK) as api:
+        yield api, server
+
+
+def said(model: wire.Reply):
+    return reply(model.model_dump_json())
+
+
+def sample(number: int) -> wire.SampleView:
+    return wire.SampleView(
+        id=number,
+        purpose="initial",
+        query_id=number,
+        sampler="a",
+        attempt=1,
+        late=False,
+        requested_coordinates=[0.0],
+        coordinates=[0.0],
+        action=[0.0],
+        next_coordinates=[0.1],
+        reward=1.0,
+        terminated=False,
+        truncated=False,
+        created_at=0.0,
+    )
+
+
+def test_samples_are_handed_in_again_under_the_same_key_after_a_lost_reply():
+    added = said(wire.AddedSamples(sample_ids=[1], duplicates=1, ledger=wire.Ledger(manual=1, total=1)))
+    with api_of(lost_reply, added, added) as (api, server):
+        api.add_samples("pendulum", "me", [SAMPLE])
+        api.add_samples("pendulum", "me", [SAMPLE])
+    keys = [wire.AddSamples.model_validate_json(r.body).idempotency_key for r in server.received]
+    assert keys[0] == keys[1] != keys[2]
+
+
+def test_a_claim_is_not_repeated_after_a_lost_reply():
+    with api_of(lost_reply) as (api, server):
+        with pytest.raises(errors.ServerUnreachable):
+            api.claim("pendulum", "me")
+        assert len(server.received) == 1
+
+
+def test_all_pages_of_samples_are_read():
+    full = wire.SamplePage(samples=[sample(1), sample(2)], next_after=2)
+    last = wire.SamplePage(samples=[], next_after=None)
+    with api_of(said(full), said(last)) as (api, server):
+        assert [s.id for s in api.samples("a b")] == [1, 2]
+    assert [r.path for r in server.received] == [f"/v1/surrogates/a%20b/samples?after={n}" for n in (0, 2)]
+
+
+def event(number: int) -> str:
+    body = wire.Event(id=number, kind="sample", created_at=0.0, body={}).model_dump_json()
+    return f"id: {number}\nevent: sample\ndata: {body}\n\n"
+
+
+def test_a_broken_stream_of_events_goes_on_after_the_last_one():
+    first = reply(": connected\n\n" + event(1) + event(2), content_type="text/event-stream")
+    second = reply(": connected\n\n" + event(3), content_type="text/event-stream")
+    gone = problem(Code.UNKNOWN_SURROGATE)
+    with api_of(first, lost_reply, second, gone) as (api, server):
+        events = api.events("pendulum", after=0)
+        assert [next(events).id for _ in range(3)] == [1, 2, 3]
+        with pytest.raises(errors.UnknownSurrogate):
+            next(events)
+    assert [r.headers["Last-Event-ID"] for r in server.received] == ["0", "2", "2", "3"]
+
+
+def test_a_patch_says_only_what_it_is_given():
+    with api_of(problem(Code.FORBIDDEN)) as (api, server):
+        with pytest.raises(errors.Forbidden):
+            api.patch_surrogate("pendulum", paused=True)
+        assert server.received[0].method == "PATCH"
+        assert json.loads(server.received[0].body) == {"paused": True, "budget": None, "target": None}
+
+
+def test_another_protocol_is_refused():
+    newer = said(wire.Health(version="9", protocol=wire.PROTOCOL + 1))
+    with (
+        api_of(newer) as (api, _),
+        pytest.raises(errors.ProtocolMismatch, match=r"expected protocol 1 .* got 2"),
+    ):
+        api.health()
+
+
+def test_an_answer_of_another_shape_is_refused():
+    other = reply('{"models": [{"version": "first"}]}')
+    with (
+        api_of(other) as (api, _),
+        pytest.raises(errors.ProtocolMismatch, match=r"models: models\.0\.version"),
+    ):
+        api.models("pendulum")
+
+
+def test_a_server_on_its_way_up_is_waited_for():
+    ready = said(wire.Ready(status="ready", storage="ok"))
+    with api_of(problem(Code.UNAVAILABLE), ready, said(wire.Health(version="1"))) as (api, _):
+        assert api.wait_until_ready(5.0).version == "1"

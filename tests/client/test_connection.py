@@ -1,0 +1,166 @@
+"""What the network does to a request: lost replies, time-outs, dead and foreign servers. On real sockets."""
+
+import pickle
+import socket
+import threading
+
+import pytest
+
+from support.scripted_server import lost_reply, problem, reply, scripted_server
+from surrogym_client import errors
+from surrogym_client.connection import Connection, Retries, Timeouts
+from surrogym_shared.codes import Code
+
+QUICK = Retries(seconds=2.0, first_delay=0.01, longest_delay=0.05)
+NEVER = Retries(seconds=0.0)
+BODY = b'{"seq":1}'
+
+
+def unused_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.mark.parametrize("failure", [lost_reply, problem(Code.UNAVAILABLE), problem(Code.TOO_MANY_REQUESTS)])
+def test_a_failed_request_is_sent_again_unchanged(failure):
+    with (
+        scripted_server(failure, failure, reply("done")) as server,
+        Connection(server.url, retries=QUICK) as c,
+    ):
+        assert c.send("POST", "/x", BODY) == b"done"
+    assert [r.body for r in server.received] == [BODY] * 3
+
+
+def test_what_must_not_be_repeated_is_not_sent_again_after_a_lost_reply():
+    with scripted_server(lost_reply) as server, Connection(server.url, retries=QUICK) as connection:
+        with pytest.raises(errors.ServerUnreachable, match="was lost"):
+            connection.send("POST", "/x", BODY, repeatable=False)
+        assert len(server.received) == 1
+
+
+def test_what_must_not_be_repeated_is_sent_again_when_the_server_refused_it():
+    script = [problem(Code.UNAVAILABLE), reply("done")]
+    with scripted_server(*script) as server, Connection(server.url, retries=QUICK) as connection:
+        assert connection.send("POST", "/x", BODY, repeatable=False) == b"done"
+
+
+def test_a_late_reply_never_answers_a_later_request():
+    script = [reply("late", delay=0.4), reply("second"), reply("third")]
+    with scripted_server(*script) as server, Connection(server.url, retries=QUICK) as connection:
+        assert connection.send("POST", "/x", b"1", timeout=0.1) == b"second"
+        threading.Event().wait(0.5)
+        assert connection.send("POST", "/x", b"2") == b"third"
+
+
+def test_a_time_out_is_told_from_a_dead_server():
+    with (
+        scripted_server(reply("late", delay=0.3)) as server,
+        Connection(server.url, retries=NEVER) as connection,
+        pytest.raises(errors.RequestTimeout, match="did not answer in time"),
+    ):
+        connection.send("GET", "/x", timeout=0.05)
+
+
+def test_a_dead_server_is_named():
+    url = f"http://127.0.0.1:{unused_port()}"
+    with Connection(url, retries=NEVER) as connection, pytest.raises(errors.ServerUnreachable, match=url):
+        connection.send("GET", "/x")
+
+
+def test_a_server_that_comes_up_late_is_waited_for():
+    port = unused_port()
+    listening = socket.socket()
+
+    def serve_once() -> None:
+        threading.Event().wait(0.2)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind(("127.0.0.1", port))
+        listening.listen()
+        peer, _ = listening.accept()
+        with peer:
+            peer.recv(65536)
+            peer.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\nConnection: close\r\n\r\nup")
+
+    thread = threading.Thread(target=serve_once)
+    thread.start()
+    with listening, Connection(f"http://127.0.0.1:{port}", retries=Retries(seconds=20)) as connection:
+        assert connection.send("GET", "/x") == b"up"
+        thread.join()
+
+
+def test_a_refusal_is_raised_at_once_as_its_own_error():
+    refusal = problem(Code.SPEC_CONFLICT, "another spec")
+    with scripted_server(refusal) as server, Connection(server.url, retries=QUICK) as connection:
+        with pytest.raises(errors.SpecConflict, match="another spec"):
+            connection.send("POST", "/x", BODY)
+        assert len(server.received) == 1
+
+
+def test_a_server_of_another_kind_is_no_surrogym_server():
+    with (
+        scripted_server(reply("<html>", 404, "text/html")) as server,
+        Connection(server.url) as connection,
+        pytest.raises(errors.ProtocolMismatch, match=r"expected a Surrogym server.*404.*text/html"),
+    ):
+        connection.send("GET", "/x")
+
+
+def test_a_gateway_without_a_server_behind_it_is_waited_for():
+    script = [reply("<html>", 502, "text/html"), reply("done")]
+    with scripted_server(*script) as server, Connection(server.url, retries=QUICK) as connection:
+        assert connection.send("GET", "/x") == b"done"
+
+
+@pytest.mark.parametrize("url", ["pendulum", "ftp://host", "http://", "http://host:port", "host:8000"])
+def test_what_is_no_address_is_refused(url: str):
+    with pytest.raises(
+        errors.ServerUnreachable, match=r"expected a server address like http://127.0.0.1:8000, got"
+    ):
+        Connection(url)
+
+
+def test_the_token_is_sent_and_the_environment_gives_defaults(monkeypatch: pytest.MonkeyPatch):
+    with scripted_server(reply("done")) as server:
+        monkeypatch.setenv("SURROGYM_URL", server.url + "/")
+        monkeypatch.setenv("SURROGYM_TOKEN", "from-environment")
+        for token, expected in ((None, "Bearer from-environment"), ("own", "Bearer own")):
+            with Connection(token=token) as connection:
+                connection.send("GET", "/x")
+            assert server.received[-1].headers["Authorization"] == expected
+        assert server.received[-1].path == "/x"
+
+
+def test_without_anything_it_is_the_loopback_server(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("SURROGYM_URL", raising=False)
+    assert Connection().url == "http://127.0.0.1:8000"
+
+
+def test_no_proxy_comes_between_programs_of_one_machine(monkeypatch: pytest.MonkeyPatch):
+    for name in ("HTTP_PROXY", "http_proxy", "ALL_PROXY", "all_proxy"):
+        monkeypatch.setenv(name, f"http://127.0.0.1:{unused_port()}")
+    for name in ("NO_PROXY", "no_proxy"):
+        monkeypatch.delenv(name, raising=False)
+    with scripted_server(reply("done")) as server, Connection(server.url, retries=NEVER) as connection:
+        assert connection.send("GET", "/x") == b"done"
+
+
+def test_a_pickled_connection_connects_anew():
+    with (
+        scripted_server(reply("done")) as server,
+        Connection(server.url, "secret", Timeouts(step=3)) as original,
+    ):
+        with pickle.loads(pickle.dumps(original)) as again:
+            assert again.send("GET", "/x") == b"done"
+            assert again.timeouts == Timeouts(step=3)
+        assert server.received[-1].headers["Authorization"] == "Bearer secret"
+
+
+def test_pauses_grow_to_their_limit_and_end_with_the_budget():
+    pauses = Retries(seconds=0.4, first_delay=0.01, longest_delay=0.04).delays()
+    taken = [next(pauses) for _ in range(6)]
+    limits = [0.01, 0.02, 0.04, 0.04, 0.04, 0.04]
+    assert all(limit / 2 <= pause <= limit for pause, limit in zip(taken, limits, strict=True))
+    threading.Event().wait(0.5)
+    assert next(pauses, None) is None
+    assert list(NEVER.delays()) == []

@@ -1,0 +1,43 @@
+"""The Gymnasium ids work, and the thin client stays thin. In other processes: imports can't be undone."""
+
+import subprocess
+import sys
+
+import gymnasium
+import pytest
+
+import surrogym_client
+from surrogym_client.registration import ENVIRONMENT_ID, register
+
+
+def run(code: str) -> str:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_importing_the_package_registers_the_environment():
+    code = "import gymnasium, surrogym_client; print(gymnasium.spec('surrogym/Remote-v0').entry_point)"
+    assert run(code).strip() == "surrogym_client.remote:make_env"
+
+
+def test_the_id_may_name_the_package_to_import():
+    code = (
+        "import gymnasium\n"
+        "try: gymnasium.make_vec('surrogym_client:surrogym/Remote-v0', url='nowhere', surrogate='x')\n"
+        "except Exception as error: print(type(error).__name__, error)"
+    )
+    assert run(code).startswith("ServerUnreachable expected a server address")
+
+
+def test_registering_twice_is_harmless():
+    before = gymnasium.spec(ENVIRONMENT_ID)
+    register()
+    assert gymnasium.spec(ENVIRONMENT_ID) is before
+    assert surrogym_client.register is register
+
+
+@pytest.mark.parametrize("module", ["transport", "env", "vector", "remote", "api", "spaces"])
+def test_the_thin_client_needs_no_torch(module: str):
+    code = f"import sys, surrogym_client.{module}; print(*sys.modules)"
+    assert not {"torch", "stable_baselines3"} & set(run(code).split())

@@ -1,0 +1,89 @@
+"""A real HTTP server on a loopback socket that does what a test's script says, also the impolite things."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+from surrogym_shared.codes import STATUS, Code, Problem
+
+
+@dataclass
+class Received:
+    method: str
+    path: str
+    body: bytes
+    headers: dict[str, str]
+
+
+Answer = Callable[[BaseHTTPRequestHandler], None]
+
+
+@dataclass
+class ScriptedServer:
+    """Answers request i with ``script[i]``, and every later one with the last entry."""
+
+    url: str
+    script: list[Answer]
+    received: list[Received] = field(default_factory=list)
+
+
+def reply(body: str, status: int = 200, content_type: str = "application/json", delay: float = 0.0) -> Answer:
+    def answer(handler: BaseHTTPRequestHandler) -> None:
+        if delay:
+            threading.Event().wait(delay)
+        content = body.encode()
+        handler.send_response(status)
+        handler.send_header("Content-Type", content_type)
+        handler.send_header("Content-Length", str(len(content)))
+        handler.end_headers()
+        handler.wfile.write(content)
+
+    return answer
+
+
+def problem(code: Code, detail: str = "why") -> Answer:
+    body = Problem(title=code.value, status=STATUS[code], code=code, detail=detail)
+    return reply(body.model_dump_json(), STATUS[code], "application/problem+json")
+
+
+def lost_reply(handler: BaseHTTPRequestHandler) -> None:
+    """Take the request and cut the connection."""
+    handler.close_connection = True
+
+
+@contextmanager
+def scripted_server(*script: Answer) -> Iterator[ScriptedServer]:
+    lock = threading.Lock()
+
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def _handle(self) -> None:
+            body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+            with lock:
+                number = len(server.received)
+                server.received.append(Received(self.command, self.path, body, dict(self.headers)))
+            try:
+                server.script[min(number, len(server.script) - 1)](self)
+            except OSError:
+                self.close_connection = True
+
+        do_GET = do_POST = do_PATCH = do_DELETE = _handle
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    http = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server = ScriptedServer(f"http://127.0.0.1:{http.server_port}", list(script))
+    thread = threading.Thread(target=http.serve_forever, kwargs={"poll_interval": 0.02})
+    thread.start()
+    try:
+        yield server
+    finally:
+        http.shutdown()
+        http.server_close()
+        thread.join()
