@@ -93,8 +93,8 @@ class Designs(ABC):
     def due(self) -> list[str]:
         """Names of the surrogates to fit now, oldest first.
 
-        Such a surrogate has samples, no pending or leased query, and something new since its last fit (a
-        sample, a query set aside, an ask, another budget or target); it is not paused, and nobody holds the right.
+        Such a surrogate has samples, no pending or leased query, and something new since its last fit: a sample,
+        a query set aside, an ask, another budget or target. It isn't paused, and nobody holds the right.
         """
 
     @abstractmethod

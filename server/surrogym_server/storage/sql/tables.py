@@ -12,7 +12,7 @@ import numpy as np
 import sqlalchemy as sa
 from sqlalchemy.engine import Dialect
 
-from surrogym_server.storage.records import Vector
+from surrogym_server.storage.records import Array, Vector
 
 metadata = sa.MetaData(
     naming_convention={
