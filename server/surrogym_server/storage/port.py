@@ -81,9 +81,7 @@ class Designs(ABC):
     """The right to fit: at any time at most one server fits a surrogate."""
 
     @abstractmethod
-    def ask(
-        self, name: str, queries: int, *, checkpoint: str | None = None, key: str | None = None
-    ) -> SurrogateRecord:
+    def ask(self, name: str, queries: int, *, checkpoint: str | None = None, key: str | None = None) -> SurrogateRecord:
         """Ask the next fit for ``queries`` more, whatever its verdict; a fit becomes due.
 
         The budget is raised to hold them, beside the samples, the open queries and what was asked before.
@@ -93,8 +91,8 @@ class Designs(ABC):
     def due(self) -> list[str]:
         """Names of the surrogates to fit now, oldest first.
 
-        Such a surrogate has samples, no pending or leased query, and something new since its last fit: a sample,
-        a query set aside, an ask, another budget or target. It isn't paused, and nobody holds the right.
+        Such a surrogate has samples, no pending or leased query, and something new since its last fit
+        (a sample, a query set aside, an ask, another budget or target). It isn't paused, and nobody holds the right.
         """
 
     @abstractmethod
@@ -186,9 +184,7 @@ class Samples(ABC):
     """Samples: never changed, never lost once acknowledged."""
 
     @abstractmethod
-    def add(
-        self, name: str, sampler: str, samples: Sequence[NewSample], *, key: str | None = None
-    ) -> AddedSamples:
+    def add(self, name: str, sampler: str, samples: Sequence[NewSample], *, key: str | None = None) -> AddedSamples:
         """Store a batch, all or nothing, and answer the queries it names; committed when it returns.
 
         A sample takes the purpose of its query, or ``manual``. Under a lease that has ended (by its time or a

@@ -29,9 +29,7 @@ class Answered:
     fingerprint: str | None
 
 
-def read_answered(
-    connection: Connection, held: Row[Any], batch: Sequence[NewSample]
-) -> list[Answered | None]:
+def read_answered(connection: Connection, held: Row[Any], batch: Sequence[NewSample]) -> list[Answered | None]:
     """For each sample the lease it was reported under, or None; locks their queries.
 
     Raises:
@@ -67,9 +65,7 @@ def _lock_queries(connection: Connection, held: Row[Any], named: set[int]) -> di
     return {row.id: row.purpose for row in connection.execute(wanted)}
 
 
-def _leases(
-    connection: Connection, held: Row[Any], purposes: dict[int, Purpose]
-) -> dict[tuple[int, str], Answered]:
+def _leases(connection: Connection, held: Row[Any], purposes: dict[int, Purpose]) -> dict[tuple[int, str], Answered]:
     """All leases of these queries, by query and token."""
     if not purposes:
         return {}

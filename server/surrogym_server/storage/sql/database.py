@@ -74,9 +74,7 @@ def connect(url: str) -> Database:
     try:
         parsed = sa.make_url(url)
     except sa.exc.ArgumentError:
-        raise InvalidInput(
-            f"expected a database address such as sqlite:///surrogym.db, got {url!r}"
-        ) from None
+        raise InvalidInput(f"expected a database address such as sqlite:///surrogym.db, got {url!r}") from None
     match parsed.get_backend_name():
         case "sqlite" if parsed.database and parsed.database != ":memory:":
             return _sqlite(Path(parsed.database))
@@ -93,9 +91,7 @@ def _sqlite(path: Path) -> Database:
     except OSError as error:
         raise Unavailable(f"expected a folder for the database, got {path.parent}: {error}") from None
     lock = FileLock(path.with_name(path.name + ".lock"))
-    engine = sa.create_engine(
-        URL.create("sqlite", database=str(path)), connect_args={"timeout": BUSY_SECONDS}, **POOL
-    )
+    engine = sa.create_engine(URL.create("sqlite", database=str(path)), connect_args={"timeout": BUSY_SECONDS}, **POOL)
     sa.event.listen(engine, "connect", _prepare_sqlite)
     sa.event.listen(engine, "begin", _begin_sqlite)
     return Database(engine, lock)
@@ -116,13 +112,19 @@ def _postgresql(url: URL) -> Database:
     return Database(engine)
 
 
+# exactly these: IntegrityError and ProgrammingError derive from DatabaseError, and are our own bugs
+UNUSABLE = (sa.exc.OperationalError, sa.exc.InterfaceError, sa.exc.TimeoutError, sa.exc.DatabaseError)
+UNSTORABLE = (sa.exc.DataError, OverflowError, UnicodeEncodeError)
+
+
 @contextlib.contextmanager
 def _translated() -> Iterator[None]:
     try:
         yield
-    except (sa.exc.OperationalError, sa.exc.InterfaceError, sa.exc.TimeoutError) as error:
+    except (*UNUSABLE, *UNSTORABLE) as error:
         reason = getattr(error, "orig", None) or error
-        raise Unavailable(f"the database can't be used now: {reason}") from error
-    except (sa.exc.DataError, OverflowError, UnicodeEncodeError) as error:
-        reason = getattr(error, "orig", None) or error
-        raise InvalidInput(f"expected a value the database can store: {reason}") from error
+        if isinstance(error, UNSTORABLE):
+            raise InvalidInput(f"expected a value the database can store: {reason}") from error
+        if type(error) in UNUSABLE:
+            raise Unavailable(f"the database can't be used now: {reason}") from error
+        raise

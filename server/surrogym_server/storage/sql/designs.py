@@ -32,9 +32,7 @@ class SqlDesigns(port.Designs):
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def ask(
-        self, name: str, queries: int, *, checkpoint: str | None = None, key: str | None = None
-    ) -> SurrogateRecord:
+    def ask(self, name: str, queries: int, *, checkpoint: str | None = None, key: str | None = None) -> SurrogateRecord:
         body = fingerprint(queries, checkpoint)
         with self._database.write() as connection:
             held = hold(connection, name, surrogates.c.budget, surrogates.c.extra_queries)
@@ -142,6 +140,4 @@ def _spoken_for(connection: Connection, surrogate_id: int) -> int:
     awaited = sa.select(sa.func.count()).where(
         queries.c.surrogate_id == surrogate_id, queries.c.status.in_(OPEN_STATUSES)
     )
-    return int(
-        connection.execute(sa.select(taken.scalar_subquery() + awaited.scalar_subquery())).scalar_one()
-    )
+    return int(connection.execute(sa.select(taken.scalar_subquery() + awaited.scalar_subquery())).scalar_one())

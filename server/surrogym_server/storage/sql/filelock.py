@@ -21,9 +21,7 @@ class FileLock:
         try:
             self._connection = sqlite3.connect(path, timeout=0, isolation_level=None, check_same_thread=False)
         except sqlite3.OperationalError as error:
-            raise Unavailable(
-                f"expected a folder to write the database to, got {path.parent}: {error}"
-            ) from None
+            raise Unavailable(f"expected a folder to write the database to, got {path.parent}: {error}") from None
         try:
             self._connection.execute("BEGIN EXCLUSIVE")
         except sqlite3.OperationalError as error:

@@ -42,9 +42,7 @@ def unknown_surrogate(name: str) -> UnknownSurrogate:
 
 
 def append_event(connection: Connection, held: Row[Any], kind: EventKind, **body: Any) -> None:
-    connection.execute(
-        sa.insert(events).values(surrogate_id=held.id, kind=kind, created_at=held.now, body=body)
-    )
+    connection.execute(sa.insert(events).values(surrogate_id=held.id, kind=kind, created_at=held.now, body=body))
 
 
 def touch(connection: Connection, held: Row[Any], **changes: Any) -> None:
@@ -73,9 +71,7 @@ def recall(connection: Connection, held: Row[Any], operation: str, key: str | No
     return found.result
 
 
-def remember(
-    connection: Connection, held: Row[Any], operation: str, key: str | None, body: str, result: Any
-) -> None:
+def remember(connection: Connection, held: Row[Any], operation: str, key: str | None, body: str, result: Any) -> None:
     """Keep what the operation returned for this key."""
     if key is not None:
         connection.execute(

@@ -40,9 +40,7 @@ class SqlSamples(port.Samples):
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def add(
-        self, name: str, sampler: str, samples: Sequence[NewSample], *, key: str | None = None
-    ) -> AddedSamples:
+    def add(self, name: str, sampler: str, samples: Sequence[NewSample], *, key: str | None = None) -> AddedSamples:
         body = fingerprint(sampler, [asdict(sample) for sample in samples])
         with self._database.write() as connection:
             held = hold(connection, name)
@@ -101,9 +99,7 @@ def _store(
     for identity, sample, lease in zip(identities, batch, answered, strict=True):
         row = _row(held, sampler, sample, lease)
         if prints.setdefault(identity, row["fingerprint"]) != row["fingerprint"]:
-            raise IdempotencyConflict(
-                f"expected the sample first reported for query {sample.query_id}, got another"
-            )
+            raise IdempotencyConflict(f"expected the sample first reported for query {sample.query_id}, got another")
         if identity not in ids:
             new.setdefault(identity, row)
     ids |= dict(zip(new, _insert(connection, held, sampler, list(new.values())), strict=True))

@@ -54,9 +54,7 @@ class SqlSurrogates(port.Surrogates):
             held = hold(connection, name)
             before = read(connection, name)
             changes: dict[str, Any] = {
-                field: value
-                for field, value in asked.items()
-                if value is not None and value != getattr(before, field)
+                field: value for field, value in asked.items() if value is not None and value != getattr(before, field)
             }
             if paused is False and before.phase == "failed":
                 changes |= {"phase": resting_phase(before.round), "error": None}

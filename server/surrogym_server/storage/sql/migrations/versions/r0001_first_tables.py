@@ -91,9 +91,7 @@ def _queries() -> None:
         sa.PrimaryKeyConstraint("id", name="pk_queries"),
         sqlite_autoincrement=True,
     )
-    op.create_index(
-        "ix_queries_surrogate_id_status_id", "queries", ["surrogate_id", "status", "id"], unique=False
-    )
+    op.create_index("ix_queries_surrogate_id_status_id", "queries", ["surrogate_id", "status", "id"], unique=False)
 
 
 def _leases() -> None:
@@ -109,9 +107,7 @@ def _leases() -> None:
         sa.Column("expires", sa.Double(), nullable=False),
         sa.Column("outcome", sa.Text(), nullable=False),
         sa.ForeignKeyConstraint(["query_id"], ["queries.id"], name="fk_leases_query_id", ondelete="CASCADE"),
-        sa.ForeignKeyConstraint(
-            ["surrogate_id"], ["surrogates.id"], name="fk_leases_surrogate_id", ondelete="CASCADE"
-        ),
+        sa.ForeignKeyConstraint(["surrogate_id"], ["surrogates.id"], name="fk_leases_surrogate_id", ondelete="CASCADE"),
         sa.PrimaryKeyConstraint("id", name="pk_leases"),
         sa.UniqueConstraint("token", name="uq_leases_token"),
         sqlite_autoincrement=True,
@@ -123,9 +119,7 @@ def _leases() -> None:
         ["surrogate_id", "outcome", "expires"],
         unique=False,
     )
-    op.create_index(
-        "uq_leases_open", "leases", ["query_id"], unique=True, sqlite_where=OPEN, postgresql_where=OPEN
-    )
+    op.create_index("uq_leases_open", "leases", ["query_id"], unique=True, sqlite_where=OPEN, postgresql_where=OPEN)
 
 
 def _samples() -> None:
@@ -207,9 +201,7 @@ def _models() -> None:
         sa.Column("description", sa.Text(), nullable=False),
         sa.Column("fit_seconds", sa.Double(), nullable=False),
         sa.Column("blob", sa.LargeBinary(), nullable=False),
-        sa.ForeignKeyConstraint(
-            ["surrogate_id"], ["surrogates.id"], name="fk_models_surrogate_id", ondelete="CASCADE"
-        ),
+        sa.ForeignKeyConstraint(["surrogate_id"], ["surrogates.id"], name="fk_models_surrogate_id", ondelete="CASCADE"),
         sa.PrimaryKeyConstraint("surrogate_id", "version", name="pk_models"),
     )
 
@@ -251,9 +243,7 @@ def _events() -> None:
         sa.Column("kind", sa.Text(), nullable=False),
         sa.Column("created_at", sa.Double(), nullable=False),
         sa.Column("body", sa.Text(), nullable=False),
-        sa.ForeignKeyConstraint(
-            ["surrogate_id"], ["surrogates.id"], name="fk_events_surrogate_id", ondelete="CASCADE"
-        ),
+        sa.ForeignKeyConstraint(["surrogate_id"], ["surrogates.id"], name="fk_events_surrogate_id", ondelete="CASCADE"),
         sa.PrimaryKeyConstraint("id", name="pk_events"),
         sqlite_autoincrement=True,
     )

@@ -1,0 +1,188 @@
+"""Every test here runs on each adapter: a fresh SQLite file, a fresh database of a real PostgreSQL server."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import pwd
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psycopg
+import pytest
+
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import LeasedQuery, NewDesign, NewModel, NewSample, NewSurrogate
+from surrogym_server.storage.sql import open_storage
+
+SPEC = {"environment": "Pendulum-v1", "coordinates": [{"name": "angle"}, {"name": "speed"}]}
+SECONDS = 60.0  # a lease no test outlives
+NAME = "pendulum"
+DATABASES = itertools.count()
+
+
+@pytest.fixture(scope="session")
+def postgresql_server() -> Iterator[str]:
+    """The folder of a running server's socket."""
+    programs = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"), key=lambda path: int(path.parts[4]))
+    if not programs:
+        pytest.skip("PostgreSQL's programs are not here; install them with: apt install postgresql")
+    folder = Path(tempfile.mkdtemp(prefix="surrogym-pg-"))
+    user = _owner_of(folder)
+    try:
+        initdb = [programs[-1], "-D", folder / "data", "-A", "trust", "-U", "postgres", "-N"]
+        subprocess.run(initdb, check=True, stdout=subprocess.DEVNULL, cwd=folder, **user)
+        settings = (
+            "listen_addresses=",
+            f"unix_socket_directories={folder}",
+            "fsync=off",
+            "max_connections=200",
+        )
+        command = [programs[-1].with_name("postgres"), "-D", folder / "data"]
+        command += itertools.chain.from_iterable(("-c", setting) for setting in settings)
+        with open(folder / "log", "wb") as log:
+            server = subprocess.Popen(command, stdout=log, stderr=log, cwd=folder, **user)
+        _wait_for(server, folder)
+        yield str(folder)
+        server.send_signal(signal.SIGINT)
+        server.wait(30)
+    finally:
+        shutil.rmtree(folder)
+
+
+def _owner_of(folder: Path) -> dict[str, Any]:
+    """PostgreSQL refuses root; root runs it as the user Debian made for it."""
+    if os.geteuid() != 0:
+        return {}
+    owner = pwd.getpwnam("postgres")
+    os.chown(folder, owner.pw_uid, owner.pw_gid)
+    return {"user": owner.pw_uid, "group": owner.pw_gid, "extra_groups": []}
+
+
+def _wait_for(server: subprocess.Popen[bytes], folder: Path) -> None:
+    while server.poll() is None:
+        try:
+            psycopg.connect(host=str(folder), user="postgres", dbname="postgres").close()
+            return
+        except psycopg.OperationalError:
+            time.sleep(0.05)
+    pytest.fail((folder / "log").read_text())
+
+
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.postgresql)])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """The address of an empty database."""
+    if request.param == "sqlite":
+        return f"sqlite:///{tmp_path}/surrogym.db"
+    folder = request.getfixturevalue("postgresql_server")
+    name = f"test_{next(DATABASES)}"
+    with psycopg.connect(host=folder, user="postgres", dbname="postgres", autocommit=True) as connection:
+        connection.execute(f"CREATE DATABASE {name}")
+    return f"postgresql://postgres@/{name}?host={folder}"
+
+
+@pytest.fixture
+def storage(url: str) -> Iterator[Storage]:
+    opened = open_storage(url)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def make(storage: Storage) -> Callable[..., str]:
+    """Create a surrogate with m queries of C = 2 and F = 1."""
+
+    def create(queries: int = 3, name: str = NAME, **changes: Any) -> str:
+        coordinates = np.arange(2.0 * queries).reshape(queries, 2)
+        action = np.full((queries, 1), 0.5)
+        storage.surrogates.create(
+            NewSurrogate(
+                **{"name": name, "spec": SPEC, "budget": 30, "target": 0.999, "state": {"round": 0}} | changes,
+                query_coordinates=coordinates,
+                query_action=action,
+            )
+        )
+        return name
+
+    return create
+
+
+@pytest.fixture
+def answer() -> Callable[..., NewSample]:
+    """The sample that answers a leased query."""
+
+    def sample_for(query: LeasedQuery, **changes: Any) -> NewSample:
+        values: dict[str, Any] = {
+            "coordinates": query.coordinates,
+            "action": query.action,
+            "next_coordinates": tuple(q + 0.1 for q in query.coordinates),
+            "reward": -1.25,
+            "terminated": False,
+            "query_id": query.id,
+            "lease_token": query.token,
+        }
+        return NewSample(**values | changes)
+
+    return sample_for
+
+
+@pytest.fixture
+def by_hand() -> Callable[..., NewSample]:
+    """A sample without a query."""
+
+    def sample(reward: float = 0.0, **changes: Any) -> NewSample:
+        values: dict[str, Any] = {"coordinates": (1.0, 2.0), "action": (0.5,), "next_coordinates": (1.5, 2.5)}
+        return NewSample(**values | changes, reward=reward, terminated=False)
+
+    return sample
+
+
+@pytest.fixture
+def answer_all(storage: Storage, answer: Callable[..., NewSample]) -> Callable[[str], None]:
+    """Claim and answer what is pending."""
+
+    def run(name: str) -> None:
+        claimed = storage.queries.claim(name, "worker", 100, SECONDS)
+        storage.samples.add(name, "worker", [answer(query) for query in claimed])
+
+    return run
+
+
+@pytest.fixture
+def design() -> Callable[..., NewDesign]:
+    """What a fit gives, with m next queries."""
+
+    def make_design(queries: int = 0, **changes: Any) -> NewDesign:
+        model = NewModel(
+            samples=3,
+            data_hash="abc",
+            fidelity={"target": 0.999},
+            description={},
+            fit_seconds=0.5,
+            blob=b"\0model",
+        )
+        values: dict[str, Any] = {"model": model, "state": {"round": 1}, "phase": "sampling"}
+        chosen = {"query_coordinates": np.ones((queries, 2)), "query_action": np.ones((queries, 1))}
+        return NewDesign(**values | chosen | changes)
+
+    return make_design
+
+
+@pytest.fixture
+def until() -> Callable[[Callable[[], bool]], None]:
+    """Wait for something the database's clock brings about."""
+
+    def wait(happened: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + 30
+        while not happened():
+            assert time.monotonic() < deadline, "it never happened"
+            time.sleep(0.01)
+
+    return wait

@@ -1,0 +1,109 @@
+"""Many threads at once: nothing is handed out, fitted or counted twice."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from typing import TypeVar
+
+import pytest
+
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import NewSample, NewSurrogate, QueryCounts
+from surrogym_server.storage.sql import open_storage
+
+T = TypeVar("T")
+
+THREADS = 6
+LONG = 60.0
+
+
+def at_once(work: Callable[[int], T]) -> list[T]:
+    """Start the same work in all threads at the same moment."""
+    gate = threading.Barrier(THREADS)
+
+    def run(number: int) -> T:
+        gate.wait()
+        return work(number)
+
+    with ThreadPoolExecutor(THREADS) as threads:
+        return list(threads.map(run, range(THREADS)))
+
+
+def test_no_query_is_claimed_twice(
+    storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
+) -> None:
+    name = make(queries=60)
+
+    def work(number: int) -> list[int]:
+        mine: list[int] = []
+        while claimed := storage.queries.claim(name, f"w{number}", 2, LONG):
+            storage.samples.add(name, f"w{number}", [answer(query) for query in claimed])
+            mine += [query.id for query in claimed]
+        return mine
+
+    ids = [id for mine in at_once(work) for id in mine]
+    assert len(ids) == len(set(ids)) == 60
+    assert storage.queries.counts(name) == QueryCounts(answered=60)
+    assert storage.samples.count(name) == 60
+
+
+def test_one_thread_gets_the_right_to_fit(
+    storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None]
+) -> None:
+    name = make()
+    answer_all(name)
+    leases = at_once(lambda number: storage.designs.begin(name, f"server {number}", LONG))
+    assert sum(lease is not None for lease in leases) == 1
+
+
+def test_one_sample_comes_of_many_identical_reports(
+    storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
+) -> None:
+    name = make(queries=1)
+    [leased] = storage.queries.claim(name, "a", 1, LONG)
+    added = at_once(lambda _: storage.samples.add(name, "a", [answer(leased)], key="k"))
+    assert len({one.ids for one in added}) == 1
+    assert sum(one.duplicates for one in added) == THREADS - 1
+    assert storage.samples.count(name) == 1
+
+
+def test_one_surrogate_comes_of_many_identical_requests(storage: Storage) -> None:
+    made = at_once(lambda _: storage.surrogates.create(NewSurrogate("a", {"x": 1}, 30, 0.9)))
+    assert sum(created for _, created in made) == 1
+
+
+def test_a_reader_of_events_misses_none(
+    storage: Storage, make: Callable[..., str], by_hand: Callable[..., NewSample]
+) -> None:
+    name = make(queries=0)
+    seen: list[int] = []
+
+    def work(number: int) -> None:
+        if number:
+            for _ in range(10):
+                storage.samples.add(name, "a", [by_hand()])
+            return
+        while len(seen) < 10 * (THREADS - 1):
+            events = storage.events.list(name, after=seen[-1] if seen else 0)
+            seen.extend(event.id for event in events if event.kind == "sample")
+
+    at_once(work)
+    assert len(set(seen)) == 10 * (THREADS - 1)
+
+
+@pytest.mark.postgresql
+@pytest.mark.parametrize("url", ["postgresql"], indirect=True)
+def test_several_servers_share_one_postgresql(
+    url: str, answer: Callable[..., NewSample], by_hand: Callable[..., NewSample]
+) -> None:
+    with ThreadPoolExecutor(THREADS) as threads, ExitStack() as stack:
+        servers = list(threads.map(lambda _: open_storage(url), range(THREADS)))
+        for server in servers:
+            stack.callback(server.close)
+        servers[0].surrogates.create(NewSurrogate("a", {}, 30, 0.9))
+        at_once(lambda number: servers[number].samples.add("a", "w", [by_hand()]))
+        leases = at_once(lambda number: servers[number].designs.begin("a", f"server {number}", LONG))
+    assert sum(lease is not None for lease in leases) == 1

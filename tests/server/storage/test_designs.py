@@ -1,0 +1,224 @@
+"""The right to fit: one server at a time, and nothing half stored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from surrogym_server.errors import (
+    IdempotencyConflict,
+    InvalidInput,
+    LeaseExpired,
+    NoModel,
+    UnknownModel,
+    UnknownSurrogate,
+)
+from surrogym_server.storage.port import MAX_ATTEMPTS, Storage
+from surrogym_server.storage.records import FitLease, NewDesign, NewSample
+
+LONG = 60.0
+SHORT = 0.02
+Wait = Callable[[Callable[[], bool]], None]
+
+
+@pytest.fixture
+def due(storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None]) -> str:
+    """A surrogate whose queries are all answered."""
+    name = make(queries=3)
+    answer_all(name)
+    return name
+
+
+def begun(storage: Storage, name: str, seconds: float = LONG) -> FitLease:
+    lease = storage.designs.begin(name, "me", seconds)
+    assert lease is not None
+    return lease
+
+
+def test_a_fit_is_due_when_all_queries_are_closed(
+    storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
+) -> None:
+    name = make(queries=2)
+    assert storage.designs.due() == [], "nothing to learn from"
+    first, second = storage.queries.claim(name, "a", 2, LONG)
+    storage.samples.add(name, "a", [answer(first)])
+    assert storage.designs.due() == [], "one is still leased"
+    assert storage.designs.begin(name, "me", LONG) is None
+    storage.samples.add(name, "a", [answer(second)])
+    assert storage.designs.due() == [name]
+
+
+def test_one_at_a_time_may_fit(storage: Storage, due: str) -> None:
+    lease = begun(storage, due)
+    assert storage.surrogates.get(due).phase == "fitting"
+    assert storage.designs.begin(due, "another", LONG) is None
+    assert storage.designs.due() == []
+    assert storage.designs.renew(lease, 2 * LONG).expires > lease.expires
+
+
+def test_the_right_of_a_dead_server_passes_on(
+    storage: Storage, due: str, design: Callable[..., NewDesign], until: Wait
+) -> None:
+    dead = begun(storage, due, SHORT)
+    until(lambda: storage.designs.due() == [due])
+    heir = begun(storage, due)
+    for late in (lambda: storage.designs.renew(dead, LONG), lambda: storage.designs.commit(dead, design())):
+        with pytest.raises(LeaseExpired):
+            late()
+    storage.designs.abort(dead, "must not touch what another is fitting")
+    assert storage.surrogates.get(due).phase == "fitting"
+    assert storage.designs.commit(heir, design()) == 1
+
+
+def test_a_slow_fit_that_nobody_took_over_still_counts(
+    storage: Storage, due: str, design: Callable[..., NewDesign], until: Wait
+) -> None:
+    lease = begun(storage, due, SHORT)
+    until(lambda: storage.designs.due() == [due])
+    assert storage.designs.commit(lease, design()) == 1
+
+
+def test_a_commit_stores_model_state_phase_and_queries_together(
+    storage: Storage, due: str, design: Callable[..., NewDesign]
+) -> None:
+    storage.designs.commit(begun(storage, due), design(queries=2, state={"keys": [1, 2]}))
+    record = storage.surrogates.get(due)
+    assert (record.phase, record.round, record.state, record.error) == ("sampling", 1, {"keys": [1, 2]}, None)
+    pending = storage.queries.list(due, ["pending"])
+    assert [(query.purpose, query.round) for query in pending] == 2 * [("adaptive", 1)]
+    assert storage.models.blob(due) == b"\0model"
+    assert storage.designs.due() == []
+
+
+def test_rounds_go_on_until_no_queries_come(
+    storage: Storage, due: str, design: Callable[..., NewDesign], answer_all: Callable[[str], None]
+) -> None:
+    assert storage.designs.commit(begun(storage, due), design(queries=1)) == 1
+    answer_all(due)
+    assert storage.designs.commit(begun(storage, due), design(phase="ready")) == 2
+    assert storage.designs.due() == []
+    assert storage.surrogates.get(due).round == 2
+    assert (storage.ledger.read(due).initial, storage.ledger.read(due).adaptive) == (3, 1)
+
+
+def test_what_comes_in_during_a_fit_makes_the_next_one_due(
+    storage: Storage, due: str, design: Callable[..., NewDesign], by_hand: Callable[..., NewSample]
+) -> None:
+    lease = begun(storage, due)
+    storage.samples.add(due, "a", [by_hand()])
+    storage.designs.commit(lease, design(phase="ready"))
+    assert storage.designs.due() == [due]
+
+
+def test_a_failed_fit_waits_for_something_new(storage: Storage, due: str, by_hand: Callable[..., NewSample]) -> None:
+    storage.designs.abort(begun(storage, due), "singular")
+    record = storage.surrogates.get(due)
+    assert (record.phase, record.error) == ("failed", "singular")
+    assert storage.designs.due() == []
+    storage.samples.add(due, "a", [by_hand()])
+    assert storage.designs.due() == [due]
+
+
+def test_a_failed_fit_is_tried_again_when_resumed(storage: Storage, due: str) -> None:
+    storage.designs.abort(begun(storage, due), "singular")
+    storage.surrogates.change(due, paused=False)
+    assert storage.designs.due() == [due]
+
+
+def test_a_fit_given_up_at_shutdown_stays_due(storage: Storage, due: str) -> None:
+    lease = begun(storage, due)
+    storage.designs.abort(lease, None)
+    storage.designs.abort(lease, None)
+    assert storage.surrogates.get(due).phase == "collecting"
+    assert storage.designs.due() == [due]
+
+
+@pytest.mark.parametrize("change", [{"budget": 60}, {"target": 0.9}])
+def test_another_budget_or_target_wakes_a_finished_design(
+    storage: Storage, due: str, design: Callable[..., NewDesign], change: dict[str, float]
+) -> None:
+    storage.designs.commit(begun(storage, due), design(phase="over_budget"))
+    storage.surrogates.change(due, paused=False)
+    assert storage.designs.due() == [], "resuming what was not paused is nothing new"
+    storage.surrogates.change(due, **change)  # type: ignore[arg-type]
+    assert storage.designs.due() == [due]
+
+
+def test_a_paused_design_is_not_fitted(storage: Storage, due: str) -> None:
+    storage.surrogates.change(due, paused=True)
+    assert storage.designs.due() == []
+    assert storage.designs.begin(due, "me", LONG) is None
+
+
+def test_the_design_goes_on_without_queries_that_were_set_aside(
+    storage: Storage, due: str, design: Callable[..., NewDesign]
+) -> None:
+    storage.designs.commit(begun(storage, due), design(queries=1))
+    for _ in range(MAX_ATTEMPTS):
+        [leased] = storage.queries.claim(due, "a", 1, LONG)
+        storage.queries.fail(due, leased.id, leased.token, "unreachable")
+    assert storage.designs.due() == [due]
+
+
+def test_asking_raises_the_budget_and_reaches_the_next_fit_once(
+    storage: Storage, due: str, design: Callable[..., NewDesign]
+) -> None:
+    storage.surrogates.change(due, budget=4)
+    storage.designs.commit(begun(storage, due), design(phase="ready"))
+    for _ in range(2):
+        record = storage.designs.ask(due, 5, checkpoint="half-way", key="k")
+    assert (record.extra_queries, record.budget, record.checkpoint) == (5, 8, "half-way")
+    with pytest.raises(IdempotencyConflict):
+        storage.designs.ask(due, 6, checkpoint="half-way", key="k")
+    lease = begun(storage, due)
+    assert (lease.extra_queries, lease.checkpoint) == (5, "half-way")
+    storage.designs.ask(due, 2)
+    storage.designs.commit(lease, design(queries=5))
+    assert storage.surrogates.get(due).extra_queries == 2, "asked for after the fit began"
+
+
+def test_a_budget_that_is_large_enough_stays(storage: Storage, due: str) -> None:
+    assert storage.designs.ask(due, 5).budget == 30
+
+
+def test_a_fit_of_a_deleted_surrogate_goes_nowhere(
+    storage: Storage, due: str, design: Callable[..., NewDesign], make: Callable[..., str]
+) -> None:
+    lease = begun(storage, due)
+    storage.surrogates.delete(due)
+    with pytest.raises(UnknownSurrogate):
+        storage.designs.commit(lease, design())
+    storage.designs.abort(lease, None)
+    make(name=due)
+    with pytest.raises(LeaseExpired):
+        storage.designs.commit(lease, design())
+
+
+def test_a_refused_commit_leaves_nothing_behind(storage: Storage, due: str, design: Callable[..., NewDesign]) -> None:
+    lease = begun(storage, due)
+    uneven = design(queries=2)
+    broken = NewDesign(uneven.model, uneven.state, "sampling", uneven.query_coordinates, uneven.query_action[:1])
+    with pytest.raises(InvalidInput, match="2 and 1"):
+        storage.designs.commit(lease, broken)
+    assert storage.models.list(due) == []
+    assert storage.surrogates.get(due).round == 0
+    assert storage.designs.commit(lease, uneven) == 1
+
+
+def test_models_are_numbered_from_one_in_each_surrogate(
+    storage: Storage, make: Callable[..., str], design: Callable[..., NewDesign]
+) -> None:
+    one, two = make(name="one"), make(name="two")
+    model = design().model
+    with pytest.raises(NoModel):
+        storage.models.get(one)
+    assert [storage.models.add(name, model) for name in (one, one, two)] == [1, 2, 1]
+    assert [record.version for record in storage.models.list(one)] == [1, 2]
+    assert storage.models.get(one).version == 2
+    assert storage.models.get(one, 1).fidelity == model.fidelity
+    assert storage.models.blob(one, 1) == model.blob
+    with pytest.raises(UnknownModel, match="3"):
+        storage.models.get(one, 3)
+    with pytest.raises(UnknownModel):
+        storage.models.blob(two, 2)

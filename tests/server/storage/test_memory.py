@@ -1,0 +1,94 @@
+"""Occupancy, saved sessions and events."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import NewDesign, NewSample, SavedSession
+
+
+def test_occupancy_comes_back_by_checkpoint_and_the_latest_is_known(storage: Storage, make: Callable[..., str]) -> None:
+    name = make()
+    early, late = np.random.default_rng(0).normal(size=(2, 7, 2))
+    assert storage.occupancy.latest(name) is None
+    storage.occupancy.put(name, "early", early)
+    storage.occupancy.put(name, "late", late)
+    found = storage.occupancy.get(name, "early")
+    assert found is not None
+    assert found.states.tobytes() == early.tobytes()
+    assert found.states.shape == (7, 2)
+    newest = storage.occupancy.latest(name)
+    assert newest is not None
+    assert newest.checkpoint == "late"
+    assert storage.occupancy.get(name, "never") is None
+
+
+def test_the_same_checkpoint_again_replaces_and_is_the_latest(storage: Storage, make: Callable[..., str]) -> None:
+    name = make()
+    for checkpoint, value in (("a", 1.0), ("b", 2.0), ("a", 3.0)):
+        storage.occupancy.put(name, checkpoint, np.full((1, 2), value))
+    newest = storage.occupancy.latest(name)
+    assert newest is not None
+    assert (newest.checkpoint, newest.states.tolist()) == ("a", [[3.0, 3.0]])
+
+
+def test_occupancy_remembers_the_round_it_came_in(
+    storage: Storage,
+    make: Callable[..., str],
+    answer_all: Callable[[str], None],
+    design: Callable[..., NewDesign],
+) -> None:
+    name = make()
+    answer_all(name)
+    lease = storage.designs.begin(name, "me", 60)
+    assert lease is not None
+    storage.designs.commit(lease, design())
+    storage.occupancy.put(name, "c", np.zeros((0, 2)))
+    found = storage.occupancy.get(name, "c")
+    assert found is not None
+    assert (found.round, found.states.shape) == (1, (0, 2))
+
+
+def test_sessions_are_given_back_once(storage: Storage) -> None:
+    storage.sessions.save([])
+    storage.sessions.save([SavedSession("s", "p", b"old"), SavedSession("t", "p", b"\0\xff")])
+    storage.sessions.save([SavedSession("s", "p", b"new")])
+    taken = sorted(storage.sessions.take(), key=lambda session: session.id)
+    assert taken == [SavedSession("s", "p", b"new"), SavedSession("t", "p", b"\0\xff")]
+    assert storage.sessions.take() == []
+
+
+def test_events_tell_the_story_in_order(
+    storage: Storage,
+    make: Callable[..., str],
+    answer_all: Callable[[str], None],
+    design: Callable[..., NewDesign],
+    by_hand: Callable[..., NewSample],
+) -> None:
+    name = make(queries=2)
+    make(name="another")
+    answer_all(name)
+    lease = storage.designs.begin(name, "me", 60)
+    assert lease is not None
+    storage.designs.commit(lease, design(queries=1))
+    storage.ledger.report(name, 10, key="k")
+    events = storage.events.list(name)
+    kinds = [event.kind for event in events]
+    assert kinds == ["created", "queries", "sample", "phase", "fit", "queries", "phase", "ledger"]
+    ids = [event.id for event in events]
+    assert ids == sorted(set(ids))
+    assert events[2].body["sampler"] == "worker"
+    assert events[4].body["version"] == 1
+    assert storage.events.list(name, after=ids[3]) == events[4:]
+    assert storage.events.list(name, limit=2) == events[:2]
+
+
+def test_times_are_seconds_since_1970(storage: Storage, make: Callable[..., str]) -> None:
+    name = make(queries=1)
+    created = storage.surrogates.get(name).created_at
+    [leased] = storage.queries.claim(name, "a", 1, 60.0)
+    assert 1.7e9 < created < 1e11
+    assert 60.0 <= leased.expires - created < 600.0

@@ -1,0 +1,138 @@
+"""Opening a database: the schema, what is refused, and what survives a kill."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+
+from surrogym_server.errors import InvalidInput, Unavailable
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql.tables import metadata
+
+WRITER = """
+import sys
+from surrogym_server.storage.records import NewSample, NewSurrogate
+from surrogym_server.storage.sql import open_storage
+
+storage = open_storage(sys.argv[1])
+storage.surrogates.create(NewSurrogate("a", {}, 30, 0.9))
+for number in range(100_000):
+    sample = NewSample((1.0,), (1.0,), (1.0,), float(number), False)
+    [id] = storage.samples.add("a", "w", [sample], key=str(number)).ids
+    print(number, id, flush=True)
+"""
+
+
+def engine(url: str) -> sa.Engine:
+    return sa.create_engine(url.replace("postgresql:", "postgresql+psycopg:"), poolclass=sa.NullPool)
+
+
+def test_migrations_make_the_tables_the_program_uses(url: str) -> None:
+    open_storage(url).close()
+    with engine(url).connect() as connection:
+        context = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(context, metadata) == []
+
+
+def test_opening_again_keeps_everything(url: str, storage: Storage, make: Callable[..., str]) -> None:
+    make(name="kept")
+    before = storage.surrogates.list()
+    storage.close()
+    again = open_storage(url)
+    assert again.surrogates.list() == before
+    again.close()
+
+
+def test_a_database_of_a_newer_program_is_refused_and_left_alone(url: str) -> None:
+    open_storage(url).close()
+    with engine(url).begin() as connection:
+        connection.execute(sa.text("UPDATE alembic_version SET version_num = '9999'"))
+    with pytest.raises(Unavailable, match=r"newer Surrogym.*9999"):
+        open_storage(url)
+    with engine(url).connect() as connection:
+        assert connection.execute(sa.text("SELECT version_num FROM alembic_version")).scalar() == "9999"
+
+
+def test_ping_answers_and_closing_twice_is_harmless(storage: Storage) -> None:
+    storage.ping()
+    storage.close()
+    storage.close()
+
+
+@pytest.mark.parametrize("url", ["mysql://host/name", "sqlite://", "sqlite:///:memory:", "surrogym.db"])
+def test_other_addresses_are_refused(url: str) -> None:
+    with pytest.raises(InvalidInput, match="expected"):
+        open_storage(url)
+
+
+def test_a_refused_address_does_not_print_its_password() -> None:
+    with pytest.raises(InvalidInput) as refused:
+        open_storage("mysql://user:secret@host/name")
+    assert "secret" not in str(refused.value)
+
+
+def test_a_second_server_on_the_same_file_is_refused(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/surrogym.db"
+    first = open_storage(url)
+    with pytest.raises(Unavailable, match="only server"):
+        open_storage(url)
+    first.ping()
+    first.close()
+    open_storage(url).close()
+
+
+def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "surrogym.db").write_text("a diary\n" * 1000)
+    with pytest.raises(Unavailable, match="not a database"):
+        open_storage(f"sqlite:///{tmp_path}/surrogym.db")
+
+
+def test_a_folder_that_can_not_be_made_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(Unavailable, match="folder"):
+        open_storage(f"sqlite:///{tmp_path}/file/surrogym.db")
+
+
+@pytest.mark.postgresql
+def test_a_postgresql_that_is_not_there_is_unavailable(tmp_path: Path) -> None:
+    with pytest.raises(Unavailable):
+        open_storage(f"postgresql://postgres@/x?host={tmp_path}")
+
+
+def test_sqlite_waits_for_the_disk_before_it_acknowledges(tmp_path: Path) -> None:
+    from surrogym_server.storage.sql.database import connect
+
+    database = connect(f"sqlite:///{tmp_path}/surrogym.db")
+    with database.write() as connection:
+        pragmas = {
+            name: connection.exec_driver_sql(f"PRAGMA {name}").scalar()
+            for name in ("journal_mode", "synchronous", "foreign_keys")
+        }
+    database.close()
+    assert pragmas == {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1}
+
+
+def test_a_killed_writer_loses_nothing_it_acknowledged(url: str) -> None:
+    writer = subprocess.Popen([sys.executable, "-c", WRITER, url], stdout=subprocess.PIPE, text=True)
+    assert writer.stdout is not None
+    acknowledged = [writer.stdout.readline().split() for _ in range(20)]
+    os.kill(writer.pid, signal.SIGKILL)
+    acknowledged += [line.split() for line in writer.stdout.read().splitlines()]
+    writer.stdout.close()
+    writer.wait()
+
+    storage = open_storage(url)
+    stored = {sample.id: sample.reward for sample in storage.samples.page("a", 0, 100_000)}
+    storage.close()
+    assert {int(id): float(number) for number, id in acknowledged}.items() <= stored.items()
+    assert len(stored) <= len(acknowledged) + 1, "at most the one that was on its way"

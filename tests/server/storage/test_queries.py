@@ -1,0 +1,185 @@
+"""The queue: each query to one sampler at a time, never lost with it, set aside when it keeps failing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from surrogym_server.errors import ForeignLease, IdempotencyConflict, InvalidInput, LeaseExpired, UnknownQuery
+from surrogym_server.storage.port import MAX_ATTEMPTS, Storage
+from surrogym_server.storage.records import NewSample, QueryCounts
+
+LONG = 60.0
+SHORT = 0.02
+
+
+def test_claims_go_out_oldest_first_and_once(storage: Storage, make: Callable[..., str]) -> None:
+    name = make(queries=3)
+    first = storage.queries.claim(name, "a", 2, LONG)
+    second = storage.queries.claim(name, "b", 2, LONG)
+    ids = [query.id for query in first + second]
+    assert ids == sorted(ids)
+    assert len(set(ids)) == 3
+    assert storage.queries.claim(name, "c", 2, LONG) == []
+    assert {query.attempt for query in first + second} == {1}
+    assert storage.queries.counts(name) == QueryCounts(leased=3)
+
+
+def test_a_query_says_who_has_it(storage: Storage, make: Callable[..., str]) -> None:
+    name = make(queries=1)
+    [leased] = storage.queries.claim(name, "arm-7", 1, LONG)
+    query = storage.queries.get(name, leased.id)
+    assert (query.status, query.sampler, query.attempts) == ("leased", "arm-7", 1)
+
+
+def test_coordinates_come_back_bit_for_bit(storage: Storage, make: Callable[..., str]) -> None:
+    name = make(queries=0)
+    odd = np.array([[0.1 + 0.2, -0.0], [5e-324, 1.7976931348623157e308]])
+    storage.queries.enqueue(name, odd, np.array([[np.pi], [1 / 3]]))
+    claimed = storage.queries.claim(name, "a", 2, LONG)
+    assert np.array([query.coordinates for query in claimed]).tobytes() == odd.tobytes()
+    assert [query.action for query in claimed] == [(np.pi,), (1 / 3,)]
+
+
+def test_a_paused_surrogate_hands_out_nothing(storage: Storage, make: Callable[..., str]) -> None:
+    name = make()
+    storage.surrogates.change(name, paused=True)
+    assert storage.queries.claim(name, "a", 1, LONG) == []
+    storage.surrogates.change(name, paused=False)
+    assert len(storage.queries.claim(name, "a", 1, LONG)) == 1
+
+
+def test_the_query_of_a_dead_sampler_goes_to_the_next(
+    storage: Storage, make: Callable[..., str], until: Callable[[Callable[[], bool]], None]
+) -> None:
+    name = make(queries=1)
+    [lost] = storage.queries.claim(name, "dead", 1, SHORT)
+    claims = []
+    until(lambda: bool(claims.extend(storage.queries.claim(name, "next", 1, LONG)) or claims))
+    assert (claims[0].id, claims[0].attempt) == (lost.id, 2)
+    assert claims[0].token != lost.token
+    assert storage.ledger.read(name).unresolved == 1
+
+
+def test_a_lease_that_ran_out_counts_as_unresolved_before_anyone_sweeps(
+    storage: Storage, make: Callable[..., str], until: Callable[[Callable[[], bool]], None]
+) -> None:
+    name = make(queries=1)
+    storage.queries.claim(name, "dead", 1, SHORT)
+    until(lambda: storage.ledger.read(name).unresolved == 1)
+    assert storage.queries.counts(name).leased == 1
+    assert storage.queries.sweep_expired() == 1
+    assert storage.queries.sweep_expired() == 0
+    assert storage.queries.counts(name).pending == 1
+    assert storage.ledger.read(name).unresolved == 1
+
+
+def test_renewing_keeps_a_lease_alive(
+    storage: Storage, make: Callable[..., str], until: Callable[[Callable[[], bool]], None]
+) -> None:
+    name = make(queries=2)
+    kept, lost = storage.queries.claim(name, "a", 2, 0.5)
+    expires = storage.queries.renew(name, kept.id, kept.token, LONG)
+    assert expires > kept.expires
+    until(lambda: storage.queries.sweep_expired() == 1)
+    assert storage.queries.get(name, kept.id).status == "leased"
+    assert storage.queries.get(name, lost.id).status == "pending"
+    with pytest.raises(LeaseExpired, match="claim again"):
+        storage.queries.renew(name, lost.id, lost.token, LONG)
+
+
+def test_a_query_that_keeps_failing_is_set_aside_with_its_error(storage: Storage, make: Callable[..., str]) -> None:
+    name = make(queries=1)
+    statuses = []
+    for attempt in range(1, MAX_ATTEMPTS + 1):
+        [leased] = storage.queries.claim(name, "a", 1, LONG)
+        assert leased.attempt == attempt
+        query = storage.queries.fail(name, leased.id, leased.token, f"fell over {attempt}")
+        statuses.append(query.status)
+    assert statuses == ["pending", "pending", "set_aside"]
+    assert query.error == "fell over 3"
+    assert storage.queries.claim(name, "a", 1, LONG) == []
+    assert [event.body for event in storage.events.list(name) if event.kind == "set_aside"] == [
+        {"query_id": leased.id, "error": "fell over 3"}
+    ]
+    assert storage.ledger.read(name).unresolved == 0, "a failure is reported, so it is resolved"
+
+
+def test_a_query_whose_leases_all_run_out_is_set_aside(
+    storage: Storage, make: Callable[..., str], until: Callable[[Callable[[], bool]], None]
+) -> None:
+    name = make(queries=1)
+
+    def gone() -> bool:
+        storage.queries.claim(name, "hangs", 1, SHORT)
+        return storage.queries.counts(name).set_aside == 1
+
+    until(gone)
+    [query] = storage.queries.list(name, ["set_aside"])
+    assert query.attempts == MAX_ATTEMPTS
+    assert query.error is not None
+    assert storage.ledger.read(name).unresolved == MAX_ATTEMPTS
+
+
+def test_failing_twice_under_one_lease_counts_once(storage: Storage, make: Callable[..., str]) -> None:
+    name = make(queries=1)
+    [leased] = storage.queries.claim(name, "a", 1, LONG)
+    first = storage.queries.fail(name, leased.id, leased.token, "x")
+    assert storage.queries.fail(name, leased.id, leased.token, "x") == first
+    [again] = storage.queries.claim(name, "b", 1, LONG)
+    assert again.attempt == 2
+
+
+def test_an_answered_query_can_neither_fail_nor_be_renewed(
+    storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
+) -> None:
+    name = make(queries=1)
+    [leased] = storage.queries.claim(name, "a", 1, LONG)
+    storage.samples.add(name, "a", [answer(leased)])
+    with pytest.raises(LeaseExpired):
+        storage.queries.fail(name, leased.id, leased.token, "too late")
+    with pytest.raises(LeaseExpired):
+        storage.queries.renew(name, leased.id, leased.token, LONG)
+    assert storage.queries.get(name, leased.id).status == "answered"
+
+
+def test_foreign_tokens_and_unknown_queries_are_told_apart(storage: Storage, make: Callable[..., str]) -> None:
+    name, other = make(name="one"), make(name="two")
+    mine, neighbour = storage.queries.claim(name, "a", 2, LONG)
+    [foreign] = storage.queries.claim(other, "a", 1, LONG)
+    with pytest.raises(ForeignLease, match=f"query {mine.id}"):
+        storage.queries.fail(name, mine.id, neighbour.token, "x")
+    with pytest.raises(ForeignLease):
+        storage.queries.renew(name, mine.id, "invented", LONG)
+    with pytest.raises(UnknownQuery, match=str(foreign.id)):
+        storage.queries.renew(name, foreign.id, foreign.token, LONG)
+    with pytest.raises(UnknownQuery):
+        storage.queries.get(name, foreign.id)
+
+
+def test_asking_by_hand_twice_with_one_key_queues_once(storage: Storage, make: Callable[..., str]) -> None:
+    name = make(queries=0)
+    q, u = np.ones((2, 2)), np.ones((2, 1))
+    ids = storage.queries.enqueue(name, q, u, key="k")
+    assert storage.queries.enqueue(name, q, u, key="k") == ids
+    with pytest.raises(IdempotencyConflict, match="'k'"):
+        storage.queries.enqueue(name, q + 1, u, key="k")
+    assert [query.id for query in storage.queries.list(name)] == ids
+    assert {query.purpose for query in storage.queries.list(name)} == {"manual"}
+    assert storage.queries.enqueue(name, q, u) != ids, "without a key it is another request"
+
+
+def test_queries_need_as_many_actions_as_coordinates(storage: Storage, make: Callable[..., str]) -> None:
+    name = make(queries=0)
+    with pytest.raises(InvalidInput, match="2 and 1"):
+        storage.queries.enqueue(name, np.ones((2, 2)), np.ones((1, 1)))
+
+
+def test_queries_are_listed_by_status(storage: Storage, make: Callable[..., str]) -> None:
+    name = make(queries=3)
+    [leased] = storage.queries.claim(name, "a", 1, LONG)
+    assert [query.id for query in storage.queries.list(name, ["leased"])] == [leased.id]
+    assert len(storage.queries.list(name, ["pending", "leased"])) == 3
+    assert len(storage.queries.list(name, limit=2)) == 2
