@@ -1,0 +1,33 @@
+"""The implementations of SurrogatePort that the suite runs over, each with a surrogate of Pendulum."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import ModuleType
+
+import pytest
+
+import surrogym_client.errors
+from surrogym_client.transport import HttpSurrogate
+from surrogym_shared.port import SurrogatePort
+
+
+@dataclass(frozen=True)
+class Harness:
+    """``errors`` is the exception tree of the implementation; both trees use the same names."""
+
+    name: str
+    port: SurrogatePort
+    errors: ModuleType
+
+
+@pytest.fixture(scope="session")
+def http_harness(pendulum_server):
+    with HttpSurrogate(pendulum_server.url, "pendulum") as port:
+        yield Harness("http", port, surrogym_client.errors)
+
+
+@pytest.fixture(params=["http"])
+def harness(request: pytest.FixtureRequest) -> Harness:
+    """One implementation after the other; a new one adds its fixture above, and its name here."""
+    return request.getfixturevalue(f"{request.param}_harness")

@@ -1,0 +1,45 @@
+"""Answer a surrogate's queries from the original environment, in this process, until its design is done."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from surrogym_client.api import Api
+from surrogym_client.original.gymnasium import GymnasiumEnvironment
+from surrogym_shared import wire
+from surrogym_shared.spec import EnvironmentSpec
+
+FINISHED = ("ready", "over_budget")
+
+
+def teach(
+    api: Api, name: str, spec: EnvironmentSpec, queries: int, seconds: float = 120.0
+) -> wire.SurrogateView:
+    """Register a surrogate and answer ``queries`` initial queries: one fit, and no adaptive ones."""
+    design = spec.design.model_copy(update={"initial": queries, "budget": queries})
+    api.create_surrogate(name, spec.model_copy(update={"design": design}))
+    original, deadline = GymnasiumEnvironment(spec), time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        claimed = api.claim(name, "teacher", max_queries=queries, wait_seconds=1.0)
+        if claimed.phase in FINISHED:
+            return api.surrogate(name)
+        if claimed.phase == "failed":
+            raise AssertionError(f"the design of {name} failed: {api.surrogate(name).error}")
+        if claimed.queries:
+            api.add_samples(name, "teacher", [_answer(original, query) for query in claimed.queries])
+    raise AssertionError(f"the design of {name} was not done after {seconds} s: {api.surrogate(name)}")
+
+
+def _answer(original: GymnasiumEnvironment, query: wire.Query) -> wire.NewSample:
+    step = original.step_from(np.array(query.coordinates), np.array(query.action))
+    return wire.NewSample(
+        query_id=query.id,
+        lease_token=query.lease_token,
+        coordinates=np.asarray(step.coordinates).tolist(),
+        action=np.asarray(step.action).tolist(),
+        next_coordinates=np.asarray(step.next_coordinates).tolist(),
+        reward=step.reward,
+        terminated=step.terminated,
+    )
