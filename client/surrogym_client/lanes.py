@@ -91,7 +91,11 @@ class Lanes:
         return self._request.autoreset_mode
 
     def reset(self, seed: int | Sequence[int | None] | None = None, mask: Bools | None = None) -> LaneReset:
-        """Start new episodes in all lanes, or those of the mask (N,); a None among seeds goes on unseeded."""
+        """Start new episodes in all lanes, or those of the mask (N,); a None among seeds goes on unseeded.
+
+        Raises:
+            ValueError: a list of seeds that has not N entries.
+        """
         chosen = np.ones(self.num_envs, dtype=bool) if mask is None else mask
         try:
             result, lost = self._seeded(seed, mask), None
@@ -129,13 +133,15 @@ class Lanes:
     def _seeded(self, seed: int | Sequence[int | None] | None, mask: Bools | None) -> ResetResult:
         if seed is None or isinstance(seed, int | np.integer):
             return self.port.reset(self.view.id, seed=seed, mask=mask)
+        if len(seed) != self.num_envs:
+            raise ValueError(f"seed: expected one number or {self.num_envs}, one a lane, got {len(seed)}")
         chosen = np.ones(self.num_envs, dtype=bool) if mask is None else mask
-        given = np.array([s is not None for s in seed], dtype=bool)
-        if (chosen & ~given).any():
-            result = self.port.reset(self.view.id, mask=chosen & ~given)
-        if (chosen & given).any():
-            seeds = [0 if s is None else int(s) for s in seed]
-            result = self.port.reset(self.view.id, seed=seeds, mask=None if given.all() else chosen & given)
+        seeded = chosen & [s is not None for s in seed]
+        if (chosen & ~seeded).any():
+            result = self.port.reset(self.view.id, mask=chosen & ~seeded)
+        if seeded.any():
+            numbers = [0 if s is None else int(s) for s in seed]
+            result = self.port.reset(self.view.id, seed=numbers, mask=None if seeded.all() else seeded)
         return result
 
     def _advance(self, action: NDArray[Any]) -> StepResult:

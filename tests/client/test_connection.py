@@ -114,9 +114,7 @@ def test_a_gateway_without_a_server_behind_it_is_waited_for():
 
 @pytest.mark.parametrize("url", ["pendulum", "ftp://host", "http://", "http://host:port", "host:8000"])
 def test_what_is_no_address_is_refused(url: str):
-    with pytest.raises(
-        errors.ServerUnreachable, match=r"expected a server address like http://127.0.0.1:8000, got"
-    ):
+    with pytest.raises(errors.ServerUnreachable, match=r"expected a server address like http://127.0.0.1:8000, got"):
         Connection(url)
 
 

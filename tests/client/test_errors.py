@@ -9,9 +9,7 @@ from surrogym_shared.codes import STATUS, Code, Problem
 
 
 def problem(code: Code) -> Problem:
-    return Problem(
-        title=code.value, status=STATUS[code], code=code, detail=f"about {code.value}", expected_seq=7
-    )
+    return Problem(title=code.value, status=STATUS[code], code=code, detail=f"about {code.value}", expected_seq=7)
 
 
 def leaves(cls: type) -> list[type]:

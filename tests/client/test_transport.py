@@ -165,9 +165,7 @@ def test_an_older_or_newer_server_is_refused():
         port.open(wire.OpenSession())
 
 
-@pytest.mark.parametrize(
-    "body", ['{"seq": 1}', "not json", step_reply(1).model_dump_json()[:-1] + ',"more":1}']
-)
+@pytest.mark.parametrize("body", ['{"seq": 1}', "not json", step_reply(1).model_dump_json()[:-1] + ',"more":1}'])
 def test_an_answer_that_is_no_step_is_refused(body: str):
     with scripted_server(view(), reply(body)) as server, surrogate(server) as port:
         port.open(wire.OpenSession(num_envs=2))

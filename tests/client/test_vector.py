@@ -70,6 +70,24 @@ def test_a_seed_list_may_leave_lanes_to_go_on_unseeded():
         assert_same(remote.reset(seed=seeds), reference.reset(seed=seeds))
 
 
+def test_seeds_reach_only_the_lanes_of_the_mask():
+    remote, reference = both(AutoresetMode.DISABLED)
+    assert_same(remote.reset(seed=SEEDS), reference.reset(seed=SEEDS))
+    first, second = actions(2)
+    assert_same(remote.step(first), reference.step(first))
+    mask = np.array([True, False, True, False])
+    for seeds in ([9, 9, 9, 9], [None, 9, 3, None]):
+        ours = remote.reset(seed=seeds, options={"reset_mask": mask})
+        assert_same(ours, reference.reset(seed=seeds, options={"reset_mask": mask.copy()}))
+    assert_same(remote.step(second), reference.step(second))
+
+
+def test_a_list_of_seeds_has_one_a_lane():
+    for envs in both(AutoresetMode.NEXT_STEP):
+        with pytest.raises(ValueError, match="seed"):
+            envs.reset(seed=[1, 2])
+
+
 def test_an_int_seed_repeats_and_an_unseeded_reset_goes_on():
     remote, _ = both(AutoresetMode.NEXT_STEP)
     first, second = remote.reset(seed=0)[0], remote.reset()[0]
