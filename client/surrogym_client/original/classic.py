@@ -1,6 +1,6 @@
 """Gymnasium's classic control tasks: their specifications, and how their state is written and read.
 
-Sources of every number: the task's own Gymnasium class. Angles are in radians, as the tasks themselves have them.
+Source of every number: the task's own Gymnasium class. Angles are in radians.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 
 from surrogym_client.original.protocol import Array, Native
 from surrogym_shared.spec import (
-    BoxAction,
     Bounds,
+    BoxAction,
     Coordinate,
     DiscreteAction,
     EnvironmentSpec,
@@ -36,15 +36,16 @@ CIRCLE = Uniform(low=-math.pi, high=math.pi)
 class Task:
     """One known environment.
 
-    ``write`` puts coordinates (C,) into the unwrapped environment and clears what it remembers of earlier steps;
-    ``perturbable`` names physical attributes that ``--perturb`` may change, and ``settle`` recomputes what follows from them.
+    ``write`` puts coordinates (C,) into the unwrapped environment and clears what it remembers of earlier
+    steps. ``perturbable`` names the physical attributes that ``--perturb`` may change; ``settle`` recomputes
+    what follows from them.
     """
 
     spec: Callable[[], EnvironmentSpec]
     write: Callable[[Native, Array], None]
     read: Callable[[Native], Array]
     perturbable: tuple[str, ...]
-    settle: Callable[[Native], None] = lambda env: None
+    settle: Callable[[Native], None] | None = None
 
 
 def pendulum() -> EnvironmentSpec:
@@ -87,7 +88,7 @@ def cartpole() -> EnvironmentSpec:
 
 
 def cartpole_of_the_paper() -> EnvironmentSpec:
-    """CartPole as in the paper's section 5.2: twice the allowed range, a learned reward of 0 or 1, no termination."""
+    """CartPole as in the paper's section 5.2: twice the range, a learned reward of 0 or 1, no termination."""
     return _cartpole(x=4.8, pole=math.radians(24), termination=(), time_limit=200, min_steps=195)
 
 
@@ -121,8 +122,8 @@ def _cartpole(
 def mountain_car_continuous() -> EnvironmentSpec:
     """MountainCarContinuous-v0: reach the right hill; 100 on arrival, minus the squared force.
 
-    Positions are sampled up to 0.52, from where no step reaches the right wall at 0.6, so that only the left wall,
-    which also stops the car, has to be declared.
+    Positions are sampled up to 0.52, from where no step reaches the right wall at 0.6, so that only the left
+    wall, which also stops the car, has to be declared.
     """
     return _mountain_car(
         "MountainCarContinuous-v0", BoxAction(low=(-1.0,), high=(1.0,)), goal=0.45, time_limit=999

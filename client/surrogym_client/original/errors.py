@@ -1,7 +1,7 @@
 """What can go wrong beside the original environment.
 
 OriginalError
-├── UnknownEnvironment      no adapter, module or factory of this name, or one that can't be expressed; choose another
+├── UnknownEnvironment      nothing can be made of this name, or no specification can express it
 └── StepFailed              the environment did not give a step; the query fails, the worker goes on
     ├── StepTimedOut        it took longer than its limit and was killed; the next step starts a fresh one
     └── EnvironmentDied     its process ended; the next step starts a fresh one

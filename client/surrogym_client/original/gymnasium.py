@@ -23,7 +23,7 @@ def task_for(environment: str, preset: str) -> Task:
 
 
 class GymnasiumEnvironment:
-    """A classic control task that is set to given coordinates: its unwrapped environment, without a time limit."""
+    """A classic control task that is set to given coordinates: unwrapped, so without a time limit."""
 
     def __init__(self, spec: EnvironmentSpec) -> None:
         import gymnasium
@@ -57,7 +57,7 @@ class GymnasiumEnvironment:
 
 
 def native_action(spec: EnvironmentSpec, action: Array) -> Any:
-    """What the environment's own ``step`` takes for an action (F,): an int, or an array of the space's type."""
+    """What the environment's own ``step`` takes for an action (F,): an int, or an array."""
     if isinstance(spec.action, BoxAction):
         return np.asarray(action, dtype=np.float32)
     numbers = np.asarray(action, dtype=np.int64)

@@ -49,7 +49,7 @@ def make(
 
 
 def is_known(name: str) -> bool:
-    """Whether a built-in adapter knows this Gymnasium id; only such names are taken from a server's specification."""
+    """Whether a built-in adapter knows this Gymnasium id; only such names are taken from a server."""
     from surrogym_client.original import classic, mujoco
 
     return name in classic.TASKS or mujoco.is_known(name)
@@ -85,6 +85,7 @@ def _known(
 ) -> OriginalEnvironment:
     from surrogym_client.original import classic, mujoco
     from surrogym_client.original.gymnasium import GymnasiumEnvironment, task_for
+    from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
 
     if name in classic.TASKS:
         base = spec or task_for(name, design.get("preset", "default")).spec()
@@ -92,7 +93,7 @@ def _known(
     if mujoco.is_known(name):
         base = spec or mujoco.specification(name)
         return mujoco.MujocoEnvironment(name, with_choices(base, design, bins))
-    known = ", ".join((*classic.TASKS, *mujoco.SPECIFICATIONS))
+    known = ", ".join((*classic.TASKS, *SPECIFICATIONS))
     raise UnknownEnvironment(
         f"no adapter knows the environment {name!r}: expected one of {known}, "
         "a MuJoCo id together with a specification, or package.module:factory"

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RealStep:
-    """One step of the original environment. ``coordinates`` and ``action`` are what was achieved, not what was asked."""
+    """One real step. ``coordinates`` and ``action`` are what was achieved, not what was asked for."""
 
     coordinates: ArrayLike  # (C,)
     action: ArrayLike  # (F,)

@@ -1,0 +1,50 @@
+"""Terms of a specification, evaluated on coordinates."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.original.protocol import Array
+from surrogym_shared.spec import EnvironmentSpec, Inequality, Part, Term
+
+Bools = NDArray[np.bool_]
+
+
+def evaluate(spec: EnvironmentSpec, term: Term, coordinates: Array) -> Array:
+    """The value (n,) of a term at coordinates (n, C)."""
+    total = np.sum([_part(spec, part, coordinates) for part in term.parts], axis=0)
+    if term.low is None and term.high is None:
+        return np.asarray(total)
+    return np.asarray(np.clip(total, term.low, term.high))
+
+
+def observe(spec: EnvironmentSpec, coordinates: Array) -> Array:
+    """The declared observation (n, D) at coordinates (n, C)."""
+    return np.stack([evaluate(spec, entry.term, coordinates) for entry in spec.observation], axis=1)
+
+
+def holds(spec: EnvironmentSpec, inequality: Inequality, coordinates: Array) -> Bools:
+    """Whether (n,) an inequality holds at coordinates (n, C)."""
+    compare = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal}[
+        inequality.relation
+    ]
+    return np.asarray(compare(evaluate(spec, inequality.term, coordinates), inequality.value))
+
+
+def terminates(spec: EnvironmentSpec, coordinates: Array) -> Bools:
+    """Whether (n,) any of the declared terminations holds at coordinates (n, C)."""
+    ended = np.zeros(len(coordinates), dtype=np.bool_)
+    for group in spec.termination:
+        ended |= np.all([holds(spec, inequality, coordinates) for inequality in group], axis=0)
+    return ended
+
+
+def _part(spec: EnvironmentSpec, part: Part, coordinates: Array) -> Array:
+    if part.function == "one":
+        return np.full(len(coordinates), part.coefficient)
+    names = spec.coordinate_names
+    combined = sum(weight * coordinates[:, names.index(name)] for name, weight in part.weights.items())
+    angle = np.asarray(combined)
+    value = {"linear": angle, "sin": np.sin(angle), "cos": np.cos(angle)}[part.function]
+    return np.asarray(part.coefficient * value)

@@ -1,0 +1,93 @@
+"""Names become environments, or one clear sentence."""
+
+import textwrap
+
+import pytest
+
+from surrogym_client import original
+from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.loading import is_known
+
+OWN = textwrap.dedent(
+    """
+    from surrogym_client.original import RealStep
+    from surrogym_shared.spec import *
+
+    class Cart:
+        def spec(self):
+            return EnvironmentSpec(
+                environment="a cart",
+                coordinates=(Coordinate(name="x", sampling=Uniform(low=-1, high=1)),),
+                observation=(ObservationEntry(name="x", term=Term.linear(x=1)),),
+                action=BoxAction(low=(-1.0,), high=(1.0,)),
+                start={"x": Uniform(low=-0.5, high=0.5)},
+            )
+
+        def step_from(self, coordinates, action):
+            return RealStep(coordinates, action, coordinates + 0.1 * action, reward=-abs(coordinates[0]))
+
+        def close(self):
+            pass
+
+    class NoEnvironment:
+        pass
+
+    a_number = 3
+    """
+)
+
+
+@pytest.fixture
+def own_module(tmp_path, monkeypatch):
+    (tmp_path / "own_cart.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return "own_cart"
+
+
+def test_design_choices_reach_the_specification():
+    spec = original.make("Pendulum-v1", budget=30, initial=10, target=0.99, seed=7, bins=5).spec()
+    assert (spec.design.budget, spec.design.initial, spec.design.target, spec.design.seed) == (30, 10, 0.99, 7)
+    assert spec.action.bins == (5,)
+
+
+def test_a_given_specification_replaces_the_adapters_own():
+    spec = original.make("Pendulum-v1", budget=17).spec()
+    assert original.make("Pendulum-v1", spec=spec).spec() == spec
+
+
+def test_choices_that_contradict_are_refused():
+    with pytest.raises(ValueError, match="initial 20 exceeds the budget 10"):
+        original.make("Pendulum-v1", budget=10, initial=20)
+    with pytest.raises(ValueError, match="bins need a continuous action, got a discrete one"):
+        original.make("CartPole-v1", bins=3)
+
+
+def test_ones_own_environment_is_loaded_by_name(own_module):
+    environment = original.make(f"{own_module}:Cart", budget=12)
+    assert environment.spec().design.budget == 12
+    assert environment.spec().environment == "a cart"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("Nowhere-v3", "no adapter knows the environment 'Nowhere-v3': expected one of Pendulum-v1"),
+        ("own_cart:Missing", "expected package.module:factory, got 'own_cart:Missing'"),
+        ("no_such_module:x", "No module named 'no_such_module'"),
+        (":x", "expected package.module:factory, got ':x'"),
+        ("own_cart:a_number", "to be callable, got a int"),
+        ("own_cart:NoEnvironment", "spec, step_from and close, got a NoEnvironment"),
+    ],
+)
+def test_names_that_give_nothing(own_module, name, message):
+    with pytest.raises(UnknownEnvironment, match=message):
+        original.make(name)
+
+
+def test_a_servers_specification_can_not_name_a_module():
+    assert is_known("Pendulum-v1")
+    assert is_known("Hopper-v5")
+    assert not is_known("own_cart:Cart")
+    assert not is_known("own_cart:Env-v0")
+    assert not is_known("a robot")
