@@ -5,11 +5,19 @@ It is a pure function of its job, so it runs in a process of its own, and the sa
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import time
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+
+from surrogym_server.sampling.design import Decision, DesignState, Request, advance, initial_design
+from surrogym_server.surrogate.codec import to_bytes
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.surrogate.model import OutputModel
+from surrogym_server.surrogate.samples import Samples
 
 Array = NDArray[np.float64]
 Verdict = Literal["continue", "ready", "over_budget"]
@@ -17,18 +25,17 @@ Verdict = Literal["continue", "ready", "over_budget"]
 
 @dataclass(frozen=True)
 class DesignJob:
-    """What one round needs. ``spec`` and ``state`` are JSON-able; ``previous`` is the last model, for a warm start."""
+    """What one round needs."""
 
-    spec: dict[str, Any]
+    definition: EnvironmentDefinition
     coordinates: Array  # (n, C) samples so far, in order of arrival
     action: Array  # (n, F)
     next_coordinates: Array  # (n, C)
     reward: Array  # (n,)
     terminated: NDArray[np.bool_]  # (n,)
-    state: dict[str, Any]  # DesignState; {} before the first round
+    state: dict[str, Any]  # DesignState as JSON; {} before the first round
     budget: int  # real steps the design may take in all
     target: float  # confidence index
-    previous: bytes | None = None
     pending_coordinates: Array | None = None  # (p, C) queries asked and not yet answered
     pending_action: Array | None = None  # (p, F)
     extra_queries: int = 0  # asked for with improve: chosen whatever the verdict
@@ -51,11 +58,63 @@ class DesignResult:
     query_action: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (m, F)
 
 
-def initial_queries(spec: dict[str, Any], budget: int) -> tuple[dict[str, Any], Array, Array]:
+def initial_queries(definition: EnvironmentDefinition, budget: int) -> tuple[dict[str, Any], Array, Array]:
     """The Latin hypercube of the first round: (state, coordinates (m, C), action (m, F))."""
-    raise NotImplementedError
+    q, u = initial_design(definition, budget)
+    return DesignState().to_json(), q.numpy(), u.numpy()
 
 
 def run_design_job(job: DesignJob) -> DesignResult:
-    """Fit, judge, choose."""
-    raise NotImplementedError
+    """Fit, judge, choose. Raises InvalidInput or NumericalFailure."""
+    torch.set_num_threads(job.threads)
+    started = time.perf_counter()
+    samples = Samples(
+        *(torch.from_numpy(a) for a in (job.coordinates, job.action, job.next_coordinates, job.reward, job.terminated))
+    )
+    decision = advance(job.definition, samples, DesignState.from_json(job.state), _request(job))
+    return DesignResult(
+        model=to_bytes(decision.model),
+        description=decision.model.description,
+        fidelity=_fidelity(decision, job.target, len(samples)),
+        data_hash=samples.digest,
+        state=decision.state.to_json(),
+        verdict=decision.verdict,
+        seconds=time.perf_counter() - started,
+        query_coordinates=decision.q.numpy(),
+        query_action=decision.u.numpy(),
+    )
+
+
+def _request(job: DesignJob) -> Request:
+    def rows(array: Array | None, width: int) -> torch.Tensor:
+        return torch.zeros(0, width, dtype=torch.float64) if array is None else torch.from_numpy(array)
+
+    return Request(
+        budget=job.budget,
+        target=job.target,
+        pending_q=rows(job.pending_coordinates, len(job.definition.coordinates)),
+        pending_u=rows(job.pending_action, job.definition.action.size),
+        extra=job.extra_queries,
+        states=None if job.occupancy is None else torch.from_numpy(job.occupancy),
+    )
+
+
+def _fidelity(decision: Decision, target: float, samples: int) -> dict[str, Any]:
+    outputs = (*decision.model.transitions, decision.model.reward)
+    rows = [
+        {"name": o.name, "structure": _structure(o), "tolerance": t, **asdict(c)}
+        for o, c, t in zip(outputs, decision.confidences, decision.state.tolerances, strict=True)
+    ]
+    return {
+        "confidence_index": min(c.confidence_index for c in decision.confidences),
+        "confidence_index_paper": min(c.confidence_index_paper for c in decision.confidences),
+        "target": target,
+        "samples": samples,
+        "outputs": rows,
+    }
+
+
+def _structure(output: OutputModel) -> str:
+    if output.posterior is None:
+        return "constant"
+    return f"{output.posterior.hyper.kernel} on {output.feature_map}"

@@ -1,0 +1,21 @@
+"""Gaussian processes, exact, float64: one output, well done. Notation: docs/notation.md.
+
+========  ======================  =========================================================
+paper     code                    meaning
+========  ======================  =========================================================
+x~        ``x`` (..., d)          input of the process: encoded coordinates and action
+Lambda    ``lengthscale`` (d,)    Lambda = diag(lengthscale ** -2)
+sigma_f^2 ``signal_variance``     variance of the squared-exponential part
+--        ``linear_variance``     variance of the linear part, 0 without one
+--        ``quadratic_variance``  variance of the quadratic part, 0 without one
+sigma_n^2 ``noise_variance``      noise, added once to the diagonal
+K         ``covariance(x, x)``    latent covariance, without noise
+beta      ``weights`` (n,)        (K + sigma_n^2 I)^-1 y
+========  ======================  =========================================================
+"""
+
+from surrogym_server.gp.fit import FitOptions, Fitted, fit
+from surrogym_server.gp.kernel import Hyperparameters
+from surrogym_server.gp.posterior import Posterior, condition
+
+__all__ = ["FitOptions", "Fitted", "Hyperparameters", "Posterior", "condition", "fit"]

@@ -1,0 +1,131 @@
+"""Hyperparameters by maximum marginal likelihood with priors (maximum a posteriori), L-BFGS with analytic gradients.
+
+Free parameters are logarithms, theta = [log lengthscale (d), log sigma_f^2, log sigma_l^2 (if linear),
+log sigma_q^2 (if quadratic), log sigma_n^2].
+d log p(y) / d theta_j = 1/2 tr((beta beta^T - (K + sigma_n^2 I)^-1) dK/d theta_j); R&W (2006), eq. 5.9.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from torch import Tensor
+
+from surrogym_server.gp.kernel import Hyperparameters
+from surrogym_server.gp.posterior import Posterior, condition
+
+NOISE_FLOOR = 1e-8  # of the output's variance
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """What to fit, and the normal priors on logarithms: (mean, deviation). Inputs and outputs are standardised.
+
+    The length scale's prior grows with sqrt(d), as distances do (Hvarfner et al., ICML 2024).
+    """
+
+    linear: bool = True  # parts beside the squared exponential
+    quadratic: bool = False
+    lengthscale_prior: tuple[float, float] = (math.log(2.0), 1.2)
+    signal_prior: tuple[float, float] = (0.0, 2.0)
+    linear_prior: tuple[float, float] = (0.0, 2.0)
+    quadratic_prior: tuple[float, float] = (-2.0, 2.0)
+    noise_prior: tuple[float, float] = (math.log(1e-7), 3.0)
+    max_iterations: int = 100
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A fit: the posterior, its score (log evidence at the optimum, priors included), and theta for a warm start."""
+
+    posterior: Posterior
+    score: float
+    theta: Array
+
+
+def fit(x: Tensor, y: Tensor, options: FitOptions, starts: Sequence[Array] = ()) -> Fitted:
+    """Fit a process to x (n, d) and y (n,), both standardised.
+
+    The default start is always tried, so a warm start can only help. Raises NumericalFailure.
+    """
+    objective = _Objective(x, y, options)
+    best: tuple[float, Array] | None = None
+    for start in (objective.default_start, *starts):
+        found = minimize(
+            objective,
+            np.clip(start, objective.lower, objective.upper),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=np.stack([objective.lower, objective.upper], 1),
+            options={"maxiter": options.max_iterations, "ftol": 1e-9, "gtol": 1e-5},
+        )
+        if best is None or found.fun < best[0]:
+            best = (float(found.fun), found.x)
+    assert best is not None
+    return Fitted(condition(objective.hyper(best[1]), x, y), -best[0], best[1])
+
+
+class _Objective:
+    """Negative log evidence with priors, and its gradient. Squared differences are computed once."""
+
+    def __init__(self, x: Tensor, y: Tensor, options: FitOptions) -> None:
+        self.y, self.options = y, options
+        self.squared = (x[None] - x[:, None]).square().permute(2, 0, 1).contiguous()  # (d, n, n)
+        self.linear = 1 + x @ x.T
+        self.quadratic = x.square() @ x.square().T
+        n, d = x.shape
+        lengthscale = (options.lengthscale_prior[0] + 0.5 * math.log(d), options.lengthscale_prior[1])
+        priors = [lengthscale] * d + [options.signal_prior]
+        priors += [options.linear_prior] * options.linear + [options.quadratic_prior] * options.quadratic
+        self.prior = np.array([*priors, options.noise_prior])
+        size = len(self.prior)
+        self.lower, self.upper = np.full(size, math.log(1e-8)), np.full(size, math.log(1e4))
+        self.lower[:d], self.upper[:d] = math.log(0.02), math.log(1e3)
+        self.lower[-1], self.upper[-1] = math.log(NOISE_FLOOR), math.log(2.0)
+        self.default_start = self.prior[:, 0].copy()
+        self.default_start[-1] = math.log(1e-4)
+        self.n, self.d = n, d
+
+    def hyper(self, theta: Array) -> Hyperparameters:
+        values = np.exp(theta)
+        lengthscale = torch.as_tensor(values[: self.d], dtype=self.y.dtype, device=self.y.device)
+        linear = float(values[self.d + 1]) if self.options.linear else 0.0
+        quadratic = float(values[-2]) if self.options.quadratic else 0.0
+        return Hyperparameters(lengthscale, float(values[self.d]), linear, quadratic, float(values[-1]))
+
+    def __call__(self, theta: Array) -> tuple[float, Array]:
+        hyper = self.hyper(theta)
+        scaled = self.squared / hyper.lengthscale.square()[:, None, None]
+        smooth = hyper.signal_variance * torch.exp(-0.5 * scaled.sum(0))
+        k = smooth + hyper.linear_variance * self.linear + hyper.quadratic_variance * self.quadratic
+        k.diagonal().add_(hyper.noise_variance)
+        factor, info = torch.linalg.cholesky_ex(k)
+        if bool(info):  # outside what float64 can factor: a wall for the line search
+            return 1e10, np.zeros_like(theta)
+        weights = torch.cholesky_solve(self.y[:, None], factor)[:, 0]
+        log_evidence = -0.5 * (self.y @ weights) - factor.diagonal().log().sum() - 0.5 * self.n * math.log(2 * math.pi)
+        half = 0.5 * (torch.outer(weights, weights) - torch.cholesky_inverse(factor))
+        gradient = self._gradient(hyper, half, smooth, scaled)
+        z = (theta - self.prior[:, 0]) / self.prior[:, 1]
+        value = -float(log_evidence) + 0.5 * float(z @ z) + float(np.log(self.prior[:, 1]).sum())
+        return value, z / self.prior[:, 1] - gradient
+
+    def _gradient(self, hyper: Hyperparameters, half: Tensor, smooth: Tensor, scaled: Tensor) -> Array:
+        weighted = half * smooth
+        parts: list[Any] = [(scaled * weighted).sum((1, 2)), weighted.sum()[None]]
+        if self.options.linear:
+            parts.append(hyper.linear_variance * (half * self.linear).sum()[None])
+        if self.options.quadratic:
+            parts.append(hyper.quadratic_variance * (half * self.quadratic).sum()[None])
+        parts.append(hyper.noise_variance * half.diagonal().sum()[None])
+        gradient: Array = torch.cat(parts).cpu().numpy()
+        return gradient

@@ -1,0 +1,94 @@
+"""Exact posterior (eq. 6 and 7, with the inverses the paper left out).
+
+mean(x) = k(x, X) (K + sigma_n^2 I)^-1 y,  var(x) = k(x, x) - |L^-1 k(X, x)|^2 with L L^T = K + sigma_n^2 I.
+The variance is the latent one, without noise; it is taken by a triangular solve, never through an inverse.
+Reference: Rasmussen and Williams (2006), algorithm 2.1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from surrogym_server.errors import NumericalFailure
+from surrogym_server.gp.kernel import Hyperparameters, covariance, variance
+
+MAX_JITTER = 1e-4
+BLOCK = 16_384  # rows predicted at once: bounds memory at any batch size
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """A process conditioned on n points, with all that prediction needs: nothing is recomputed on loading."""
+
+    hyper: Hyperparameters
+    x: Tensor  # (n, d)
+    y: Tensor  # (n,)
+    factor: Tensor  # (n, n) lower Cholesky factor of K + (sigma_n^2 + jitter) I
+    weights: Tensor  # (n,)
+    jitter: float  # added to the diagonal to factor it, 0 as a rule
+
+    def mean(self, x: Tensor) -> Tensor:
+        """Posterior mean at x (m, d), shape (m,)."""
+        return covariance(self.hyper, x, self.x) @ self.weights
+
+    def mean_and_variance(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Posterior mean and latent variance at x (m, d), each (m,)."""
+        means, variances = [], []
+        for block in torch.split(x, BLOCK):
+            k = covariance(self.hyper, block, self.x)
+            v = torch.linalg.solve_triangular(self.factor, k.T, upper=False)
+            means.append(k @ self.weights)
+            variances.append((variance(self.hyper, block) - v.square().sum(0)).clamp_min(0))
+        return torch.cat(means), torch.cat(variances)
+
+    def leave_one_out(self) -> tuple[Tensor, Tensor]:
+        """Predictive mean and variance (noise included) of each y from all others, (n,) each; R&W (2006), eq. 5.12."""
+        precision = torch.cholesky_inverse(self.factor).diagonal()
+        return self.y - self.weights / precision, 1 / precision
+
+    def extend(self, x: Tensor, y: Tensor) -> Posterior:
+        """Condition on one more point, x (d,) and y (), in O(n^2): a new row of the factor."""
+        k = covariance(self.hyper, x[None], self.x)
+        row = torch.linalg.solve_triangular(self.factor, k.T, upper=False).T
+        pivot = variance(self.hyper, x[None]) + self.hyper.noise_variance + self.jitter - row.square().sum(1)
+        pivot = pivot.clamp_min(self.hyper.noise_variance).sqrt()
+        n = self.x.shape[0]
+        factor = torch.zeros(n + 1, n + 1, dtype=self.factor.dtype, device=self.factor.device)
+        factor[:n, :n], factor[n, :n], factor[n, n] = self.factor, row[0], pivot[0]
+        y = torch.cat([self.y, y.reshape(1)])
+        return Posterior(self.hyper, torch.cat([self.x, x[None]]), y, factor, _weights(factor, y), self.jitter)
+
+
+def condition(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
+    """Condition a process on x (n, d) and y (n,).
+
+    Raises:
+        NumericalFailure: no jitter up to 1e-4 of the prior's variance makes the covariance factor.
+    """
+    k = covariance(hyper, x, x)
+    k.diagonal().add_(hyper.noise_variance)
+    factor, jitter = factorise(k)
+    return Posterior(hyper, x, y, factor, _weights(factor, y), jitter)
+
+
+def factorise(k: Tensor) -> tuple[Tensor, float]:
+    """Lower Cholesky factor of k (n, n) and its jitter: 0, else 1e-10 of the mean diagonal, times ten each try."""
+    factor, info = torch.linalg.cholesky_ex(k)
+    if not bool(info):
+        return factor, 0.0
+    scale, relative = float(k.diagonal().mean()), 1e-10
+    while relative <= MAX_JITTER:
+        factor, info = torch.linalg.cholesky_ex(
+            k + relative * scale * torch.eye(len(k), dtype=k.dtype, device=k.device)
+        )
+        if not bool(info):
+            return factor, relative * scale
+        relative *= 10
+    raise NumericalFailure(f"covariance of {len(k)} points is singular: no jitter up to {MAX_JITTER:g} repairs it")
+
+
+def _weights(factor: Tensor, y: Tensor) -> Tensor:
+    return torch.cholesky_solve(y[:, None], factor)[:, 0]

@@ -1,0 +1,178 @@
+"""The rounds of Algorithm 1: fit, judge, choose. Pure: state and samples in, decision and new state out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from surrogym_server.sampling.acquisition import Candidates, acquisition, candidates_of, condition_on, near
+from surrogym_server.sampling.confidence import OutputConfidence, confidence, deviations
+from surrogym_server.sampling.latin_hypercube import latin_hypercube, random_points
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.surrogate.learn import learn
+from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.surrogate.samples import Samples, increments
+
+Verdict = Literal["continue", "ready", "over_budget"]
+TOLERANCE = 0.05  # of the output's deviation over the initial design
+HYPERCUBE_TRIES = 50
+
+
+@dataclass(frozen=True)
+class DesignState:
+    """What one round leaves for the next; JSON-able."""
+
+    round: int = 0
+    tolerances: tuple[float, ...] = ()  # per output; frozen after the first round
+    thetas: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        thetas = {key: theta.tolist() for key, theta in self.thetas.items()}
+        return {"round": self.round, "tolerances": list(self.tolerances), "thetas": thetas}
+
+    @classmethod
+    def from_json(cls, state: dict[str, Any]) -> DesignState:
+        thetas = {key: np.array(theta) for key, theta in state.get("thetas", {}).items()}
+        return cls(state.get("round", 0), tuple(state.get("tolerances", ())), thetas)
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a round is asked to do. Pending queries count as if they had been answered."""
+
+    budget: int
+    target: float
+    pending_q: Tensor  # (p, C)
+    pending_u: Tensor  # (p, F)
+    extra: int = 0  # queries to choose whatever the verdict
+    states: Tensor | None = None  # (v, C) visited by policies
+
+
+@dataclass(frozen=True)
+class Decision:
+    model: SurrogateModel
+    confidences: tuple[OutputConfidence, ...]  # per output
+    state: DesignState
+    verdict: Verdict
+    q: Tensor  # (m, C) next queries
+    u: Tensor  # (m, F)
+
+
+def initial_design(definition: EnvironmentDefinition, budget: int) -> tuple[Tensor, Tensor]:
+    """The Latin hypercube that everything starts from: coordinates (n, C), actions (n, F), n at most the budget."""
+    paper = definition.design.preset == "paper"
+    count = min(definition.design.initial, budget)
+    if definition.design.acquisition == "latin_hypercube":
+        count = budget
+    return latin_hypercube(definition, count, _rng(definition, "initial"), 1 if paper else HYPERCUBE_TRIES)
+
+
+def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignState, request: Request) -> Decision:
+    """One round. Raises InvalidInput or NumericalFailure as ``learn`` does."""
+    learned = learn(definition, samples, state.thetas)
+    tolerances = state.tolerances or default_tolerances(definition, samples)
+    q, u = monte_carlo(definition)
+    deviation = deviations(learned.model, q, u)
+    outputs = (*learned.model.transitions, learned.model.reward)
+    confidences = tuple(confidence(o, deviation[:, i], tolerances[i]) for i, o in enumerate(outputs))
+    verdict = judge(definition, confidences, tolerances, len(samples), request)
+    chosen_q, chosen_u = _choose(learned.model, samples, (q, u), confidences, tolerances, verdict, request)
+    if verdict == "continue" and not len(chosen_q) and not len(request.pending_q):
+        verdict = "over_budget"  # nothing distinct is left to ask
+    new_state = DesignState(state.round + 1, tolerances, learned.thetas)
+    return Decision(learned.model, confidences, new_state, verdict, chosen_q, chosen_u)
+
+
+def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
+    """The Monte Carlo set of eq. 8, the same in every round: coordinates (m, C), actions (m, F)."""
+    return random_points(definition, definition.design.monte_carlo, _rng(definition, "monte carlo"))
+
+
+def default_tolerances(definition: EnvironmentDefinition, samples: Samples) -> tuple[float, ...]:
+    """Tolerance of each output: the declared one, else 5 % of the output's deviation over the samples at hand.
+
+    Preset ``paper`` has 1 in raw units for all.
+    """
+    if definition.design.preset == "paper":
+        return (1.0,) * len(definition.outputs)
+    targets = torch.cat([increments(definition, samples), samples.reward[:, None]], -1)
+    spread = targets.std(0, correction=0)
+    declared = dict(definition.tolerances)
+    return tuple(
+        declared.get(name, max(TOLERANCE * float(spread[i]), 1e-9)) for i, name in enumerate(definition.outputs)
+    )
+
+
+def judge(
+    definition: EnvironmentDefinition,
+    confidences: tuple[OutputConfidence, ...],
+    tolerances: tuple[float, ...],
+    samples: int,
+    request: Request,
+) -> Verdict:
+    """Whether to go on. The default trusts a confidence only when leave-one-out errors agree and adaptive queries,
+    half as many as the initial design had, have tried to disprove it; the paper trusts the index alone."""
+    sure = all(c.confidence_index >= request.target for c in confidences)
+    if definition.design.preset == "default":
+        sure = sure and all(c.leave_one_out_error <= t for c, t in zip(confidences, tolerances, strict=True))
+        sure = sure and samples >= math.ceil(1.5 * definition.design.initial)
+    if sure:
+        return "ready"
+    return "continue" if samples < request.budget else "over_budget"
+
+
+def _choose(
+    model: SurrogateModel,
+    samples: Samples,
+    monte_carlo: tuple[Tensor, Tensor],
+    confidences: tuple[OutputConfidence, ...],
+    tolerances: tuple[float, ...],
+    verdict: Verdict,
+    request: Request,
+) -> tuple[Tensor, Tensor]:
+    """One query for each output below its target, least confident first, as if those before had been answered."""
+    order = sorted(range(len(confidences)), key=lambda i: confidences[i].confidence_index)
+    below = [i for i in order if confidences[i].confidence_index < request.target] or order[:1]
+    if verdict == "continue":
+        wanted = below[: max(0, request.budget - len(samples) - len(request.pending_q))]
+    else:
+        wanted = [below[i % len(below)] for i in range(request.extra)]
+    candidates = candidates_of(model, *monte_carlo, request.states)
+    for q, u in zip(request.pending_q, request.pending_u, strict=True):
+        model = condition_on(model, q, u)
+    taken = (torch.cat([samples.q, request.pending_q]), torch.cat([samples.u, request.pending_u]))
+    picks: list[int] = []
+    reserved = _reserved(model, samples, candidates)
+    for position, column in enumerate(wanted):
+        value = acquisition(model, candidates, column, tolerances[column])
+        if position == 0 and reserved is not None:
+            value = torch.where(reserved, value, -torch.inf)
+        value[near(model.definition, candidates.q, candidates.u, *taken)] = -torch.inf
+        pick = int(value.argmax())
+        if value[pick] == -torch.inf:
+            continue
+        picks.append(pick)
+        q, u = candidates.q[pick], candidates.u[pick]
+        model = condition_on(model, q, u)
+        taken = (torch.cat([taken[0], q[None]]), torch.cat([taken[1], u[None]]))
+    return candidates.q[picks], candidates.u[picks]
+
+
+def _reserved(model: SurrogateModel, samples: Samples, candidates: Candidates) -> Tensor | None:
+    """Candidates predicted to end an episode, as long as no sample has: what ending pays must be seen once."""
+    definition = model.definition
+    if not definition.termination_groups or bool(samples.terminated.any()):
+        return None
+    ends = definition.terminated(model.transition(candidates.q, candidates.u).q_next)
+    ends &= ~definition.terminated(candidates.q)
+    return ends if bool(ends.any()) else None
+
+
+def _rng(definition: EnvironmentDefinition, purpose: str) -> np.random.Generator:
+    return np.random.default_rng([definition.design.seed, *purpose.encode()])

@@ -1,0 +1,53 @@
+"""Latin hypercube over the joint state-action space (section 3.2): equally probable intervals, one point in each."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.distance import pdist
+from torch import Tensor
+
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+
+Array = NDArray[np.float64]
+
+
+def latin_hypercube(
+    definition: EnvironmentDefinition, count: int, rng: np.random.Generator, tries: int = 1
+) -> tuple[Tensor, Tensor]:
+    """A design of ``count`` points: coordinates (count, C) and actions (count, F).
+
+    Each coordinate is stratified in probability, so truncated distributions keep their shape; discrete actions are
+    balanced. Of ``tries`` designs the one whose closest pair is farthest apart is taken.
+    """
+    dimensions = len(definition.coordinates) + definition.action.size
+    designs = [_unit_hypercube(count, dimensions, rng) for _ in range(tries)]
+    best = max(designs, key=_closest_pair) if tries > 1 and count > 1 else designs[0]
+    return from_unit(definition, torch.from_numpy(best))
+
+
+def random_points(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Independent draws from the sampling distributions: coordinates (count, C) and actions (count, F)."""
+    dimensions = len(definition.coordinates) + definition.action.size
+    return from_unit(definition, torch.from_numpy(rng.random((count, dimensions))))
+
+
+def from_unit(definition: EnvironmentDefinition, p: Tensor) -> tuple[Tensor, Tensor]:
+    """Coordinates and actions of probabilities p (n, C + F) in [0, 1)."""
+    size = len(definition.coordinates)
+    q = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(definition.coordinates)], -1)
+    action, u = definition.action, p[:, size:]
+    if action.nvec:
+        return q, torch.floor(u * torch.tensor(action.nvec, dtype=p.dtype))
+    low, high = (torch.tensor(limit, dtype=p.dtype) for limit in (action.low, action.high))
+    return q, low + (high - low) * u
+
+
+def _unit_hypercube(count: int, dimensions: int, rng: np.random.Generator) -> Array:
+    cells = np.stack([rng.permutation(count) for _ in range(dimensions)], 1)
+    return (cells + rng.random((count, dimensions))) / count
+
+
+def _closest_pair(points: Array) -> float:
+    return float(pdist(points).min())

@@ -1,0 +1,51 @@
+"""Occupancy P_i (eq. 11): a kernel density over states, as a ratio to the uniform density over the sampling range.
+
+Gaussian kernels on standardised coordinates, a von Mises kernel for angles, Scott's bandwidth n^(-1/(d+4)), and a
+uniform floor, so that no region is ever given up.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from surrogym_server.surrogate.definition import CoordinateDefinition, EnvironmentDefinition
+from surrogym_server.surrogate.distributions import scaling
+
+FLOOR = 0.1  # share of the uniform density
+BLOCK = 4_096
+
+
+def log_occupancy(definition: EnvironmentDefinition, states: Tensor, q: Tensor, floor: float = FLOOR) -> Tensor:
+    """log P_i at q (m, C) given visited states (v, C): log of density over uniform density, (m,)."""
+    count, moving = len(states), len(definition.moving)
+    bandwidth = count ** (-1 / (moving + 4))
+    densities = []
+    for block in torch.split(q, BLOCK):
+        log_kernel = torch.zeros(len(block), count, dtype=q.dtype, device=q.device)
+        for index in definition.moving:
+            log_kernel += _log_kernel(definition.coordinates[index], block[:, index], states[:, index], bandwidth)
+        densities.append(torch.logsumexp(log_kernel, 1) - math.log(count))
+    density = torch.cat(densities)
+    return torch.logaddexp(math.log1p(-floor) + density, density.new_tensor(math.log(floor)))
+
+
+def _log_kernel(coordinate: CoordinateDefinition, at: Tensor, states: Tensor, bandwidth: float) -> Tensor:
+    """Log kernel of one coordinate, at (m,) against states (v,), relative to its uniform density: (m, v)."""
+    difference = at[:, None] - states[None]
+    if coordinate.kind == "angle":
+        spread = _circular_deviation(states)
+        kappa = 1 / (bandwidth * spread).square()
+        log_normaliser = torch.log(torch.special.i0e(kappa))  # i0(k) = i0e(k) exp(k)
+        return kappa * (difference.cos() - 1) - log_normaliser
+    _, scale = scaling(coordinate.sampling)
+    width = (bandwidth * states.std(correction=0)).clamp_min(1e-3 * scale)
+    log_uniform = -math.log(coordinate.sampling.high - coordinate.sampling.low)
+    return -0.5 * (difference / width).square() - width.log() - 0.5 * math.log(2 * math.pi) - log_uniform
+
+
+def _circular_deviation(angles: Tensor) -> Tensor:
+    length = torch.hypot(angles.cos().mean(), angles.sin().mean()).clamp(1e-9, 1 - 1e-6)
+    return (-2 * length.log()).sqrt()

@@ -1,0 +1,39 @@
+"""query_uncertainty: everything the design knows about given points, as numpy for the edge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from surrogym_server.sampling.acquisition import candidates_of
+from surrogym_server.sampling.confidence import deviations, log_model_uncertainty
+from surrogym_server.surrogate.model import SurrogateModel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class UncertaintyResult:
+    """Each (n, O), outputs in the order of definition.outputs."""
+
+    mean: Array  # increments of the moving outputs, then the reward
+    deviation: Array
+    model_uncertainty: Array
+    input_probability: Array
+    log_uncertainty_index: Array
+
+
+def query_uncertainty(
+    model: SurrogateModel, q: Array, u: Array, tolerances: Array, occupancy: Array | None = None
+) -> UncertaintyResult:
+    """Mean, deviation, U_m, P_i and log U at q (n, C), u (n, F) under tolerances (O,)."""
+    at, action = torch.from_numpy(q), torch.from_numpy(u)
+    states = None if occupancy is None else torch.from_numpy(occupancy)
+    mean, deviation = model.means(at, action), deviations(model, at, action)
+    log_p = candidates_of(model, at, action, states).log_p[:, None].expand_as(deviation)
+    log_u_m = log_model_uncertainty(deviation, torch.from_numpy(tolerances))
+    parts = (mean, deviation, log_u_m.exp(), log_p.exp(), log_u_m + log_p)
+    return UncertaintyResult(*(p.numpy() for p in parts))

@@ -1,0 +1,1 @@
+"""From samples to a model of one environment: terms, coordinates, features, targets, reward, termination."""

@@ -1,0 +1,121 @@
+"""A model as bytes and back: safetensors with a JSON header. Nothing is pickled, nothing is recomputed on loading."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor
+
+from surrogym_server.errors import InvalidInput
+from surrogym_server.gp import Hyperparameters, Posterior
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.surrogate.features import FeatureMap, encode
+from surrogym_server.surrogate.model import OutputModel, SurrogateModel
+
+FORMAT = 1
+
+
+def to_bytes(model: SurrogateModel) -> bytes:
+    """The whole model, serving arrays included."""
+    outputs = (*model.transitions, model.reward)
+    tensors: dict[str, Tensor] = {}
+    for index, output in enumerate(outputs):
+        if (posterior := output.posterior) is not None:
+            arrays = {"x": posterior.x, "y": posterior.y, "factor": posterior.factor, "weights": posterior.weights}
+            arrays["lengthscale"] = posterior.hyper.lengthscale
+            tensors |= {f"{index}.{name}": tensor.contiguous() for name, tensor in arrays.items()}
+    header = {
+        "format": FORMAT,
+        "outputs": [_header(output) for output in outputs],
+        "terminal_reward": model.terminal_reward,
+        "samples": model.samples,
+        "digest": model.digest,
+    }
+    return save(tensors, {"surrogym": json.dumps(header)})
+
+
+def from_bytes(definition: EnvironmentDefinition, data: bytes) -> SurrogateModel:
+    """The model that ``to_bytes`` stored.
+
+    Raises:
+        InvalidInput: not such a file, or one of an environment with other outputs.
+    """
+    try:
+        length = int.from_bytes(data[:8], "little")
+        header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["surrogym"])
+        tensors = load(data)
+        outputs = tuple(_output(entry, tensors, str(i)) for i, entry in enumerate(header["outputs"]))
+    except (SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise InvalidInput(f"expected a Surrogym model in safetensors form, got {len(data)} bytes: {error}") from error
+    names = tuple(output.name for output in outputs)
+    if header["format"] != FORMAT or names != definition.outputs:
+        raise InvalidInput(
+            f"expected a model of format {FORMAT} with outputs {definition.outputs}, "
+            f"got format {header['format']} with {names}"
+        )
+    for output in outputs:
+        _require_shapes(definition, output)
+    return SurrogateModel(
+        definition, outputs[:-1], outputs[-1], header["terminal_reward"], header["samples"], header["digest"]
+    )
+
+
+def _header(output: OutputModel) -> dict[str, Any]:
+    entry = {
+        "name": output.name,
+        "feature_map": asdict(output.feature_map),
+        "centre": output.centre,
+        "scale": output.scale,
+        "left_out": output.left_out,
+        "scores": output.scores,
+        "posterior": None,
+    }
+    if (posterior := output.posterior) is not None:
+        hyper = posterior.hyper
+        entry["posterior"] = {
+            "signal_variance": hyper.signal_variance,
+            "linear_variance": hyper.linear_variance,
+            "quadratic_variance": hyper.quadratic_variance,
+            "noise_variance": hyper.noise_variance,
+            "jitter": posterior.jitter,
+        }
+    return entry
+
+
+def _output(entry: dict[str, Any], tensors: dict[str, Tensor], prefix: str) -> OutputModel:
+    posterior = None
+    if (stored := entry["posterior"]) is not None:
+        arrays = {n: tensors[f"{prefix}.{n}"] for n in ("x", "y", "factor", "weights", "lengthscale")}
+        hyper = Hyperparameters(
+            arrays["lengthscale"],
+            stored["signal_variance"],
+            stored["linear_variance"],
+            stored["quadratic_variance"],
+            stored["noise_variance"],
+        )
+        posterior = Posterior(hyper, arrays["x"], arrays["y"], arrays["factor"], arrays["weights"], stored["jitter"])
+    scores = tuple((name, score) for name, score in entry["scores"])
+    feature_map = FeatureMap(**entry["feature_map"])
+    return OutputModel(
+        entry["name"], feature_map, posterior, entry["centre"], entry["scale"], entry["left_out"], scores
+    )
+
+
+def _require_shapes(definition: EnvironmentDefinition, output: OutputModel) -> None:
+    if (posterior := output.posterior) is None:
+        return
+    q = posterior.x.new_zeros(1, len(definition.coordinates))
+    u = posterior.x.new_zeros(1, definition.action.size)
+    lead = q.new_zeros(1, len(definition.coordinates))
+    width, n = encode(definition, output.feature_map, q, u, lead).shape[1], len(posterior.y)
+    expected = {"x": (n, width), "factor": (n, n), "weights": (n,)}
+    for name, shape in expected.items():
+        if tuple(getattr(posterior, name).shape) != shape:
+            got = tuple(getattr(posterior, name).shape)
+            raise InvalidInput(f"output {output.name!r}: expected {name} of shape {shape}, got {got}")
+    if tuple(posterior.hyper.lengthscale.shape) != (width,):
+        raise InvalidInput(f"output {output.name!r}: expected {width} length scales")

@@ -1,0 +1,160 @@
+"""EnvironmentDefinition: the core's own frozen view of an environment. Specifications are converted at the edge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from surrogym_server.surrogate.distributions import Distribution
+from surrogym_server.surrogate.terms import Term, TermSet, compile_terms
+
+REWARD = "reward"
+Array = NDArray[np.float64]
+Preset = Literal["default", "paper"]
+Kind = Literal["linear", "angle", "constant"]
+Relation = Literal["<", "<=", ">", ">="]
+
+
+@dataclass(frozen=True)
+class CoordinateDefinition:
+    name: str
+    kind: Kind
+    sampling: Distribution
+    start: Distribution
+    low: float = -np.inf  # saturation bounds
+    high: float = np.inf
+    stops: int | None = None  # index of the coordinate that a bound sets to zero
+
+    @property
+    def saturates(self) -> bool:
+        return bool(np.isfinite(self.low) or np.isfinite(self.high))
+
+
+@dataclass(frozen=True)
+class ActionDefinition:
+    """A box (low, high), offered to policies as ``bins`` where given, or discrete counts ``nvec``."""
+
+    kind: Literal["box", "discrete", "multi_discrete"]
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
+    bins: tuple[int, ...] | None = None
+    nvec: tuple[int, ...] = ()
+
+    @property
+    def size(self) -> int:
+        return len(self.low) or len(self.nvec)
+
+    @property
+    def policy_counts(self) -> tuple[int, ...]:
+        """How many values a policy chooses from in each entry; empty for a continuous policy."""
+        return self.nvec or self.bins or ()
+
+
+@dataclass(frozen=True)
+class Inequality:
+    term: Term
+    relation: Relation
+    value: float
+
+
+@dataclass(frozen=True)
+class DesignDefinition:
+    """Settings of the adaptive design, every default resolved."""
+
+    preset: Preset
+    initial: int
+    acquisition: Literal["uncertainty_index", "variance", "latin_hypercube"]
+    monte_carlo: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class EnvironmentDefinition:
+    """One environment. C coordinates, D observation entries, F action entries."""
+
+    coordinates: tuple[CoordinateDefinition, ...]
+    observation_names: tuple[str, ...]
+    observation_terms: tuple[Term, ...]
+    observation_low: tuple[float, ...]
+    observation_high: tuple[float, ...]
+    action: ActionDefinition
+    termination_groups: tuple[tuple[Inequality, ...], ...]
+    time_limit: int | None
+    reward_timing: Literal["before", "after"]
+    penalty: float
+    tolerances: tuple[tuple[str, float], ...]
+    design: DesignDefinition
+
+    @cached_property
+    def coordinate_names(self) -> tuple[str, ...]:
+        return tuple(c.name for c in self.coordinates)
+
+    @cached_property
+    def moving(self) -> tuple[int, ...]:
+        """Indices of the coordinates that the dynamics move."""
+        return tuple(i for i, c in enumerate(self.coordinates) if c.kind != "constant")
+
+    @cached_property
+    def outputs(self) -> tuple[str, ...]:
+        """Modelled outputs by name: moving coordinates (preset ``paper``: observation entries), then the reward."""
+        if self.design.preset == "paper":
+            return (*self.observation_names, REWARD)
+        return (*(self.coordinates[i].name for i in self.moving), REWARD)
+
+    @cached_property
+    def observe(self) -> TermSet:
+        """Observation of coordinates: q (..., C) -> o (..., D)."""
+        return compile_terms(self.observation_terms, len(self.coordinates))
+
+    @cached_property
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Saturation bounds, (C,) each."""
+        low = torch.tensor([c.low for c in self.coordinates], dtype=torch.float64)
+        return low, torch.tensor([c.high for c in self.coordinates], dtype=torch.float64)
+
+    @cached_property
+    def angles(self) -> tuple[int, ...]:
+        return tuple(i for i, c in enumerate(self.coordinates) if c.kind == "angle")
+
+    @cached_property
+    def _termination_terms(self) -> TermSet:
+        terms = [i.term for group in self.termination_groups for i in group]
+        return compile_terms(terms, len(self.coordinates))
+
+    def terminated(self, q: Tensor) -> Tensor:
+        """Whether an episode ends at q (..., C), shape (...): any group all of whose inequalities hold."""
+        over = torch.zeros(q.shape[:-1], dtype=torch.bool, device=q.device)
+        if not self.termination_groups:
+            return over
+        values = self._termination_terms(q)
+        column = 0
+        for group in self.termination_groups:
+            holds = torch.ones_like(over)
+            for inequality in group:
+                holds &= compare(values[..., column], inequality.relation, inequality.value)
+                column += 1
+            over |= holds
+        return over
+
+
+def compare(value: Tensor, relation: Relation, bound: float) -> Tensor:
+    match relation:
+        case "<":
+            return value < bound
+        case "<=":
+            return value <= bound
+        case ">":
+            return value > bound
+        case ">=":
+            return value >= bound
+
+
+def wrap(angle: Tensor) -> Tensor:
+    """Angle in [-pi, pi)."""
+    return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi

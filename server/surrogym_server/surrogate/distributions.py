@@ -1,0 +1,70 @@
+"""One-dimensional distributions of coordinates, through their inverse distribution functions.
+
+Everything random is drawn as a uniform number first, so that Latin hypercubes and counter-based noise share one path.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Uniform:
+    low: float
+    high: float
+
+    def quantile(self, p: Tensor) -> Tensor:
+        """Value below which a share p lies."""
+        return self.low + (self.high - self.low) * p
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal, truncated to [low, high]."""
+
+    mean: float
+    std: float
+    low: float
+    high: float
+
+    def quantile(self, p: Tensor) -> Tensor:
+        """Value below which a share p lies."""
+        edges = torch.tensor([self.low, self.high], dtype=p.dtype, device=p.device)
+        below, above = torch.special.ndtr((edges - self.mean) / self.std)
+        value: Tensor = self.mean + self.std * torch.special.ndtri(below + (above - below) * p)
+        return torch.clamp(value, self.low, self.high)
+
+
+@dataclass(frozen=True)
+class Fixed:
+    value: float
+
+    @property
+    def low(self) -> float:
+        return self.value
+
+    @property
+    def high(self) -> float:
+        return self.value
+
+    def quantile(self, p: Tensor) -> Tensor:
+        """The value, whatever p."""
+        return torch.full_like(p, self.value)
+
+
+Distribution = Uniform | Normal | Fixed
+
+
+def scaling(distribution: Distribution) -> tuple[float, float]:
+    """Centre and scale that give a sampled coordinate mean 0 and deviation about 1."""
+    match distribution:
+        case Uniform(low, high):
+            return (low + high) / 2, (high - low) / math.sqrt(12)
+        case Normal(mean, std):
+            return mean, std
+        case Fixed(value):
+            return value, 1.0

@@ -1,0 +1,92 @@
+"""One step of the state: AUR-D moves the mean, AUR-P moves particles (section 4 of the paper)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.surrogate.model import SurrogateModel
+
+WEIGHT_FLOOR = 1e-12  # of the reward's variance, so that a certain particle's weight stays finite
+
+
+@dataclass(frozen=True)
+class Moved:
+    """What the model says of one step of N lanes."""
+
+    q: Tensor  # (N, C) output state
+    particles: Tensor  # (N, P, C)
+    reward_mean: Tensor  # (N,)
+    reward: Tensor  # (N,) penalised, eq. 14
+    terminated: Tensor  # (N,) bool
+    deviation: Tensor | None  # (N, O)
+
+
+def move_mean(model: SurrogateModel, q: Tensor, u: Tensor, penalty: float, deviations: bool) -> Moved:
+    """AUR-D: q (N, C) under u (N, F) goes to the mean of the next state."""
+    transition = model.transition(q, u, deviations=deviations)
+    over = model.definition.terminated(transition.q_next)
+    needs_deviation = deviations or penalty > 0
+    mean, spread = model.predict_reward(q, u, transition.q_next, over, deviations=needs_deviation)
+    reward = mean if spread is None else mean - penalty * spread
+    all_deviations = None
+    if transition.deviation is not None and spread is not None:
+        all_deviations = torch.cat([transition.deviation, spread[:, None]], -1)
+    return Moved(transition.q_next, q.new_zeros(len(q), 0, q.shape[1]), mean, reward, over, all_deviations)
+
+
+def move_particles(
+    model: SurrogateModel,
+    particles: Tensor,
+    u: Tensor,
+    penalty: float,
+    noise: Tensor | None,
+    weighting: Literal["inverse_variance", "uniform"],
+) -> Moved:
+    """AUR-P: particles (N, P, C) under one action a lane, u (N, F).
+
+    With ``noise`` (N, P, M) each particle moves by a draw, without by the mean. The output state is the particles'
+    mean; the reward is the mean of their penalised rewards, weighted by 1/U with U the variance of eq. 7.
+    """
+    lanes, count, size = particles.shape
+    q, action = particles.reshape(-1, size), u.repeat_interleave(count, 0)
+    flat_noise = None if noise is None else noise.reshape(len(q), -1)
+    transition = model.transition(q, action, noise=flat_noise, deviations=True)
+    assert transition.deviation is not None
+    moved = transition.q_next.reshape(lanes, count, size)
+    output = mean_state(model.definition, moved)
+    over = model.definition.terminated(output)
+    mean, spread = model.predict_reward(q, action, transition.q_next, over.repeat_interleave(count))
+    assert spread is not None
+    weight = _weights(spread.reshape(lanes, count), model.reward.scale, weighting)
+    deviation = torch.cat([transition.deviation, spread[:, None]], -1).reshape(lanes, count, -1)
+    penalised = (mean - penalty * spread).reshape(lanes, count)
+    return Moved(
+        output,
+        moved,
+        (weight * mean.reshape(lanes, count)).sum(1),
+        (weight * penalised).sum(1),
+        over,
+        deviation.square().mean(1).sqrt(),
+    )
+
+
+def mean_state(definition: EnvironmentDefinition, particles: Tensor) -> Tensor:
+    """Mean of particles (N, P, C), (N, C); an angle's is the direction of the mean of its cosines and sines."""
+    mean = particles.mean(1)
+    for index in definition.angles:
+        angle = particles[..., index]
+        mean[:, index] = torch.atan2(angle.sin().mean(1), angle.cos().mean(1))
+    return mean
+
+
+def _weights(spread: Tensor, scale: float, weighting: Literal["inverse_variance", "uniform"]) -> Tensor:
+    """Normalised weights (N, P) of particles whose rewards deviate by spread (N, P)."""
+    if weighting == "uniform":
+        return torch.full_like(spread, 1 / spread.shape[1])
+    precision = 1 / (spread.square() + WEIGHT_FLOOR * scale**2)
+    return precision / precision.sum(1, keepdim=True)

@@ -1,0 +1,218 @@
+"""reset and step of N lanes, autoreset included, in Gymnasium's three modes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from surrogym_server.errors import InvalidInput, NotReset
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.virtual.dynamics import Moved, move_mean, move_particles
+from surrogym_server.virtual.lanes import ENDED, NEW, RUNNING, LaneState
+from surrogym_server.virtual.noise import Purpose, normal_noise
+from surrogym_server.virtual.start import start_coordinates, start_particles
+
+Floats = NDArray[np.floating[Any]]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.integer[Any]]
+
+
+@dataclass(frozen=True)
+class VirtualSettings:
+    """What a session chose when it was opened."""
+
+    num_envs: int
+    variant: Literal["deterministic", "probabilistic"] = "deterministic"
+    autoreset_mode: Literal["next_step", "same_step", "disabled"] = "next_step"
+    time_limit: int | None = None
+    penalty: float = 0.0  # k of eq. 14
+    start_box: float = 0.0  # share of episodes that start anywhere in the sampling range
+    particles: int = 1_000
+    propagation: Literal["mean", "sample"] = "sample"
+    weighting: Literal["inverse_variance", "uniform"] = "inverse_variance"
+    spread: float = 0.01  # first deviation of particles, as a share of each coordinate's range
+
+
+@dataclass(frozen=True)
+class Transition:
+    """What one step of N lanes gives, as numpy. Lanes outside the mask have reward 0 and no flags."""
+
+    observation: Floats  # (N, D) float32
+    reward: Floats  # (N,)
+    terminated: Bools  # (N,)
+    truncated: Bools  # (N,)
+    final_lanes: Ints  # (K,) lanes that ended and were reset within this step (same_step)
+    final_observation: Floats  # (K, D) float32
+    reset_lanes: Bools  # (N,) lanes that a new episode began in
+    reward_mean: Floats  # (N,)
+    deviation: Floats | None  # (N, O)
+
+
+def create(definition: EnvironmentDefinition, settings: VirtualSettings, seed: int) -> LaneState:
+    """N lanes that have not been reset yet."""
+    count, size = settings.num_envs, len(definition.coordinates)
+    particles = settings.particles if settings.variant == "probabilistic" else 0
+    zeros = torch.zeros(count, dtype=torch.int64)
+    return LaneState(
+        seed=torch.full((count,), seed, dtype=torch.int64),
+        lane=torch.arange(count),
+        episode=zeros - 1,
+        elapsed=zeros,
+        phase=torch.full((count,), NEW, dtype=torch.int8),
+        q=torch.zeros(count, size, dtype=torch.float64),
+        particles=torch.zeros(count, particles, size, dtype=torch.float64),
+    )
+
+
+def reset(
+    definition: EnvironmentDefinition,
+    settings: VirtualSettings,
+    lanes: LaneState,
+    seed: int | Sequence[int] | None = None,
+    mask: Bools | None = None,
+) -> tuple[LaneState, Floats]:
+    """New episodes in all lanes, or those of the mask (N,); gives lanes and observations (N, D).
+
+    An int seed s gives lane i the key (s, i), a list gives lane i the key (s_i, 0), both from episode 0 on; without a
+    seed each lane goes on to its next episode. Lanes outside the mask keep their state.
+
+    Raises:
+        InvalidInput: mask or list of seeds of another length.
+    """
+    chosen = _mask(mask, len(lanes))
+    if seed is not None:
+        lanes = _seeded(lanes, seed, chosen)
+    lanes = _begin(definition, settings, lanes, chosen)
+    return lanes, _observe(definition, lanes)
+
+
+def step(
+    model: SurrogateModel,
+    settings: VirtualSettings,
+    lanes: LaneState,
+    u: Floats,
+    mask: Bools | None = None,
+    deviations: bool = False,
+) -> tuple[LaneState, Transition]:
+    """Step all lanes, or those of the mask (N,), under u (N, F), the model's actions.
+
+    Raises:
+        InvalidInput: a mask of another length.
+        NotReset: a lane that was never reset, or that ended under autoreset disabled.
+    """
+    definition = model.definition
+    chosen = _mask(mask, len(lanes))
+    waiting = _waiting(settings, lanes, chosen)
+    moving = chosen & ~waiting
+    moved = _move(model, settings, lanes.take(moving), torch.from_numpy(u)[moving], deviations)
+    after, truncated = _advanced(settings, lanes, moving, moved)
+    terminated = _scatter(moving, moved.terminated)
+    ended = moving & (terminated | truncated)
+    final_lanes = torch.zeros(0, dtype=torch.int64)
+    final_observation = np.zeros((0, len(definition.observation_names)), dtype=np.float32)
+    beginning = waiting
+    if settings.autoreset_mode == "same_step" and bool(ended.any()):
+        final_lanes = ended.nonzero()[:, 0]
+        final_observation = _observe(definition, after.take(ended))
+        beginning = ended
+    after = _begin(definition, settings, after, beginning)
+    return after, Transition(
+        observation=_observe(definition, after),
+        reward=_scatter(moving, moved.reward).numpy(),
+        terminated=terminated.numpy(),
+        truncated=truncated.numpy(),
+        final_lanes=final_lanes.numpy(),
+        final_observation=final_observation,
+        reset_lanes=beginning.numpy(),
+        reward_mean=_scatter(moving, moved.reward_mean).numpy(),
+        deviation=None if moved.deviation is None or not deviations else _scatter(moving, moved.deviation).numpy(),
+    )
+
+
+def _waiting(settings: VirtualSettings, lanes: LaneState, chosen: Tensor) -> Tensor:
+    """Lanes (N,) that this step resets instead of moving."""
+    ended = chosen & (lanes.phase == ENDED)
+    refused = chosen & (lanes.phase == NEW)
+    if settings.autoreset_mode != "next_step":
+        refused = refused | ended
+    if bool(refused.any()):
+        which = refused.nonzero()[:, 0].tolist()
+        shown = f"{which[:8]}{' and more' if len(which) > 8 else ''}"
+        raise NotReset(f"lanes {shown} have no running episode: reset them before stepping")
+    return ended
+
+
+def _move(model: SurrogateModel, settings: VirtualSettings, lanes: LaneState, u: Tensor, deviations: bool) -> Moved:
+    if settings.variant == "deterministic":
+        return move_mean(model, lanes.q, u, settings.penalty, deviations)
+    noise = None
+    if settings.propagation == "sample":
+        noise = normal_noise(lanes, Purpose.TRANSITION, settings.particles, len(model.transitions))
+    return move_particles(model, lanes.particles, u, settings.penalty, noise, settings.weighting)
+
+
+def _advanced(settings: VirtualSettings, lanes: LaneState, moving: Tensor, moved: Moved) -> tuple[LaneState, Tensor]:
+    """Lanes after their move, and which were truncated (N,). As in Gymnasium, a step may end an episode both ways."""
+    before = lanes.take(moving)
+    elapsed = before.elapsed + 1
+    cut = torch.zeros_like(moved.terminated) if settings.time_limit is None else elapsed >= settings.time_limit
+    phase = torch.where(moved.terminated | cut, ENDED, RUNNING).to(torch.int8)
+    after = replace(before, elapsed=elapsed, phase=phase, q=moved.q, particles=moved.particles)
+    return lanes.put(moving, after), _scatter(moving, cut)
+
+
+def _begin(definition: EnvironmentDefinition, settings: VirtualSettings, lanes: LaneState, chosen: Tensor) -> LaneState:
+    if not bool(chosen.any()):
+        return lanes
+    fresh = lanes.take(chosen)
+    fresh = replace(fresh, episode=fresh.episode + 1, elapsed=torch.zeros_like(fresh.elapsed))
+    q = start_coordinates(definition, fresh, settings.start_box)
+    particles = fresh.particles
+    if settings.variant == "probabilistic":
+        particles = start_particles(definition, fresh, q, settings.particles, settings.spread)
+    phase = torch.full_like(fresh.phase, RUNNING)
+    return lanes.put(chosen, replace(fresh, phase=phase, q=q, particles=particles))
+
+
+def _seeded(lanes: LaneState, seed: int | Sequence[int], chosen: Tensor) -> LaneState:
+    if isinstance(seed, int):
+        seeds, numbers = torch.full_like(lanes.seed, seed), torch.arange(len(lanes))
+    else:
+        if len(seed) != len(lanes):
+            raise InvalidInput(f"seed: expected an integer or {len(lanes)} of them, got {len(seed)}")
+        seeds, numbers = torch.tensor(list(seed), dtype=torch.int64), torch.zeros_like(lanes.lane)
+    return replace(
+        lanes,
+        seed=torch.where(chosen, seeds, lanes.seed),
+        lane=torch.where(chosen, numbers, lanes.lane),
+        episode=torch.where(chosen, -1, lanes.episode),
+    )
+
+
+def _observe(definition: EnvironmentDefinition, lanes: LaneState) -> Floats:
+    observation: Floats = definition.observe(lanes.q).to(torch.float32).numpy()
+    return observation
+
+
+def _mask(mask: Bools | None, count: int) -> Tensor:
+    if mask is None:
+        return torch.ones(count, dtype=torch.bool)
+    if len(mask) != count:
+        raise InvalidInput(f"mask: expected {count} entries, got {len(mask)}")
+    return torch.as_tensor(mask, dtype=torch.bool)
+
+
+def _scatter(mask: Tensor, values: Tensor) -> Tensor:
+    """Values of the masked lanes among all N, zero elsewhere."""
+    if bool(mask.all()):
+        return values
+    full = values.new_zeros(len(mask), *values.shape[1:])
+    full[mask] = values
+    return full

@@ -1,0 +1,51 @@
+"""LaneState: everything the next step of N lanes depends on, as tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+NEW, RUNNING, ENDED = 0, 1, 2  # phase of a lane
+
+
+@dataclass(frozen=True)
+class LaneState:
+    """State of N lanes. P is 0 in the deterministic variant."""
+
+    seed: Tensor  # (N,) int64, key of the noise
+    lane: Tensor  # (N,) int64, key of the noise
+    episode: Tensor  # (N,) int64, -1 before the first
+    elapsed: Tensor  # (N,) int64, steps in this episode
+    phase: Tensor  # (N,) int8: NEW, RUNNING, or ENDED and waiting for a reset
+    q: Tensor  # (N, C) output state: what observation and termination are read from
+    particles: Tensor  # (N, P, C)
+
+    def __len__(self) -> int:
+        return len(self.seed)
+
+    def take(self, index: NDArray[Any] | Tensor) -> LaneState:
+        """The lanes of an index or mask, in its order."""
+        at = torch.as_tensor(index)
+        return LaneState(*(getattr(self, f.name)[at] for f in fields(self)))
+
+    def put(self, index: NDArray[Any] | Tensor, other: LaneState) -> LaneState:
+        """These lanes with those of an index or mask replaced by ``other``."""
+        at = torch.as_tensor(index)
+        replaced = []
+        for f in fields(self):
+            tensor = getattr(self, f.name).clone()
+            tensor[at] = getattr(other, f.name)
+            replaced.append(tensor)
+        return LaneState(*replaced)
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        return {f.name: getattr(self, f.name).numpy() for f in fields(self)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> LaneState:
+        return cls(*(torch.from_numpy(arrays[f.name].copy()) for f in fields(cls)))

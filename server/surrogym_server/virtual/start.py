@@ -1,0 +1,42 @@
+"""The start of an episode: declared distribution or anywhere in the sampling range, and the first particles."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.surrogate.model import settle
+from surrogym_server.virtual.lanes import LaneState
+from surrogym_server.virtual.noise import Purpose, normal_noise, uniform_noise
+
+
+def start_coordinates(definition: EnvironmentDefinition, lanes: LaneState, box_share: float) -> Tensor:
+    """Start of each lane's present episode, (N, C); a share of the episodes starts anywhere in the sampling range."""
+    coordinates = definition.coordinates
+    p = uniform_noise(lanes, Purpose.START, len(coordinates))
+    declared = torch.stack([c.start.quantile(p[:, i]) for i, c in enumerate(coordinates)], -1)
+    if box_share == 0:
+        return declared
+    anywhere = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(coordinates)], -1)
+    in_box = uniform_noise(lanes, Purpose.BOX_START, 1) < box_share
+    return torch.where(in_box, anywhere, declared)
+
+
+def start_particles(
+    definition: EnvironmentDefinition, lanes: LaneState, q: Tensor, count: int, spread: float
+) -> Tensor:
+    """Particles around starts q (N, C), (N, P, C): normal with a fixed low deviation in each dimension (section 4)."""
+    deviation = torch.tensor([_deviation(definition, i, spread) for i in range(len(definition.coordinates))])
+    noise = normal_noise(lanes, Purpose.SPREAD, count, len(definition.coordinates))
+    return settle(definition, q[:, None] + deviation.to(q.dtype) * noise)
+
+
+def _deviation(definition: EnvironmentDefinition, index: int, spread: float) -> float:
+    coordinate = definition.coordinates[index]
+    if coordinate.kind == "constant":
+        return 0.0
+    width = 2 * math.pi if coordinate.kind == "angle" else coordinate.sampling.high - coordinate.sampling.low
+    return spread * width
