@@ -23,6 +23,7 @@ Purpose = Literal["initial", "adaptive", "manual"]
 QueryStatus = Literal["pending", "leased", "answered", "set_aside"]
 Variant = Literal["deterministic", "probabilistic"]
 AutoresetMode = Literal["next_step", "same_step", "disabled"]
+Role = Literal["read", "train", "sample", "admin"]
 
 SurrogateName = Annotated[str, Field(pattern=NAME_PATTERN)]
 Key = Annotated[str, Field(min_length=1, max_length=128)]

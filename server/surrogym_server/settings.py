@@ -1,0 +1,125 @@
+"""Settings of one server, read once from the environment (``SURROGYM_*``) and the command line."""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from surrogym_server.errors import InvalidInput
+from surrogym_shared.wire import MAX_LANES, Role
+
+PREFIX = "SURROGYM_"
+LOCAL_NAMES = ("localhost",)
+MIN_TOKEN_LENGTH = 8
+ROLES: tuple[Role, ...] = get_args(Role)
+
+LogLevel = Literal["critical", "error", "warning", "info", "debug"]
+
+
+class Settings(BaseModel):
+    """What a server is started with. Every field can be given as ``SURROGYM_<FIELD>``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
+
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65_535, description="0 takes any free port")] = 8000
+    database: str = Field(default="surrogym.db", min_length=1, description="SQLite file, or a SQLAlchemy URL")
+    tokens: dict[str, Role] = Field(default_factory=dict, description="role of each bearer token")
+    insecure: bool = Field(default=False, description="allow another address than loopback without a token")
+    device: str = "cpu"
+    threads: Annotated[int, Field(ge=1, le=1024, description="of one torch operation")] = 1
+    session_idle_seconds: Annotated[float, Field(gt=0)] = 3_600.0
+    max_body_bytes: Annotated[int, Field(ge=1_024)] = 32 * 1024 * 1024
+    max_sessions: Annotated[int, Field(ge=1)] = 256
+    max_lanes: Annotated[int, Field(ge=1, le=MAX_LANES, description="of one session")] = MAX_LANES
+    sweep_seconds: Annotated[float, Field(gt=0, description="between looks at leases and sessions")] = 1.0
+    log_level: LogLevel = "info"
+
+    @model_validator(mode="after")
+    def _closed_by_default(self) -> Self:
+        short = [token for token in self.tokens if len(token) < MIN_TOKEN_LENGTH]
+        if short:
+            raise ValueError(f"expected tokens of at least {MIN_TOKEN_LENGTH} characters, got {len(short[0])}")
+        if not (self.tokens or self.insecure or self.loopback):
+            raise ValueError(f"host {self.host} is not loopback: expected a token (or --insecure), got none")
+        return self
+
+    @property
+    def loopback(self) -> bool:
+        """Whether the address is reachable from this machine alone."""
+        if self.host in LOCAL_NAMES:
+            return True
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return False
+
+    @property
+    def database_url(self) -> str:
+        """The database as a SQLAlchemy URL; a plain path means a SQLite file."""
+        return self.database if "://" in self.database else f"sqlite:///{self.database}"
+
+
+def read_settings(environment: Mapping[str, str], **options: Any) -> Settings:
+    """Settings from the environment, overruled by the options that are not None.
+
+    Args:
+        environment: usually ``os.environ``. ``SURROGYM_TOKEN`` is an admin token, ``SURROGYM_TOKENS`` a list
+            like ``sample:secret1,train:secret2``, ``SURROGYM_TOKEN_FILE`` a file with one such entry a line.
+        options: fields of ``Settings``, and ``token_file``.
+
+    Raises:
+        InvalidInput: a value can't be used; says which, what was expected and what came.
+    """
+    fields = {
+        name: environment[PREFIX + name.upper()]
+        for name in Settings.model_fields
+        if name != "tokens" and PREFIX + name.upper() in environment
+    }
+    given = {name: value for name, value in options.items() if value is not None}
+    token_file = given.pop("token_file", environment.get(f"{PREFIX}TOKEN_FILE"))
+    tokens = _read_tokens(environment, token_file)
+    try:
+        return Settings.model_validate({**fields, "tokens": tokens, **given})
+    except ValidationError as error:
+        raise InvalidInput(_one_sentence(error)) from error
+
+
+def _read_tokens(environment: Mapping[str, str], token_file: str | Path | None) -> dict[str, Role]:
+    entries = environment.get(f"{PREFIX}TOKENS", "").split(",")
+    if token := environment.get(f"{PREFIX}TOKEN"):
+        entries.append(f"admin:{token}")
+    if token_file:
+        entries.extend(_read_lines(Path(token_file)))
+    return dict(_parse_token(entry.strip()) for entry in entries if entry.strip())
+
+
+def _read_lines(path: Path) -> list[str]:
+    try:
+        lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidInput(f"the token file {str(path)!r} can't be read: {error}") from error
+    if not any(lines):
+        raise InvalidInput(f"the token file {str(path)!r} is empty: expected lines like 'sample:token'")
+    return lines
+
+
+def _parse_token(entry: str) -> tuple[str, Role]:
+    role, colon, token = entry.partition(":")
+    if not colon:
+        return entry, "admin"
+    for known in ROLES:
+        if role == known:
+            return token, known
+    raise InvalidInput(f"unknown role of a token: expected one of {', '.join(ROLES)}, got {role!r}")
+
+
+def _one_sentence(error: ValidationError) -> str:
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    message = first["msg"].removeprefix("Value error, ")
+    return f"setting {where}: {message}" if where and where != "tokens" else message

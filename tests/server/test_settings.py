@@ -1,0 +1,71 @@
+"""Closed by default: what a server may be started with, and what it says to the rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from surrogym_server.errors import InvalidInput
+from surrogym_server.settings import read_settings
+
+TOKEN = "a-long-token"
+
+
+def test_defaults_listen_on_loopback_alone():
+    settings = read_settings({})
+    assert (settings.host, settings.port, settings.tokens, settings.loopback) == ("127.0.0.1", 8000, {}, True)
+    assert settings.database_url == "sqlite:///surrogym.db"
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "robot.example"])
+def test_another_address_needs_a_token(host: str):
+    with pytest.raises(InvalidInput, match=rf"^host {host} is not loopback: expected a token"):
+        read_settings({}, host=host)
+    assert read_settings({"SURROGYM_TOKEN": TOKEN}, host=host).tokens == {TOKEN: "admin"}
+    assert read_settings({}, host=host, insecure=True).host == host
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "::1", "localhost"])
+def test_loopback_needs_none(host: str):
+    assert read_settings({}, host=host).loopback
+
+
+def test_options_overrule_the_environment():
+    environment = {"SURROGYM_PORT": "9000", "SURROGYM_THREADS": "3"}
+    settings = read_settings(environment, port=0, threads=None)
+    assert (settings.port, settings.threads) == (0, 3)
+
+
+def test_tokens_come_with_roles(tmp_path: Path):
+    file = tmp_path / "tokens"
+    file.write_text("train:train-token\n\nplain-admin-token\n")
+    environment = {"SURROGYM_TOKENS": "read:read-token,sample:sample-token"}
+    assert read_settings(environment, token_file=file).tokens == {
+        "read-token": "read",
+        "sample-token": "sample",
+        "train-token": "train",
+        "plain-admin-token": "admin",
+    }
+
+
+@pytest.mark.parametrize(
+    ("environment", "message"),
+    [
+        ({"SURROGYM_PORT": "many"}, "setting port: .*integer"),
+        ({"SURROGYM_PORT": "70000"}, "setting port: .*65535"),
+        ({"SURROGYM_TOKEN": "short"}, "at least 8 characters, got 5"),
+        ({"SURROGYM_TOKENS": "king:some-long-token"}, "one of read, train, sample, admin, got 'king'"),
+        ({"SURROGYM_TOKEN_FILE": "/no/such/file"}, "'/no/such/file' can't be read"),
+        ({"SURROGYM_LOG_LEVEL": "loud"}, "setting log_level: .*'info'"),
+    ],
+)
+def test_what_cannot_be_used_is_named(environment: dict[str, str], message: str):
+    with pytest.raises(InvalidInput, match=message):
+        read_settings(environment)
+
+
+def test_a_refusal_does_not_print_the_token():
+    with pytest.raises(InvalidInput) as refusal:
+        read_settings({"SURROGYM_TOKEN": "secret", "SURROGYM_PORT": "-1"})
+    assert "secret" not in str(refusal.value)
