@@ -1,0 +1,47 @@
+"""A bounded, uniform sample of the coordinates that one session visited."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+CAPACITY = 4_096
+
+
+@dataclass(frozen=True)
+class Reservoir:
+    """The ``CAPACITY`` visited coordinates of highest priority.
+
+    The priority of the t-th visit is the t-th draw of a generator keyed by ``seed``, so the sample is uniform
+    over all visits, and the same visits give the same sample whatever requests they came in.
+    """
+
+    seed: int
+    seen: int = 0
+    states: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (m, C)
+    priority: Array = field(default_factory=lambda: np.zeros(0))  # (m,)
+
+    def visit(self, states: Array) -> Reservoir:
+        """The reservoir after visits to states (n, C), in order."""
+        priority = _priorities(self.seed, self.seen, len(states))
+        full = len(self.priority) == CAPACITY
+        candidates = np.flatnonzero(priority > self.priority.min()) if full else np.arange(len(states))
+        seen = self.seen + len(states)
+        if len(candidates) == 0:
+            return Reservoir(self.seed, seen, self.states, self.priority)
+        held = self.states if len(self.states) else np.zeros((0, states.shape[1]))
+        joined_states = np.concatenate([held, states[candidates]])
+        joined = np.concatenate([self.priority, priority[candidates]])
+        kept = np.sort(np.argsort(joined, kind="stable")[-CAPACITY:])
+        return Reservoir(self.seed, seen, joined_states[kept], joined[kept])
+
+
+def _priorities(seed: int, first: int, count: int) -> Array:
+    """Draws ``first`` to ``first + count - 1`` of the stream of ``seed``; a Philox block holds four."""
+    block, offset = divmod(first, 4)
+    generator = np.random.Generator(np.random.Philox(key=seed, counter=block))
+    return generator.random(offset + count)[offset:]

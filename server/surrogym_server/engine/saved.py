@@ -1,0 +1,120 @@
+"""A session as bytes and back: arrays in NPZ form with a JSON header. Nothing is pickled."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import asdict, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_server.engine.occupancy import Reservoir
+from surrogym_server.engine.session import Answer, Outcome, Session
+from surrogym_server.errors import InvalidInput
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.virtual import LaneState, VirtualSettings
+from surrogym_shared.port import ResetResult, StepResult
+
+FORMAT = 1
+RAGGED = ("final_lanes", "final_observation")  # of another length in each step
+
+Arrays = dict[str, NDArray[Any]]
+
+
+def session_to_bytes(session: Session) -> bytes:
+    """All of a session but its definition, which its surrogate has."""
+    header: dict[str, Any] = {
+        "format": FORMAT,
+        "id": session.id,
+        "surrogate": session.surrogate,
+        "settings": asdict(session.settings),
+        "seed": session.seed,
+        "model": session.model,
+        "opened_by": session.opened_by,
+    }
+    arrays: Arrays = {"versions": session.versions, **_prefixed("lanes", session.lanes.to_arrays())}
+    if session.answer is not None:
+        header["answer"] = {"seq": session.answer.seq, "digest": session.answer.digest}
+        arrays |= _outcome_arrays(session.answer.outcome)
+    if session.visited is not None:
+        header["visited"] = {"seed": session.visited.seed, "seen": session.visited.seen}
+        arrays |= _prefixed("visited", {"states": session.visited.states, "priority": session.visited.priority})
+    arrays["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()
+
+
+def session_from_bytes(definition: EnvironmentDefinition, data: bytes) -> Session:
+    """The session that ``session_to_bytes`` saved; its next step is bit-identical.
+
+    Raises:
+        InvalidInput: saved by another version of this program.
+    """
+    with np.load(io.BytesIO(data), allow_pickle=False) as file:
+        arrays: Arrays = {name: file[name] for name in file.files}
+    header = json.loads(arrays["header"].tobytes())
+    if header["format"] != FORMAT:
+        raise InvalidInput(f"expected a session saved in format {FORMAT}, got {header['format']}")
+    opened_by = header["opened_by"]
+    return Session(
+        id=header["id"],
+        surrogate=header["surrogate"],
+        definition=definition,
+        settings=VirtualSettings(**header["settings"]),
+        seed=header["seed"],
+        model=header["model"],
+        lanes=LaneState.from_arrays(_unprefixed("lanes", arrays)),
+        versions=arrays["versions"],
+        answer=_answer(header, arrays),
+        visited=_visited(header, arrays),
+        opened_by=None if opened_by is None else (opened_by[0], opened_by[1]),
+    )
+
+
+def _answer(header: dict[str, Any], arrays: Arrays) -> Answer | None:
+    if (kept := header.get("answer")) is None:
+        return None
+    reset = _unprefixed("reset", arrays)
+    outcome = ResetResult(**reset) if reset else _steps(_unprefixed("steps", arrays))
+    return Answer(kept["seq"], kept["digest"], outcome)
+
+
+def _visited(header: dict[str, Any], arrays: Arrays) -> Reservoir | None:
+    if (kept := header.get("visited")) is None:
+        return None
+    return Reservoir(kept["seed"], kept["seen"], arrays["visited/states"], arrays["visited/priority"])
+
+
+def _outcome_arrays(outcome: Outcome) -> Arrays:
+    if isinstance(outcome, ResetResult):
+        return _prefixed("reset", _fields(outcome))
+    rows = [_fields(step) for step in outcome]
+    arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0] if name not in RAGGED}
+    arrays |= {name: np.concatenate([row[name] for row in rows]) for name in RAGGED}
+    arrays["final_counts"] = np.array([len(row["final_lanes"]) for row in rows])
+    return _prefixed("steps", arrays)
+
+
+def _steps(arrays: Arrays) -> tuple[StepResult, ...]:
+    ends = np.cumsum(arrays.pop("final_counts"))[:-1]
+    ragged = {name: np.split(arrays.pop(name), ends) for name in RAGGED}
+    count = len(arrays["reward"])
+    columns: dict[str, Any] = {"deviation": [None] * count, **arrays, **ragged}
+    return tuple(StepResult(**{name: column[t] for name, column in columns.items()}) for t in range(count))
+
+
+def _fields(result: ResetResult | StepResult) -> Arrays:
+    values = {field.name: getattr(result, field.name) for field in fields(result)}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _prefixed(prefix: str, arrays: Arrays) -> Arrays:
+    return {f"{prefix}/{name}": array for name, array in arrays.items()}
+
+
+def _unprefixed(prefix: str, arrays: Arrays) -> Arrays:
+    start = f"{prefix}/"
+    return {name.removeprefix(start): array for name, array in arrays.items() if name.startswith(start)}

@@ -1,0 +1,233 @@
+"""One live session as one frozen, serialisable object, and the pure functions that advance it.
+
+Shapes: N lanes, D observation entries, F action entries, C coordinates.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_server.engine.occupancy import Reservoir
+from surrogym_server.errors import IdempotencyConflict, InvalidInput, SeqConflict
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.virtual import LaneState, Transition, VirtualSettings, create, reset, step
+from surrogym_shared.port import ResetResult, StepResult
+
+Bools = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+Versions = NDArray[np.int64]
+ModelChoice = Literal["latest"] | int
+ModelOf = Callable[[int], SurrogateModel]
+Seeds = int | Sequence[int] | None
+Outcome = ResetResult | tuple[StepResult, ...]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The last reply, kept so that a repeat of its request gets it again."""
+
+    seq: int
+    digest: str
+    outcome: Outcome
+
+
+@dataclass(frozen=True)
+class Session:
+    """One trainer's virtual environment: all that its next step depends on."""
+
+    id: str
+    surrogate: str
+    definition: EnvironmentDefinition
+    settings: VirtualSettings
+    seed: int
+    model: ModelChoice
+    lanes: LaneState
+    versions: Versions  # (N,) the model each lane's episode runs under
+    answer: Answer | None = None
+    visited: Reservoir | None = None
+    opened_by: tuple[str, str] | None = None  # idempotency key and digest of the opening
+
+    @property
+    def seq(self) -> int:
+        """The last seq that was answered."""
+        return 0 if self.answer is None else self.answer.seq
+
+
+def open_session(
+    id: str,
+    surrogate: str,
+    definition: EnvironmentDefinition,
+    settings: VirtualSettings,
+    *,
+    seed: int,
+    model: ModelChoice,
+    version: int,
+    occupancy: bool,
+    opened_by: tuple[str, str] | None = None,
+) -> Session:
+    """A session whose lanes are not reset yet, all under one model version."""
+    return Session(
+        id=id,
+        surrogate=surrogate,
+        definition=definition,
+        settings=settings,
+        seed=seed,
+        model=model,
+        lanes=create(definition, settings, seed),
+        versions=np.full(settings.num_envs, version, dtype=np.int64),
+        visited=Reservoir(seed) if occupancy else None,
+        opened_by=opened_by,
+    )
+
+
+def replay(session: Session, seq: int | None, digest: str) -> Answer | None:
+    """The kept answer when the request repeats the last one; None when it is the next one.
+
+    Raises:
+        SeqConflict: neither.
+    """
+    if seq is None or seq == session.seq + 1:
+        return None
+    answer = session.answer
+    if answer is not None and seq == answer.seq and digest == answer.digest:
+        return answer
+    repeated = " with another body" if answer is not None and seq == answer.seq else ""
+    raise SeqConflict(f"expected seq {session.seq + 1}, got {seq}{repeated}", expected=session.seq + 1)
+
+
+def answered(session: Session, digest: str, outcome: Outcome) -> tuple[Session, Answer]:
+    """The session with the outcome kept as its last answer."""
+    answer = Answer(session.seq + 1, digest, outcome)
+    return replace(session, answer=answer), answer
+
+
+def reset_session(session: Session, seed: Seeds, mask: Bools | None, latest: int) -> tuple[Session, ResetResult]:
+    """Start new episodes in the lanes of the mask, under version ``latest``."""
+    lanes, observation = reset(session.definition, session.settings, session.lanes, seed, mask)
+    chosen = np.ones(session.settings.num_envs, dtype=bool) if mask is None else mask
+    versions = np.where(chosen, latest, session.versions)
+    session = replace(session, lanes=lanes, versions=versions)
+    return _visited(session, chosen), ResetResult(observation, versions)
+
+
+def step_session(
+    session: Session,
+    action: Floats,
+    mask: Bools | None,
+    deviations: bool,
+    model_of: ModelOf,
+    latest: int,
+) -> tuple[Session, StepResult]:
+    """Step the lanes of the mask with actions (N, F) in the model's units.
+
+    Every lane steps under its own version; one whose episode ended and began anew goes on under ``latest``.
+    """
+    _check_mask(mask, session.settings.num_envs)
+    lanes, transition = _step_versions(session, action, mask, deviations, model_of)
+    versions = np.where(transition.reset_lanes, latest, session.versions)
+    session = _visited(replace(session, lanes=lanes, versions=versions), mask)
+    return session, _result(transition, versions)
+
+
+def _step_versions(
+    session: Session, action: Floats, mask: Bools | None, deviations: bool, model_of: ModelOf
+) -> tuple[LaneState, Transition]:
+    versions = np.unique(session.versions)
+    if len(versions) == 1:
+        model = model_of(int(versions[0]))
+        return step(model, session.settings, session.lanes, action, mask, deviations)
+    lanes, parts = session.lanes, []
+    for version in versions:
+        index = np.flatnonzero(session.versions == version)
+        part, transition = step(
+            model_of(int(version)),
+            session.settings,
+            session.lanes.take(index),
+            action[index],
+            None if mask is None else mask[index],
+            deviations,
+        )
+        lanes = lanes.put(index, part)
+        parts.append((index, transition))
+    return lanes, _join(parts)
+
+
+def _join(parts: Sequence[tuple[NDArray[np.intp], Transition]]) -> Transition:
+    """One transition of all lanes from those of disjoint groups, each with its lane numbers."""
+    order = np.argsort(np.concatenate([index for index, _ in parts]))
+
+    def lanewise(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        joined: NDArray[Any] = np.concatenate(arrays)[order]
+        return joined
+
+    transitions = [transition for _, transition in parts]
+    final_lanes = np.concatenate([index[t.final_lanes] for index, t in parts])
+    final_order = np.argsort(final_lanes)
+    deviation = [t.deviation for t in transitions if t.deviation is not None]
+    return Transition(
+        observation=lanewise([t.observation for t in transitions]),
+        reward=lanewise([t.reward for t in transitions]),
+        terminated=lanewise([t.terminated for t in transitions]),
+        truncated=lanewise([t.truncated for t in transitions]),
+        final_lanes=final_lanes[final_order],
+        final_observation=np.concatenate([t.final_observation for t in transitions])[final_order],
+        reset_lanes=lanewise([t.reset_lanes for t in transitions]),
+        reward_mean=lanewise([t.reward_mean for t in transitions]),
+        deviation=lanewise(deviation) if deviation else None,
+    )
+
+
+def _result(transition: Transition, versions: Versions) -> StepResult:
+    return StepResult(
+        observation=transition.observation,
+        reward=transition.reward,
+        terminated=transition.terminated,
+        truncated=transition.truncated,
+        final_lanes=transition.final_lanes,
+        final_observation=transition.final_observation,
+        model_version=versions,
+        reward_mean=transition.reward_mean,
+        deviation=transition.deviation,
+    )
+
+
+def _visited(session: Session, chosen: Bools | None) -> Session:
+    if session.visited is None:
+        return session
+    states = session.lanes.q.numpy()
+    return replace(session, visited=session.visited.visit(states if chosen is None else states[chosen]))
+
+
+def _check_mask(mask: Bools | None, lanes: int) -> None:
+    if mask is not None and mask.shape != (lanes,):
+        raise InvalidInput(f"mask: expected {lanes} entries, one a lane, got {len(mask)}")
+
+
+def check_opening(session: Session, digest: str) -> Session:
+    """The session an idempotency key opened, if its opening had the same body.
+
+    Raises:
+        IdempotencyConflict: it had another one.
+    """
+    if session.opened_by is None or session.opened_by[1] != digest:
+        raise IdempotencyConflict("this idempotency key opened a session with another body")
+    return session
+
+
+def digest_of(operation: str, *parts: object) -> str:
+    """A fingerprint of a request that does not depend on what carried it."""
+    sha = hashlib.sha256(operation.encode())
+    for part in parts:
+        if isinstance(part, np.ndarray):
+            sha.update(f"|{part.dtype}{part.shape}|".encode())
+            sha.update(np.ascontiguousarray(part).tobytes())
+        else:
+            sha.update(f"|{part!r}|".encode())
+    return sha.hexdigest()

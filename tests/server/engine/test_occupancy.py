@@ -1,0 +1,49 @@
+"""The reservoir of visited states: bounded, uniform over all visits, and the same however they were batched."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from surrogym_server.engine.occupancy import CAPACITY, Reservoir
+
+
+def visit(batch: int, visits: int, seed: int = 5) -> Reservoir:
+    reservoir = Reservoir(seed)
+    for first in range(0, visits, batch):
+        numbers = np.arange(first, min(first + batch, visits), dtype=float)
+        reservoir = reservoir.visit(np.stack([numbers, -numbers], axis=-1))
+    return reservoir
+
+
+def test_all_are_kept_while_there_is_room():
+    reservoir = visit(batch=7, visits=100)
+    np.testing.assert_array_equal(reservoir.states[:, 0], np.arange(100))
+    assert reservoir.seen == 100
+
+
+def test_the_sample_does_not_depend_on_the_batches():
+    visits = 2 * CAPACITY + 11
+    kept = [visit(batch, visits).states for batch in (1, 3, 64, visits)]
+    for other in kept[1:]:
+        np.testing.assert_array_equal(other, kept[0])
+
+
+def test_beyond_its_capacity_it_is_a_uniform_sample():
+    visits = 8 * CAPACITY
+    reservoir = visit(batch=1000, visits=visits)
+    assert reservoir.states.shape == (CAPACITY, 2)
+    assert reservoir.seen == visits
+    quarters = np.histogram(reservoir.states[:, 0], bins=4, range=(0, visits))[0]
+    expected, deviation = CAPACITY / 4, np.sqrt(CAPACITY * 3 / 16)
+    assert np.abs(quarters - expected).max() < 5 * deviation
+
+
+def test_another_seed_keeps_others():
+    kept = [set(visit(1000, 4 * CAPACITY, seed).states[:, 0]) for seed in (1, 2)]
+    assert kept[0] != kept[1]
+
+
+def test_a_visit_changes_nothing_of_the_old_one():
+    before = visit(batch=10, visits=10)
+    before.visit(np.zeros((5, 2)))
+    assert (before.seen, len(before.states)) == (10, 10)
