@@ -1,0 +1,193 @@
+"""The designer: whenever a surrogate is due, fit it, store model and next queries, wake who waits"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from contextlib import suppress
+from typing import Protocol
+
+import numpy as np
+
+from surrogym_server.engine.design_job import DesignJob, DesignResult
+from surrogym_server.engine.models import ModelCache
+from surrogym_server.errors import InvalidInput, SurrogymError, Unavailable
+from surrogym_server.services.definitions import Definitions
+from surrogym_server.services.notices import Notices
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import (
+    OPEN_STATUSES,
+    FitLease,
+    NewDesign,
+    NewModel,
+    Phase,
+    SurrogateRecord,
+)
+
+logger = logging.getLogger(__name__)
+
+FIT_LEASE_SECONDS = 30.0
+RENEWALS_PER_LEASE = 3
+
+
+class FitRunner(Protocol):
+    """Where jobs are done; ``engine.fits.Fits`` is one."""
+
+    async def run(self, job: DesignJob) -> DesignResult: ...
+
+
+class Designer:
+    def __init__(
+        self,
+        storage: Storage,
+        definitions: Definitions,
+        fits: FitRunner,
+        models: ModelCache,
+        notices: Notices,
+        *,
+        owner: str,
+        threads: int,
+        look_seconds: float,
+    ) -> None:
+        """
+        Args:
+            storage: holds the right to fit.
+            definitions: of the surrogates in it.
+            fits: where jobs are done.
+            models: told of each new version.
+            notices: wake this designer, and are posted after each fit.
+            owner: name of this server in the right to fit.
+            threads: of torch in a fit.
+            look_seconds: how often to look for what no notice told.
+        """
+        self._storage = storage
+        self._definitions = definitions
+        self._fits = fits
+        self._models = models
+        self._notices = notices
+        self._owner = owner
+        self._threads = threads
+        self._look_seconds = look_seconds
+
+    async def run(self) -> None:
+        """Fit what is due, for ever; ends by cancellation, and what was being fitted stays due."""
+        with self._notices.listen() as listener:
+            while True:
+                try:
+                    await self.fit_all_due()
+                except Unavailable as error:
+                    logger.warning("storage is away, the design waits: %s", error)
+                await listener.wait(self._look_seconds)
+
+    async def fit_all_due(self) -> None:
+        """Fit every surrogate that is due, one after the other."""
+        await asyncio.to_thread(self._give_up_hopeless)
+        for name in await asyncio.to_thread(self._storage.designs.due):
+            with suppress(SurrogymError):  # deleted or taken by another server meanwhile
+                await self._fit(name)
+
+    def improve(self, name: str, queries: int, checkpoint: str | None, key: str | None) -> SurrogateRecord:
+        """Ask the next fit for more queries, weighted by the occupancy of a checkpoint (None: the latest, if
+        any).
+
+        Raises:
+            InvalidInput: no occupancy was submitted under this name.
+        """
+        if checkpoint is not None and self._storage.occupancy.get(name, checkpoint) is None:
+            raise InvalidInput(f"no occupancy was submitted as {checkpoint!r}: submit it from a session first")
+        if checkpoint is None and (latest := self._storage.occupancy.latest(name)) is not None:
+            checkpoint = latest.checkpoint
+        record = self._storage.designs.ask(name, queries, checkpoint=checkpoint, key=key)
+        self._notices.post(name)
+        return record
+
+    async def _fit(self, name: str) -> None:
+        lease = await asyncio.to_thread(self._storage.designs.begin, name, self._owner, FIT_LEASE_SECONDS)
+        if lease is None:
+            return
+        self._notices.post(name)
+        keeper = asyncio.create_task(self._keep(lease))
+        try:
+            result = await self._fits.run(await asyncio.to_thread(self._job, lease))
+            await asyncio.to_thread(self._commit, lease, result)
+        except asyncio.CancelledError:
+            self._abort(lease, None)
+            raise
+        except Exception as error:
+            logger.warning("the fit of %s failed", name, exc_info=not isinstance(error, SurrogymError))
+            await asyncio.to_thread(self._abort, lease, f"the fit failed: {error}")
+        finally:
+            keeper.cancel()
+            self._notices.post(name)
+
+    async def _keep(self, lease: FitLease) -> None:
+        while True:
+            await asyncio.sleep(FIT_LEASE_SECONDS / RENEWALS_PER_LEASE)
+            with suppress(SurrogymError):  # the commit will say so
+                await asyncio.to_thread(self._storage.designs.renew, lease, FIT_LEASE_SECONDS)
+
+    def _job(self, lease: FitLease) -> DesignJob:
+        name = lease.surrogate
+        record, samples = self._storage.surrogates.get(name), self._storage.samples.arrays(name)
+        pending = self._storage.queries.list(name, OPEN_STATUSES)
+        visited = None if lease.checkpoint is None else self._storage.occupancy.get(name, lease.checkpoint)
+        return DesignJob(
+            definition=self._definitions.get(name),
+            coordinates=samples.coordinates,
+            action=samples.action,
+            next_coordinates=samples.next_coordinates,
+            reward=samples.reward,
+            terminated=samples.terminated,
+            state=record.state,
+            budget=record.budget,
+            target=record.target,
+            pending_coordinates=np.array([query.coordinates for query in pending]) if pending else None,
+            pending_action=np.array([query.action for query in pending]) if pending else None,
+            extra_queries=lease.extra_queries,
+            occupancy=None if visited is None else visited.states,
+            threads=self._threads,
+        )
+
+    def _commit(self, lease: FitLease, result: DesignResult) -> None:
+        model = NewModel(
+            samples=int(result.fidelity["samples"]),
+            data_hash=result.data_hash,
+            fidelity=result.fidelity,
+            description=result.description,
+            fit_seconds=result.seconds,
+            blob=result.model,
+        )
+        design = NewDesign(
+            model=model,
+            state=result.state,
+            phase=phase_after(result),
+            query_coordinates=result.query_coordinates,
+            query_action=result.query_action,
+        )
+        version = self._storage.designs.commit(lease, design)
+        self._models.publish(lease.surrogate, version)
+
+    def _abort(self, lease: FitLease, error: str | None) -> None:
+        with suppress(SurrogymError):
+            self._storage.designs.abort(lease, error)
+
+    def _give_up_hopeless(self) -> None:
+        """Fail the designs whose initial queries were all set aside: nothing to fit, and nothing to wait for."""
+        for record in self._storage.surrogates.list():
+            if record.phase == "collecting" and not record.paused and (error := self._hopeless(record.name)):
+                self._storage.surrogates.set_phase(record.name, "failed", error)
+                self._notices.post(record.name)
+
+    def _hopeless(self, name: str) -> str | None:
+        counts = self._storage.queries.counts(name)
+        if counts.open or not counts.set_aside or self._storage.samples.count(name):
+            return None
+        last = self._storage.queries.list(name, ("set_aside",))[-1]
+        return f"all {counts.set_aside} initial queries were set aside; the last said: {last.error}"
+
+
+def phase_after(result: DesignResult) -> Phase:
+    """The phase that a fit leads to."""
+    if len(result.query_coordinates):
+        return "sampling"
+    return "ready" if result.verdict == "ready" else "over_budget"

@@ -1,0 +1,105 @@
+"""Models: history, export, import, and what one says about given points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_server.engine.fidelity import fidelity_of
+from surrogym_server.engine.models import ModelCache
+from surrogym_server.sampling.uncertainty import UncertaintyResult, query_uncertainty
+from surrogym_server.services.definitions import Definitions, check_points
+from surrogym_server.services.notices import Notices
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import ModelRecord, NewModel
+from surrogym_server.surrogate.codec import from_bytes
+from surrogym_server.surrogate.describe import PointPrediction, predict_points
+from surrogym_server.surrogate.model import SurrogateModel
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Said(Generic[T]):
+    """What a model says, and which."""
+
+    version: int
+    outputs: tuple[str, ...]
+    result: T
+
+
+def load_model(storage: Storage, definitions: Definitions, name: str, version: int) -> SurrogateModel:
+    """A stored model, ready to predict. Raises ``UnknownModel`` or ``UnknownSurrogate``."""
+    return from_bytes(definitions.get(name), storage.models.blob(name, version))
+
+
+class ModelService:
+    def __init__(self, storage: Storage, definitions: Definitions, models: ModelCache, notices: Notices) -> None:
+        self._storage = storage
+        self._definitions = definitions
+        self._models = models
+        self._notices = notices
+
+    def list(self, name: str) -> list[ModelRecord]:
+        """All models, oldest first."""
+        self._storage.surrogates.get(name)
+        return self._storage.models.list(name)
+
+    def get(self, name: str, version: int) -> ModelRecord:
+        """Raises ``UnknownModel``."""
+        return self._storage.models.get(name, version)
+
+    def export(self, name: str, version: int) -> bytes:
+        """The model as a safetensors file. Raises ``UnknownModel``."""
+        return self._storage.models.blob(name, version)
+
+    def add(self, name: str, data: bytes) -> ModelRecord:
+        """Import a safetensors file as the newest model, judged by this surrogate's tolerances.
+
+        Raises:
+            InvalidInput: no model of this surrogate.
+        """
+        record = self._storage.surrogates.get(name)
+        model = from_bytes(self._definitions.get(name), data)
+        new = NewModel(
+            samples=model.samples,
+            data_hash=model.digest,
+            fidelity=fidelity_of(model, record.state.get("tolerances", ()), record.target),
+            description=model.description,
+            fit_seconds=0.0,
+            blob=data,
+        )
+        version = self._storage.models.add(name, new)
+        self._models.publish(name, version)
+        self._notices.post(name)
+        return self._storage.models.get(name, version)
+
+    def predict(self, name: str, q: Array, u: Array, version: int | None) -> Said[PointPrediction]:
+        """One mean step from each of q (n, C) under u (n, F).
+
+        Raises:
+            InvalidInput: wrong shape, or an action out of bounds.
+            NoModel, UnknownModel: as the classes say.
+        """
+        version, model = self._model(name, version)
+        q, u = check_points(model.definition, q, u)
+        return Said(version, model.definition.outputs, predict_points(model, q, u))
+
+    def query_uncertainty(self, name: str, q: Array, u: Array, version: int | None) -> Said[UncertaintyResult]:
+        """Uncertainty at q (n, C) under u (n, F), weighted by the latest occupancy; raises as ``predict``."""
+        version, model = self._model(name, version)
+        q, u = check_points(model.definition, q, u)
+        fidelity = self._storage.models.get(name, version).fidelity
+        tolerances = np.array([output["tolerance"] for output in fidelity["outputs"]])
+        occupancy = self._storage.occupancy.latest(name)
+        states = None if occupancy is None else occupancy.states
+        return Said(version, model.definition.outputs, query_uncertainty(model, q, u, tolerances, states))
+
+    def _model(self, name: str, version: int | None) -> tuple[int, SurrogateModel]:
+        self._storage.surrogates.get(name)
+        version = self._models.latest(name) if version is None else version
+        return version, self._models.get(name, version)

@@ -1,0 +1,64 @@
+"""Wake-ups between the services of one process: something happened to a surrogate."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from itertools import chain
+
+
+class Listener:
+    """One who waits. A notice that comes while it looks elsewhere is remembered."""
+
+    def __init__(self) -> None:
+        self._event = asyncio.Event()
+
+    def wake(self) -> None:
+        self._event.set()
+
+    async def wait(self, seconds: float) -> None:
+        """Until the next notice since the last wait, but no longer than ``seconds``."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(seconds):  # wait_for of Python 3.11 can swallow a cancellation
+                await self._event.wait()
+        self._event.clear()
+
+
+class Notices:
+    """Listeners by surrogate. ``post`` may be called from any thread, the rest from the event loop's."""
+
+    def __init__(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._listeners: defaultdict[str, set[Listener]] = defaultdict(set)
+        self._everything: set[Listener] = set()
+        self.closing = False
+
+    def post(self, surrogate: str) -> None:
+        """Wake all who listen to a surrogate, and those who listen to all."""
+        with suppress(RuntimeError):  # the loop has ended, and nobody listens any more
+            self._loop.call_soon_threadsafe(self._wake, surrogate)
+
+    def close(self) -> None:
+        """Wake everybody for good, because the server ends."""
+        self.closing = True
+        for listener in (*self._everything, *chain.from_iterable(self._listeners.values())):
+            listener.wake()
+
+    @contextmanager
+    def listen(self, surrogate: str | None = None) -> Iterator[Listener]:
+        """A listener to one surrogate, or to all, for the time of the context."""
+        listener = Listener()
+        listeners = self._everything if surrogate is None else self._listeners[surrogate]
+        listeners.add(listener)
+        try:
+            yield listener
+        finally:
+            listeners.discard(listener)
+            if surrogate is not None and not listeners:
+                self._listeners.pop(surrogate, None)
+
+    def _wake(self, surrogate: str) -> None:
+        for listener in (*self._listeners.get(surrogate, ()), *self._everything):
+            listener.wake()

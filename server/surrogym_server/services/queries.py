@@ -1,0 +1,91 @@
+"""The queue of queries as samplers see it: claim with a long poll, renew, fail, ask by hand."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_server.services.definitions import Definitions, check_points, check_settable
+from surrogym_server.services.notices import Notices
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import LeasedQuery, Phase, QueryRecord, QueryStatus
+
+Array = NDArray[np.float64]
+
+POLL_SECONDS = 2.0  # notices cross no process border, so another server's queries are found by looking
+FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "failed")
+
+
+@dataclass(frozen=True)
+class Claim:
+    queries: list[LeasedQuery]
+    phase: Phase
+    paused: bool
+
+
+class QueryService:
+    def __init__(self, storage: Storage, definitions: Definitions, notices: Notices) -> None:
+        self._storage = storage
+        self._definitions = definitions
+        self._notices = notices
+
+    async def claim(self, name: str, sampler: str, limit: int, lease_seconds: float, wait_seconds: float) -> Claim:
+        """Lease up to ``limit`` queries; while there are none, wait for some, or for the design to finish.
+
+        Raises:
+            UnknownSurrogate: no such surrogate, or it was deleted meanwhile.
+        """
+        deadline = time.monotonic() + wait_seconds
+        with self._notices.listen(name) as listener:
+            first = claim = await self._claim(name, sampler, limit, lease_seconds)
+            while not (claim.queries or _finished_since(first, claim) or self._notices.closing):
+                left = deadline - time.monotonic()
+                if left <= 0:
+                    break
+                await listener.wait(min(left, POLL_SECONDS))
+                claim = await self._claim(name, sampler, limit, lease_seconds)
+            return claim
+
+    def renew(self, name: str, query_id: int, token: str, lease_seconds: float) -> None:
+        """The sampler's heartbeat. Raises ``UnknownQuery``, ``ForeignLease`` or ``LeaseExpired``."""
+        self._storage.queries.renew(name, query_id, token, lease_seconds)
+
+    def fail(self, name: str, query_id: int, token: str, error: str) -> QueryRecord:
+        """Give a query back with an error. Raises ``UnknownQuery``, ``ForeignLease`` or ``LeaseExpired``."""
+        record = self._storage.queries.fail(name, query_id, token, error)
+        self._notices.post(name)
+        return record
+
+    def ask(self, name: str, coordinates: Array, action: Array, key: str | None) -> list[QueryRecord]:
+        """Queue queries by hand: coordinates (m, C), action (m, F).
+
+        Raises:
+            InvalidInput: wrong shape, or out of bounds.
+            IdempotencyConflict: the same key with other queries.
+        """
+        definition = self._definitions.get(name)
+        q, u = check_points(definition, check_settable(definition, coordinates), action)
+        ids = self._storage.queries.enqueue(name, q, u, key=key)
+        self._notices.post(name)
+        return [self._storage.queries.get(name, id) for id in ids]
+
+    def list(self, name: str, statuses: Sequence[QueryStatus]) -> list[QueryRecord]:
+        """The queries of these statuses (none: all), oldest first."""
+        return self._storage.queries.list(name, statuses)
+
+    async def _claim(self, name: str, sampler: str, limit: int, lease_seconds: float) -> Claim:
+        def claim() -> Claim:
+            queries = self._storage.queries.claim(name, sampler, limit, lease_seconds)
+            record = self._storage.surrogates.get(name)
+            return Claim(queries, record.phase, record.paused)
+
+        return await asyncio.to_thread(claim)
+
+
+def _finished_since(first: Claim, now: Claim) -> bool:
+    return now.phase != first.phase and now.phase in FINISHED

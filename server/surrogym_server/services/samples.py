@@ -1,0 +1,86 @@
+"""Samples: add, read; and the ledger of real steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from surrogym_server.errors import InvalidInput
+from surrogym_server.services.definitions import Definitions, check_coordinates
+from surrogym_server.services.notices import Notices
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import LedgerRecord, NewSample, SampleRecord
+from surrogym_server.surrogate.actions import model_actions
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+
+PAGE = 10_000
+
+
+@dataclass(frozen=True)
+class Added:
+    ids: tuple[int, ...]
+    duplicates: int
+    ledger: LedgerRecord
+
+
+class SampleService:
+    def __init__(self, storage: Storage, definitions: Definitions, notices: Notices) -> None:
+        self._storage = storage
+        self._definitions = definitions
+        self._notices = notices
+
+    def add(self, name: str, sampler: str, samples: Sequence[NewSample], key: str | None) -> Added:
+        """Store real steps, all or nothing; committed when it returns.
+
+        Raises:
+            InvalidInput: wrong shape, action out of bounds, or samples without a query and without a key.
+            UnknownQuery, ForeignLease, IdempotencyConflict: as the classes say.
+        """
+        definition = self._definitions.get(name)
+        checked = [_checked(definition, index, sample) for index, sample in enumerate(samples)]
+        if key is None and any(sample.query_id is None for sample in checked):
+            raise InvalidInput("samples without a query_id: expected an idempotency_key, got none")
+        added = self._storage.samples.add(name, sampler, checked, key=key)
+        self._notices.post(name)
+        return Added(added.ids, added.duplicates, self._storage.ledger.read(name))
+
+    def page(self, name: str, after: int, limit: int) -> list[SampleRecord]:
+        """Up to ``limit`` samples with an id above ``after``."""
+        self._storage.surrogates.get(name)
+        return self._storage.samples.page(name, after, limit)
+
+    def all(self, name: str) -> list[SampleRecord]:
+        """All samples, in order of arrival."""
+        records = page = self.page(name, 0, PAGE)
+        while len(page) == PAGE:
+            page = self.page(name, page[-1].id, PAGE)
+            records = records + page
+        return records
+
+    def coordinate_names(self, name: str) -> tuple[str, ...]:
+        """What the entries of a sample's coordinates are called."""
+        return self._definitions.get(name).coordinate_names
+
+    def report_steps(self, name: str, steps: int, episodes: int, note: str, key: str) -> LedgerRecord:
+        """Count evaluation steps, once per key."""
+        return self._storage.ledger.report(name, steps, key=key, episodes=episodes, note=note)
+
+
+def _checked(definition: EnvironmentDefinition, index: int, sample: NewSample) -> NewSample:
+    where = f"samples.{index}"
+    if (sample.query_id is None) != (sample.lease_token is None):
+        raise InvalidInput(f"{where}: expected query_id and lease_token together, got one of them")
+    check_coordinates(definition, f"{where}.coordinates", np.array([sample.coordinates]))
+    check_coordinates(definition, f"{where}.next_coordinates", np.array([sample.next_coordinates]))
+    for what in ("observation", "next_observation"):
+        _check_observation(definition, f"{where}.{what}", getattr(sample, what))
+    action = model_actions(definition.action, np.array([sample.action]))
+    return replace(sample, action=tuple(action[0].tolist()))
+
+
+def _check_observation(definition: EnvironmentDefinition, where: str, observation: tuple[float, ...] | None) -> None:
+    expected = len(definition.observation_names)
+    if observation is not None and len(observation) != expected:
+        raise InvalidInput(f"{where}: expected {expected} entries, got {len(observation)}")

@@ -1,0 +1,218 @@
+"""Sessions: open, reset, step, roll out, submit occupancy, close; save at shutdown and restore at start."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_server.engine.models import ModelCache
+from surrogym_server.engine.saved import session_from_bytes, session_to_bytes
+from surrogym_server.engine.session import (
+    Answer,
+    ModelChoice,
+    Outcome,
+    Session,
+    digest_of,
+    open_session,
+    reset_session,
+    step_session,
+)
+from surrogym_server.engine.sessions import LiveSessions
+from surrogym_server.errors import InvalidInput, NotReset, SurrogymError, TooLarge
+from surrogym_server.services.definitions import Definitions
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import SavedSession
+from surrogym_server.surrogate.actions import policy_actions
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.virtual import VirtualSettings
+
+Bools = NDArray[np.bool_]
+Array = NDArray[np.float64]
+
+SESSION_ID_BYTES = 16
+MAX_PARTICLES = 4_000_000  # of all lanes of a session
+MAX_ROLLOUT_STEPS = 1_000_000  # of all lanes in one request
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What a trainer asks for. A time limit or penalty of None is the surrogate's; a seed of None is drawn."""
+
+    settings: VirtualSettings
+    penalty: float | None
+    seed: int | None
+    model: ModelChoice
+    occupancy: bool
+    key: str | None
+
+
+class SessionService:
+    def __init__(
+        self,
+        storage: Storage,
+        definitions: Definitions,
+        models: ModelCache,
+        live: LiveSessions,
+        max_lanes: int,
+    ) -> None:
+        self._storage = storage
+        self._definitions = definitions
+        self._models = models
+        self._live = live
+        self._max_lanes = max_lanes
+        self._opening = asyncio.Lock()
+
+    @property
+    def idle_seconds(self) -> float:
+        return self._live.idle_seconds
+
+    async def open(self, surrogate: str, opening: Opening) -> Session:
+        """Open a session; the same key and body again give the session they opened.
+
+        Raises:
+            UnknownSurrogate, NoModel, UnknownModel, IdempotencyConflict, Overloaded: as the classes say.
+            TooLarge: more lanes or particles than the limit.
+        """
+        self._check_size(opening.settings)
+        digest = digest_of("open", opening)
+        async with self._opening:
+            if opening.key and (known := self._live.opened_by(surrogate, opening.key, digest)):
+                return known
+            return self._live.add(await asyncio.to_thread(self._open, surrogate, opening, digest))
+
+    def get(self, id: str) -> Session:
+        """Raises ``UnknownSession`` or ``SessionExpired``."""
+        return self._live.get(id)
+
+    def close(self, id: str) -> None:
+        """End a session; harmless when it has ended."""
+        self._live.close(id)
+
+    async def reset(self, id: str, seq: int | None, seed: int | Sequence[int] | None, mask: Bools | None) -> Answer:
+        """New episodes in the lanes of the mask (N,).
+
+        Raises:
+            InvalidInput: a mask or a list of seeds of another length than N.
+            SeqConflict, UnknownSession, SessionExpired: as the classes say.
+        """
+
+        def work(session: Session) -> tuple[Session, Outcome]:
+            return reset_session(session, seed, mask, self._latest(session))
+
+        return await self._live.advance(id, seq, digest_of("reset", seed, mask), work)
+
+    async def step(self, id: str, seq: int | None, action: Array, mask: Bools | None, deviations: bool) -> Answer:
+        """One step of the lanes of the mask (N,) with a policy's actions (N, F) or (N,).
+
+        Raises:
+            InvalidInput: wrong shape, not finite, out of bounds.
+            NotReset: a lane to step has not been reset.
+            SeqConflict, UnknownSession, SessionExpired: as the classes say.
+        """
+
+        def work(session: Session) -> tuple[Session, Outcome]:
+            u = policy_actions(session.definition.action, action, session.settings.num_envs)
+            stepped, result = self._step(session, u, mask, deviations)
+            return stepped, (result,)
+
+        return await self._live.advance(id, seq, digest_of("step", action, mask, deviations), work)
+
+    async def rollout(self, id: str, seq: int | None, actions: Array) -> Answer:
+        """T steps with a policy's actions (T, N, F) or (T, N), all or none. Raises as ``step``."""
+
+        def work(session: Session) -> tuple[Session, Outcome]:
+            lanes, results = session.settings.num_envs, []
+            if len(actions) * lanes > MAX_ROLLOUT_STEPS:
+                raise TooLarge(f"expected at most {MAX_ROLLOUT_STEPS} steps in all, got {len(actions)} x {lanes}")
+            planned = [policy_actions(session.definition.action, row, lanes) for row in actions]
+            for u in planned:
+                session, result = self._step(session, u, None, False)
+                results.append(result)
+            return session, tuple(results)
+
+        return await self._live.advance(id, seq, digest_of("rollout", actions), work, steps=len(actions))
+
+    async def submit_occupancy(self, id: str, checkpoint: str) -> int:
+        """Store the states that a session visited under a name; returns how many.
+
+        Raises:
+            InvalidInput: the session was opened without occupancy.
+            NotReset: nothing was visited yet.
+        """
+        session = self._live.get(id)
+        if session.visited is None:
+            raise InvalidInput("expected a session opened with occupancy=true, got one without")
+        states = session.visited.states
+        if not len(states):
+            raise NotReset("this session has visited no state yet: reset and step it first")
+        await asyncio.to_thread(self._storage.occupancy.put, session.surrogate, checkpoint, states)
+        return len(states)
+
+    def save(self) -> int:
+        """Hand all live sessions to storage; returns how many."""
+        saved = [SavedSession(s.id, s.surrogate, session_to_bytes(s)) for s in self._live]
+        self._storage.sessions.save(saved)
+        return len(saved)
+
+    def restore(self) -> int:
+        """Take the saved sessions back; returns how many. One whose surrogate is gone is dropped."""
+        restored = 0
+        for saved in self._storage.sessions.take():
+            try:
+                definition = self._definitions.get(saved.surrogate)
+                self._live.add(session_from_bytes(definition, saved.data))
+            except SurrogymError:
+                continue
+            restored += 1
+        return restored
+
+    def _check_size(self, settings: VirtualSettings) -> None:
+        if settings.num_envs > self._max_lanes:
+            raise TooLarge(f"expected at most {self._max_lanes} lanes, got {settings.num_envs}")
+        particles = settings.num_envs * settings.particles
+        if settings.variant == "probabilistic" and particles > MAX_PARTICLES:
+            raise TooLarge(f"expected at most {MAX_PARTICLES} particles in all lanes, got {particles}")
+
+    def _open(self, surrogate: str, opening: Opening, digest: str) -> Session:
+        definition = self._definitions.get(surrogate)
+        latest = self._models.latest(surrogate)
+        version = latest if opening.model == "latest" else opening.model
+        self._models.get(surrogate, version)
+        return open_session(
+            secrets.token_urlsafe(SESSION_ID_BYTES),
+            surrogate,
+            definition,
+            resolved(opening, definition),
+            seed=secrets.randbits(63) if opening.seed is None else opening.seed,
+            model=opening.model,
+            version=version,
+            occupancy=opening.occupancy,
+            opened_by=None if opening.key is None else (opening.key, digest),
+        )
+
+    def _step(self, session: Session, u: Array, mask: Bools | None, deviations: bool) -> tuple[Session, Any]:
+        return step_session(
+            session,
+            u,
+            mask,
+            deviations,
+            lambda version: self._models.get(session.surrogate, version),
+            self._latest(session),
+        )
+
+    def _latest(self, session: Session) -> int:
+        return self._models.latest(session.surrogate) if session.model == "latest" else session.model
+
+
+def resolved(opening: Opening, definition: EnvironmentDefinition) -> VirtualSettings:
+    return replace(
+        opening.settings,
+        time_limit=opening.settings.time_limit or definition.time_limit,
+        penalty=definition.penalty if opening.penalty is None else opening.penalty,
+    )

@@ -1,0 +1,118 @@
+"""Surrogates: create, look at, change, delete."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_server.engine.models import ModelCache
+from surrogym_server.engine.sessions import LiveSessions
+from surrogym_server.errors import NoModel
+from surrogym_server.services.definitions import Define
+from surrogym_server.services.notices import Notices
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import (
+    LedgerRecord,
+    ModelRecord,
+    NewSurrogate,
+    QueryCounts,
+    SurrogateRecord,
+)
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+
+Array = NDArray[np.float64]
+Plan = Callable[[EnvironmentDefinition, int], tuple[dict[str, Any], Array, Array]]
+
+
+@dataclass(frozen=True)
+class SurrogateStatus:
+    """A surrogate and all that is counted of it."""
+
+    record: SurrogateRecord
+    outputs: tuple[str, ...]
+    model: ModelRecord | None  # the latest
+    ledger: LedgerRecord
+    queries: QueryCounts
+    samples: int
+
+
+class SurrogateService:
+    def __init__(
+        self,
+        storage: Storage,
+        define: Define,
+        plan: Plan,
+        models: ModelCache,
+        live: LiveSessions,
+        notices: Notices,
+    ) -> None:
+        """``plan`` gives the first queries under a budget: (state, coordinates (m, C), action (m, F))."""
+        self._storage = storage
+        self._define = define
+        self._plan = plan
+        self._models = models
+        self._live = live
+        self._notices = notices
+
+    def create(self, name: str, spec: dict[str, Any], budget: int, target: float) -> SurrogateStatus:
+        """Create a surrogate with its initial queries; the same name and spec again changes nothing.
+
+        Raises:
+            SpecConflict: the name exists with another spec.
+            InvalidSpec: a spec that the preset can't represent.
+        """
+        state, coordinates, action = self._plan(self._define(spec), budget)
+        self._storage.surrogates.create(
+            NewSurrogate(
+                name=name,
+                spec=spec,
+                budget=budget,
+                target=target,
+                state=state,
+                query_coordinates=coordinates,
+                query_action=action,
+            )
+        )
+        self._notices.post(name)
+        return self.status(name)
+
+    def status(self, name: str) -> SurrogateStatus:
+        """Raises ``UnknownSurrogate``."""
+        return self._status(self._storage.surrogates.get(name))
+
+    def list(self) -> list[SurrogateStatus]:
+        """All of them, oldest first."""
+        return [self._status(record) for record in self._storage.surrogates.list()]
+
+    def change(self, name: str, paused: bool | None, budget: int | None, target: float | None) -> SurrogateStatus:
+        """Change what is not None; raises ``UnknownSurrogate``."""
+        self._storage.surrogates.change(name, paused=paused, budget=budget, target=target)
+        self._notices.post(name)
+        return self.status(name)
+
+    async def delete(self, name: str) -> None:
+        """Remove a surrogate with its samples, models and sessions; raises ``UnknownSurrogate``."""
+        await asyncio.to_thread(self._storage.surrogates.delete, name)
+        self._live.close_all_of(name)
+        self._models.forget(name)
+        self._notices.post(name)
+
+    def _status(self, record: SurrogateRecord) -> SurrogateStatus:
+        name = record.name
+        try:
+            model = self._storage.models.get(name)
+        except NoModel:
+            model = None
+        return SurrogateStatus(
+            record=record,
+            outputs=self._define(record.spec).outputs,
+            model=model,
+            ledger=self._storage.ledger.read(name),
+            queries=self._storage.queries.counts(name),
+            samples=self._storage.samples.count(name),
+        )

@@ -1,0 +1,34 @@
+"""The sweeper: ends the leases and the sessions whose time has come."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+
+from surrogym_server.engine.sessions import LiveSessions
+from surrogym_server.errors import SurrogymError
+from surrogym_server.storage.port import Storage
+
+logger = logging.getLogger(__name__)
+
+
+class Sweeper:
+    def __init__(self, storage: Storage, live: LiveSessions, seconds: float) -> None:
+        self._storage = storage
+        self._live = live
+        self._seconds = seconds
+
+    async def run(self) -> None:
+        """Sweep every so many seconds, for ever; ends by cancellation."""
+        while True:
+            await self.sweep()
+            await asyncio.sleep(self._seconds)
+
+    async def sweep(self) -> None:
+        """Sweep once. A lease that ends here leaves its query to the next sampler, or sets it aside."""
+        for id in self._live.sweep():
+            logger.info("session %s was idle and has expired", id)
+        try:
+            await asyncio.to_thread(self._storage.queries.sweep_expired)
+        except SurrogymError as error:
+            logger.warning("leases were not swept: %s", error)
