@@ -1,0 +1,55 @@
+"""Route of events: what happens to a surrogate, as server-sent events."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+from fastapi import APIRouter, Header, Query
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import StreamingResponse
+
+from surrogym_server import convert
+from surrogym_server.api.auth import READ
+from surrogym_server.api.problems import documented
+from surrogym_server.api.state import Use
+from surrogym_server.storage.records import EventRecord
+from surrogym_shared.codes import Code
+
+router = APIRouter(prefix="/v1/surrogates/{name}", tags=["events"])
+
+STREAM = "text/event-stream"
+
+
+@router.get(
+    "/events",
+    summary="Follow what happens",
+    response_class=StreamingResponse,
+    dependencies=[READ],
+    responses={
+        200: {"content": {STREAM: {"example": 'id: 1\nevent: created\ndata: {"id": 1, "kind": "created"}\n\n'}}},
+        **documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
+    },
+)
+async def events(
+    name: str,
+    use: Use,
+    after: Annotated[int | None, Query(ge=0)] = None,
+    last_event_id: Annotated[int | None, Header(ge=0)] = None,
+) -> StreamingResponse:
+    """Queries, samples, fits and phases as they come. ``Last-Event-ID`` or ``after`` goes on behind a known
+    event; without either the stream begins with what happens from now on."""
+    newest = await run_in_threadpool(use.events.newest, name)
+    start = next((id for id in (last_event_id, after) if id is not None), newest)
+    headers = {"cache-control": "no-store", "x-accel-buffering": "no"}
+    return StreamingResponse(_lines(use.events.follow(name, start)), media_type=STREAM, headers=headers)
+
+
+async def _lines(records: AsyncIterator[EventRecord | None]) -> AsyncIterator[str]:
+    yield ": connected\n\n"
+    async for record in records:
+        if record is None:
+            yield ": still here\n\n"
+        else:
+            body = convert.event(record).model_dump_json()
+            yield f"id: {record.id}\nevent: {record.kind}\ndata: {body}\n\n"

@@ -1,0 +1,88 @@
+"""Routes of models: history, export, import, and what the latest says about points."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import Response
+
+from surrogym_server import convert
+from surrogym_server.api import examples
+from surrogym_server.api.auth import ADMIN, READ
+from surrogym_server.api.body import example
+from surrogym_server.api.problems import documented
+from surrogym_server.api.state import Use
+from surrogym_shared.codes import Code
+from surrogym_shared.wire import ModelList, ModelView, Points, Prediction, Uncertainty
+
+router = APIRouter(prefix="/v1/surrogates/{name}", tags=["models"])
+
+SAFETENSORS = "application/octet-stream"
+FILE: dict[str, Any] = {SAFETENSORS: {"schema": {"type": "string", "format": "binary"}}}
+POINT_ERRORS = documented(
+    Code.UNKNOWN_SURROGATE, Code.UNKNOWN_MODEL, Code.NO_MODEL, Code.INVALID_REQUEST, Code.TOO_LARGE
+)
+
+
+@router.get(
+    "/models",
+    summary="History of models",
+    dependencies=[READ],
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
+)
+def list_all(name: str, use: Use) -> ModelList:
+    """Every fit with its fidelity, oldest first."""
+    return ModelList(models=[convert.model_view(record) for record in use.models.list(name)])
+
+
+@router.get(
+    "/models/{version}",
+    summary="One model",
+    response_model=ModelView,
+    dependencies=[READ],
+    responses={
+        200: {"content": {SAFETENSORS: {}}},
+        **documented(Code.UNKNOWN_SURROGATE, Code.UNKNOWN_MODEL, Code.NO_MODEL, Code.INVALID_REQUEST),
+    },
+)
+def get(name: str, version: int, use: Use, format: Literal["json", "safetensors"] = "json") -> ModelView | Response:
+    """Its structure and fidelity, or with ``format=safetensors`` the model itself, complete."""
+    if format == "json":
+        return convert.model_view(use.models.get(name, version))
+    return Response(use.models.export(name, version), media_type=SAFETENSORS)
+
+
+@router.post(
+    "/models",
+    status_code=201,
+    summary="Import a model",
+    dependencies=[ADMIN],
+    openapi_extra={"requestBody": {"required": True, "content": FILE}},
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST, Code.TOO_LARGE),
+)
+async def add(name: str, request: Request, use: Use) -> ModelView:
+    """The body is a file that the export gave, of the same outputs. It becomes the newest version."""
+    data = await request.body()
+    return convert.model_view(await run_in_threadpool(use.models.add, name, data))
+
+
+@router.post(
+    "/query_uncertainty",
+    summary="Uncertainty of given points",
+    dependencies=[READ],
+    responses=POINT_ERRORS,
+)
+def query_uncertainty(name: str, body: Annotated[Points, example(examples.POINTS)], use: Use) -> Uncertainty:
+    """Per point and output: mean, deviation, model uncertainty (eq. 10), input probability (eq. 11) and the
+    uncertainty index (eq. 12) of Active Uncertainty Reduction."""
+    q, u = convert.numbers("coordinates", body.coordinates), convert.numbers("action", body.action)
+    return convert.uncertainty(use.models.query_uncertainty(name, q, u, body.model))
+
+
+@router.post("/predict", summary="The stateless transition", dependencies=[READ], responses=POINT_ERRORS)
+def predict(name: str, body: Annotated[Points, example(examples.POINTS)], use: Use) -> Prediction:
+    """One mean step from each point; no session is needed."""
+    q, u = convert.numbers("coordinates", body.coordinates), convert.numbers("action", body.action)
+    return convert.prediction(use.models.predict(name, q, u, body.model))

@@ -1,0 +1,166 @@
+"""The one error table: every exception of the server becomes a problem body (RFC 9457)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import Response
+from starlette.exceptions import HTTPException
+
+from surrogym_server import errors
+from surrogym_shared.codes import PROBLEM_MEDIA_TYPE, STATUS, Code, Problem
+
+CODES: dict[type[errors.SurrogymError], Code] = {
+    errors.InvalidInput: Code.INVALID_REQUEST,
+    errors.InvalidSpec: Code.INVALID_SPEC,
+    errors.TooLarge: Code.TOO_LARGE,
+    errors.UnknownSurrogate: Code.UNKNOWN_SURROGATE,
+    errors.UnknownQuery: Code.UNKNOWN_QUERY,
+    errors.UnknownModel: Code.UNKNOWN_MODEL,
+    errors.UnknownSession: Code.UNKNOWN_SESSION,
+    errors.SessionExpired: Code.SESSION_EXPIRED,
+    errors.SpecConflict: Code.SPEC_CONFLICT,
+    errors.IdempotencyConflict: Code.IDEMPOTENCY_CONFLICT,
+    errors.SeqConflict: Code.SEQ_CONFLICT,
+    errors.ForeignLease: Code.FOREIGN_LEASE,
+    errors.LeaseExpired: Code.LEASE_EXPIRED,
+    errors.NotReset: Code.NOT_RESET,
+    errors.NoModel: Code.NO_MODEL,
+    errors.Unauthenticated: Code.UNAUTHENTICATED,
+    errors.Forbidden: Code.FORBIDDEN,
+    errors.Overloaded: Code.TOO_MANY_REQUESTS,
+    errors.Unavailable: Code.UNAVAILABLE,
+    errors.NumericalFailure: Code.INTERNAL,
+}
+
+HTTP_CODES = {
+    401: Code.UNAUTHENTICATED,
+    403: Code.FORBIDDEN,
+    404: Code.NOT_FOUND,
+    405: Code.METHOD_NOT_ALLOWED,
+    413: Code.TOO_LARGE,
+    415: Code.UNSUPPORTED_MEDIA_TYPE,
+    429: Code.TOO_MANY_REQUESTS,
+    503: Code.UNAVAILABLE,
+}
+
+RETRY_AFTER_SECONDS = "1"
+SHOWN_CHARACTERS = 120
+
+
+def install(app: FastAPI) -> None:
+    """Make every error reply of the app a problem body."""
+    app.add_exception_handler(errors.SurrogymError, _surrogym_error)
+    app.add_exception_handler(RequestValidationError, _request_invalid)
+    app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(Exception, _unexpected)
+
+
+def code_of(error: errors.SurrogymError) -> Code:
+    """The code of an error: that of its class, or of the nearest class above it in the table."""
+    return next(CODES[cls] for cls in type(error).__mro__ if cls in CODES)
+
+
+def problem_response(
+    code: Code,
+    detail: str,
+    *,
+    status: int | None = None,
+    headers: Mapping[str, str] | None = None,
+    **members: Any,
+) -> Response:
+    """A problem body as a reply."""
+    status = STATUS[code] if status is None else status
+    title = code.value.replace("_", " ")
+    problem = Problem(title=title, status=status, code=code, detail=detail, **members)
+    return Response(
+        problem.model_dump_json(exclude_none=True),
+        status_code=status,
+        headers=dict(headers or {}),
+        media_type=PROBLEM_MEDIA_TYPE,
+    )
+
+
+def documented(*codes: Code) -> dict[int | str, dict[str, Any]]:
+    """The error replies of a route, for OpenAPI."""
+    by_status: dict[int, list[str]] = {}
+    for code in codes:
+        by_status.setdefault(STATUS[code], []).append(code.value)
+    return {
+        status: {
+            "description": f"Problem with code {' or '.join(names)}.",
+            "content": {PROBLEM_MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+        }
+        for status, names in by_status.items()
+    }
+
+
+def validation_detail(found: Sequence[Any]) -> str:
+    """The first error of a validation, as one sentence: where, what was expected, and what came."""
+    first = found[0]
+    where = ".".join(str(part) for part in first["loc"] if part != "body") or "the body"
+    expected = first["msg"].removeprefix("Value error, ")
+    more = f" ({len(found) - 1} more)" if len(found) > 1 else ""
+    return f"{where}: {expected}, got {shown(first.get('input'))}{more}"
+
+
+def shown(value: Any) -> str:
+    """What came, short enough for a message."""
+    text = "nothing" if value is None else repr(value)
+    return text if len(text) <= SHOWN_CHARACTERS else f"{text[:SHOWN_CHARACTERS]}..."
+
+
+def _located(found: Sequence[Any]) -> list[dict[str, str]]:
+    return [
+        {
+            "field": ".".join(str(part) for part in error["loc"] if part != "body"),
+            "expected": error["msg"].removeprefix("Value error, "),
+            "got": shown(error.get("input")),
+        }
+        for error in found[:16]
+    ]
+
+
+def _invalid(found: Sequence[Any]) -> Response:
+    about_spec = "spec" in found[0]["loc"]
+    code = Code.INVALID_SPEC if about_spec else Code.INVALID_REQUEST
+    return problem_response(code, validation_detail(found), errors=_located(found))
+
+
+async def _surrogym_error(_: Request, error: Exception) -> Response:
+    assert isinstance(error, errors.SurrogymError)
+    code = code_of(error)
+    members = {"expected_seq": error.expected} if isinstance(error, errors.SeqConflict) else {}
+    return problem_response(code, str(error), headers=_headers(code), **members)
+
+
+def _headers(code: Code) -> dict[str, str]:
+    if code is Code.UNAUTHENTICATED:
+        return {"www-authenticate": "Bearer"}
+    if code in (Code.TOO_MANY_REQUESTS, Code.UNAVAILABLE):
+        return {"retry-after": RETRY_AFTER_SECONDS}
+    return {}
+
+
+async def _request_invalid(_: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    return _invalid(error.errors())
+
+
+async def _http_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    code = HTTP_CODES.get(error.status_code, Code.INVALID_REQUEST)
+    detail = {
+        Code.NOT_FOUND: f"no route {request.url.path!r}: see /docs",
+        Code.METHOD_NOT_ALLOWED: f"{request.method} is not allowed on {request.url.path!r}",
+    }.get(code, str(error.detail))
+    return problem_response(code, detail, status=error.status_code, headers=error.headers)
+
+
+async def _unexpected(_: Request, error: Exception) -> Response:
+    """Starlette logs the error itself."""
+    assert not isinstance(error, errors.SurrogymError)
+    return problem_response(Code.INTERNAL, "the server failed on this request; its log says more")

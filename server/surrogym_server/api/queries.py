@@ -1,0 +1,93 @@
+"""Routes of queries, as samplers use them: claim, renew, fail; and by hand."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query
+from fastapi.responses import Response
+
+from surrogym_server import convert
+from surrogym_server.api import examples
+from surrogym_server.api.auth import READ, SAMPLE
+from surrogym_server.api.body import example
+from surrogym_server.api.problems import documented
+from surrogym_server.api.state import Use
+from surrogym_shared.codes import Code
+from surrogym_shared.wire import (
+    AskQueries,
+    ClaimedQueries,
+    ClaimQueries,
+    FailQuery,
+    QueryList,
+    QueryStatus,
+    QueryView,
+    RenewLease,
+)
+
+router = APIRouter(prefix="/v1/surrogates/{name}", tags=["queries"])
+
+LEASE_ERRORS = documented(
+    Code.UNKNOWN_SURROGATE,
+    Code.UNKNOWN_QUERY,
+    Code.FOREIGN_LEASE,
+    Code.LEASE_EXPIRED,
+    Code.INVALID_REQUEST,
+)
+
+
+@router.post(
+    "/queries:claim",
+    summary="Lease queries to answer",
+    dependencies=[SAMPLE],
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
+)
+async def claim(name: str, body: Annotated[ClaimQueries, example(examples.CLAIM)], use: Use) -> ClaimedQueries:
+    """Up to ``max_queries`` at once, each to one sampler only. While there are none the reply waits, at most
+    ``wait_seconds``, or until the design is finished."""
+    claimed = await use.queries.claim(name, body.sampler, body.max_queries, body.lease_seconds, body.wait_seconds)
+    return convert.claimed(claimed, body.lease_seconds)
+
+
+@router.post(
+    "/queries/{query_id}:renew",
+    status_code=204,
+    summary="Keep a lease",
+    dependencies=[SAMPLE],
+    responses=LEASE_ERRORS,
+)
+def renew(name: str, query_id: int, body: Annotated[RenewLease, example(examples.RENEW)], use: Use) -> Response:
+    """The heartbeat of a sampler whose real step takes long: the lease ends ``lease_seconds`` from now."""
+    use.queries.renew(name, query_id, body.lease_token, body.lease_seconds)
+    return Response(status_code=204)
+
+
+@router.post("/queries/{query_id}:fail", summary="Give a query back", dependencies=[SAMPLE], responses=LEASE_ERRORS)
+def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.FAIL)], use: Use) -> QueryView:
+    """It goes to the next sampler; one that keeps failing is set aside, and the design goes on without it."""
+    return convert.query_view(use.queries.fail(name, query_id, body.lease_token, body.error))
+
+
+@router.post(
+    "/queries",
+    status_code=201,
+    summary="Ask for queries by hand",
+    dependencies=[SAMPLE],
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.INVALID_REQUEST),
+)
+def ask(name: str, body: Annotated[AskQueries, example(examples.ASK)], use: Use) -> QueryList:
+    """Queued behind those of the design, whose model learns from the answers too."""
+    q = convert.numbers("coordinates", body.coordinates)
+    u = convert.numbers("action", body.action)
+    return convert.query_list(use.queries.ask(name, q, u, body.idempotency_key))
+
+
+@router.get(
+    "/queries",
+    summary="The queue of queries",
+    dependencies=[READ],
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
+)
+def list_all(name: str, use: Use, status: Annotated[list[QueryStatus], Query()] = []) -> QueryList:  # noqa: B006
+    """Oldest first; ``status`` may be given several times."""
+    return convert.query_list(use.queries.list(name, status))

@@ -1,0 +1,81 @@
+"""Routes of samples and the ledger of real steps."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Query
+from fastapi.responses import Response
+
+from surrogym_server import convert
+from surrogym_server.api import examples
+from surrogym_server.api.auth import READ, SAMPLE, TRAIN_OR_SAMPLE
+from surrogym_server.api.body import example
+from surrogym_server.api.problems import documented
+from surrogym_server.api.state import Use
+from surrogym_server.api.tables import CSV, NPZ, as_csv, as_npz
+from surrogym_shared.codes import Code
+from surrogym_shared.wire import AddedSamples, AddSamples, Ledger, ReportSteps, SamplePage
+
+router = APIRouter(prefix="/v1/surrogates/{name}", tags=["samples"])
+
+MAX_PAGE = 10_000
+
+
+@router.post(
+    "/add_sample",
+    summary="Hand in real steps",
+    dependencies=[SAMPLE],
+    responses=documented(
+        Code.UNKNOWN_SURROGATE,
+        Code.UNKNOWN_QUERY,
+        Code.FOREIGN_LEASE,
+        Code.IDEMPOTENCY_CONFLICT,
+        Code.INVALID_REQUEST,
+    ),
+)
+def add_sample(name: str, body: Annotated[AddSamples, example(examples.ADD_SAMPLE)], use: Use) -> AddedSamples:
+    """One or many, all or none, with or without a query; stored for good when the reply comes. A repeat is
+    harmless: a sample of a query is known by its lease token, others by the idempotency key."""
+    samples = [convert.new_sample(sample) for sample in body.samples]
+    return convert.added_samples(use.samples.add(name, body.sampler, samples, body.idempotency_key))
+
+
+@router.get(
+    "/samples",
+    summary="The real steps",
+    response_model=SamplePage,
+    dependencies=[READ],
+    responses={
+        200: {"content": {CSV: {}, NPZ: {}}},
+        **documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
+    },
+)
+def samples(
+    name: str,
+    use: Use,
+    after: Annotated[int, Query(ge=0)] = 0,
+    limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = 1_000,
+    format: Literal["json", "csv", "npz"] = "json",
+) -> SamplePage | Response:
+    """JSON comes in pages: give ``next_after`` as ``after`` for the next. CSV and NPZ come whole."""
+    if format == "json":
+        return convert.sample_page(use.samples.page(name, after, limit), limit)
+    write, media_type = (as_csv, CSV) if format == "csv" else (as_npz, NPZ)
+    content = write(use.samples.coordinate_names(name), use.samples.all(name))
+    return Response(content, media_type=media_type, headers=_attachment(f"{name}.{format}"))
+
+
+@router.post(
+    "/ledger",
+    summary="Report real steps of an evaluation",
+    dependencies=[TRAIN_OR_SAMPLE],
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.INVALID_REQUEST),
+)
+def report(name: str, body: Annotated[ReportSteps, example(examples.LEDGER)], use: Use) -> Ledger:
+    """Counted on a line of their own, beside what the design cost, once per idempotency key."""
+    return convert.ledger(use.samples.report_steps(name, body.steps, body.episodes, body.note, body.idempotency_key))
+
+
+def _attachment(name: str) -> dict[str, str]:
+    return {"content-disposition": f'attachment; filename="{name}"'}

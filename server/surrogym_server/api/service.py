@@ -1,0 +1,55 @@
+"""Routes of the service itself: health, readiness, and its documentation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter, FastAPI, Request
+from fastapi.openapi.docs import get_swagger_ui_html
+from fastapi.openapi.utils import get_openapi
+from fastapi.responses import HTMLResponse, JSONResponse
+
+from surrogym_server.api.auth import READ
+from surrogym_server.api.problems import documented
+from surrogym_server.api.state import Use
+from surrogym_shared.codes import Code, Problem
+from surrogym_shared.wire import Health, Ready
+
+router = APIRouter(tags=["service"])
+
+SCHEMAS = "#/components/schemas/{model}"
+
+
+@router.get("/healthz", summary="That the process lives")
+async def healthz(request: Request) -> Health:
+    """Needs no token and no database."""
+    return Health(version=request.app.version)
+
+
+@router.get("/readyz", summary="That it can work", responses=documented(Code.UNAVAILABLE))
+def readyz(use: Use) -> Ready:
+    """Whether the database answers. Needs no token."""
+    use.storage.ping()
+    return Ready(status="ready", storage="ok")
+
+
+@router.get("/openapi.json", include_in_schema=False, dependencies=[READ])
+async def openapi(request: Request) -> JSONResponse:
+    return JSONResponse(describe(request.app))
+
+
+@router.get("/docs", include_in_schema=False, dependencies=[READ])
+async def docs(request: Request) -> HTMLResponse:
+    return get_swagger_ui_html(openapi_url="/openapi.json", title=request.app.title)
+
+
+def describe(app: FastAPI) -> dict[str, Any]:
+    """OpenAPI of the app, the problem body included."""
+    if app.openapi_schema is None:
+        schema = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+        problem = Problem.model_json_schema(ref_template=SCHEMAS)
+        parts = schema["components"]["schemas"]
+        parts.update(problem.pop("$defs", {}))
+        parts["Problem"] = problem
+        app.openapi_schema = schema
+    return app.openapi_schema

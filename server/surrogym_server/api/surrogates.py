@@ -1,0 +1,90 @@
+"""Routes of surrogates: create, list, look at, change, delete, improve."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter
+from fastapi.responses import Response
+
+from surrogym_server import convert
+from surrogym_server.api import examples
+from surrogym_server.api.auth import ADMIN, READ, TRAIN
+from surrogym_server.api.body import example
+from surrogym_server.api.problems import documented
+from surrogym_server.api.state import Use
+from surrogym_shared.codes import Code
+from surrogym_shared.wire import CreateSurrogate, Improve, PatchSurrogate, SurrogateList, SurrogateView
+
+router = APIRouter(prefix="/v1/surrogates", tags=["surrogates"])
+
+
+@router.post(
+    "",
+    status_code=201,
+    summary="Register an original environment",
+    dependencies=[ADMIN],
+    responses=documented(Code.INVALID_REQUEST, Code.INVALID_SPEC, Code.SPEC_CONFLICT),
+)
+def create(body: Annotated[CreateSurrogate, example(examples.CREATE)], use: Use) -> SurrogateView:
+    """Create a surrogate from a specification and queue its initial queries. The same name and specification
+    again change nothing; another specification under the name is refused."""
+    spec = body.spec
+    budget = convert.default_budget(spec)
+    status = use.surrogates.create(body.name, spec.model_dump(mode="json"), budget, spec.design.target)
+    return convert.surrogate_view(status)
+
+
+@router.get("", summary="All surrogates", dependencies=[READ])
+def list_all(use: Use) -> SurrogateList:
+    """Each with its phase, number of samples and confidence, oldest first."""
+    return SurrogateList(surrogates=[convert.surrogate_summary(status) for status in use.surrogates.list()])
+
+
+@router.get(
+    "/{name}",
+    summary="One surrogate",
+    dependencies=[READ],
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
+)
+def get(name: str, use: Use) -> SurrogateView:
+    """Phase, fidelity of every output, ledger of real steps, and counts of queries."""
+    return convert.surrogate_view(use.surrogates.status(name))
+
+
+@router.patch(
+    "/{name}",
+    summary="Pause, resume, change budget or target",
+    dependencies=[ADMIN],
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
+)
+def patch(name: str, body: Annotated[PatchSurrogate, example(examples.PATCH)], use: Use) -> SurrogateView:
+    """What is left out stays. A raised budget or target sets a finished design going again, and resuming a
+    failed one tries it again."""
+    return convert.surrogate_view(use.surrogates.change(name, body.paused, body.budget, body.target))
+
+
+@router.delete(
+    "/{name}",
+    status_code=204,
+    summary="Delete a surrogate",
+    dependencies=[ADMIN],
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
+)
+async def delete(name: str, use: Use) -> Response:
+    """With its samples, models and sessions. There is no way back."""
+    await use.surrogates.delete(name)
+    return Response(status_code=204)
+
+
+@router.post(
+    "/{name}/improve",
+    summary="Ask the design for more queries",
+    dependencies=[TRAIN],
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.INVALID_REQUEST),
+)
+def improve(name: str, body: Annotated[Improve, example(examples.IMPROVE)], use: Use) -> SurrogateView:
+    """Chosen by the acquisition, weighted by the states that policies visited and submitted. The budget is
+    raised to hold them."""
+    use.designer.improve(name, body.queries, body.checkpoint, body.idempotency_key)
+    return convert.surrogate_view(use.surrogates.status(name))

@@ -1,0 +1,44 @@
+"""Samples as a CSV table and as NPZ arrays."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from surrogym_server.storage.records import SampleRecord
+
+CSV = "text/csv"
+NPZ = "application/x-npz"
+
+PLAIN = ("id", "purpose", "query_id", "sampler", "attempt", "late", "reward", "terminated", "truncated")
+ARRAYS = ("id", "purpose", "coordinates", "action", "next_coordinates", "reward", "terminated", "truncated")
+
+
+def as_csv(coordinate_names: Sequence[str], records: Sequence[SampleRecord]) -> bytes:
+    """One line a sample; coordinates are ``q.<name>``, next ones ``next.<name>``, actions ``u.0`` on."""
+    text = io.StringIO()
+    writer = csv.writer(text)
+    actions = [f"u.{i}" for i in range(len(records[0].action))] if records else []
+    q, q_next = [f"q.{name}" for name in coordinate_names], [f"next.{name}" for name in coordinate_names]
+    writer.writerow([*PLAIN, *q, *actions, *q_next])
+    for record in records:
+        plain = [_cell(getattr(record, name)) for name in PLAIN]
+        writer.writerow([*plain, *record.coordinates, *record.action, *record.next_coordinates])
+    return text.getvalue().encode()
+
+
+def as_npz(coordinate_names: Sequence[str], records: Sequence[SampleRecord]) -> bytes:
+    """Arrays of n samples: coordinates (n, C), action (n, F), next_coordinates (n, C), the others (n,)."""
+    arrays: dict[str, Any] = {name: np.array([getattr(record, name) for record in records]) for name in ARRAYS}
+    buffer = io.BytesIO()
+    np.savez(buffer, coordinate_names=np.array(coordinate_names), **arrays)
+    return buffer.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    """Text that a spreadsheet can't take for a formula: a sampler's name is a stranger's."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in "=+-@\t\r" else value
