@@ -1,0 +1,23 @@
+"""``python -m surrogym_server serve``: the server's commands without the client's."""
+
+from __future__ import annotations
+
+import typer
+
+from surrogym_server.cli.serve import register
+
+
+def main() -> None:
+    """Run the commands of the server."""
+    app = typer.Typer(name="surrogym-server", no_args_is_help=True, add_completion=False)
+    app.callback()(_keep_names)
+    register(app)
+    app()
+
+
+def _keep_names() -> None:
+    """The Surrogym server."""
+
+
+if __name__ == "__main__":
+    main()

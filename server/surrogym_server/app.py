@@ -1,0 +1,184 @@
+"""The app: the only place that builds things."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any, TypedDict
+from uuid import uuid4
+
+import torch
+from fastapi import FastAPI
+from fastapi.responses import Response
+
+from surrogym_server import dashboard
+from surrogym_server.api import events, models, problems, queries, samples, service, sessions, surrogates
+from surrogym_server.api.auth import Gate
+from surrogym_server.api.guards import BodyLimit, KnownHosts
+from surrogym_server.api.state import Services
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
+from surrogym_server.engine.fits import Fits
+from surrogym_server.engine.models import ModelCache
+from surrogym_server.engine.sessions import LiveSessions
+from surrogym_server.services.definitions import Definitions
+from surrogym_server.services.designer import Designer
+from surrogym_server.services.events import EventService
+from surrogym_server.services.models import ModelService, load_model
+from surrogym_server.services.notices import Notices
+from surrogym_server.services.queries import QueryService
+from surrogym_server.services.samples import SampleService
+from surrogym_server.services.sessions import SessionService
+from surrogym_server.services.surrogates import Plan, SurrogateService
+from surrogym_server.services.sweeper import Sweeper
+from surrogym_server.settings import LOCAL_NAMES, Settings
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.sql import open_storage
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_shared.spec import EnvironmentSpec
+
+logger = logging.getLogger(__name__)
+
+DESCRIPTION = """Learns a virtual environment from a handful of real steps and serves it to any trainer.
+
+A sampler claims queries and adds samples; a trainer opens a session and steps it; the server chooses the queries.
+"""
+STEP_THREADS = 4
+
+
+@dataclass(frozen=True)
+class DesignPort:
+    """What does the design's work; tests put a cheaper one in its place."""
+
+    plan: Plan = initial_queries
+    run: Callable[[DesignJob], DesignResult] = run_design_job
+
+
+class State(TypedDict):
+    """What every request carries."""
+
+    services: Services
+
+
+@dataclass(frozen=True)
+class _Engine:
+    fits: Fits
+    live: LiveSessions
+    threads: ThreadPoolExecutor
+    notices: Notices
+
+
+def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI:
+    """The server as an ASGI app. Its database is open from here to the end of its lifespan.
+
+    Raises:
+        InvalidInput: the address of the database can't be used.
+        Unavailable: the database is taken, or does not answer.
+    """
+    storage = open_storage(settings.database_url)
+    app = FastAPI(
+        title="Surrogym",
+        version=version("surrogym"),
+        description=DESCRIPTION,
+        lifespan=lambda app: _lifespan(app, settings, storage, design),
+        docs_url=None,
+        redoc_url=None,
+        openapi_url=None,
+    )
+    app.state.gate = Gate(settings.tokens)
+    app.state.notices = None
+    problems.install(app)
+    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes)
+    if settings.loopback and not settings.tokens:
+        app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", settings.host}))
+    for room in (service, surrogates, queries, samples, models, events, sessions):
+        app.include_router(room.router)
+    _add_dashboard(app)
+    return app
+
+
+def say_goodbye(app: FastAPI) -> None:
+    """Let long polls and event streams end, so that a shutdown need not wait for them."""
+    if app.state.notices is not None:
+        app.state.notices.close()
+
+
+@asynccontextmanager
+async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: DesignPort) -> AsyncIterator[State]:
+    torch.set_num_threads(settings.threads)
+    engine = _build_engine(settings, design)
+    app.state.notices = engine.notices
+    services, sweeper = _build_services(settings, design, storage, engine)
+    engine.fits.start()
+    restored = services.sessions.restore()
+    logger.info("%d sessions came back", restored)
+    tasks = [asyncio.create_task(services.designer.run()), asyncio.create_task(sweeper.run())]
+    try:
+        yield {"services": services}
+    finally:
+        engine.notices.close()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        engine.threads.shutdown()
+        await asyncio.to_thread(engine.fits.close)
+        logger.info("%d sessions were saved", services.sessions.save())
+        storage.close()
+
+
+def _build_engine(settings: Settings, design: DesignPort) -> _Engine:
+    threads = ThreadPoolExecutor(STEP_THREADS, thread_name_prefix="step")
+    live = LiveSessions(threads, limit=settings.max_sessions, idle_seconds=settings.session_idle_seconds)
+    return _Engine(Fits(design.run), live, threads, Notices())
+
+
+def _build_services(
+    settings: Settings, design: DesignPort, storage: Storage, engine: _Engine
+) -> tuple[Services, Sweeper]:
+    definitions = Definitions(storage, _define)
+    cache = ModelCache(
+        load=lambda name, version: load_model(storage, definitions, name, version),
+        newest=lambda name: storage.models.get(name).version,
+    )
+    designer = Designer(
+        storage,
+        definitions,
+        engine.fits,
+        cache,
+        engine.notices,
+        owner=uuid4().hex,
+        threads=settings.threads,
+        look_seconds=settings.sweep_seconds,
+    )
+    services = Services(
+        surrogates=SurrogateService(storage, _define, design.plan, cache, engine.live, engine.notices),
+        queries=QueryService(storage, definitions, engine.notices),
+        samples=SampleService(storage, definitions, engine.notices),
+        models=ModelService(storage, definitions, cache, engine.notices),
+        sessions=SessionService(storage, definitions, cache, engine.live, settings.max_lanes),
+        designer=designer,
+        events=EventService(storage, engine.notices),
+        storage=storage,
+    )
+    return services, Sweeper(storage, engine.live, settings.sweep_seconds)
+
+
+def _define(spec: dict[str, Any]) -> EnvironmentDefinition:
+    return definition_from_spec(EnvironmentSpec.model_validate(spec))
+
+
+def _add_dashboard(app: FastAPI) -> None:
+    for path, (name, media_type) in dashboard.FILES.items():
+        app.add_api_route(path, _static(name, media_type), include_in_schema=False)
+
+
+def _static(name: str, media_type: str) -> Callable[[], Awaitable[Response]]:
+    async def page() -> Response:
+        return Response(dashboard.read(name), media_type=media_type, headers=dashboard.HEADERS)
+
+    return page

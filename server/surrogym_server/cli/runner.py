@@ -1,0 +1,104 @@
+"""The server process: from its listening socket to its clean end."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from pathlib import Path
+from types import FrameType
+
+import uvicorn
+from fastapi import FastAPI
+
+from surrogym_server.app import create_app, say_goodbye
+from surrogym_server.errors import InvalidInput
+from surrogym_server.settings import Settings
+
+GRACE_SECONDS = 5
+PARENT_LOOK_SECONDS = 0.5
+ANY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "::1"}
+
+
+class Runner(uvicorn.Server):
+    """Announces its address, ends long polls at shutdown, and takes a signal as a wish, not as a failure."""
+
+    def __init__(self, app: FastAPI, settings: Settings, url: str, ready_file: Path | None) -> None:
+        config = uvicorn.Config(
+            app,
+            log_config=None,
+            access_log=settings.log_level == "debug",
+            server_header=False,
+            timeout_graceful_shutdown=GRACE_SECONDS,
+        )
+        super().__init__(config)
+        self._app = app
+        self._url = url
+        self._ready_file = ready_file
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        if self._ready_file is not None:
+            _write_at_once(self._ready_file, self._url)
+        sys.stdout.write(f"Surrogym listens on {self._url}\n")
+        sys.stdout.flush()
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        say_goodbye(self._app)
+        await super().shutdown(sockets)
+
+    def handle_exit(self, sig: int, _: FrameType | None) -> None:
+        self.force_exit = self.should_exit and sig == signal.SIGINT
+        self.should_exit = True
+
+
+def run(settings: Settings, ready_file: Path | None, exit_with_parent: bool) -> None:
+    """Serve until a signal comes, or the parent ends.
+
+    Raises:
+        InvalidInput: the address can't be listened on.
+        Unavailable: the database is taken or does not answer.
+    """
+    logging.basicConfig(level=settings.log_level.upper(), format="%(levelname)s %(name)s: %(message)s")
+    for quiet in ("uvicorn.error", "alembic"):
+        logging.getLogger(quiet).setLevel(max(logging.WARNING, logging.getLogger().level))
+    with _listen(settings.host, settings.port) as listener:
+        runner = Runner(create_app(settings), settings, _url(listener, settings.host), ready_file)
+        if exit_with_parent:
+            threading.Thread(target=_end_with_parent, args=(runner, os.getppid()), daemon=True).start()
+        runner.run(sockets=[listener])
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    """A bound socket, so that a taken port is known before anything else is opened."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        listener = socket.socket(family, kind, protocol)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+    except OSError as error:
+        raise InvalidInput(f"can't listen on {host} port {port}: {error.strerror or error}") from error
+    return listener
+
+
+def _url(listener: socket.socket, host: str) -> str:
+    """The address under which a client on this machine finds the server."""
+    name = ANY_ADDRESS.get(host, host)
+    return f"http://{f'[{name}]' if ':' in name else name}:{listener.getsockname()[1]}"
+
+
+def _write_at_once(path: Path, text: str) -> None:
+    """Write a file that readers see whole or not at all."""
+    draft = path.with_name(f"{path.name}.tmp")
+    draft.write_text(text, encoding="utf-8")
+    draft.replace(path)
+
+
+def _end_with_parent(runner: Runner, parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(PARENT_LOOK_SECONDS)
+    runner.should_exit = True

@@ -1,0 +1,80 @@
+"""``surrogym serve``: run the server."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from surrogym_server.errors import InvalidInput, SurrogymError
+
+WORKERS_VARIABLE = "WEB_CONCURRENCY"
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``serve`` to an app of commands."""
+    app.command()(serve)
+
+
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on. [default: 127.0.0.1]")] = None,
+    port: Annotated[int | None, typer.Option(help="Port; 0 takes any free one. [default: 8000]")] = None,
+    database: Annotated[
+        str | None, typer.Option(help="SQLite file, or a SQLAlchemy URL. [default: surrogym.db]")
+    ] = None,
+    token_file: Annotated[
+        Path | None, typer.Option(help="File with one token a line: an admin token, or role:token.")
+    ] = None,
+    insecure: Annotated[
+        bool | None, typer.Option("--insecure", help="Allow another address than loopback without a token.")
+    ] = None,
+    threads: Annotated[int | None, typer.Option(help="Threads of one torch operation. [default: 1]")] = None,
+    session_idle_seconds: Annotated[
+        float | None, typer.Option(help="Idle time after which a session expires. [default: 3600]")
+    ] = None,
+    log_level: Annotated[
+        str | None, typer.Option(help="critical, error, warning, info or debug. [default: info]")
+    ] = None,
+    ready_file: Annotated[
+        Path | None, typer.Option(help="File to write the URL to, once the server accepts requests.")
+    ] = None,
+    exit_with_parent: Annotated[
+        bool, typer.Option("--exit-with-parent", help="End when the process that started this one ends.")
+    ] = False,
+) -> None:
+    """Run the server until Ctrl-C.
+
+    Most options can also be given as environment variables, such as SURROGYM_PORT; a token as SURROGYM_TOKEN.
+
+    Example: surrogym serve --port 8000 --database surrogym.db
+    """
+    from surrogym_server.cli import runner  # imports torch, which --help must not wait for
+    from surrogym_server.settings import read_settings
+
+    try:
+        _refuse_workers()
+        settings = read_settings(
+            os.environ,
+            host=host,
+            port=port,
+            database=database,
+            token_file=token_file,
+            insecure=insecure,
+            threads=threads,
+            session_idle_seconds=session_idle_seconds,
+            log_level=log_level,
+        )
+        runner.run(settings, ready_file, exit_with_parent)
+    except SurrogymError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(1) from None
+
+
+def _refuse_workers() -> None:
+    workers = os.environ.get(WORKERS_VARIABLE, "1")
+    if workers != "1":
+        raise InvalidInput(
+            f"expected one worker process, got {WORKERS_VARIABLE}={workers}: sessions live in one process"
+        )

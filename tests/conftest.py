@@ -1,0 +1,27 @@
+"""Fixtures of all rooms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from support.server import ServerProcess, running_server
+from support.teaching import teach
+from surrogym_client.api import Api
+from surrogym_client.original.classic import pendulum
+
+
+@pytest.fixture(scope="session")
+def server_process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
+    """One real server for the whole run; its tests keep apart by the names of their surrogates."""
+    with running_server(tmp_path_factory.mktemp("server")) as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def pendulum_server(server_process: ServerProcess) -> ServerProcess:
+    """The server, with a surrogate ``pendulum`` that has learned from a dozen real steps."""
+    with Api(server_process.url) as api:
+        teach(api, "pendulum", pendulum(), queries=12)
+    return server_process

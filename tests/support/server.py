@@ -1,0 +1,70 @@
+"""A real server process on any free port, with its SQLite file in a folder of the test."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+STARTING_SECONDS = 120.0
+STOPPING_SECONDS = 60.0
+
+
+@dataclass
+class ServerProcess:
+    """A running server. ``url`` is where it listens, ``log`` what it has said."""
+
+    url: str
+    process: subprocess.Popen[bytes]
+    folder: Path
+
+    @property
+    def log(self) -> str:
+        return (self.folder / "server.log").read_text()
+
+    def stop(self, sig: int = signal.SIGTERM) -> int:
+        """Send a signal and wait for the end; returns the exit status."""
+        if self.process.poll() is None:
+            self.process.send_signal(sig)
+        return self.process.wait(STOPPING_SECONDS)
+
+
+def start_server(folder: Path, *options: str, **environment: str) -> ServerProcess:
+    """Start ``surrogym serve`` on the database of a folder, and wait until it accepts requests.
+
+    Args:
+        folder: holds database and log; starting again in it goes on with its database.
+        options: further options of the command.
+        environment: further environment variables.
+    """
+    ready = folder / "ready"
+    ready.unlink(missing_ok=True)
+    defaults = ["--port", "0", "--database", str(folder / "surrogym.db"), "--ready-file", str(ready)]
+    command = [sys.executable, "-m", "surrogym_server", "serve", *defaults, *options]
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")}
+    with (folder / "server.log").open("ab") as log:
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=kept | environment)
+    deadline = time.monotonic() + STARTING_SECONDS
+    while not ready.exists():
+        if process.poll() is not None or time.monotonic() > deadline:
+            process.kill()
+            raise AssertionError(f"the server did not start: {(folder / 'server.log').read_text()}")
+        time.sleep(0.02)
+    return ServerProcess(ready.read_text(), process, folder)
+
+
+@contextmanager
+def running_server(folder: Path, *options: str, **environment: str) -> Iterator[ServerProcess]:
+    """A server for the time of the context."""
+    server = start_server(folder, *options, **environment)
+    try:
+        yield server
+    finally:
+        if server.process.poll() is None:
+            server.stop()
