@@ -1,0 +1,317 @@
+"""The worker beside the original environment: claims queries, takes the real step, hands in what happened."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from types import TracebackType
+from typing import Any, Literal, Self, TypeVar
+
+import numpy as np
+from pydantic import ValidationError
+
+from surrogym_client.api import Api
+from surrogym_client.connection import Retries
+from surrogym_client.errors import InvalidInput, LeaseExpired, NotThere, ServerUnreachable, SurrogymClientError
+from surrogym_client.original.errors import StepFailed, UnknownEnvironment
+from surrogym_client.original.protocol import OriginalEnvironment, RealStep
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query
+
+FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "failed")
+PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)  # with a server that is away
+
+T = TypeVar("T")
+Outcome = Literal["answered", "failed"]
+
+
+def worker_name() -> str:
+    """A name that tells this worker from others in the ledger."""
+    return f"{socket.gethostname()}-{os.getpid()}"[:128]
+
+
+@dataclass(frozen=True)
+class SamplerSettings:
+    """How a worker works.
+
+    ``batch``: queries claimed at once. ``until_done``: stop when the design has reached its target or its budget;
+    ``once``: stop after the first claim that gives any; ``max_queries`` and ``time_limit`` (seconds) stop it too.
+    """
+
+    name: str = field(default_factory=worker_name)
+    batch: int = 4
+    wait_seconds: float = 20.0
+    lease_seconds: float = 60.0
+    once: bool = False
+    until_done: bool = False
+    max_queries: int | None = None
+    time_limit: float | None = None
+
+
+@dataclass(frozen=True)
+class SamplerReport:
+    """What a worker did. ``phase`` is the last one the server told."""
+
+    answered: int
+    failed: int
+    seconds: float
+    phase: Phase | None
+
+
+class Sampler:
+    """Answers the queries of one surrogate.
+
+    A step that fails gives its query back with the error; a server that is away is waited for, and an answer is not
+    given up meanwhile.
+
+    Args:
+        api: the server.
+        surrogate: its name there.
+        environment: the original environment; wrap it into ``IsolatedEnvironment`` where it may hang or crash.
+        settings: when to stop, how much to claim.
+        report: called after every query with it, what became of it, and the error if there was one.
+
+    Example:
+        >>> with Api("http://127.0.0.1:8000") as api:
+        ...     Sampler(api, "pendulum", original.make("Pendulum-v1")).run()
+    """
+
+    def __init__(
+        self,
+        api: Api,
+        surrogate: str,
+        environment: OriginalEnvironment,
+        settings: SamplerSettings | None = None,
+        report: Callable[[Query, Outcome, str], None] | None = None,
+    ) -> None:
+        self._api = api
+        self._surrogate = surrogate
+        self._environment = environment
+        self._settings = settings or SamplerSettings()
+        self._report = report
+        self._counts: dict[Outcome, int] = {"answered": 0, "failed": 0}
+        self._phase: Phase | None = None
+        self._started = time.monotonic()
+        self._stopping = threading.Event()
+
+    def stop(self) -> None:
+        """End ``run`` after the step that is under way; for another thread, or a signal handler."""
+        self._stopping.set()
+
+    def run(self) -> SamplerReport:
+        """Work until a setting says stop, ``stop`` is called, or Ctrl-C comes.
+
+        Raises:
+            UnknownSurrogate: there is none of this name, or it was deleted.
+            ServerUnreachable: the server stayed away for too long.
+            UnknownEnvironment: the environment can't be made, or is another one than the surrogate's.
+        """
+        self._started = time.monotonic()
+        self._check()
+        with Heartbeat(self._api, self._surrogate, self._settings.lease_seconds) as heartbeat:
+            while not self._stopping.is_set() and (limit := self._limit()) > 0:
+                claimed = _patiently(partial(self._claim, limit))
+                self._phase = claimed.phase
+                self._work(claimed.queries, heartbeat)
+                if self._enough(claimed):
+                    break
+        return self._summary()
+
+    def _check(self) -> None:
+        """Refuse an environment whose coordinates or action are not the surrogate's."""
+        asked, own = self._api.surrogate(self._surrogate).spec, self._environment.spec()
+        expected, got = _shape(asked), _shape(own)
+        if expected != got:
+            raise UnknownEnvironment(
+                f"the environment does not fit surrogate {self._surrogate!r}: expected {expected}, got {got}"
+            )
+
+    def _claim(self, limit: int) -> ClaimedQueries:
+        s = self._settings
+        waits = not (s.until_done and (self._phase is None or self._phase in FINISHED))
+        left = s.wait_seconds if s.time_limit is None else min(s.wait_seconds, max(0.0, self._time_left()))
+        return self._api.claim(
+            self._surrogate,
+            s.name,
+            max_queries=limit,
+            wait_seconds=left if waits else 0.0,
+            lease_seconds=s.lease_seconds,
+        )
+
+    def _work(self, queries: list[Query], heartbeat: Heartbeat) -> None:
+        """Answer queries one by one; those left when a person interrupts are given back."""
+        left = list(queries)
+        heartbeat.hold(left)
+        try:
+            while left and not self._stopping.is_set():
+                self._answer(left[0])
+                heartbeat.release(left.pop(0))
+        finally:
+            for query in left:
+                heartbeat.release(query)
+                self._give_back(query, "the sampler was stopped")
+
+    def _answer(self, query: Query) -> None:
+        try:
+            step = self._environment.step_from(np.array(query.coordinates), np.array(query.action))
+            self._hand_in(sample_of(query, step))
+        except (StepFailed, InvalidInput) as error:
+            self._fail(query, str(error))
+        except SurrogymClientError:
+            raise
+        except Exception as error:  # an environment that is not isolated may raise anything
+            self._fail(query, f"{type(error).__name__}: {error}")
+        else:
+            self._count(query, "answered", "")
+
+    def _hand_in(self, sample: NewSample) -> None:
+        _patiently(lambda: self._api.add_samples(self._surrogate, self._settings.name, [sample]))
+
+    def _fail(self, query: Query, error: str) -> None:
+        _patiently(lambda: self._give_back(query, error or "no reason given"))
+        self._count(query, "failed", error)
+
+    def _give_back(self, query: Query, error: str) -> None:
+        try:
+            self._api.fail(self._surrogate, query.id, query.lease_token, error[:4_000])
+        except (LeaseExpired, NotThere):
+            return  # the query has gone to the next one already
+
+    def _count(self, query: Query, outcome: Outcome, error: str) -> None:
+        self._counts[outcome] += 1
+        if self._report is not None:
+            self._report(query, outcome, error)
+
+    def _limit(self) -> int:
+        """How many queries to claim next; 0 when it is time to stop."""
+        s = self._settings
+        if s.time_limit is not None and self._time_left() <= 0:
+            return 0
+        return s.batch if s.max_queries is None else min(s.batch, s.max_queries - sum(self._counts.values()))
+
+    def _time_left(self) -> float:
+        return self._started + (self._settings.time_limit or 0.0) - time.monotonic()
+
+    def _enough(self, claimed: ClaimedQueries) -> bool:
+        if self._settings.once and claimed.queries:
+            return True
+        return self._settings.until_done and not claimed.queries and claimed.phase in FINISHED
+
+    def _summary(self) -> SamplerReport:
+        seconds = time.monotonic() - self._started
+        return SamplerReport(self._counts["answered"], self._counts["failed"], seconds, self._phase)
+
+
+class Heartbeat:
+    """Renews the leases that a worker holds, from a thread of its own, at a third of their length."""
+
+    def __init__(self, api: Api, surrogate: str, lease_seconds: float) -> None:
+        self._api = api
+        self._surrogate = surrogate
+        self._lease_seconds = lease_seconds
+        self._held: dict[int, Query] = {}
+        self._lock = threading.Lock()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ending.set()
+        self._thread.join(timeout=5.0)
+
+    def hold(self, queries: list[Query]) -> None:
+        with self._lock:
+            self._held.update({query.id: query for query in queries})
+
+    def release(self, query: Query) -> None:
+        with self._lock:
+            self._held.pop(query.id, None)
+
+    def _beat(self) -> None:
+        while not self._ending.wait(self._lease_seconds / 3):
+            with self._lock:
+                held = list(self._held.values())
+            for query in held:
+                self._renew(query)
+
+    def _renew(self, query: Query) -> None:
+        try:
+            self._api.renew(self._surrogate, query.id, query.lease_token, lease_seconds=self._lease_seconds)
+        except ServerUnreachable:
+            return  # the next beat tries again
+        except SurrogymClientError:
+            self.release(query)  # a late answer is still a true observation, so the step goes on
+
+
+def sample_of(query: Query, step: RealStep) -> NewSample:
+    """The sample that answers a query.
+
+    Raises:
+        StepFailed: the step has numbers that are not finite, or of the wrong shape.
+    """
+    try:
+        return NewSample(
+            query_id=query.id,
+            lease_token=query.lease_token,
+            coordinates=_numbers(step.coordinates, len(query.coordinates), "coordinates"),
+            action=_numbers(step.action, len(query.action), "action"),
+            next_coordinates=_numbers(step.next_coordinates, len(query.coordinates), "next_coordinates"),
+            reward=float(step.reward),
+            terminated=bool(step.terminated),
+            truncated=bool(step.truncated),
+            observation=_entries(step.observation),
+            next_observation=_entries(step.next_observation),
+        )
+    except (ValidationError, TypeError) as error:
+        raise StepFailed(f"a step that can't be used: {_first(error)}") from error
+
+
+def _shape(spec: EnvironmentSpec) -> str:
+    names = ", ".join(spec.coordinate_names)
+    return f"coordinates ({names}) and a {spec.action.kind} action of {spec.action.size}"
+
+
+def _numbers(values: Any, size: int, what: str) -> list[float]:
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != (size,):
+        raise StepFailed(f"a step of the wrong shape: expected ({size},) for {what}, got {array.shape}")
+    numbers: list[float] = array.tolist()
+    return numbers
+
+
+def _entries(values: Any) -> list[float] | None:
+    return None if values is None else np.asarray(values, dtype=np.float64).ravel().tolist()
+
+
+def _first(error: Exception) -> str:
+    if not isinstance(error, ValidationError):
+        return str(error)
+    first = error.errors()[0]
+    return f"{'.'.join(map(str, first['loc']))}: {first['msg']}, got {first['input']}"
+
+
+def _patiently(request: Callable[[], T]) -> T:
+    """Ask until the server is back; every request here may be repeated.
+
+    Raises:
+        ServerUnreachable: it stayed away for longer than ``PATIENCE``.
+    """
+    delays = PATIENCE.delays()
+    while True:
+        try:
+            return request()
+        except ServerUnreachable:
+            pause = next(delays, None)
+            if pause is None:
+                raise
+            time.sleep(pause)

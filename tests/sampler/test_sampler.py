@@ -1,0 +1,123 @@
+"""The worker against a real server: every query is answered or fails with its reason, and the worker stays alive."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from functools import partial
+
+import pytest
+
+from support.moody import SPEC, GivesNonsense, HangsLeft, Line, RaisesLeft, Slow
+from surrogym_client import original
+from surrogym_client.api import Api
+from surrogym_client.connection import Retries
+from surrogym_client.errors import ServerUnreachable, UnknownSurrogate
+from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.isolated import IsolatedEnvironment
+from surrogym_client.sampler import Sampler, SamplerSettings
+
+ONE_ROUND = SamplerSettings(name="worker", max_queries=6, wait_seconds=5.0, time_limit=60.0)
+
+
+@pytest.fixture
+def api(server_process):
+    with Api(server_process.url) as api:
+        yield api
+
+
+@pytest.fixture
+def line(api):
+    name = f"line-{uuid.uuid4().hex[:8]}"
+    api.create_surrogate(name, SPEC)
+    yield name
+    api.delete_surrogate(name)
+
+
+def test_every_query_is_answered_and_the_worker_stops_when_the_design_is_done(api, line):
+    told = []
+    settings = SamplerSettings(until_done=True, time_limit=90.0)
+    report = Sampler(api, line, Line(), settings, lambda *seen: told.append(seen)).run()
+    view = api.surrogate(line)
+    assert (report.answered, report.failed) == (6, 0)
+    assert view.ledger.total == 6
+    assert report.phase == view.phase
+    assert view.phase in ("ready", "over_budget")
+    assert [outcome for _, outcome, _ in told] == ["answered"] * 6
+
+
+def test_once_stops_after_the_first_claim(api, line):
+    report = Sampler(api, line, Line(), SamplerSettings(once=True, batch=2, wait_seconds=5.0)).run()
+    assert report.answered == 2
+    assert api.surrogate(line).queries.pending == 4
+
+
+def test_an_environment_that_raises_fails_the_query_with_its_error(api, line):
+    report = Sampler(api, line, RaisesLeft(), ONE_ROUND).run()
+    assert report.answered + report.failed == 6
+    assert report.failed > 0
+    errors = [query.error for query in api.queries(line) if query.error]
+    assert errors
+    assert all("there is a wall on the left" in error for error in errors)
+
+
+def test_an_environment_that_hangs_is_killed_and_the_worker_goes_on(api, line):
+    settings = SamplerSettings(name="worker", batch=6, max_queries=6, wait_seconds=5.0)
+    with IsolatedEnvironment(HangsLeft, step_limit=0.5) as environment:
+        report = Sampler(api, line, environment, settings).run()
+    assert report.answered > 0
+    assert report.failed > 0
+    errors = [query.error for query in api.queries(line) if query.error]
+    assert errors == ["step_from took longer than 0.5 s and was killed"] * report.failed
+
+
+def test_a_step_of_the_wrong_shape_fails_the_query(api, line):
+    Sampler(api, line, GivesNonsense(), SamplerSettings(once=True, batch=1, wait_seconds=5.0)).run()
+    (failed,) = [query.error for query in api.queries(line) if query.error]
+    assert failed == "a step of the wrong shape: expected (1,) for next_coordinates, got (2,)"
+
+
+def test_a_lease_shorter_than_the_step_is_kept_alive(api, line):
+    settings = SamplerSettings(name="slow", batch=1, once=True, lease_seconds=0.9, wait_seconds=5.0)
+    Sampler(api, line, Slow(), settings).run()
+    (sample,) = api.samples(line)
+    assert not sample.late
+    assert sample.attempt == 1
+
+
+def test_stop_ends_the_worker_and_gives_back_what_it_holds(api, line):
+    settings = SamplerSettings(batch=6, wait_seconds=5.0)
+    sampler = Sampler(api, line, Line(), settings, lambda *_: sampler.stop())
+    report = sampler.run()
+    assert report.answered == 1
+    assert api.surrogate(line).queries.leased == 0
+    assert api.surrogate(line).queries.pending == 5
+
+
+def test_two_workers_share_the_queries(api, line):
+    settings = [SamplerSettings(name=name, batch=1, until_done=True, time_limit=90.0) for name in ("first", "second")]
+    threads = [threading.Thread(target=Sampler(api, line, Line(), s).run) for s in settings]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert api.surrogate(line).ledger.total == 6
+
+
+def test_another_environment_than_the_surrogates_is_refused(api, line):
+    with pytest.raises(UnknownEnvironment, match=r"expected coordinates \(x\)"):
+        Sampler(api, line, original.make("Pendulum-v1")).run()
+
+
+def test_a_factory_that_fails_ends_the_worker_at_once(api, line):
+    environment = IsolatedEnvironment(partial(original.make, "Nowhere-v1"))
+    with pytest.raises(UnknownEnvironment, match="no adapter knows"):
+        Sampler(api, line, environment).run()
+    assert api.surrogate(line).queries.leased == 0
+
+
+def test_an_unknown_surrogate_and_a_missing_server_are_told(server_process):
+    with Api(server_process.url) as api, pytest.raises(UnknownSurrogate):
+        Sampler(api, "nobody", Line()).run()
+    with Api("http://127.0.0.1:9", retries=Retries(seconds=0)) as api, pytest.raises(ServerUnreachable):
+        Sampler(api, "nobody", Line()).run()
