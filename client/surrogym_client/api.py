@@ -175,9 +175,7 @@ class Api:
         idempotency_key: str | None = None,
     ) -> wire.AddedSamples:
         """Hand in real steps; the answer comes after they are stored for good."""
-        body = wire.AddSamples(
-            sampler=sampler, samples=list(samples), idempotency_key=idempotency_key or new_key()
-        )
+        body = wire.AddSamples(sampler=sampler, samples=list(samples), idempotency_key=idempotency_key or new_key())
         return self._post(wire.AddedSamples, f"{_surrogate(name)}/add_sample", body)
 
     def samples(self, name: str) -> Iterator[wire.SampleView]:
@@ -196,18 +194,14 @@ class Api:
         self, name: str, steps: int, *, episodes: int = 0, note: str = "", idempotency_key: str | None = None
     ) -> wire.Ledger:
         """Enter real steps of an evaluation into the ledger."""
-        body = wire.ReportSteps(
-            steps=steps, episodes=episodes, note=note, idempotency_key=idempotency_key or new_key()
-        )
+        body = wire.ReportSteps(steps=steps, episodes=episodes, note=note, idempotency_key=idempotency_key or new_key())
         return self._post(wire.Ledger, f"{_surrogate(name)}/ledger", body)
 
     def improve(
         self, name: str, queries: int, *, checkpoint: str | None = None, idempotency_key: str | None = None
     ) -> wire.SurrogateView:
         """Ask the design for more queries, weighted by the occupancy submitted under ``checkpoint``."""
-        body = wire.Improve(
-            queries=queries, checkpoint=checkpoint, idempotency_key=idempotency_key or new_key()
-        )
+        body = wire.Improve(queries=queries, checkpoint=checkpoint, idempotency_key=idempotency_key or new_key())
         return self._post(wire.SurrogateView, f"{_surrogate(name)}/improve", body)
 
     # Models
@@ -308,9 +302,7 @@ def new_key() -> str:
 def check_protocol(protocol: int, url: str) -> None:
     """Refuse a server of another protocol version."""
     if protocol != wire.PROTOCOL:
-        raise ProtocolMismatch(
-            f"expected protocol {wire.PROTOCOL} at {url}, got {protocol}: upgrade the older side"
-        )
+        raise ProtocolMismatch(f"expected protocol {wire.PROTOCOL} at {url}, got {protocol}: upgrade the older side")
 
 
 def parse(reply: type[R], content: bytes, path: str) -> R:

@@ -106,7 +106,7 @@ class Connection:
         self.close()
 
     def close(self) -> None:
-        """Close the sockets; the server's side (sessions, leases) is untouched."""
+        """Close the sockets. Sessions and leases on the server stay, and a later request connects anew."""
         self._client.close()
 
     def send(
@@ -137,13 +137,14 @@ class Connection:
             ProtocolMismatch: what answered is no Surrogym server.
             ProblemError: the server refused; its subclass says why.
         """
-        request = self._client.build_request(
+        client = self._open_client()
+        request = client.build_request(
             method, self.url + path, content=body, params=params, timeout=self._timeout(timeout)
         )
         delays: Iterator[float] | None = None
         while True:
             try:
-                return _body(self._client.send(request))
+                return _body(client.send(request))
             except (httpx.TransportError, Unavailable) as failure:
                 # A failed request's connection is closed with it, so a late reply answers nobody.
                 delays = (retries or self.retries).delays() if delays is None else delays
@@ -162,15 +163,19 @@ class Connection:
         """
         timeout = self._timeout(idle_seconds)
         try:
-            with self._client.stream(
-                "GET", self.url + path, headers=dict(headers), timeout=timeout
-            ) as response:
+            url, client = self.url + path, self._open_client()
+            with client.stream("GET", url, headers=dict(headers), timeout=timeout) as response:
                 if response.is_error:
                     response.read()
                     _body(response)
                 yield response.iter_lines()
         except httpx.TransportError as failure:
             raise _given_up(failure, self.url) from failure
+
+    def _open_client(self) -> httpx.Client:
+        if self._client.is_closed:
+            self._client = _new_client(self.url, self._token)
+        return self._client
 
     def _timeout(self, seconds: float | None) -> httpx.Timeout:
         return httpx.Timeout(seconds or self.timeouts.request, connect=self.timeouts.connect)
@@ -180,9 +185,7 @@ def _checked(url: str) -> str:
     try:
         parsed = httpx.URL(url)
     except httpx.InvalidURL as error:
-        raise ServerUnreachable(
-            f"expected a server address like {DEFAULT_URL}, got {url!r}: {error}"
-        ) from error
+        raise ServerUnreachable(f"expected a server address like {DEFAULT_URL}, got {url!r}: {error}") from error
     if parsed.scheme not in ("http", "https") or not parsed.host:
         raise ServerUnreachable(f"expected a server address like {DEFAULT_URL}, got {url!r}")
     return url.rstrip("/")

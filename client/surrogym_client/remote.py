@@ -13,9 +13,7 @@ from surrogym_client.transport import HttpSurrogate
 from surrogym_client.vector import RemoteVectorEnv
 
 
-def make_env(
-    *, surrogate: str, url: str | None = None, token: str | None = None, **options: Any
-) -> RemoteEnv:
+def make_env(*, surrogate: str, url: str | None = None, token: str | None = None, **options: Any) -> RemoteEnv:
     """One lane of a surrogate; options are those of ``RemoteEnv``."""
     return RemoteEnv(HttpSurrogate(url, surrogate, token), **options)
 

@@ -117,8 +117,7 @@ class SurrogateVecEnv(VecEnv):
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         return [
-            self._attribute(lane, method_name)(*method_args, **method_kwargs)
-            for lane in self._get_indices(indices)
+            self._attribute(lane, method_name)(*method_args, **method_kwargs) for lane in self._get_indices(indices)
         ]
 
     def env_is_wrapped(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, Self, TypeVar
 from urllib.parse import quote
 
@@ -101,7 +102,7 @@ class HttpSurrogate:
         self.disconnect()
 
     def disconnect(self) -> None:
-        """Close the sockets. Sessions stay: they end with ``close``, or expire on the server."""
+        """Close the sockets. Sessions stay, until ``close`` or their expiry; a later request connects anew."""
         self.connection.close()
 
     def spec(self) -> EnvironmentSpec:
@@ -119,9 +120,7 @@ class HttpSurrogate:
         self._seq[view.id] = view.seq
         return view
 
-    def reset(
-        self, session: str, *, seed: int | Sequence[int] | None = None, mask: Bools | None = None
-    ) -> ResetResult:
+    def reset(self, session: str, *, seed: int | Sequence[int] | None = None, mask: Bools | None = None) -> ResetResult:
         body: dict[str, Any] = {}
         if seed is not None:
             body["seed"] = int(seed) if isinstance(seed, int | np.integer) else [int(s) for s in seed]
@@ -154,11 +153,14 @@ class HttpSurrogate:
         return parse(wire.SubmittedOccupancy, self.connection.send("POST", route, body), route).states
 
     def close(self, session: str) -> None:
+        """End the session; with the last one, the sockets are closed too."""
         self._seq.pop(session, None)
         try:
-            self.connection.send("DELETE", _session(session), retries=Retries(seconds=0))
-        except SessionLost:
-            return
+            with suppress(SessionLost):
+                self.connection.send("DELETE", _session(session), retries=Retries(seconds=0))
+        finally:
+            if not self._seq:
+                self.disconnect()
 
     @property
     def _route(self) -> str:
@@ -199,9 +201,7 @@ def _sendable(action: NDArray[Any]) -> Any:
     """Actions as nested lists; what JSON can't carry is refused here, the rest is the server's to judge."""
     array = np.asarray(action)
     if array.dtype.kind not in "biuf":
-        raise refused_here(
-            Code.INVALID_REQUEST, f"action: expected an array of numbers, got dtype {array.dtype}"
-        )
+        raise refused_here(Code.INVALID_REQUEST, f"action: expected an array of numbers, got dtype {array.dtype}")
     if not np.isfinite(array).all():
         place = np.argwhere(~np.isfinite(array))[0].tolist()
         value = array[tuple(place)]

@@ -26,9 +26,8 @@ pytestmark = [
 
 
 @pytest.fixture
-def port(pendulum_server):
-    with HttpSurrogate(pendulum_server.url, "pendulum") as port:
-        yield port
+def port(pendulum_server) -> HttpSurrogate:
+    return HttpSurrogate(pendulum_server.url, "pendulum")
 
 
 @pytest.mark.parametrize("variant", ["deterministic", "probabilistic"])
@@ -74,11 +73,17 @@ def test_lanes_of_one_session_are_as_good_as_an_environment_each(port: HttpSurro
     apart.close()
 
 
-@pytest.mark.parametrize("algorithm", [PPO, A2C, SAC])
+SETTINGS: dict[type[BaseAlgorithm], dict[str, int]] = {
+    PPO: {"n_steps": 8, "batch_size": 32},
+    A2C: {"n_steps": 8},
+    SAC: {"learning_starts": 8, "batch_size": 8},
+}
+
+
+@pytest.mark.parametrize("algorithm", list(SETTINGS))
 def test_any_algorithm_learns_on_it(pendulum_server, algorithm: type[BaseAlgorithm]):
     envs = SurrogateVecEnv(pendulum_server.url, "pendulum", num_envs=4, time_limit=10)
-    settings = {"learning_starts": 8, "batch_size": 8} if algorithm is SAC else {"n_steps": 8}
-    model = algorithm("MlpPolicy", envs, seed=0, device="cpu", **settings)
+    model = algorithm("MlpPolicy", envs, seed=0, device="cpu", **SETTINGS[algorithm])
     model.learn(total_timesteps=64)
     returns, lengths = evaluate_policy(model, envs, 4, return_episode_rewards=True, warn=False)
     assert lengths == [10] * 4

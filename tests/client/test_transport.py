@@ -173,6 +173,18 @@ def test_an_answer_that_is_no_step_is_refused(body: str):
             port.step("abc", ACTION)
 
 
+def test_the_last_session_takes_its_sockets_with_it():
+    with scripted_server(view(), step(1), reply(""), step(5)) as server:
+        port = surrogate(server)
+        port.open(wire.OpenSession(num_envs=2))
+        port.step("abc", ACTION)
+        port.close("abc")
+        assert port.connection._client.is_closed
+        port._seq["def"] = 4
+        port.step("def", ACTION)
+        port.disconnect()
+
+
 def test_closing_a_session_that_is_gone_is_harmless():
     with scripted_server(problem(Code.UNKNOWN_SESSION)) as server, surrogate(server) as port:
         port.close("abc")

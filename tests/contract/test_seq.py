@@ -64,9 +64,7 @@ def test_the_same_seq_with_another_body_is_refused(post: Post):
     for what, body in REQUESTS[1:]:
         refused = post(what, body)
         assert (refused.status_code, refused.json()["expected_seq"]) == (409, 3)
-    assert post("step", {"seq": 2, "action": ACTION}).content == first.content, (
-        "the kept reply is still there"
-    )
+    assert post("step", {"seq": 2, "action": ACTION}).content == first.content, "the kept reply is still there"
 
 
 def test_a_refused_request_takes_no_seq(post: Post):

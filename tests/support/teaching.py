@@ -14,9 +14,7 @@ from surrogym_shared.spec import EnvironmentSpec
 FINISHED = ("ready", "over_budget")
 
 
-def teach(
-    api: Api, name: str, spec: EnvironmentSpec, queries: int, seconds: float = 120.0
-) -> wire.SurrogateView:
+def teach(api: Api, name: str, spec: EnvironmentSpec, queries: int, seconds: float = 120.0) -> wire.SurrogateView:
     """Register a surrogate and answer ``queries`` initial queries: one fit, and no adaptive ones."""
     design = spec.design.model_copy(update={"initial": queries, "budget": queries})
     api.create_surrogate(name, spec.model_copy(update={"design": design}))
