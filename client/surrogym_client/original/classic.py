@@ -54,9 +54,7 @@ def pendulum() -> EnvironmentSpec:
         environment="Pendulum-v1",
         coordinates=(
             Coordinate(name="theta", kind="angle", sampling=CIRCLE, unit="rad"),
-            Coordinate(
-                name="speed", sampling=Uniform(low=-8, high=8), bounds=Bounds(low=-8, high=8), unit="rad/s"
-            ),
+            Coordinate(name="speed", sampling=Uniform(low=-8, high=8), bounds=Bounds(low=-8, high=8), unit="rad/s"),
         ),
         observation=(
             ObservationEntry(name="cos", term=Term.cos(theta=1), low=-1, high=1),
@@ -125,9 +123,7 @@ def mountain_car_continuous() -> EnvironmentSpec:
     Positions are sampled up to 0.52, from where no step reaches the right wall at 0.6, so that only the left
     wall, which also stops the car, has to be declared.
     """
-    return _mountain_car(
-        "MountainCarContinuous-v0", BoxAction(low=(-1.0,), high=(1.0,)), goal=0.45, time_limit=999
-    )
+    return _mountain_car("MountainCarContinuous-v0", BoxAction(low=(-1.0,), high=(1.0,)), goal=0.45, time_limit=999)
 
 
 def mountain_car() -> EnvironmentSpec:
@@ -146,9 +142,7 @@ def _mountain_car(
                 sampling=Uniform(low=-1.2, high=0.52),
                 bounds=Bounds(low=-1.2, stops="velocity"),
             ),
-            Coordinate(
-                name="velocity", sampling=Uniform(low=-0.07, high=0.07), bounds=Bounds(low=-0.07, high=0.07)
-            ),
+            Coordinate(name="velocity", sampling=Uniform(low=-0.07, high=0.07), bounds=Bounds(low=-0.07, high=0.07)),
         ),
         observation=(
             ObservationEntry(name="position", term=Term.linear(position=1), low=-1.2, high=0.6),
@@ -187,10 +181,7 @@ def acrobot() -> EnvironmentSpec:
             ObservationEntry(name="sin1", term=Term.sin(theta1=1), low=-1, high=1),
             ObservationEntry(name="cos2", term=Term.cos(theta2=1), low=-1, high=1),
             ObservationEntry(name="sin2", term=Term.sin(theta2=1), low=-1, high=1),
-            *(
-                ObservationEntry(name=name, term=_linear(name), low=-top, high=top)
-                for name, (_, top) in speeds.items()
-            ),
+            *(ObservationEntry(name=name, term=_linear(name), low=-top, high=top) for name, (_, top) in speeds.items()),
         ),
         action=DiscreteAction(n=3),
         start={name: Uniform(low=-0.1, high=0.1) for name in ("theta1", "theta2", "speed1", "speed2")},
@@ -244,9 +235,7 @@ _ACROBOT_PHYSICS = ("LINK_LENGTH_1", "LINK_MASS_1", "LINK_MASS_2", "LINK_MOI")
 TASKS: dict[str, Task] = {
     "Pendulum-v1": Task(pendulum, _write_pendulum, _read_state, _PENDULUM_PHYSICS),
     "CartPole-v1": Task(cartpole, _write_cartpole, _read_state, _CARTPOLE_PHYSICS, _settle_cartpole),
-    "MountainCarContinuous-v0": Task(
-        mountain_car_continuous, _write_state, _read_state, ("power", "max_speed")
-    ),
+    "MountainCarContinuous-v0": Task(mountain_car_continuous, _write_state, _read_state, ("power", "max_speed")),
     "MountainCar-v0": Task(mountain_car, _write_state, _read_state, ("force", "gravity", "max_speed")),
     "Acrobot-v1": Task(acrobot, _write_state, _read_state, _ACROBOT_PHYSICS),
 }

@@ -73,9 +73,7 @@ class IsolatedEnvironment:
             ok, value = pipe.recv()
         except (EOFError, OSError) as error:
             code = self._kill()
-            raise EnvironmentDied(
-                f"the environment's process ended with exit code {code} in {method}"
-            ) from error
+            raise EnvironmentDied(f"the environment's process ended with exit code {code} in {method}") from error
         if not ok:
             raise StepFailed(value)
         return value

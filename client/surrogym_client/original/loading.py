@@ -80,9 +80,7 @@ def load_factory(name: str) -> Any:
     return factory
 
 
-def _known(
-    name: str, spec: EnvironmentSpec | None, design: dict[str, Any], bins: int | None
-) -> OriginalEnvironment:
+def _known(name: str, spec: EnvironmentSpec | None, design: dict[str, Any], bins: int | None) -> OriginalEnvironment:
     from surrogym_client.original import classic, mujoco
     from surrogym_client.original.gymnasium import GymnasiumEnvironment, task_for
     from surrogym_client.original.mujoco_tasks import SPECIFICATIONS

@@ -98,9 +98,7 @@ class Joints:
         model = env.model
         self.names = tuple(model.joint(i).name or f"joint{i}" for i in range(model.njnt))
         if model.nq != model.njnt or model.nv != model.njnt:
-            raise UnknownEnvironment(
-                "free and ball joints can't be expressed: expected hinges and slides only"
-            )
+            raise UnknownEnvironment("free and ball joints can't be expressed: expected hinges and slides only")
         self._rest = np.concatenate([env.init_qpos, env.init_qvel])
 
     def columns(self, coordinates: tuple[str, ...]) -> list[int]:
@@ -108,9 +106,7 @@ class Joints:
         known = [*self.names, *(name + VELOCITY for name in self.names)]
         unknown = [name for name in coordinates if name not in known]
         if unknown:
-            raise UnknownEnvironment(
-                f"coordinates {unknown} are no joints of the model: expected some of {known}"
-            )
+            raise UnknownEnvironment(f"coordinates {unknown} are no joints of the model: expected some of {known}")
         return [known.index(name) for name in coordinates]
 
     def write(self, columns: list[int], coordinates: Array) -> None:

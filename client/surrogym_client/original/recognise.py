@@ -72,9 +72,7 @@ def _coordinates(env: Native, joints: Joints, ranges: Mapping[str, tuple[float, 
     given = {name: (float(low), float(high)) for name, (low, high) in ranges.items()}
     model = env.model
     limits = {
-        name: tuple(map(float, model.jnt_range[i]))
-        for i, name in enumerate(joints.names)
-        if model.jnt_limited[i]
+        name: tuple(map(float, model.jnt_range[i])) for i, name in enumerate(joints.names) if model.jnt_limited[i]
     }
     names = [*joints.names, *(name + VELOCITY for name in joints.names)]
     joints.columns(tuple(given))
@@ -121,9 +119,7 @@ def _observation_terms(env: Native, frame: EnvironmentSpec) -> list[Term]:
 def _basis(env: Native, frame: EnvironmentSpec) -> list[Term]:
     hinges = [c.name for c, kind in zip(frame.coordinates, env.model.jnt_type, strict=False) if kind == HINGE]
     linear = [Term.linear(**{name: 1.0}) for name in frame.coordinate_names]
-    angles = [{name: 1.0} for name in hinges] + [
-        {a: 1.0, b: 1.0} for a, b in itertools.combinations(hinges, 2)
-    ]
+    angles = [{name: 1.0} for name in hinges] + [{a: 1.0, b: 1.0} for a, b in itertools.combinations(hinges, 2)]
     circular = [term for weights in angles for term in (Term.sin(**weights), Term.cos(**weights))]
     return [Term.constant(1.0), *linear, *circular]
 
@@ -140,8 +136,6 @@ def _observe_at(env: Native, joints: Joints, columns: list[int], place: Array) -
 
 
 def _sum(basis: list[Term], weights: Array) -> Term:
-    kept = [
-        (term, float(np.round(w, 9))) for term, w in zip(basis, weights, strict=True) if abs(w) > TOLERANCE
-    ]
+    kept = [(term, float(np.round(w, 9))) for term, w in zip(basis, weights, strict=True) if abs(w) > TOLERANCE]
     parts = tuple(part for term, weight in kept for part in (weight * term).parts)
     return Term(parts=parts) if parts else Term.constant(0)

@@ -26,9 +26,7 @@ def observe(spec: EnvironmentSpec, coordinates: Array) -> Array:
 
 def holds(spec: EnvironmentSpec, inequality: Inequality, coordinates: Array) -> Bools:
     """Whether (n,) an inequality holds at coordinates (n, C)."""
-    compare = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal}[
-        inequality.relation
-    ]
+    compare = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal}[inequality.relation]
     return np.asarray(compare(evaluate(spec, inequality.term, coordinates), inequality.value))
 
 

@@ -1,0 +1,197 @@
+"""Whole episodes in an original environment, for evaluation. Each episode has an environment of its own.
+
+Shapes: C coordinates, D observation entries, F action entries.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from surrogym_client.original.classic import TASKS
+from surrogym_client.original.gymnasium import native_action, task_for, wrapped
+from surrogym_client.original.mujoco import Joints, is_known, open_mujoco
+from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
+from surrogym_client.original.protocol import Array, Factory, OriginalEnvironment
+from surrogym_client.original.terms import observe
+from surrogym_shared.spec import EnvironmentSpec, Fixed, Normal, Uniform
+
+SMALLEST_FACTOR = 0.05  # a mass or a length stays positive, however large the perturbation
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What one step of an episode gave."""
+
+    observation: Array  # (D,)
+    reward: float
+    terminated: bool
+    coordinates: Array  # (C,)
+
+
+class Episode(ABC):
+    """One episode. ``perturb`` comes first if at all, then ``reset`` or ``place``, then steps."""
+
+    def __init__(self, spec: EnvironmentSpec) -> None:
+        self.spec = spec
+
+    @abstractmethod
+    def reset(self, seed: int) -> Moment:
+        """Start as the environment does."""
+
+    @abstractmethod
+    def place(self, coordinates: Array) -> Moment:
+        """Start at coordinates (C,)."""
+
+    @abstractmethod
+    def step(self, action: Array) -> Moment:
+        """Apply action (F,)."""
+
+    @abstractmethod
+    def perturb(self, rng: np.random.Generator, sigma: float) -> None:
+        """Change physical attributes by normal factors of mean 1 and deviation sigma."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release what the episode holds."""
+
+    def _shown(self, coordinates: Array) -> Array:
+        """The declared observation (D,)."""
+        return observe(self.spec, coordinates[None])[0]
+
+
+class GymnasiumEpisode(Episode):
+    """An episode of a Gymnasium environment that has a built-in adapter; its observation is the environment's own."""
+
+    def __init__(self, spec: EnvironmentSpec) -> None:
+        super().__init__(spec)
+        self._env = self._open()
+        self._own_observation = _shows_the_same(spec)
+
+    def _open(self) -> Any:
+        import gymnasium
+
+        self._task = task_for(self.spec.environment, "default")
+        return gymnasium.make(self.spec.environment).unwrapped
+
+    def _read(self) -> Array:
+        return self._task.read(self._env)
+
+    def _write(self, coordinates: Array) -> None:
+        self._env.reset(seed=0)
+        self._task.write(self._env, coordinates)
+
+    def reset(self, seed: int) -> Moment:
+        observation, _ = self._env.reset(seed=seed)
+        return self._moment(observation, 0.0, terminated=False)
+
+    def place(self, coordinates: Array) -> Moment:
+        self._write(coordinates)
+        return Moment(self._shown(coordinates), 0.0, False, coordinates)
+
+    def step(self, action: Array) -> Moment:
+        observation, reward, terminated, _, _ = self._env.step(native_action(self.spec, action))
+        return self._moment(observation, float(reward), terminated=bool(terminated))
+
+    def perturb(self, rng: np.random.Generator, sigma: float) -> None:
+        for name in self._task.perturbable:
+            setattr(self._env, name, getattr(self._env, name) * _factor(rng, sigma))
+        if self._task.settle is not None:
+            self._task.settle(self._env)
+
+    def close(self) -> None:
+        self._env.close()
+
+    def _moment(self, observation: Any, reward: float, *, terminated: bool) -> Moment:
+        coordinates = wrapped(self.spec, self._read())
+        shown = np.asarray(observation) if self._own_observation else self._shown(coordinates)
+        return Moment(shown, reward, terminated, coordinates)
+
+
+class MujocoEpisode(GymnasiumEpisode):
+    """The same for MuJoCo; perturbed are the masses of all bodies."""
+
+    def _open(self) -> Any:
+        env = open_mujoco(self.spec.environment)
+        self._joints = Joints(env)
+        self._columns = self._joints.columns(self.spec.coordinate_names)
+        return env
+
+    def _read(self) -> Array:
+        return self._joints.read(self._columns)
+
+    def _write(self, coordinates: Array) -> None:
+        self._joints.write(self._columns, coordinates)
+
+    def perturb(self, rng: np.random.Generator, sigma: float) -> None:
+        for body in range(self._env.model.nbody):
+            self._env.model.body_mass[body] *= _factor(rng, sigma)
+
+
+class SteppedEpisode(Episode):
+    """An episode of one's own environment, made of real steps, each from where the last one ended."""
+
+    def __init__(self, environment: OriginalEnvironment) -> None:
+        super().__init__(environment.spec())
+        self._environment = environment
+        self._at = np.zeros(0)
+
+    def reset(self, seed: int) -> Moment:
+        return self.place(draw(self.spec, np.random.default_rng(seed), wide=False))
+
+    def place(self, coordinates: Array) -> Moment:
+        self._at = coordinates
+        return Moment(self._shown(coordinates), 0.0, False, coordinates)
+
+    def step(self, action: Array) -> Moment:
+        step = self._environment.step_from(self._at, action)
+        self._at = np.asarray(step.next_coordinates, dtype=np.float64)
+        return Moment(self._shown(self._at), float(step.reward), bool(step.terminated), self._at)
+
+    def perturb(self, rng: np.random.Generator, sigma: float) -> None:
+        del rng, sigma
+        raise ValueError("only environments with a built-in adapter can be perturbed")
+
+    def close(self) -> None:
+        self._environment.close()
+
+
+def open_episode(name: str, spec: EnvironmentSpec | None, factory: Factory) -> Episode:
+    """An episode of the environment called ``name``; ``factory`` makes it where no adapter knows the name."""
+    if name in TASKS:
+        return GymnasiumEpisode(spec or factory().spec())
+    if is_known(name):
+        return MujocoEpisode(spec or factory().spec())
+    return SteppedEpisode(factory())
+
+
+def draw(spec: EnvironmentSpec, rng: np.random.Generator, *, wide: bool) -> Array:
+    """Start coordinates (C,): from the start distribution, or from the whole sampling range."""
+    chosen = [c.sampling if wide else spec.start[c.name] for c in spec.coordinates]
+    return np.array([_draw_one(distribution, rng) for distribution in chosen])
+
+
+def _draw_one(distribution: Uniform | Normal | Fixed, rng: np.random.Generator) -> float:
+    match distribution:
+        case Fixed():
+            return distribution.value
+        case Uniform():
+            return float(rng.uniform(distribution.low, distribution.high))
+        case Normal():
+            low, high = distribution.limits
+            while not low <= (value := float(rng.normal(distribution.mean, distribution.std))) <= high:
+                pass
+            return value
+
+
+def _factor(rng: np.random.Generator, sigma: float) -> float:
+    return max(SMALLEST_FACTOR, 1.0 + sigma * float(rng.standard_normal()))
+
+
+def _shows_the_same(spec: EnvironmentSpec) -> bool:
+    """Whether the specification's observation is the environment's own, entry by entry."""
+    builtin = TASKS[spec.environment].spec if spec.environment in TASKS else SPECIFICATIONS.get(spec.environment)
+    return builtin is not None and builtin().observation == spec.observation

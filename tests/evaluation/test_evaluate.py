@@ -1,0 +1,159 @@
+"""Evaluation takes real steps of the original environment and counts and judges them rightly."""
+
+from functools import partial
+
+import gymnasium
+import numpy as np
+import pytest
+
+from support.moody import Line
+from surrogym_client import original
+from surrogym_client.evaluate import (
+    EvaluationSettings,
+    decode_actions,
+    evaluate,
+    interquartile_mean,
+)
+from surrogym_client.original.episodes import open_episode
+from surrogym_shared.spec import Success
+
+
+def pendulum_policy(observation):
+    """Pumps energy, then holds the pole upright."""
+    cos, sin, speed = observation.T
+    angle = np.arctan2(sin, cos)
+    pump = 2 * np.sign(speed * (10 - (0.5 * speed**2 / 3 + 10 * cos) * 1.0))
+    return np.where(cos > 0.8, -12 * angle - 3 * speed, pump).clip(-2, 2)[:, None]
+
+
+def cartpole_policy(observation):
+    x, velocity, pole, omega = observation.T
+    return (pole + 0.3 * omega + 0.01 * x + 0.03 * velocity > 0).astype(int)
+
+
+def opener(name, **options):
+    spec = original.make(name, **options).spec()
+    return partial(open_episode, name, spec, partial(original.make, name))
+
+
+def by_gymnasium(name, policy, seeds):
+    """The same episodes, run by Gymnasium itself."""
+    returns, lengths = [], []
+    for seed in seeds:
+        env = gymnasium.make(name)
+        observation, _ = env.reset(seed=seed)
+        total, length, done = 0.0, 0, False
+        while not done:
+            action = policy(observation[None])[0]
+            action = action.astype(np.float32) if isinstance(env.action_space, gymnasium.spaces.Box) else int(action)
+            observation, reward, terminated, truncated, _ = env.step(action)
+            total, length, done = total + float(reward), length + 1, terminated or truncated
+        returns.append(total)
+        lengths.append(length)
+    return returns, lengths
+
+
+@pytest.mark.parametrize(
+    ("name", "policy"),
+    [
+        ("Pendulum-v1", pendulum_policy),
+        ("CartPole-v1", cartpole_policy),
+        ("MountainCarContinuous-v0", lambda o: np.sign(o[:, 1:])),
+        ("Acrobot-v1", lambda o: np.where(o[:, 4] > 0, 2, 0)),
+    ],
+)
+def test_returns_are_gymnasiums_own(name, policy):
+    result = evaluate(policy, opener(name), EvaluationSettings(episodes=4))
+    returns, lengths = by_gymnasium(name, policy, range(10_000, 10_004))
+    np.testing.assert_allclose(result.returns, returns, rtol=1e-5)
+    assert result.lengths.tolist() == lengths
+    assert result.steps == sum(lengths)
+
+
+def test_success_of_cartpole_is_its_length():
+    good = evaluate(cartpole_policy, opener("CartPole-v1"), EvaluationSettings(episodes=3))
+    bad = evaluate(lambda o: np.zeros(len(o), int), opener("CartPole-v1"), EvaluationSettings(episodes=3))
+    assert good.success.all()
+    assert not bad.success.any()
+    assert good.summary()["success_rate"] == 1.0
+
+
+def test_success_of_mountain_car_is_arrival():
+    pumping = evaluate(lambda o: np.sign(o[:, 1:]), opener("MountainCarContinuous-v0"), EvaluationSettings(episodes=2))
+    idle = evaluate(lambda o: np.zeros((len(o), 1)), opener("MountainCarContinuous-v0"), EvaluationSettings(episodes=2))
+    assert pumping.success.all()
+    assert not idle.success.any()
+    assert idle.lengths.tolist() == [999, 999]
+
+
+def test_success_of_pendulum_is_the_last_twenty_steps_upright():
+    held = evaluate(pendulum_policy, opener("Pendulum-v1"), EvaluationSettings(episodes=20))
+    upright = np.cos(held.trace.coordinates[-20:, 0]) > 0.95
+    assert held.success[0] == upright.all()
+    limp = evaluate(lambda o: np.zeros((len(o), 1)), opener("Pendulum-v1"), EvaluationSettings(episodes=5))
+    assert not limp.success.any()
+
+
+def test_the_trace_is_the_first_episode():
+    result = evaluate(pendulum_policy, opener("Pendulum-v1"), EvaluationSettings(episodes=2))
+    assert result.trace.coordinates.shape == (201, 2)
+    assert result.trace.action.shape == (200, 1)
+    assert result.trace.reward.sum() == pytest.approx(result.returns[0])
+
+
+def test_wide_starts_cover_the_sampling_range_and_repeat():
+    settings = EvaluationSettings(episodes=30, wide=True)
+    starts = []
+
+    def policy(observation):
+        if not starts:
+            starts.append(observation.copy())
+        return np.zeros((len(observation), 1))
+
+    first = evaluate(policy, opener("Pendulum-v1"), settings)
+    assert np.abs(starts[0][:, 2]).max() > 4
+    assert evaluate(policy, opener("Pendulum-v1"), settings).returns.tolist() == first.returns.tolist()
+
+
+def test_perturbation_changes_the_physics_and_settles_what_follows():
+    plain = evaluate(cartpole_policy, opener("CartPole-v1"), EvaluationSettings(episodes=3))
+    changed = evaluate(cartpole_policy, opener("CartPole-v1"), EvaluationSettings(episodes=3, perturb=0.3))
+    assert not np.allclose(plain.trace.coordinates[:10], changed.trace.coordinates[:10])
+    episode = opener("CartPole-v1")()
+    episode.perturb(np.random.default_rng(0), 0.3)
+    env = episode._env
+    assert env.total_mass == env.masscart + env.masspole != 1.1
+    assert env.polemass_length == env.masspole * env.length
+
+
+def test_ones_own_environment_is_evaluated_by_its_steps():
+    result = evaluate(
+        lambda o: -np.sign(o), partial(open_episode, "a line", None, Line), EvaluationSettings(episodes=3)
+    )
+    assert result.lengths.tolist() == [20, 20, 20]
+    assert result.success is None
+    assert result.summary()["success_rate"] is None
+    assert np.abs(result.trace.coordinates[-1, 0]) <= 0.1
+
+
+def test_bins_are_decoded_and_bounds_kept():
+    spec = original.make("Pendulum-v1", bins=5).spec()
+    np.testing.assert_allclose(decode_actions(spec, np.arange(5), 5)[:, 0], [-2, -1, 0, 1, 2])
+    plain = original.make("Pendulum-v1").spec()
+    np.testing.assert_allclose(decode_actions(plain, np.array([[5.0], [-5.0]]), 2)[:, 0], [2, -2])
+    with pytest.raises(ValueError, match=r"expected actions of shape \(2, 1\), got \(3, 1\)"):
+        decode_actions(plain, np.zeros((3, 1)), 2)
+
+
+def test_interquartile_mean_leaves_out_the_quarters():
+    assert interquartile_mean(np.array([-1000.0, 1, 2, 3, 4, 5, 6, 1000])) == 3.5
+    assert interquartile_mean(np.array([7.0])) == 7.0
+
+
+def test_every_given_criterion_must_hold():
+    spec = original.make("CartPole-v1").spec()
+    strict = spec.model_copy(update={"success": Success(min_steps=100, min_return=1e6)})
+    result = evaluate(
+        cartpole_policy, partial(open_episode, "CartPole-v1", strict, lambda: None), EvaluationSettings(episodes=2)
+    )
+    assert not result.success.any()
