@@ -177,6 +177,20 @@ def test_a_late_answer_leaves_the_query_to_a_live_lease_and_both_are_data(
     ]
 
 
+def test_sweeping_leaves_a_query_answered_that_was_answered_late(
+    storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample], until: Wait
+) -> None:
+    name = make(queries=1)
+    [slow] = storage.queries.claim(name, "slow", 1, SHORT)
+    until(lambda: storage.queries.sweep_expired() == 1)
+    storage.queries.claim(name, "dead", 1, SHORT)
+    until(lambda: storage.ledger.read(name).unresolved == 2)
+    storage.samples.add(name, "slow", [answer(slow)])
+    assert storage.queries.sweep_expired() == 1
+    assert storage.queries.counts(name) == QueryCounts(answered=1)
+    assert storage.ledger.read(name).unresolved == 1
+
+
 def test_a_late_answer_to_an_answered_query_is_kept(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample], until: Wait
 ) -> None:
