@@ -47,6 +47,7 @@ HTTP_CODES = {
     503: Code.UNAVAILABLE,
 }
 
+NO_FIELDS = ("body", "query", "path", "header", "float", "int", "str", "bool")
 RETRY_AFTER_SECONDS = "1"
 SHOWN_CHARACTERS = 120
 
@@ -99,12 +100,12 @@ def documented(*codes: Code) -> dict[int | str, dict[str, Any]]:
 
 
 def validation_detail(found: Sequence[Any]) -> str:
-    """The first error of a validation, as one sentence: where, what was expected, and what came."""
-    first = found[0]
-    where = ".".join(str(part) for part in first["loc"] if part != "body") or "the body"
-    expected = first["msg"].removeprefix("Value error, ")
-    more = f" ({len(found) - 1} more)" if len(found) > 1 else ""
-    return f"{where}: {expected}, got {shown(first.get('input'))}{more}"
+    """The most telling error of a validation, as one sentence: where, what was expected, and what came.
+
+    Of a value that fits none of several types, the deepest error is about the type it nearly fits.
+    """
+    telling = _located([max(found, key=lambda error: len(error["loc"]))])[0]
+    return f"{telling['field'] or 'the body'}: {telling['expected']}, got {telling['got']}"
 
 
 def shown(value: Any) -> str:
@@ -116,12 +117,17 @@ def shown(value: Any) -> str:
 def _located(found: Sequence[Any]) -> list[dict[str, str]]:
     return [
         {
-            "field": ".".join(str(part) for part in error["loc"] if part != "body"),
+            "field": ".".join(str(part) for part in error["loc"] if _is_field(part)),
             "expected": error["msg"].removeprefix("Value error, "),
             "got": shown(error.get("input")),
         }
         for error in found[:16]
     ]
+
+
+def _is_field(part: int | str) -> bool:
+    """Whether a part of a location is a field or an index, not the place of the value or a type it was tried as."""
+    return isinstance(part, int) or (part.isidentifier() and part not in NO_FIELDS)
 
 
 def _invalid(found: Sequence[Any]) -> Response:

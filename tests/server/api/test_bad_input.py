@@ -1,0 +1,336 @@
+"""Bad input gets a clear 4xx problem body, and changes nothing."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import pytest
+
+from support import pendulum
+from surrogym_shared.codes import PROBLEM_MEDIA_TYPE, STATUS, Code, Problem
+
+MAX_BODY = 32 * 1024 * 1024
+
+
+def refused(reply: httpx.Response, code: Code, *said: str) -> Problem:
+    """The problem body of a refusal, which says all of ``said``."""
+    assert reply.headers["content-type"] == PROBLEM_MEDIA_TYPE, reply.text
+    problem = Problem.model_validate_json(reply.content)
+    assert (problem.code, problem.status, reply.status_code) == (code, STATUS[code], STATUS[code]), reply.text
+    for words in said:
+        assert words in problem.detail
+    return problem
+
+
+def post(client: httpx.Client, path: str, body: Any) -> httpx.Response:
+    """Unlike the client's own JSON, this sends NaN too."""
+    return client.post(path, content=json.dumps(body), headers={"content-type": "application/json"})
+
+
+# Unknown things
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "code"),
+    [
+        ("GET", "/v1/surrogates/nobody", Code.UNKNOWN_SURROGATE),
+        ("DELETE", "/v1/surrogates/nobody", Code.UNKNOWN_SURROGATE),
+        ("GET", "/v1/surrogates/nobody/samples", Code.UNKNOWN_SURROGATE),
+        ("GET", "/v1/surrogates/nobody/samples?format=csv", Code.UNKNOWN_SURROGATE),
+        ("GET", "/v1/surrogates/nobody/queries", Code.UNKNOWN_SURROGATE),
+        ("GET", "/v1/surrogates/nobody/models", Code.UNKNOWN_SURROGATE),
+        ("GET", "/v1/surrogates/nobody/models/1", Code.UNKNOWN_SURROGATE),
+        ("GET", "/v1/surrogates/nobody/events", Code.UNKNOWN_SURROGATE),
+        ("GET", "/v1/sessions/nobody", Code.UNKNOWN_SESSION),
+        ("GET", "/v1/nothing", Code.NOT_FOUND),
+        ("PUT", "/v1/surrogates", Code.METHOD_NOT_ALLOWED),
+    ],
+)
+def test_what_is_not_there(client: httpx.Client, method: str, path: str, code: Code):
+    refused(client.request(method, path), code)
+
+
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("queries:claim", {"sampler": "s"}),
+        ("queries", {"coordinates": [[0, 0]], "action": [[0]]}),
+        ("add_sample", {"sampler": "s", "idempotency_key": "k", "samples": [pendulum.real_step([0, 0], [0])]}),
+        ("ledger", {"steps": 1, "idempotency_key": "k"}),
+        ("improve", {"queries": 1}),
+        ("predict", {"coordinates": [[0, 0]], "action": [[0]]}),
+        ("query_uncertainty", {"coordinates": [[0, 0]], "action": [[0]]}),
+        ("sessions", {}),
+    ],
+)
+def test_an_unknown_surrogate_in_every_post(client: httpx.Client, path: str, body: Any):
+    refused(post(client, f"/v1/surrogates/nobody/{path}", body), Code.UNKNOWN_SURROGATE, "nobody")
+
+
+@pytest.mark.parametrize("what", ["reset", "step", "rollout", "occupancy"])
+def test_an_unknown_session(client: httpx.Client, what: str):
+    bodies = {"step": {"action": [[0]]}, "rollout": {"actions": [[[0]]]}, "occupancy": {"checkpoint": "c"}}
+    reply = post(client, f"/v1/sessions/nobody/{what}", bodies.get(what, {}))
+    refused(reply, Code.UNKNOWN_SESSION, "'nobody'")
+
+
+# Specifications
+
+
+def crossed(field: str, value: Any) -> dict[str, Any]:
+    spec = copy.deepcopy(pendulum.spec())
+    target = spec
+    *path, last = field.split(".")
+    for part in path:
+        target = target[int(part)] if part.isdigit() else target[part]
+    target[last] = value
+    return spec
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("coordinates.0.sampling.low", 4.0, "uniform range crosses: expected low < high, got [4.0, 3.1416]"),
+        ("coordinates.1.bounds.low", 9.0, "bounds cross"),
+        ("action.low", [3.0], "action 0 crosses"),
+        ("coordinates.1.sampling.high", 9.0, "leaves the high bound 8.0"),
+        ("coordinates.0.colour", "red", "Extra inputs are not permitted, got 'red'"),
+        ("coordinates.0.sampling.low", float("nan"), "finite number, got nan"),
+        ("start", {}, "start distribution lacks ['theta', 'theta_dot']"),
+        ("time_limit", 0, "greater than or equal to 1, got 0"),
+    ],
+)
+def test_a_spec_that_contradicts_itself(client: httpx.Client, name: str, field: str, value: Any, said: str):
+    reply = post(client, "/v1/surrogates", {"name": name, "spec": crossed(field, value)})
+    problem = refused(reply, Code.INVALID_SPEC, said)
+    assert problem.model_extra is not None
+    assert problem.model_extra["errors"][0]["field"].startswith("spec")
+    refused(client.get(f"/v1/surrogates/{name}"), Code.UNKNOWN_SURROGATE)
+
+
+def test_a_second_spec_under_the_same_name(client: httpx.Client, fresh: str):
+    before = client.get(f"/v1/surrogates/{fresh}").json()
+    other = pendulum.spec()
+    other["time_limit"] = 100
+    refused(post(client, "/v1/surrogates", {"name": fresh, "spec": other}), Code.SPEC_CONFLICT, fresh)
+    assert client.get(f"/v1/surrogates/{fresh}").json() == before
+
+
+@pytest.mark.parametrize("bad", ["", "a/b", "-x", "x" * 65, "ä"])
+def test_a_name_that_is_none(client: httpx.Client, bad: str):
+    refused(post(client, "/v1/surrogates", {"name": bad, "spec": pendulum.spec()}), Code.INVALID_REQUEST, "name")
+
+
+# Samples and leases
+
+
+def sample(**changes: Any) -> dict[str, Any]:
+    return {**pendulum.real_step([0.1, 0.0], [0.5]), **changes}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"coordinates": [0.1]}, "samples.0.coordinates: expected (n, 2)"),
+        ({"next_coordinates": [0.1, 0.2, 0.3]}, "samples.0.next_coordinates: expected (n, 2)"),
+        ({"action": [0.1, 0.2]}, "action: expected shape (1, 1), got (1, 2)"),
+        ({"action": [2.5]}, "action: expected entry 0 in [-2, 2], got 2.5"),
+        ({"observation": [1.0]}, "samples.0.observation: expected 3 entries, got 1"),
+        ({"reward": float("nan")}, "samples.0.reward: Input should be a finite number, got nan"),
+        ({"coordinates": [float("inf"), 0.0]}, "samples.0.coordinates.0: Input should be a finite number, got inf"),
+        ({"reward": "1.0"}, "samples.0.reward: Input should be a valid number, got '1.0'"),
+        ({"terminated": 1}, "samples.0.terminated: Input should be a valid boolean, got 1"),
+        ({"mood": "good"}, "samples.0.mood: Extra inputs are not permitted, got 'good'"),
+        ({"query_id": 1}, "query_id and lease_token together"),
+    ],
+)
+def test_a_sample_that_cannot_be_used(client: httpx.Client, fresh: str, changes: dict[str, Any], said: str):
+    body = {"sampler": "s", "idempotency_key": "k", "samples": [sample(), sample(**changes)][::-1]}
+    refused(post(client, f"/v1/surrogates/{fresh}/add_sample", body), Code.INVALID_REQUEST, said)
+    assert client.get(f"/v1/surrogates/{fresh}/samples").json()["samples"] == []
+
+
+def test_a_foreign_lease(client: httpx.Client, fresh: str):
+    query = pendulum.claim(client, fresh, max_queries=1)["queries"][0]
+    foreign = {"query_id": query["id"], "lease_token": "not-the-token"}
+    body = {"sampler": "thief", "samples": [sample(**foreign)]}
+    refused(post(client, f"/v1/surrogates/{fresh}/add_sample", body), Code.FOREIGN_LEASE)
+    path = f"/v1/surrogates/{fresh}/queries/{query['id']}"
+    refused(post(client, f"{path}:renew", {"lease_token": "not-the-token"}), Code.FOREIGN_LEASE)
+    refused(post(client, f"{path}:fail", {"lease_token": "not-the-token", "error": "e"}), Code.FOREIGN_LEASE)
+    view = client.get(f"/v1/surrogates/{fresh}").json()
+    assert (view["queries"]["leased"], view["samples"]) == (1, 0)
+
+
+def test_an_unknown_query(client: httpx.Client, fresh: str):
+    body = {"sampler": "s", "samples": [sample(query_id=10**9, lease_token="t")]}
+    refused(post(client, f"/v1/surrogates/{fresh}/add_sample", body), Code.UNKNOWN_QUERY)
+
+
+def test_a_sample_without_a_query_needs_a_key(client: httpx.Client, fresh: str):
+    body = {"sampler": "s", "samples": [sample()]}
+    refused(post(client, f"/v1/surrogates/{fresh}/add_sample", body), Code.INVALID_REQUEST, "idempotency_key")
+
+
+def test_the_same_key_with_another_body(client: httpx.Client, fresh: str):
+    path = f"/v1/surrogates/{fresh}/add_sample"
+    body = {"sampler": "s", "idempotency_key": "k", "samples": [sample()]}
+    first = post(client, path, body).json()
+    assert post(client, path, body).json()["sample_ids"] == first["sample_ids"]
+    refused(post(client, path, {**body, "samples": [sample(reward=0.0)]}), Code.IDEMPOTENCY_CONFLICT)
+    assert client.get(f"/v1/surrogates/{fresh}").json()["ledger"]["manual"] == 1
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ({"coordinates": [[0, 0, 0]], "action": [[0]]}, "coordinates: expected (n, 2)"),
+        ({"coordinates": [[0, 9]], "action": [[0]]}, "'theta_dot': expected a value in [-8, 8], got 9"),
+        ({"coordinates": [[0, 0], [0]], "action": [[0], [0]]}, "coordinates: expected rows of one length"),
+        ({"coordinates": [[0, 0]], "action": [[0], [0]]}, "as many actions as coordinates, got 2 and 1"),
+        ({"coordinates": [], "action": []}, "at least 1 item"),
+    ],
+)
+def test_a_query_by_hand_that_cannot_be_asked(client: httpx.Client, fresh: str, body: Any, said: str):
+    refused(post(client, f"/v1/surrogates/{fresh}/queries", body), Code.INVALID_REQUEST, said)
+    assert len(client.get(f"/v1/surrogates/{fresh}/queries").json()["queries"]) == pendulum.INITIAL
+
+
+# Models
+
+
+def test_points_that_are_none(client: httpx.Client, taught: str):
+    for path in ("predict", "query_uncertainty"):
+        body = {"coordinates": [[0, 0]], "action": [[5]]}
+        refused(post(client, f"/v1/surrogates/{taught}/{path}", body), Code.INVALID_REQUEST, "[-2, 2], got 5")
+        good = {"coordinates": [[0, 0]], "action": [[1]]}
+        refused(post(client, f"/v1/surrogates/{taught}/{path}", {**good, "model": 99}), Code.UNKNOWN_MODEL)
+
+
+def test_nothing_has_been_fitted_yet(client: httpx.Client, fresh: str):
+    refused(post(client, f"/v1/surrogates/{fresh}/sessions", {}), Code.NO_MODEL)
+    points = {"coordinates": [[0, 0]], "action": [[0]]}
+    refused(post(client, f"/v1/surrogates/{fresh}/predict", points), Code.NO_MODEL)
+
+
+@pytest.mark.parametrize("content", [b"", b"no model", b"\x80\x04K\x01.", (2**40).to_bytes(8, "little") + b"{}"])
+def test_a_file_that_is_no_model(client: httpx.Client, taught: str, content: bytes):
+    before = client.get(f"/v1/surrogates/{taught}/models").json()
+    refused(client.post(f"/v1/surrogates/{taught}/models", content=content), Code.INVALID_REQUEST, "expected")
+    assert client.get(f"/v1/surrogates/{taught}/models").json() == before
+
+
+def test_occupancy_that_nobody_submitted(client: httpx.Client, taught: str):
+    body = {"queries": 1, "checkpoint": "never"}
+    refused(post(client, f"/v1/surrogates/{taught}/improve", body), Code.INVALID_REQUEST, "'never'")
+
+
+# Sessions
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ({"action": [[0.0]]}, "action: expected shape (2, 1), got (1, 1)"),
+        ({"action": [[0.0, 0.0], [0.0, 0.0]]}, "action: expected shape (2, 1), got (2, 2)"),
+        ({"action": [[0.0], [0.0, 0.0]]}, "rows of one length"),
+        ({"action": [[2.1], [0.0]]}, "expected entry 0 in [-2, 2], got 2.1 in row 0"),
+        ({"action": [[float("nan")], [0.0]]}, "finite number, got nan"),
+        ({"action": [[float("inf")], [0.0]]}, "finite number, got inf"),
+        ({"action": [["1"], [0.0]]}, "valid number, got '1'"),
+        ({"action": [[0.0], [0.0]], "mask": [True]}, "mask: expected 2 entries, one a lane, got 1"),
+        ({"action": [[0.0], [0.0]], "mask": [1, 0]}, "valid boolean, got 1"),
+        ({"action": [[0.0], [0.0]], "speed": 3}, "speed: Extra inputs are not permitted, got 3"),
+        ({}, "action: Field required"),
+        ({"action": [[0.0], [0.0]], "seq": 0}, "greater than or equal to 1, got 0"),
+    ],
+)
+def test_a_step_that_cannot_be_made(client: httpx.Client, session: str, body: Any, said: str):
+    post(client, f"/v1/sessions/{session}/reset", {"seq": 1}).raise_for_status()
+    reply = post(client, f"/v1/sessions/{session}/step", {"seq": 2, **body})
+    refused(reply, Code.INVALID_REQUEST, said)
+    assert client.get(f"/v1/sessions/{session}").json()["seq"] == 1
+    post(client, f"/v1/sessions/{session}/step", {"seq": 2, "action": [[0.0], [0.0]]}).raise_for_status()
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ({"seed": [1]}, "seed: expected an integer or 2 of them, got 1"),
+        ({"seed": -1}, "greater than or equal to 0, got -1"),
+        ({"seed": 1.5}, "valid integer"),
+        ({"mask": [True]}, "mask: expected 2 entries, got 1"),
+    ],
+)
+def test_a_reset_that_cannot_be_made(client: httpx.Client, session: str, body: Any, said: str):
+    refused(post(client, f"/v1/sessions/{session}/reset", body), Code.INVALID_REQUEST, said)
+    assert client.get(f"/v1/sessions/{session}").json()["seq"] == 0
+
+
+def test_a_step_before_the_reset(client: httpx.Client, session: str):
+    reply = post(client, f"/v1/sessions/{session}/step", {"seq": 1, "action": [[0.0], [0.0]]})
+    refused(reply, Code.NOT_RESET, "lanes [0, 1]")
+    post(client, f"/v1/sessions/{session}/reset", {"seq": 1}).raise_for_status()
+
+
+def test_a_rollout_is_made_whole_or_not_at_all(client: httpx.Client, session: str):
+    post(client, f"/v1/sessions/{session}/reset", {"seq": 1}).raise_for_status()
+    body = {"seq": 2, "actions": [[[0.0], [0.0]], [[0.0], [9.0]]]}
+    refused(post(client, f"/v1/sessions/{session}/rollout", body), Code.INVALID_REQUEST, "got 9")
+    assert client.get(f"/v1/sessions/{session}").json()["seq"] == 1
+
+
+@pytest.mark.parametrize(
+    ("body", "code"),
+    [
+        ({"num_envs": 0}, Code.INVALID_REQUEST),
+        ({"num_envs": 10**6}, Code.INVALID_REQUEST),
+        ({"num_envs": 60_000, "variant": "probabilistic"}, Code.TOO_LARGE),
+        ({"variant": "quantum"}, Code.INVALID_REQUEST),
+        ({"model": 99}, Code.UNKNOWN_MODEL),
+        ({"penalty": float("nan")}, Code.INVALID_REQUEST),
+    ],
+)
+def test_a_session_that_cannot_be_opened(client: httpx.Client, taught: str, body: Any, code: Code):
+    refused(post(client, f"/v1/surrogates/{taught}/sessions", body), code)
+
+
+# Bodies
+
+
+@pytest.mark.parametrize("path", ["/v1/surrogates", "/v1/sessions/nobody/step"])
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b'"x"', b"\xff\xfe", b"[" * 100_000, b'{"seq": ' + b"9" * 9_999])
+def test_bodies_that_are_no_json_object(client: httpx.Client, path: str, content: bytes):
+    reply = client.post(path, content=content, headers={"content-type": "application/json"})
+    assert 400 <= reply.status_code < 500
+    assert reply.headers["content-type"] == PROBLEM_MEDIA_TYPE
+
+
+@pytest.mark.parametrize("content_type", ["text/plain", "application/x-www-form-urlencoded", None])
+def test_a_form_of_another_site_is_not_json(client: httpx.Client, session: str, content_type: str | None):
+    headers = {"content-type": content_type} if content_type else {}
+    reply = client.post(f"/v1/sessions/{session}/reset", content=b"{}", headers=headers)
+    refused(reply, Code.UNSUPPORTED_MEDIA_TYPE, "application/json")
+    reply = client.post("/v1/surrogates", content=b"{}", headers=headers)
+    assert 400 <= reply.status_code < 500
+
+
+def test_an_oversized_body(client: httpx.Client, session: str):
+    headers = {"content-type": "application/json"}
+    for path in (f"/v1/sessions/{session}/step", "/v1/surrogates"):
+        reply = client.post(path, content=b" " * (MAX_BODY + 1), headers=headers)
+        refused(reply, Code.TOO_LARGE, f"at most {MAX_BODY} bytes, got {MAX_BODY + 1} bytes")
+
+
+def test_an_oversized_body_in_chunks_that_do_not_say_how_many(client: httpx.Client, session: str):
+    def chunks() -> Iterator[bytes]:
+        for _ in range(MAX_BODY // 2**20 + 1):
+            yield b" " * 2**20
+
+    headers = {"content-type": "application/json"}
+    for path in (f"/v1/sessions/{session}/step", "/v1/surrogates"):
+        refused(client.post(path, content=chunks(), headers=headers), Code.TOO_LARGE, "at most")

@@ -1,0 +1,93 @@
+"""The documentation of the API: complete, and its examples work."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import httpx
+import pytest
+
+from surrogym_server.api import examples
+from surrogym_shared import wire
+from surrogym_shared.codes import PROBLEM_MEDIA_TYPE
+
+EXAMPLES = {
+    "CREATE": wire.CreateSurrogate,
+    "PATCH": wire.PatchSurrogate,
+    "CLAIM": wire.ClaimQueries,
+    "RENEW": wire.RenewLease,
+    "FAIL": wire.FailQuery,
+    "ASK": wire.AskQueries,
+    "ADD_SAMPLE": wire.AddSamples,
+    "LEDGER": wire.ReportSteps,
+    "IMPROVE": wire.Improve,
+    "POINTS": wire.Points,
+    "OPEN": wire.OpenSession,
+    "RESET": wire.ResetSession,
+    "STEP": wire.StepSession,
+    "ROLLOUT": wire.RolloutSession,
+    "OCCUPANCY": wire.SubmitOccupancy,
+}
+
+
+@pytest.fixture(scope="module")
+def openapi(client: httpx.Client) -> dict[str, Any]:
+    document: dict[str, Any] = client.get("/openapi.json").raise_for_status().json()
+    return document
+
+
+def operations(openapi: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    return [
+        (f"{method.upper()} {path}", operation)
+        for path, methods in openapi["paths"].items()
+        for method, operation in methods.items()
+    ]
+
+
+@pytest.mark.parametrize(("name", "model"), EXAMPLES.items())
+def test_every_example_is_accepted_by_its_model(name: str, model: type[wire.Request]):
+    model.model_validate(getattr(examples, name))
+
+
+def test_no_example_is_forgotten():
+    bodies = {name for name in vars(examples) if name.isupper()} - {"PENDULUM"}
+    assert bodies == set(EXAMPLES)
+
+
+def test_every_operation_says_what_it_does(openapi: dict[str, Any]):
+    for operation, said in operations(openapi):
+        assert said["summary"], operation
+        assert said["description"], operation
+
+
+def test_every_body_has_an_example(openapi: dict[str, Any]):
+    for operation, said in operations(openapi):
+        for media_type, content in said.get("requestBody", {}).get("content", {}).items():
+            if media_type == "application/json":
+                assert "example" in content or "examples" in content, operation
+
+
+def test_every_refusal_is_a_problem(openapi: dict[str, Any]):
+    assert "Problem" in openapi["components"]["schemas"]
+    for operation, said in operations(openapi):
+        for status, reply in said["responses"].items():
+            if status >= "400":
+                assert list(reply["content"]) == [PROBLEM_MEDIA_TYPE], (operation, status)
+
+
+def test_no_reference_dangles(openapi: dict[str, Any]):
+    def references(node: Any) -> set[str]:
+        if isinstance(node, dict):
+            below = set().union(*(references(value) for value in node.values())) if node else set()
+            return below | ({node["$ref"]} if isinstance(node.get("$ref"), str) else set())
+        return set().union(*(references(value) for value in node)) if isinstance(node, list) and node else set()
+
+    known = {f"#/components/schemas/{name}" for name in openapi["components"]["schemas"]}
+    assert references(openapi) <= known
+
+
+def test_the_four_names_stay(openapi: dict[str, Any]):
+    for path in ("/v1/sessions/{id}/reset", "/v1/sessions/{id}/step"):
+        assert path in openapi["paths"]
+    for path in ("query_uncertainty", "add_sample"):
+        assert f"/v1/surrogates/{{name}}/{path}" in openapi["paths"]

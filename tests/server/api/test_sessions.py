@@ -1,0 +1,153 @@
+"""Sessions over HTTP: a step happens once, seeds mean something, lanes keep their model through an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import httpx
+import pytest
+
+from support import pendulum
+from surrogym_shared import wire
+
+Open = Callable[..., dict[str, Any]]
+ACTIONS = [[0.5], [-1.5]]
+
+
+def send(client: httpx.Client, session: str, what: str, **body: Any) -> httpx.Response:
+    return client.post(f"/v1/sessions/{session}/{what}", json=body)
+
+
+def test_replies_are_what_the_api_says(client: httpx.Client, session: str):
+    wire.ResetReply.model_validate_json(send(client, session, "reset").content)
+    step = wire.StepReply.model_validate_json(send(client, session, "step", action=ACTIONS, deviations=True).content)
+    assert (step.seq, len(step.observation), len(step.observation[0])) == (2, 2, 3)
+    assert step.deviation is not None
+    assert [len(row) for row in step.deviation] == [3, 3]
+    rollout = wire.RolloutReply.model_validate_json(send(client, session, "rollout", actions=[ACTIONS] * 3).content)
+    assert (rollout.seq, len(rollout.steps)) == (3, 3)
+
+
+def test_an_action_of_one_number_may_come_flat(client: httpx.Client, open_session: Open):
+    sessions = [open_session(num_envs=2)["id"] for _ in range(2)]
+    replies = []
+    for session, action in zip(sessions, (ACTIONS, [row[0] for row in ACTIONS]), strict=True):
+        send(client, session, "reset")
+        replies.append(send(client, session, "step", action=action).content)
+    assert replies[0] == replies[1]
+
+
+def test_a_repeated_request_gets_the_same_reply_bit_for_bit(client: httpx.Client, session: str):
+    bodies = [("reset", {"seq": 1, "seed": 5}), ("step", {"seq": 2, "action": ACTIONS})]
+    bodies.append(("rollout", {"seq": 3, "actions": [ACTIONS] * 2}))
+    for what, body in bodies:
+        first, again = (send(client, session, what, **body) for _ in range(2))
+        assert (first.status_code, again.content) == (200, first.content)
+
+
+def test_a_repeat_while_the_first_is_computed_steps_once(client: httpx.Client, session: str):
+    send(client, session, "reset", seq=1)
+    body = {"seq": 2, "actions": [ACTIONS] * 200}
+    with ThreadPoolExecutor(4) as threads:
+        replies = list(threads.map(lambda _: send(client, session, "rollout", **body), range(4)))
+    assert {reply.status_code for reply in replies} == {200}
+    assert len({reply.content for reply in replies}) == 1
+    assert client.get(f"/v1/sessions/{session}").json()["seq"] == 2
+
+
+@pytest.mark.parametrize("seq", [1, 4, 99])
+def test_any_other_seq_is_refused_with_the_expected_one(client: httpx.Client, session: str, seq: int):
+    send(client, session, "reset", seq=1)
+    send(client, session, "step", seq=2, action=ACTIONS)
+    refusal = send(client, session, "step", seq=seq, action=ACTIONS)
+    assert (refusal.status_code, refusal.json()["code"]) == (409, "seq_conflict")
+    assert refusal.json()["expected_seq"] == 3
+
+
+def test_the_same_seq_with_another_body_is_refused(client: httpx.Client, session: str):
+    send(client, session, "reset", seq=1)
+    send(client, session, "step", seq=2, action=ACTIONS)
+    for other in ({"action": [[0.5], [1.5]]}, {"action": ACTIONS, "deviations": True}):
+        assert send(client, session, "step", seq=2, **other).json()["expected_seq"] == 3
+    assert send(client, session, "reset", seq=2).json()["expected_seq"] == 3
+
+
+def test_a_request_without_seq_is_the_next_one(client: httpx.Client, session: str):
+    assert send(client, session, "reset").json()["seq"] == 1
+    assert send(client, session, "step", action=ACTIONS).json()["seq"] == 2
+    assert send(client, session, "step", seq=3, action=ACTIONS).json()["seq"] == 3
+
+
+def test_opening_with_a_key_opens_once(client: httpx.Client, open_session: Open, taught: str, name: str):
+    first, again = (open_session(num_envs=2, idempotency_key=name) for _ in range(2))
+    assert first["id"] == again["id"]
+    body = {"seed": 0, "num_envs": 3, "idempotency_key": name}
+    refusal = client.post(f"/v1/surrogates/{taught}/sessions", json=body)
+    assert refusal.json()["code"] == "idempotency_conflict"
+
+
+def test_seed_zero_is_a_seed_and_none_is_drawn(client: httpx.Client, open_session: Open):
+    starts = {}
+    for key, seed in (("a", 0), ("b", 0), ("c", 1), ("d", None)):
+        session = open_session(num_envs=2, seed=seed)
+        starts[key] = send(client, session["id"], "reset").json()["observation"]
+        assert seed in (None, session["seed"])
+    assert starts["a"] == starts["b"]
+    assert starts["a"] != starts["c"]
+    assert starts["d"] != starts["a"]
+
+
+def test_a_mask_steps_its_lanes_alone(client: httpx.Client, session: str):
+    start = send(client, session, "reset").json()["observation"]
+    step = send(client, session, "step", action=ACTIONS, mask=[False, True]).json()
+    assert step["observation"][0] == start[0]
+    assert step["observation"][1] != start[1]
+    assert step["reward"][0] == 0.0
+
+
+def test_the_time_limit_truncates_and_the_next_step_begins_anew(client: httpx.Client, open_session: Open):
+    session = open_session(num_envs=1, time_limit=2)["id"]
+    send(client, session, "reset")
+    steps = send(client, session, "rollout", actions=[[[0.0]]] * 4).json()["steps"]
+    assert [step["truncated"] for step in steps] == [[False], [True], [False], [False]]
+    assert steps[2]["reward"] == [0.0], "this step only began the next episode"
+
+
+def test_same_step_brings_the_last_observation_along(client: httpx.Client, open_session: Open):
+    session = open_session(num_envs=2, time_limit=1, autoreset_mode="same_step")["id"]
+    send(client, session, "reset")
+    step = send(client, session, "step", action=ACTIONS).json()
+    assert step["final_lanes"] == [0, 1]
+    assert step["final_observation"] != step["observation"]
+
+
+def test_no_occupancy_without_asking_for_it(client: httpx.Client, session: str, open_session: Open):
+    assert send(client, session, "occupancy", checkpoint="c").json()["code"] == "invalid_request"
+    asked = open_session(occupancy=True)["id"]
+    assert send(client, asked, "occupancy", checkpoint="c").json()["code"] == "not_reset"
+
+
+def test_closing_twice_is_harmless(client: httpx.Client, session: str):
+    assert [client.delete(f"/v1/sessions/{session}").status_code for _ in range(2)] == [204, 204]
+    assert send(client, session, "reset").json()["code"] == "unknown_session"
+
+
+def test_a_lane_keeps_its_model_to_the_end_of_its_episode(client: httpx.Client, name: str):
+    pendulum.teach(client, name, budget=5)
+    options = {"num_envs": 2, "seed": 0, "time_limit": 3, "autoreset_mode": "same_step"}
+    opened = {
+        model: client.post(f"/v1/surrogates/{name}/sessions", json={**options, "model": model}).json()["id"]
+        for model in ("latest", 1)
+    }
+    for id in opened.values():
+        send(client, id, "reset")
+    send(client, opened["latest"], "step", action=ACTIONS, mask=[True, False])
+    export = client.get(f"/v1/surrogates/{name}/models/1", params={"format": "safetensors"}).content
+    client.post(f"/v1/surrogates/{name}/models", content=export).raise_for_status()
+    versions = [send(client, opened["latest"], "step", action=ACTIONS).json()["model_version"] for _ in range(3)]
+    assert versions == [[1, 1], [2, 1], [2, 2]]
+    fixed = [send(client, opened[1], "step", action=ACTIONS).json()["model_version"] for _ in range(4)]
+    assert fixed == [[1, 1]] * 4
+    client.delete(f"/v1/surrogates/{name}")

@@ -1,0 +1,200 @@
+"""The life of a surrogate: created, sampled, fitted, finished, improved, changed, deleted."""
+
+from __future__ import annotations
+
+import csv
+import io
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from support import pendulum
+from surrogym_shared import wire
+
+
+def view(client: httpx.Client, name: str) -> wire.SurrogateView:
+    return wire.SurrogateView.model_validate_json(client.get(f"/v1/surrogates/{name}").raise_for_status().content)
+
+
+def test_creating_twice_is_harmless(client: httpx.Client, fresh: str):
+    first = client.get(f"/v1/surrogates/{fresh}").json()
+    again = client.post("/v1/surrogates", json={"name": fresh, "spec": pendulum.spec()})
+    assert (again.status_code, again.json()) == (201, first)
+    assert (first["phase"], first["queries"]["pending"]) == ("collecting", pendulum.INITIAL)
+
+
+def test_a_new_surrogate_asks_a_latin_hypercube(client: httpx.Client, fresh: str):
+    queries = client.get(f"/v1/surrogates/{fresh}/queries").json()["queries"]
+    speeds = sorted((query["coordinates"][1] + 8) / 16 * pendulum.INITIAL for query in queries)
+    assert [int(speed) for speed in speeds] == list(range(pendulum.INITIAL))
+    assert {query["purpose"] for query in queries} == {"initial"}
+
+
+def test_the_design_spends_its_budget_and_counts_it(client: httpx.Client, taught: str):
+    finished = view(client, taught)
+    assert finished.phase == "over_budget"
+    assert finished.ledger.initial == pendulum.INITIAL
+    assert finished.ledger.adaptive == pendulum.BUDGET - pendulum.INITIAL
+    assert finished.ledger.total == finished.samples == pendulum.BUDGET
+    assert finished.fidelity is not None
+    assert [output.name for output in finished.fidelity.outputs] == finished.outputs
+    assert finished.outputs == ["theta", "theta_dot", "reward"]
+
+
+def test_the_list_has_what_the_page_shows(client: httpx.Client, taught: str):
+    listed = {summary["name"]: summary for summary in client.get("/v1/surrogates").json()["surrogates"]}
+    finished = view(client, taught)
+    assert listed[taught]["confidence_index"] == finished.confidence_index
+    assert listed[taught]["model_version"] == finished.model_version
+
+
+def test_improve_asks_more_and_raises_the_budget(client: httpx.Client, name: str):
+    before = pendulum.teach(client, name, budget=6)
+    body = {"queries": 2, "idempotency_key": "once"}
+    for _ in range(2):
+        client.post(f"/v1/surrogates/{name}/improve", json=body).raise_for_status()
+    after = pendulum.finish(client, name)
+    assert (before["samples"], after["samples"], after["budget"]) == (6, 8, 8)
+
+
+def test_improve_by_the_states_a_policy_visited(client: httpx.Client, name: str):
+    pendulum.teach(client, name, budget=6)
+    opened = client.post(f"/v1/surrogates/{name}/sessions", json={"num_envs": 4, "occupancy": True}).json()
+    for what, body in (("reset", {}), ("step", {"action": [[0.0]] * 4})):
+        client.post(f"/v1/sessions/{opened['id']}/{what}", json=body).raise_for_status()
+    submitted = client.post(f"/v1/sessions/{opened['id']}/occupancy", json={"checkpoint": "first"}).json()
+    assert submitted == {"checkpoint": "first", "states": 8}
+    body = {"queries": 1, "checkpoint": "first"}
+    client.post(f"/v1/surrogates/{name}/improve", json=body).raise_for_status()
+    assert pendulum.finish(client, name)["samples"] == 7
+
+
+def test_a_raised_budget_sets_a_finished_design_going(client: httpx.Client, name: str):
+    pendulum.teach(client, name, budget=6)
+    client.patch(f"/v1/surrogates/{name}", json={"budget": 8}).raise_for_status()
+    assert pendulum.finish(client, name)["samples"] == 8
+
+
+def test_a_paused_design_hands_out_nothing(client: httpx.Client, fresh: str):
+    assert client.patch(f"/v1/surrogates/{fresh}", json={"paused": True}).json()["paused"]
+    claimed = pendulum.claim(client, fresh, wait_seconds=0)
+    assert (claimed["queries"], claimed["paused"]) == ([], True)
+    client.patch(f"/v1/surrogates/{fresh}", json={"paused": False}).raise_for_status()
+    assert pendulum.claim(client, fresh, wait_seconds=0)["queries"]
+
+
+def test_queries_set_aside_never_stick_the_design(client: httpx.Client, fresh: str):
+    lost = client.get(f"/v1/surrogates/{fresh}/queries").json()["queries"][0]["id"]
+    while (found := view(client, fresh)).phase != "over_budget":
+        assert found.phase != "failed", found.error
+        for query in pendulum.claim(client, fresh)["queries"]:
+            if query["id"] == lost:
+                body = {"lease_token": query["lease_token"], "error": "the motor did not answer"}
+                client.post(f"/v1/surrogates/{fresh}/queries/{lost}:fail", json=body).raise_for_status()
+            else:
+                pendulum.add(client, fresh, [pendulum.answer(query)]).raise_for_status()
+    assert (found.queries.set_aside, found.samples) == (1, pendulum.BUDGET)
+    aside = client.get(f"/v1/surrogates/{fresh}/queries?status=set_aside").json()["queries"]
+    assert [query["error"] for query in aside] == ["the motor did not answer"]
+
+
+def test_a_design_without_any_answer_fails_openly_and_goes_on_by_hand(client: httpx.Client, fresh: str):
+    while view(client, fresh).phase == "collecting":
+        for query in pendulum.claim(client, fresh)["queries"]:
+            body = {"lease_token": query["lease_token"], "error": "no power"}
+            path = f"/v1/surrogates/{fresh}/queries/{query['id']}:fail"
+            client.post(path, json=body).raise_for_status()
+    failed = view(client, fresh)
+    assert (failed.phase, failed.error) == (
+        "failed",
+        f"all {pendulum.INITIAL} initial queries were set aside; the last said: no power",
+    )
+    samples = [pendulum.real_step([x, 2 * x], [x / 2]) for x in np.linspace(-3, 3, pendulum.BUDGET)]
+    pendulum.add(client, fresh, samples, idempotency_key="by hand").raise_for_status()
+    while (found := view(client, fresh)).phase != "over_budget":
+        pendulum.claim(client, fresh, wait_seconds=0.2)
+    assert (found.ledger.manual, found.error, found.model_version) == (pendulum.BUDGET, None, 1)
+
+
+def test_a_heartbeat_keeps_a_lease(client: httpx.Client, fresh: str):
+    query = pendulum.claim(client, fresh, max_queries=1, lease_seconds=60)["queries"][0]
+    body = {"lease_token": query["lease_token"], "lease_seconds": 30}
+    assert client.post(f"/v1/surrogates/{fresh}/queries/{query['id']}:renew", json=body).status_code == 204
+
+
+def test_a_lease_that_ends_goes_to_the_next_sampler(client: httpx.Client, fresh: str):
+    first = pendulum.claim(client, fresh, lease_seconds=0.05)["queries"]
+    second = pendulum.claim(client, fresh, sampler="next")["queries"]
+    assert {query["id"] for query in second} <= {query["id"] for query in first}
+    assert second[0]["attempt"] == 2
+    late = pendulum.add(client, fresh, [pendulum.answer(first[0])]).raise_for_status().json()
+    kept = client.get(f"/v1/surrogates/{fresh}/samples").json()["samples"]
+    assert [(sample["id"], sample["late"]) for sample in kept] == [(late["sample_ids"][0], True)]
+
+
+def test_queries_by_hand_are_answered_too(client: httpx.Client, name: str):
+    pendulum.teach(client, name, budget=5)
+    body = {"coordinates": [[1.0, 0.5]], "action": [[0.25]], "idempotency_key": "once"}
+    asked = [client.post(f"/v1/surrogates/{name}/queries", json=body).json()["queries"] for _ in range(2)]
+    assert asked[0] == asked[1]
+    after = pendulum.finish(client, name)
+    assert (after["ledger"]["manual"], after["samples"]) == (1, 6)
+
+
+def test_the_ledger_counts_an_evaluation_once(client: httpx.Client, fresh: str):
+    body = {"steps": 200, "episodes": 1, "idempotency_key": "e"}
+    counts = [client.post(f"/v1/surrogates/{fresh}/ledger", json=body).json() for _ in range(2)]
+    assert counts[0] == counts[1]
+    assert (counts[0]["evaluation"], counts[0]["total"]) == (200, 0)
+
+
+def test_samples_come_in_pages_and_as_tables(client: httpx.Client, taught: str):
+    path = f"/v1/surrogates/{taught}/samples"
+    after: int | None = 0
+    samples: list[dict[str, Any]] = []
+    while after is not None:
+        page = client.get(path, params={"limit": 3, "after": after}).json()
+        samples, after = samples + page["samples"], page["next_after"]
+    assert len(samples) == pendulum.BUDGET
+    rows = list(csv.DictReader(io.StringIO(client.get(path, params={"format": "csv"}).text)))
+    assert [float(row["q.theta_dot"]) for row in rows] == [sample["coordinates"][1] for sample in samples]
+    assert [float(row["u.0"]) for row in rows] == [sample["action"][0] for sample in samples]
+    with np.load(io.BytesIO(client.get(path, params={"format": "npz"}).content), allow_pickle=False) as file:
+        np.testing.assert_array_equal(file["next_coordinates"], [s["next_coordinates"] for s in samples])
+        assert file["coordinate_names"].tolist() == ["theta", "theta_dot"]
+
+
+def test_models_are_kept_exported_and_imported(client: httpx.Client, taught: str, fresh: str):
+    models = client.get(f"/v1/surrogates/{taught}/models").json()["models"]
+    assert [model["version"] for model in models] == [1, 2]
+    assert client.get(f"/v1/surrogates/{taught}/models/2").json() == models[1]
+    export = client.get(f"/v1/surrogates/{taught}/models/2", params={"format": "safetensors"}).content
+    imported = client.post(f"/v1/surrogates/{fresh}/models", content=export).raise_for_status().json()
+    assert (imported["version"], imported["data_hash"]) == (1, models[1]["data_hash"])
+    points = {"coordinates": [[0.3, -1.0]], "action": [[0.7]]}
+    said = [client.post(f"/v1/surrogates/{name}/predict", json=points).json() for name in (taught, fresh)]
+    assert said[0] | {"model_version": 1} == said[1]
+    again = client.get(f"/v1/surrogates/{fresh}/models/1", params={"format": "safetensors"}).content
+    assert again == export
+
+
+def test_what_a_model_says_about_points(client: httpx.Client, taught: str):
+    known = client.get(f"/v1/surrogates/{taught}/samples").json()["samples"][0]
+    points = {"coordinates": [known["coordinates"], [1.0, 7.0]], "action": [known["action"], [2.0]]}
+    said = wire.Prediction(**client.post(f"/v1/surrogates/{taught}/predict", json=points).json())
+    assert said.reward[0] == pytest.approx(known["reward"], abs=1e-2)
+    unsure = wire.Uncertainty(**client.post(f"/v1/surrogates/{taught}/query_uncertainty", json=points).json())
+    assert unsure.deviation[0][2] < unsure.deviation[1][2], "it knows best what it has seen"
+    np.testing.assert_allclose(unsure.uncertainty_index, np.exp(unsure.log_uncertainty_index))
+
+
+def test_deleting_takes_everything_along(client: httpx.Client, name: str):
+    pendulum.teach(client, name, budget=5)
+    session = client.post(f"/v1/surrogates/{name}/sessions", json={}).json()["id"]
+    assert client.delete(f"/v1/surrogates/{name}").status_code == 204
+    assert client.get(f"/v1/surrogates/{name}").status_code == 404
+    assert client.post(f"/v1/sessions/{session}/reset", json={}).status_code == 404
+    client.post("/v1/surrogates", json={"name": name, "spec": pendulum.spec()}).raise_for_status()
+    assert view(client, name).model_version is None
