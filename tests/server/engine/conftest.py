@@ -1,0 +1,81 @@
+"""A model of the Pendulum, fitted once from real steps, and sessions of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from support import pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
+from surrogym_server.engine.session import Session, open_session
+from surrogym_server.surrogate.codec import from_bytes
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.virtual import VirtualSettings
+from surrogym_shared.spec import EnvironmentSpec
+
+Fitted = Callable[[int], SurrogateModel]
+
+
+@pytest.fixture(scope="session")
+def definition() -> EnvironmentDefinition:
+    return definition_from_spec(EnvironmentSpec.model_validate(pendulum.spec()))
+
+
+@pytest.fixture(scope="session")
+def fitted(definition: EnvironmentDefinition) -> Fitted:
+    """A model of n samples; each is fitted once."""
+    made: dict[int, SurrogateModel] = {}
+
+    def fit(samples: int) -> SurrogateModel:
+        if samples not in made:
+            made[samples] = from_bytes(definition, _design(definition, samples).model)
+        return made[samples]
+
+    return fit
+
+
+def _design(definition: EnvironmentDefinition, samples: int) -> DesignResult:
+    rng = np.random.default_rng(samples)
+    q = rng.uniform([-3, -7], [3, 7], (samples, 2))
+    u = rng.uniform(-2, 2, (samples, 1))
+    steps = [pendulum.real_step(list(at), list(action)) for at, action in zip(q, u, strict=True)]
+    threads = torch.get_num_threads()
+    return run_design_job(
+        DesignJob(
+            definition=definition,
+            coordinates=q,
+            action=u,
+            next_coordinates=np.array([step["next_coordinates"] for step in steps]),
+            reward=np.array([step["reward"] for step in steps]),
+            terminated=np.zeros(samples, dtype=bool),
+            state={},
+            budget=samples,
+            target=0.999,
+            threads=threads,
+        )
+    )
+
+
+@pytest.fixture
+def opened(definition: EnvironmentDefinition) -> Callable[..., Session]:
+    """A session of N = 4 lanes under version 1."""
+
+    def open_one(id: str = "s", occupancy: bool = False, **settings: object) -> Session:
+        values: dict[str, object] = {"num_envs": 4, "time_limit": 3, "autoreset_mode": "same_step", **settings}
+        return open_session(
+            id,
+            "pendulum",
+            definition,
+            VirtualSettings(**values),  # type: ignore[arg-type]
+            seed=3,
+            model="latest",
+            version=1,
+            occupancy=occupancy,
+        )
+
+    return open_one

@@ -1,0 +1,126 @@
+"""One session: lanes of several model versions step as if apart, and what is saved comes back whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from surrogym_server.engine.saved import session_from_bytes, session_to_bytes
+from surrogym_server.engine.session import Session, answered, digest_of, replay, reset_session, step_session
+from surrogym_server.errors import InvalidInput, SeqConflict
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_shared.port import StepResult
+
+Open = Callable[..., Session]
+Fitted = Callable[[int], SurrogateModel]
+VERSIONS = {1: 6, 2: 9}  # samples of each version's model
+ARRAYS = ("observation", "reward", "terminated", "truncated", "final_lanes", "final_observation", "deviation")
+
+
+def stepped(fitted: Fitted, session: Session, action: float = 0.5, latest: int = 2) -> tuple[Session, StepResult]:
+    u = np.full((session.settings.num_envs, 1), action)
+    return step_session(session, u, None, True, lambda version: fitted(VERSIONS[version]), latest)
+
+
+def test_lanes_of_two_versions_step_as_two_sessions_would(opened: Open, fitted: Fitted):
+    session, _ = reset_session(opened(), None, None, 1)
+    one = [stepped(fitted, replace(session, versions=np.full(4, version)))[1] for version in (1, 2)]
+    mixed, result = stepped(fitted, replace(session, versions=np.array([2, 1, 1, 2])))
+    assert not np.allclose(one[0].reward, one[1].reward), "the versions differ"
+    for lane, version in enumerate([2, 1, 1, 2]):
+        for name in ("observation", "reward", "deviation"):
+            ours, theirs = getattr(result, name)[lane], getattr(one[version - 1], name)[lane]
+            np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+    np.testing.assert_array_equal(mixed.versions, [2, 1, 1, 2])
+
+
+def test_lanes_of_two_versions_end_together(opened: Open, fitted: Fitted):
+    session, _ = reset_session(opened(time_limit=1), None, None, 1)
+    after, result = stepped(fitted, replace(session, versions=np.array([2, 1, 1, 2])))
+    np.testing.assert_array_equal(result.final_lanes, [0, 1, 2, 3])
+    assert result.truncated.all()
+    alone = stepped(fitted, replace(session, versions=np.full(4, 2)))[1]
+    np.testing.assert_allclose(result.final_observation[[0, 3]], alone.final_observation[[0, 3]], rtol=1e-6)
+    np.testing.assert_array_equal(after.versions, [2, 2, 2, 2])
+
+
+def test_a_reset_moves_its_lanes_alone(opened: Open):
+    session, _ = reset_session(opened(), None, None, 1)
+    session, result = reset_session(session, None, np.array([True, False, False, True]), 2)
+    np.testing.assert_array_equal(result.model_version, [2, 1, 1, 2])
+
+
+def test_a_mask_of_another_length_is_refused(opened: Open, fitted: Fitted):
+    session, _ = reset_session(opened(), None, None, 1)
+    session = replace(session, versions=np.array([1, 2, 1, 2]))
+    with pytest.raises(InvalidInput, match="expected 4 entries, one a lane, got 3"):
+        step_session(session, np.zeros((4, 1)), np.ones(3, dtype=bool), False, fitted, 2)
+
+
+def test_only_stepped_lanes_count_as_visits(opened: Open, fitted: Fitted):
+    session, _ = reset_session(opened(occupancy=True), None, None, 1)
+    mask = np.array([True, False, False, False])
+    session, _ = step_session(session, np.zeros((4, 1)), mask, False, lambda _: fitted(6), 1)
+    assert session.visited is not None
+    assert session.visited.seen == 5
+    np.testing.assert_array_equal(session.visited.states[4], session.lanes.q[0])
+
+
+@pytest.mark.parametrize("variant", ["deterministic", "probabilistic"])
+def test_what_was_saved_goes_on_bit_for_bit(
+    opened: Open, fitted: Fitted, definition: EnvironmentDefinition, variant: str
+):
+    session, _ = reset_session(opened(variant=variant, particles=8, occupancy=True), 11, None, 1)
+    results = []
+    for _ in range(2):
+        session, result = stepped(fitted, session)
+        results.append(result)
+    session, answer = answered(session, "digest", tuple(results))
+    back = session_from_bytes(definition, session_to_bytes(session))
+    assert (back.id, back.seed, back.settings, back.seq, back.model) == ("s", 3, session.settings, 1, "latest")
+    for ours, theirs in zip(replay(back, 1, "digest").outcome, answer.outcome, strict=True):
+        for name in ARRAYS:
+            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), strict=True)
+    for _ in range(4):
+        (session, ours), (back, theirs) = stepped(fitted, session), stepped(fitted, back)
+        for name in ARRAYS:
+            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), strict=True)
+    np.testing.assert_array_equal(back.visited.states, session.visited.states)
+
+
+def test_the_answer_of_a_reset_is_saved_too(opened: Open, definition: EnvironmentDefinition):
+    session, result = reset_session(opened(), 5, None, 1)
+    session, _ = answered(session, "digest", result)
+    back = session_from_bytes(definition, session_to_bytes(session))
+    np.testing.assert_array_equal(replay(back, 1, "digest").outcome.observation, result.observation, strict=True)
+
+
+def test_only_the_next_seq_and_a_repeat_of_the_last_are_taken(opened: Open):
+    session, result = reset_session(opened(), None, None, 1)
+    assert replay(session, 1, "a") is None
+    session, answer = answered(session, "a", result)
+    assert replay(session, None, "a") is None
+    assert replay(session, 2, "b") is None
+    assert replay(session, 1, "a") is answer
+    for seq, digest in ((1, "b"), (3, "a"), (9, "a")):
+        with pytest.raises(SeqConflict) as refusal:
+            replay(session, seq, digest)
+        assert refusal.value.expected == 2
+
+
+def test_a_digest_tells_requests_apart():
+    action = np.array([[0.5], [1.0]])
+    requests = [
+        ("step", action, None, False),
+        ("step", action, None, True),
+        ("step", action, np.array([True, True]), False),
+        ("step", action[::-1], None, False),
+        ("step", action.T, None, False),
+        ("rollout", action, None, False),
+    ]
+    assert len({digest_of(*request) for request in requests}) == len(requests)
+    assert digest_of("step", action.copy(order="F"), None, False) == digest_of(*requests[0])
