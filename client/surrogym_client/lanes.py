@@ -171,9 +171,8 @@ class Lanes:
         if self.mode == "same_step":
             lanes = np.concatenate([result.final_lanes, np.flatnonzero(cut)])
             final = np.concatenate([result.final_observation, self._observation[cut]])
-            order = np.argsort(lanes)
             shown = self._start
-            result = replace(result, final_lanes=lanes[order], final_observation=final[order])
+            result = replace(result, final_lanes=lanes, final_observation=final)
         else:
             shown = self._observation
         if self.mode == "next_step":

@@ -172,9 +172,12 @@ class HttpSurrogate:
         """Send a request that changes the session under its next seq; an error leaves the seq as it was."""
         seq = self._last_seq(session) + 1
         route = f"{_session(session)}/{what}"
-        content = self.connection.send("POST", route, _ENCODER.encode({"seq": seq, **body}), timeout=timeout)
         try:
+            content = self.connection.send("POST", route, _ENCODER.encode({"seq": seq, **body}), timeout=timeout)
             reply = decoder.decode(content)
+        except SessionLost:
+            del self._seq[session]
+            raise
         except msgspec.DecodeError as error:
             raise ProtocolMismatch(f"unexpected answer of {route}: {error}") from error
         self._seq[session] = reply.seq

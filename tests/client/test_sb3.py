@@ -1,5 +1,7 @@
 """SurrogateVecEnv speaks Stable-Baselines3's dialect: the same as DummyVecEnv on the same trajectory."""
 
+import itertools
+
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
@@ -39,6 +41,22 @@ def test_a_trajectory_is_dummy_vec_envs(remote: SurrogateVecEnv):
         assert_same_infos(remote.reset_infos, reference.reset_infos)
         cut += sum(info["TimeLimit.truncated"] for info in ours[3])
     assert cut > 3, "expected several episodes to reach the time limit"
+
+
+def test_an_episode_that_terminates_at_its_time_limit_is_not_bootstrapped():
+    def end_of(time_limit: int) -> tuple[int, dict[str, object]]:
+        envs = SurrogateVecEnv.from_port(ExactPendulum(), 1, seed=0, time_limit=time_limit)
+        envs.reset()
+        for step in itertools.count(1):
+            _, _, done, infos = envs.step(np.full((1, 1), 2.0))
+            if done[0]:
+                return step, infos[0]
+
+    terminated_at, info = end_of(time_limit=1_000)
+    assert not info["TimeLimit.truncated"]
+    assert end_of(terminated_at)[0] == terminated_at
+    assert not end_of(terminated_at)[1]["TimeLimit.truncated"]
+    assert end_of(terminated_at - 1)[1]["TimeLimit.truncated"]
 
 
 def test_seeds_are_used_once(remote: SurrogateVecEnv):

@@ -180,9 +180,19 @@ def test_the_last_session_takes_its_sockets_with_it():
         port.step("abc", ACTION)
         port.close("abc")
         assert port.connection._client.is_closed
-        port._seq["def"] = 4
+        port._seq["def"] = 4  # a session goes on, and the client connects anew
         port.step("def", ACTION)
         port.disconnect()
+
+
+def test_a_lost_session_keeps_no_socket_open():
+    with scripted_server(view(), problem(Code.SESSION_EXPIRED), reply("")) as server:
+        port = surrogate(server)
+        port.open(wire.OpenSession(num_envs=2))
+        with pytest.raises(errors.SessionExpired):
+            port.step("abc", ACTION)
+        port.close("another")
+        assert port.connection._client.is_closed
 
 
 def test_closing_a_session_that_is_gone_is_harmless():

@@ -24,7 +24,6 @@ from surrogym_shared.wire import BoxSpace, OpenSession, SessionView
 TIME_LIMIT = 12
 SPINNING = 4.0
 HIGH = [1.0, 1.0, 8.0]
-MODEL_VERSION = 3
 
 
 @dataclass
@@ -39,6 +38,11 @@ class Pendulum:
     angle: float = 0.0
     speed: float = 0.0
     running: bool = False
+
+    @property
+    def version(self) -> int:
+        """The model the episode runs under: every episode has a newer one."""
+        return self.episode + 1
 
     def reset(self) -> np.ndarray:
         self.episode += 1
@@ -76,11 +80,11 @@ class ExactEnv(gymnasium.Env):
         super().reset(seed=seed)
         if seed is not None:
             self.pendulum = Pendulum(seed=seed)
-        return self.pendulum.reset(), {"model_version": MODEL_VERSION}
+        return self.pendulum.reset(), {"model_version": self.pendulum.version}
 
     def step(self, action: np.ndarray):
         observation, reward, terminated, truncated = self.pendulum.step(float(action[0]))
-        info = {"model_version": MODEL_VERSION, "reward_mean": reward}
+        info = {"model_version": self.pendulum.version, "reward_mean": reward}
         return observation, reward, terminated, truncated, info
 
 
@@ -119,7 +123,7 @@ class ExactPendulum:
             seed=seed,
             autoreset_mode=request.autoreset_mode,
             model="latest",
-            model_version=[MODEL_VERSION] * request.num_envs,
+            model_version=[1] * request.num_envs,
             seq=0,
             time_limit=request.time_limit or TIME_LIMIT,
             penalty=0.0,
@@ -191,4 +195,4 @@ class ExactPendulum:
 
     @staticmethod
     def _versions(session: Session) -> np.ndarray:
-        return np.full(len(session.lanes), MODEL_VERSION, dtype=np.int64)
+        return np.array([lane.version for lane in session.lanes], dtype=np.int64)
