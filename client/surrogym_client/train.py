@@ -1,0 +1,241 @@
+"""Training in the virtual environment: PPO with the paper's policies, or any Stable-Baselines3 algorithm by name.
+
+Settings follow from properties of the specification alone (kind of action, time limit), never from a task's name.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import stable_baselines3
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+from surrogym_client.policies import PaperPolicy, Standardise
+from surrogym_client.sb3 import SurrogateVecEnv
+from surrogym_shared.port import SurrogatePort
+from surrogym_shared.spec import EnvironmentSpec
+
+MAX_STEPS = 1_000_000  # virtual steps of one training, the paper's cap
+ON_POLICY_STEPS = 300_000
+OFF_POLICY_STEPS = 50_000  # these learn from every step, and take far longer for each
+STATISTICS_LANES = 1_024
+LEARNING_RATE = 3e-3
+LAST_RATE = 0.02  # share of the learning rate that is left at the end
+
+
+def _decaying(remaining: float) -> float:
+    return LEARNING_RATE * max(remaining, LAST_RATE)
+
+
+PPO_DEFAULTS: dict[str, Any] = {
+    "n_steps": 64,
+    "batch_size": 256,
+    "n_epochs": 10,
+    "learning_rate": _decaying,
+    "gae_lambda": 0.9,
+}
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """What to train. None takes what the specification suggests.
+
+    ``session`` holds further fields of ``OpenSession`` (variant, particles, model, penalty, ...); ``hyperparameters``
+    go to the algorithm's constructor, over the defaults.
+    """
+
+    algorithm: str = "PPO"
+    total_steps: int | None = None
+    num_envs: int | None = None
+    seed: int = 0
+    start_box: float = 0.5
+    start_from: Path | None = None  # go on from a saved policy
+    threads: int = 1
+    tensorboard: Path | None = None
+    session: dict[str, Any] = field(default_factory=dict)
+    hyperparameters: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class TrainProgress:
+    steps: int
+    total_steps: int
+    imagined_return: float | None  # mean over the last 100 virtual episodes, penalty included
+    penalty_share: float  # of the reward's size, since the last report
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    path: Path
+    algorithm: str
+    virtual_steps: int
+    seconds: float
+    imagined_return: float | None
+    lost_episodes: int  # cut because the server lost the session
+    settings: dict[str, Any]
+
+
+def train(
+    port: SurrogatePort,
+    out: Path,
+    settings: TrainSettings | None = None,
+    progress: Callable[[TrainProgress], None] | None = None,
+) -> TrainResult:
+    """Learn a policy in the surrogate behind a port, and save it.
+
+    Args:
+        port: the surrogate.
+        out: where the policy goes (an SB3 zip); beside it, with suffix .json, what it was trained with.
+        settings: what to train.
+        progress: called after every rollout.
+
+    Raises:
+        ValueError: an unknown algorithm, one that can't take the action space, or too many steps.
+        SurrogymClientError: the surrogate can't be reached, or has no model yet.
+    """
+    settings = settings or TrainSettings()
+    torch.set_num_threads(settings.threads)
+    spec, algorithm = port.spec(), algorithm_by_name(settings.algorithm)
+    total = _total_steps(algorithm, settings)
+    num_envs = settings.num_envs or suggested_lanes(algorithm)
+    gamma = settings.hyperparameters.get("gamma", suggested_gamma(spec))
+    env = SurrogateVecEnv.from_port(
+        port, num_envs, seed=settings.seed, start_box=settings.start_box, **settings.session
+    )
+    wrapped = VecNormalize(VecMonitor(env), norm_obs=False, norm_reward=True, gamma=gamma)
+    started = time.perf_counter()
+    try:
+        statistics = observation_statistics(port, settings.seed)
+        learner = _learner(algorithm, wrapped, settings, statistics, gamma)
+        report = _Report(total, progress)
+        learner.learn(total, callback=report, reset_num_timesteps=True)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        learner.save(out)
+    finally:
+        wrapped.close()
+    result = TrainResult(
+        path=out,
+        algorithm=settings.algorithm,
+        virtual_steps=learner.num_timesteps,
+        seconds=time.perf_counter() - started,
+        imagined_return=report.imagined_return,
+        lost_episodes=report.lost,
+        settings={**asdict(settings), "num_envs": num_envs, "total_steps": total, "gamma": gamma},
+    )
+    out.with_suffix(".json").write_text(json.dumps(asdict(result), indent=2, default=str) + "\n")
+    return result
+
+
+def algorithm_by_name(name: str) -> type[BaseAlgorithm]:
+    """A Stable-Baselines3 algorithm. Raises ValueError with the known names."""
+    known = {n: a for n in dir(stable_baselines3) if isinstance(a := getattr(stable_baselines3, n), type)}
+    known = {n: a for n, a in known.items() if issubclass(a, BaseAlgorithm)}
+    if name not in known:
+        raise ValueError(f"unknown algorithm {name!r}: expected one of {', '.join(sorted(known))}")
+    found: type[BaseAlgorithm] = known[name]
+    return found
+
+
+def suggested_gamma(spec: EnvironmentSpec) -> float:
+    """A discount whose horizon, 1 / (1 - gamma), is a sixth of the time limit: 0.97 for 200 steps, 0.988 for 500."""
+    return float(np.clip(1 - 6 / (spec.time_limit or 1_000), 0.9, 0.999))
+
+
+def suggested_lanes(algorithm: type[BaseAlgorithm]) -> int:
+    """On-policy algorithms want many lanes, the others learn once for each step of all of them."""
+    return 64 if issubclass(algorithm, OnPolicyAlgorithm) else 4
+
+
+def observation_statistics(port: SurrogatePort, seed: int) -> tuple[list[float], list[float]]:
+    """Mean and deviation, (D,) each, of observations over the sampling range."""
+    env = SurrogateVecEnv.from_port(port, STATISTICS_LANES, seed=seed, start_box=1.0)
+    try:
+        observation = np.asarray(env.reset(), dtype=np.float64)
+    finally:
+        env.close()
+    deviation = observation.std(0)
+    return observation.mean(0).tolist(), np.where(deviation > 1e-6, deviation, 1.0).tolist()
+
+
+def _learner(
+    algorithm: type[BaseAlgorithm],
+    env: VecNormalize,
+    settings: TrainSettings,
+    statistics: tuple[Sequence[float], Sequence[float]],
+    gamma: float,
+) -> BaseAlgorithm:
+    if settings.start_from is not None:
+        return algorithm.load(settings.start_from, env=env, device="cpu", seed=settings.seed)
+    extractor = {"mean": statistics[0], "deviation": statistics[1]}
+    defaults: dict[str, Any] = {"gamma": gamma}
+    policy_kwargs = {"features_extractor_class": Standardise, "features_extractor_kwargs": extractor}
+    if algorithm is stable_baselines3.PPO:
+        defaults |= PPO_DEFAULTS
+    own = issubclass(algorithm, OnPolicyAlgorithm)
+    try:
+        return algorithm(
+            PaperPolicy if own else "MlpPolicy",
+            env,
+            seed=settings.seed,
+            device="cpu",
+            policy_kwargs=policy_kwargs,
+            tensorboard_log=None if settings.tensorboard is None else str(settings.tensorboard),
+            **(defaults | settings.hyperparameters),
+        )
+    except (AssertionError, TypeError) as error:
+        raise ValueError(f"{settings.algorithm} can't be trained here: {error}") from error
+
+
+def _total_steps(algorithm: type[BaseAlgorithm], settings: TrainSettings) -> int:
+    suggested = ON_POLICY_STEPS if issubclass(algorithm, OnPolicyAlgorithm) else OFF_POLICY_STEPS
+    total = suggested if settings.total_steps is None else settings.total_steps
+    if not 1 <= total <= MAX_STEPS:
+        raise ValueError(f"virtual steps: expected 1 to {MAX_STEPS}, got {total}")
+    return total
+
+
+class _Report(BaseCallback):
+    """Reports progress, and logs what the penalty took of the reward."""
+
+    def __init__(self, total: int, progress: Callable[[TrainProgress], None] | None) -> None:
+        super().__init__()
+        self._total = total
+        self._progress = progress
+        self._penalty = self._size = 0.0
+        self.lost = 0
+
+    @property
+    def imagined_return(self) -> float | None:
+        episodes = self.model.ep_info_buffer
+        return float(np.mean([e["r"] for e in episodes])) if episodes else None
+
+    def _on_step(self) -> bool:
+        infos, env = self.locals["infos"], self.training_env
+        assert isinstance(env, VecNormalize)
+        reward = env.get_original_reward()
+        mean = np.array([info["reward_mean"] for info in infos])
+        self._penalty += float(np.abs(mean - reward).sum())
+        self._size += float(np.abs(mean).sum())
+        self.lost += sum("surrogym_session_lost" in info for info in infos)
+        return True
+
+    def _on_rollout_end(self) -> None:
+        share = self._penalty / self._size if self._size else 0.0
+        self._penalty = self._size = 0.0
+        self.logger.record("surrogym/penalty_share", share)
+        if self._progress is not None:
+            steps = min(self.num_timesteps, self._total)
+            self._progress(TrainProgress(steps, self._total, self.imagined_return, share))
+
+
+__all__ = ["TrainProgress", "TrainResult", "TrainSettings", "algorithm_by_name", "train"]

@@ -1,0 +1,121 @@
+"""LocalSurrogate: a surrogate stepped in this process, for those who have the [server] extra. No server, no FastAPI."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from surrogym_server.convert import definition_from_spec, opening, session_view
+from surrogym_server.engine.session import Session, open_session, reset_session, step_session
+from surrogym_server.errors import InvalidInput, UnknownModel, UnknownSession
+from surrogym_server.services.sessions import resolved
+from surrogym_server.surrogate.actions import policy_actions
+from surrogym_server.surrogate.codec import from_bytes
+from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import OpenSession, SessionView
+
+VERSION = 1
+
+
+class LocalSurrogate:
+    """One model behind the SurrogatePort; see its laws. Errors are those of ``surrogym_server.errors``.
+
+    Args:
+        spec: the original environment.
+        model: a model of it; it is version 1, and the latest.
+
+    Example:
+        >>> surrogate = LocalSurrogate.load("spec.json", "model.safetensors")
+        >>> env = SurrogateVecEnv.from_port(surrogate, num_envs=16)
+    """
+
+    def __init__(self, spec: EnvironmentSpec, model: SurrogateModel) -> None:
+        self._spec = spec
+        self._model = model
+        self._sessions: dict[str, Session] = {}
+
+    @classmethod
+    def load(cls, spec: str | Path, model: str | Path) -> Self:
+        """Read a specification (JSON) and a model (safetensors) as the server exports them.
+
+        Raises:
+            OSError: a file that can't be read.
+            ValueError: a specification that contradicts itself.
+            InvalidInput: not a model of it.
+        """
+        read = EnvironmentSpec.model_validate_json(Path(spec).read_bytes())
+        return cls(read, from_bytes(definition_from_spec(read), Path(model).read_bytes()))
+
+    def spec(self) -> EnvironmentSpec:
+        return self._spec
+
+    def open(self, request: OpenSession) -> SessionView:
+        if request.model not in ("latest", VERSION):
+            raise UnknownModel(f"expected model 'latest' or {VERSION}, got {request.model}")
+        asked, definition = opening(request), self._model.definition
+        session = open_session(
+            secrets.token_urlsafe(8),
+            "local",
+            definition,
+            resolved(asked, definition),
+            seed=secrets.randbits(63) if asked.seed is None else asked.seed,
+            model=asked.model,
+            version=VERSION,
+            occupancy=asked.occupancy,
+        )
+        self._sessions[session.id] = session
+        return session_view(session, float("inf"))
+
+    def reset(self, session: str, *, seed: int | Sequence[int] | None = None, mask: Bools | None = None) -> ResetResult:
+        self._sessions[session], result = reset_session(self._get(session), seed, mask, VERSION)
+        return result
+
+    def step(
+        self, session: str, action: Floats | Ints, *, mask: Bools | None = None, deviations: bool = False
+    ) -> StepResult:
+        live = self._get(session)
+        u = policy_actions(live.definition.action, action, live.settings.num_envs)
+        self._sessions[session], result = step_session(live, u, mask, deviations, self._version, VERSION)
+        return result
+
+    def rollout(self, session: str, actions: Floats | Ints) -> list[StepResult]:
+        live, results = self._get(session), []
+        planned = [policy_actions(live.definition.action, row, live.settings.num_envs) for row in actions]
+        for u in planned:
+            live, result = step_session(live, u, None, False, self._version, VERSION)
+            results.append(result)
+        self._sessions[session] = live
+        return results
+
+    def submit_occupancy(self, session: str, checkpoint: str) -> int:
+        """There is no design here to weigh; says how many states there are. ``checkpoint`` is not kept."""
+        del checkpoint
+        visited = self._get(session).visited
+        if visited is None:
+            raise InvalidInput("expected a session opened with occupancy=true, got one without")
+        return len(visited.states)
+
+    def visited(self, session: str) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+        """The states that a session opened with occupancy visited, (v, C)."""
+        visited = self._get(session).visited
+        if visited is None:
+            raise InvalidInput("expected a session opened with occupancy=true, got one without")
+        return visited.states
+
+    def close(self, session: str) -> None:
+        self._sessions.pop(session, None)
+
+    def _get(self, session: str) -> Session:
+        if session not in self._sessions:
+            raise UnknownSession(f"no session {session!r}: open a new one")
+        return self._sessions[session]
+
+    def _version(self, version: int) -> SurrogateModel:
+        del version  # there is one
+        return self._model
