@@ -15,9 +15,7 @@ def space(wire: BoxSpace | DiscreteSpace | MultiDiscreteSpace) -> gymnasium.Spac
     """The Gymnasium space of one lane: float32 Box, Discrete or MultiDiscrete."""
     match wire:
         case BoxSpace():
-            return gymnasium.spaces.Box(
-                _filled(wire.low, -np.inf), _filled(wire.high, np.inf), dtype=np.float32
-            )
+            return gymnasium.spaces.Box(_filled(wire.low, -np.inf), _filled(wire.high, np.inf), dtype=np.float32)
         case DiscreteSpace():
             return gymnasium.spaces.Discrete(wire.n)
         case MultiDiscreteSpace():
