@@ -60,7 +60,8 @@ class Episode(ABC):
 
     def _shown(self, coordinates: Array) -> Array:
         """The declared observation (D,)."""
-        return observe(self.spec, coordinates[None])[0]
+        shown: Array = observe(self.spec, coordinates[None])[0]
+        return shown
 
 
 class GymnasiumEpisode(Episode):
@@ -78,7 +79,8 @@ class GymnasiumEpisode(Episode):
         return gymnasium.make(self.spec.environment).unwrapped
 
     def _read(self) -> Array:
-        return self._task.read(self._env)
+        coordinates: Array = self._task.read(self._env)
+        return coordinates
 
     def _write(self, coordinates: Array) -> None:
         self._env.reset(seed=0)

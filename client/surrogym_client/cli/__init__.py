@@ -1,0 +1,66 @@
+"""The ``surrogym`` command. Each command is a file here with ``register(app)``; others join through an entry point."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from importlib.metadata import entry_points
+
+import typer
+
+from surrogym_client.cli.errors import sentence
+
+COMMANDS = ("register", "sample", "train", "evaluate", "status", "improve", "export", "delete", "demo")
+ENTRY_POINTS = "surrogym.commands"
+INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one command and exit: 0 when it did its work, 1 when it could not, 2 for wrong usage, 130 after Ctrl-C."""
+    try:
+        build()(args=None if arguments is None else list(arguments), prog_name="surrogym")
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+    except Exception as error:
+        message = sentence(error)
+        if message is None:
+            raise
+        typer.echo(f"error: {message}", err=True)
+        sys.exit(1)
+
+
+def build() -> typer.Typer:
+    """All commands, assembled: the client's own, then those that other packages bring."""
+    app = typer.Typer(
+        name="surrogym",
+        help="Learn a virtual environment from a handful of real steps, serve it, and train on it.",
+        no_args_is_help=True,
+        add_completion=False,
+        rich_markup_mode=None,
+        pretty_exceptions_enable=False,
+    )
+    app.callback()(_version)
+    for name in COMMANDS:
+        register: Callable[[typer.Typer], None] = import_module(f"{__name__}.{name}").register
+        register(app)
+    for entry in entry_points(group=ENTRY_POINTS):
+        entry.load()(app)
+    return app
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"surrogym {version('surrogym')}")
+        raise typer.Exit
+
+
+def _version(
+    version: bool = typer.Option(
+        False, "--version", is_eager=True, callback=_show_version, help="Print the version and exit."
+    ),
+) -> None:
+    """Learn a virtual environment from a handful of real steps, serve it, and train on it."""
+    del version  # its callback has acted on it

@@ -1,0 +1,36 @@
+"""``surrogym delete``: remove a surrogate with all its samples."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from surrogym_client.cli.options import AsJson, Quiet, Server, Token, connect
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("delete")(command)
+
+
+def command(
+    surrogate: Annotated[str, typer.Argument(help="Name of the surrogate.")],
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
+    server: Server = None,
+    token: Token = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Delete a surrogate: its samples, models and sessions are gone for good.
+
+    Example: surrogym delete pendulum --yes
+    """
+    from surrogym_client.cli.output import give
+
+    with connect(server, token) as api:
+        view = api.surrogate(surrogate)
+        if not yes:
+            typer.confirm(f"Delete {surrogate!r} with its {view.samples} real samples?", abort=True, err=True)
+        api.delete_surrogate(surrogate)
+    give({"deleted": surrogate}, lambda: f"{surrogate} deleted", as_json=as_json, quiet=quiet)

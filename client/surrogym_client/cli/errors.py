@@ -1,0 +1,52 @@
+"""What a command tells a person when it can't do its work: one sentence, never a traceback."""
+
+from __future__ import annotations
+
+EXTRAS = {
+    "server": ("alembic", "fastapi", "psycopg", "safetensors", "scipy", "sqlalchemy", "starlette", "uvicorn"),
+    "train": ("matplotlib", "stable_baselines3", "tensorboard", "torch"),
+    "mujoco": ("mujoco", "imageio"),
+}
+
+
+class CommandError(Exception):
+    """A command can't do what was asked; ``str(error)`` is the sentence for the person."""
+
+
+def sentence(error: Exception) -> str | None:
+    """The sentence for an error that a person can do something about; None for a defect of the program."""
+    from pydantic import ValidationError
+
+    from surrogym_client.errors import SurrogymClientError
+    from surrogym_client.original.errors import OriginalError
+
+    match error:
+        case CommandError() | SurrogymClientError() | OriginalError():
+            return str(error)
+        case ModuleNotFoundError(name=str(name)):
+            return _missing(name.partition(".")[0])
+        case ValidationError():
+            return invalid(error)
+        case OSError(filename=str(path), strerror=str(reason)):
+            return f"{path}: {reason}"
+        case _:
+            return None
+
+
+def invalid(error: Exception) -> str:
+    """The first thing that is wrong with a model, with its place."""
+    from pydantic import ValidationError
+
+    if not isinstance(error, ValidationError):
+        return str(error)
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    message = first["msg"].removeprefix("Value error, ")
+    return f"{where}: {message}" if where else message
+
+
+def _missing(module: str) -> str | None:
+    for extra, modules in EXTRAS.items():
+        if module in modules:
+            return f"this needs {module}, which is not installed: pip install 'surrogym[{extra}]'"
+    return None

@@ -1,0 +1,129 @@
+"""``surrogym evaluate``: what a policy is worth in the original environment."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from surrogym_client.cli.options import AsJson, Quiet, Server, SpecFile, Token, read_spec
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from surrogym_client.evaluate import Evaluation, EvaluationSettings
+    from surrogym_client.original.episodes import Episode
+    from surrogym_client.policy_file import PolicyCard
+    from surrogym_shared.spec import EnvironmentSpec
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("evaluate")(command)
+
+
+def command(
+    policy: Annotated[Path, typer.Argument(help="Policy file that surrogym train, or Stable-Baselines3, wrote.")],
+    env: Annotated[
+        str | None, typer.Option(help="Gymnasium id or package.module:factory. [default: what it was trained for]")
+    ] = None,
+    spec: SpecFile = None,
+    episodes: Annotated[int, typer.Option(min=1, help="How many real episodes.")] = 100,
+    first_seed: Annotated[int, typer.Option(min=0, help="Reset seed of the first episode; the next follow.")] = 10_000,
+    wide: Annotated[bool, typer.Option("--wide", help="Start anywhere in the sampling range.")] = False,
+    perturb: Annotated[
+        float, typer.Option(min=0, help="Deviation of random factors on masses, lengths and limits.")
+    ] = 0.0,
+    algorithm: Annotated[
+        str | None, typer.Option(help="Stable-Baselines3 algorithm of the file. [default: as noted beside it, or PPO]")
+    ] = None,
+    surrogate: Annotated[
+        str | None, typer.Option(help="Enter the real steps into this surrogate's ledger. [default: as noted]")
+    ] = None,
+    server: Server = None,
+    token: Token = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Run real episodes with a policy and count successes; the real steps go to the surrogate's ledger.
+
+    Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 100
+    """
+    from surrogym_client.cli.output import give, progress
+    from surrogym_client.evaluate import EvaluationSettings, evaluate
+    from surrogym_client.policy_file import load_policy, read_card
+
+    card = read_card(policy)
+    settings = EvaluationSettings(episodes=episodes, first_seed=first_seed, wide=wide, perturb=perturb)
+    opener = _opener(env, read_spec(spec), card)
+    predict = load_policy(policy, algorithm or card.algorithm)
+    with progress("evaluate", quiet=quiet) as update:
+        result = _checked(
+            lambda: evaluate(predict, opener, settings, lambda done, n: update(done / n, f"{done} of {n} ended"))
+        )
+    _enter(result, settings, surrogate or card.surrogate, server or card.server, token, quiet=quiet)
+    summary = {"policy": str(policy), **_settings(settings), **result.summary()}
+    give(summary, lambda: _words(result), as_json=as_json)
+
+
+def _opener(env: str | None, given: EnvironmentSpec | None, card: PolicyCard) -> Callable[[], Episode]:
+    """How to open an episode. A card's word is taken for Gymnasium's own ids alone, never for a module."""
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.original.episodes import open_episode
+    from surrogym_client.original.loading import is_known, make
+
+    noted = card.spec
+    name = env or (noted.environment if noted is not None else None)
+    if name is None or (env is None and not is_known(name)):
+        raise CommandError(f"expected --env with the original environment, got none (noted beside the policy: {name})")
+    spec = given or (noted if noted is not None and noted.environment == name else None)
+    if ":" in name:
+        return lambda: open_episode(name, spec, lambda: make(name))
+    spec = spec or make(name).spec()
+    return lambda: open_episode(name, spec, lambda: make(name, spec=spec))
+
+
+def _checked(run: Callable[[], Evaluation]) -> Evaluation:
+    from surrogym_client.cli.errors import CommandError
+
+    try:
+        return run()
+    except ValueError as error:
+        raise CommandError(f"the policy does not fit the environment: {error}") from error
+
+
+def _enter(
+    result: Evaluation,
+    settings: EvaluationSettings,
+    surrogate: str | None,
+    server: str | None,
+    token: str | None,
+    *,
+    quiet: bool,
+) -> None:
+    """Enter the real steps into the ledger; a server that is gone does not spoil the result."""
+    from surrogym_client.cli.options import connect
+    from surrogym_client.cli.output import say
+    from surrogym_client.errors import SurrogymClientError
+
+    if surrogate is None:
+        return
+    note = f"{settings.episodes} episodes from seed {settings.first_seed}"
+    try:
+        with connect(server, token) as api:
+            api.report_steps(surrogate, result.steps, episodes=settings.episodes, note=note)
+    except SurrogymClientError as error:
+        say(f"not entered into the ledger of {surrogate!r}: {error}", quiet=quiet)
+
+
+def _settings(settings: EvaluationSettings) -> dict[str, Any]:
+    return {"first_seed": settings.first_seed, "wide": settings.wide, "perturb": settings.perturb}
+
+
+def _words(result: Evaluation) -> str:
+    from surrogym_client.cli.output import columns
+
+    summary = result.summary()
+    names = ("mean", "iqm", "min", "max", "std", "mean_length", "success_rate", "episodes", "steps")
+    return columns([names, [summary[name] for name in names]])

@@ -1,0 +1,37 @@
+"""``surrogym improve``: spend more real steps on a surrogate."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from surrogym_client.cli.options import AsJson, Quiet, Server, Token, connect
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("improve")(command)
+
+
+def command(
+    surrogate: Annotated[str, typer.Argument(help="Name of the surrogate.")],
+    queries: Annotated[int, typer.Option("--queries", "-n", min=1, help="How many more real steps.")] = 10,
+    checkpoint: Annotated[
+        str | None, typer.Option(help="Weigh by the states that policies visited up to this checkpoint.")
+    ] = None,
+    server: Server = None,
+    token: Token = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Ask the design for more queries; a sampler has to answer them.
+
+    Example: surrogym improve pendulum --queries 10
+    """
+    from surrogym_client.cli.output import give
+
+    with connect(server, token) as api:
+        view = api.improve(surrogate, queries, checkpoint=checkpoint)
+    words = f"{queries} more queries for {view.name}; its budget is now {view.budget}"
+    give(view.model_dump(mode="json"), lambda: words, as_json=as_json, quiet=quiet)

@@ -1,0 +1,91 @@
+"""How commands speak: the result on standard output, everything else on standard error."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+
+PLAIN_SECONDS = 5.0  # between lines of progress where no bar can be drawn
+
+Update = Callable[[float, str], None]  # share done in [0, 1], a few words
+
+
+def say(text: str, *, quiet: bool = False) -> None:
+    """A remark for the person, on standard error."""
+    if not quiet:
+        typer.echo(text, err=True)
+
+
+def give(result: dict[str, Any], text: Callable[[], str], *, as_json: bool, quiet: bool = False) -> None:
+    """The result, on standard output: as JSON, or in words; ``quiet`` leaves out words that are a mere remark."""
+    if as_json:
+        typer.echo(json.dumps(result, indent=2))
+    elif not quiet:
+        typer.echo(text())
+
+
+def columns(rows: Sequence[Sequence[object]]) -> str:
+    """Rows as aligned columns; the first row is the heading."""
+    cells = [[_cell(value) for value in row] for row in rows]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
+    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in cells)
+    return "\n".join(line.rstrip() for line in lines)
+
+
+@contextmanager
+def progress(title: str, *, quiet: bool = False) -> Iterator[Update]:
+    """A bar on a terminal, plain lines elsewhere, nothing when quiet."""
+    if quiet:
+        yield _silent
+    elif sys.stderr.isatty():
+        with _bar(title) as update:
+            yield update
+    else:
+        yield _Lines(title)
+
+
+@contextmanager
+def _bar(title: str) -> Iterator[Update]:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    parts = (
+        TextColumn("{task.description:<10}"),
+        BarColumn(24),
+        TextColumn("{task.fields[words]}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*parts, console=Console(stderr=True)) as bar:
+        task = bar.add_task(title, total=1.0, words="")
+        yield lambda share, words: bar.update(task, completed=share, words=words)
+
+
+class _Lines:
+    """Progress as lines, not too many of them."""
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._next = 0.0
+        self._last = ""
+
+    def __call__(self, share: float, words: str) -> None:
+        due = time.monotonic() >= self._next or share >= 1.0
+        if due and words != self._last:
+            self._next, self._last = time.monotonic() + PLAIN_SECONDS, words
+            say(f"{self._title}: {words}")
+
+
+def _silent(share: float, words: str) -> None:
+    del share, words
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,95 @@
+"""``surrogym register``: tell the server about an original environment."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from surrogym_client.cli.options import AsJson, Preset, Quiet, Server, SpecFile, Token, Wait, connect, read_spec
+
+if TYPE_CHECKING:
+    from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.wire import SurrogateView
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("register")(command)
+
+
+def command(
+    environment: Annotated[
+        str | None, typer.Argument(help="Gymnasium id, or package.module:factory of one's own.")
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the surrogate. [default: from the environment's]")] = None,
+    spec: SpecFile = None,
+    preset: Annotated[Preset | None, typer.Option(help="default, or paper: the method as printed.")] = None,
+    budget: Annotated[int | None, typer.Option(min=2, help="Real steps the design may take.")] = None,
+    initial: Annotated[int | None, typer.Option(min=2, help="Real steps before the first model.")] = None,
+    target: Annotated[float | None, typer.Option(help="Confidence index to reach.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the design.")] = None,
+    bins: Annotated[int | None, typer.Option(min=2, help="Offer a continuous action as so many values.")] = None,
+    print_spec: Annotated[
+        bool, typer.Option("--print-spec", help="Print the specification and register nothing.")
+    ] = False,
+    wait: Wait = 0.0,
+    server: Server = None,
+    token: Token = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Register an original environment, so that samplers and trainers can use it by name.
+
+    Example: surrogym register Pendulum-v1 --name pendulum --budget 30
+    """
+    from surrogym_client.cli.output import give
+
+    chosen = _specification(
+        environment,
+        read_spec(spec),
+        preset=preset,
+        budget=budget,
+        initial=initial,
+        target=target,
+        seed=seed,
+        bins=bins,
+    )
+    if print_spec:
+        typer.echo(chosen.model_dump_json(indent=2))
+        return
+    with connect(server, token, wait) as api:
+        view = api.create_surrogate(name or default_name(chosen.environment), chosen)
+    give(view.model_dump(mode="json"), lambda: _words(view), as_json=as_json, quiet=quiet)
+
+
+def default_name(environment: str) -> str:
+    """The environment's name without its version: ``Pendulum-v1`` is ``pendulum``."""
+    plain = re.sub(r"-v\d+$", "", environment.rpartition(":")[2])
+    return re.sub(r"[^a-z0-9._-]+", "-", plain.lower()).strip("-._")[:64] or "surrogate"
+
+
+def _specification(environment: str | None, spec: EnvironmentSpec | None, **choices: object) -> EnvironmentSpec:
+    from surrogym_client.cli.errors import CommandError, invalid
+    from surrogym_client.original.loading import make, with_choices
+
+    given = {key: value for key, value in choices.items() if value is not None}
+    try:
+        if environment is not None:
+            original = make(environment, spec=spec, **given)  # type: ignore[arg-type]
+            original.close()
+            return original.spec()
+        if spec is not None:
+            bins = given.pop("bins", None)
+            return with_choices(spec, given, bins if isinstance(bins, int) else None)
+    except ValueError as error:
+        raise CommandError(invalid(error)) from error
+    raise CommandError("expected an environment or --spec FILE, got neither")
+
+
+def _words(view: SurrogateView) -> str:
+    return (
+        f"{view.name}: {view.environment}, {len(view.spec.coordinates)} coordinates, "
+        f"budget of {view.budget} real steps, target {view.target:g}; next: surrogym sample {view.name}"
+    )

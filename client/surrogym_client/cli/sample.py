@@ -1,0 +1,113 @@
+"""``surrogym sample``: answer a surrogate's queries beside the original environment."""
+
+from __future__ import annotations
+
+import signal
+from dataclasses import asdict
+from functools import partial
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from surrogym_client.cli.options import (
+    AsJson,
+    ExitWithParent,
+    Quiet,
+    Server,
+    SpecFile,
+    Token,
+    Wait,
+    connect,
+    read_spec,
+)
+
+if TYPE_CHECKING:
+    from surrogym_client.original.protocol import Factory
+    from surrogym_client.sampler import Outcome, SamplerReport
+    from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.wire import Query
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("sample")(command)
+
+
+def command(
+    surrogate: Annotated[str, typer.Argument(help="Name of the surrogate.")],
+    env: Annotated[
+        str | None, typer.Option(help="Gymnasium id or package.module:factory. [default: the surrogate's id]")
+    ] = None,
+    spec: SpecFile = None,
+    once: Annotated[bool, typer.Option("--once", help="Stop after the first claim that gives queries.")] = False,
+    until_done: Annotated[
+        bool, typer.Option("--until-done", help="Stop when the design has reached its target or budget.")
+    ] = False,
+    max_queries: Annotated[int | None, typer.Option(min=1, help="Stop after so many queries.")] = None,
+    time_limit: Annotated[float | None, typer.Option(min=0, help="Stop after so many seconds.")] = None,
+    step_limit: Annotated[float, typer.Option(min=0.001, help="Seconds one real step may take.")] = 30.0,
+    batch: Annotated[int, typer.Option(min=1, max=256, help="Queries to claim at once.")] = 4,
+    worker: Annotated[str | None, typer.Option(help="Name of this worker. [default: host and process]")] = None,
+    wait: Wait = 0.0,
+    exit_with_parent: ExitWithParent = False,
+    server: Server = None,
+    token: Token = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Answer queries: set the original environment to a state, take one real step, report it. Ctrl-C ends it.
+
+    Example: surrogym sample pendulum --until-done
+    """
+    from surrogym_client.cli.output import give
+    from surrogym_client.lifetime import exit_with_parent as watch_parent
+    from surrogym_client.original.isolated import IsolatedEnvironment
+    from surrogym_client.sampler import Sampler, SamplerSettings, worker_name
+    from surrogym_client.waiting import wait_for_surrogate
+
+    if exit_with_parent:
+        watch_parent()
+    settings = SamplerSettings(
+        name=worker or worker_name(),
+        batch=batch,
+        once=once,
+        until_done=until_done,
+        max_queries=max_queries,
+        time_limit=time_limit,
+    )
+    with connect(server, token, wait) as api:
+        asked = wait_for_surrogate(api, surrogate, wait).spec
+        factory = _factory(env, read_spec(spec), asked)
+        with IsolatedEnvironment(factory, step_limit) as environment:
+            sampler = Sampler(api, surrogate, environment, settings, None if quiet else _tell)
+            signal.signal(signal.SIGTERM, lambda *_: sampler.stop())
+            report = sampler.run()
+    give(asdict(report), lambda: _words(report), as_json=as_json, quiet=quiet)
+    if report.phase == "failed":
+        raise typer.Exit(1)
+
+
+def _factory(env: str | None, given: EnvironmentSpec | None, asked: EnvironmentSpec) -> Factory:
+    """How to make the environment; a server's word is taken for Gymnasium's own ids alone, never for a module."""
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.original.loading import is_known, make
+
+    if env is None and not is_known(asked.environment):
+        raise CommandError(
+            f"the surrogate's environment {asked.environment!r} has no built-in adapter: "
+            "expected --env package.module:factory"
+        )
+    name = env or asked.environment
+    own = ":" in name and given is None
+    return partial(make, name) if own else partial(make, name, spec=given or asked)
+
+
+def _tell(query: Query, outcome: Outcome, error: str) -> None:
+    from surrogym_client.cli.output import say
+
+    say(f"query {query.id} ({query.purpose}) {outcome}{': ' if error else ''}{error}")
+
+
+def _words(report: SamplerReport) -> str:
+    failed = f", {report.failed} failed" if report.failed else ""
+    return f"{report.answered} queries answered{failed} in {report.seconds:.1f} s; the design is {report.phase}"

@@ -1,0 +1,169 @@
+"""``surrogym train``: learn a policy against a surrogate."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from surrogym_client.cli.options import AsJson, ExitWithParent, Quiet, Server, Token, Wait, connect
+
+if TYPE_CHECKING:
+    from surrogym_client.cli.output import Update
+    from surrogym_client.train import TrainProgress, TrainResult, TrainSettings
+    from surrogym_shared.spec import EnvironmentSpec
+
+    Record = Callable[[TrainProgress], None]
+
+Variant = Literal["deterministic", "probabilistic"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("train")(command)
+
+
+def command(
+    surrogate: Annotated[str, typer.Argument(help="Name of the surrogate.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write the policy to.")] = Path("policy.zip"),
+    algorithm: Annotated[str, typer.Option(help="Algorithm of Stable-Baselines3.")] = "PPO",
+    steps: Annotated[int | None, typer.Option(min=1, help="Virtual steps. [default: from the specification]")] = None,
+    num_envs: Annotated[
+        int | None, typer.Option(min=1, help="Lanes of the session. [default: from the specification]")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of policy and virtual environment.")] = 0,
+    variant: Annotated[Variant, typer.Option(help="deterministic or probabilistic.")] = "deterministic",
+    particles: Annotated[int | None, typer.Option(min=1, help="Particles of a probabilistic step.")] = None,
+    penalty: Annotated[
+        float | None, typer.Option(min=0, help="Deviations taken off the reward. [default: the specification's]")
+    ] = None,
+    start_from: Annotated[Path | None, typer.Option(help="Policy file to go on from.")] = None,
+    tensorboard: Annotated[Path | None, typer.Option(help="Folder for TensorBoard.")] = None,
+    wait: Wait = 0.0,
+    progress_file: Annotated[Path | None, typer.Option(hidden=True, help="Write progress as JSON lines.")] = None,
+    exit_with_parent: ExitWithParent = False,
+    server: Server = None,
+    token: Token = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Train a policy in the virtual environment; no real step is taken.
+
+    Example: surrogym train pendulum --out policy.zip --seed 0
+    """
+    from surrogym_client.cli.output import give, progress
+    from surrogym_client.lifetime import exit_with_parent as watch_parent
+
+    if exit_with_parent:
+        watch_parent()
+    spec, url = _trainable(surrogate, server, token, wait)
+    from surrogym_client.train import TrainSettings  # torch; imported once there is something to train on
+
+    options = {"variant": variant, "particles": particles, "penalty": penalty}
+    settings = TrainSettings(
+        algorithm=algorithm,
+        total_steps=steps,
+        num_envs=num_envs,
+        seed=seed,
+        start_from=start_from,
+        tensorboard=tensorboard,
+        session={key: value for key, value in options.items() if value is not None},
+    )
+    with progress("train", quiet=quiet) as update, _recording(progress_file, update) as record:
+        result = _train(url, token, surrogate, out, settings, record)
+    summary = _write_card(result, surrogate, spec, url, seed)
+    give(summary, lambda: _words(result), as_json=as_json, quiet=quiet)
+
+
+def _trainable(surrogate: str, server: str | None, token: str | None, wait: float) -> tuple[EnvironmentSpec, str]:
+    """Specification and server of a surrogate whose design is done; with ``wait``, torch is imported meanwhile."""
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.waiting import FINISHED, wait_for_design, wait_for_surrogate
+
+    with connect(server, token, wait) as api:
+        view = wait_for_surrogate(api, surrogate, wait)
+        if wait > 0:
+            import surrogym_client.train  # noqa: F401
+
+            view = wait_for_design(api, surrogate, wait)
+        if view.model_version is None:
+            raise CommandError(
+                f"{surrogate!r} has no model yet, its phase is {view.phase}: "
+                f"run surrogym sample {surrogate}, or give --wait SECONDS"
+            )
+        if view.phase not in FINISHED:
+            typer.echo(f"the design of {surrogate!r} goes on; training starts on model {view.model_version}", err=True)
+        return view.spec, api.url
+
+
+@contextmanager
+def _recording(path: Path | None, update: Update) -> Iterator[Record]:
+    """Shows progress, and writes it to a file for those who watch from outside."""
+    started = time.monotonic()
+    with path.open("a", encoding="utf-8") if path is not None else nullcontext() as file:
+
+        def record(now: TrainProgress) -> None:
+            seconds = round(time.monotonic() - started, 3)
+            update(now.steps / now.total_steps, words_of(asdict(now)))
+            if file is not None:
+                file.write(json.dumps({**asdict(now), "seconds": seconds}) + "\n")
+                file.flush()
+
+        yield record
+
+
+def _train(
+    url: str, token: str | None, surrogate: str, out: Path, settings: TrainSettings, record: Record
+) -> TrainResult:
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.train import train
+    from surrogym_client.transport import HttpSurrogate
+
+    with HttpSurrogate(url, surrogate, token) as port:
+        try:
+            return train(port, out, settings, record)
+        except ValueError as error:
+            raise CommandError(str(error)) from error
+
+
+def _write_card(result: TrainResult, surrogate: str, spec: EnvironmentSpec, url: str, seed: int) -> dict[str, Any]:
+    """Write the policy's card; gives back the result as JSON."""
+    from surrogym_client.policy_file import PolicyCard, write_card
+    from surrogym_client.versions import versions
+
+    card = PolicyCard(
+        algorithm=result.algorithm,
+        surrogate=surrogate,
+        server=url,
+        spec=spec,
+        seed=seed,
+        virtual_steps=result.virtual_steps,
+        seconds=result.seconds,
+        imagined_return=result.imagined_return,
+        settings=result.settings,
+        versions=versions(),
+    )
+    write_card(Path(result.path), card)
+    return {"policy": str(result.path), **card.model_dump(mode="json", exclude={"spec"})}
+
+
+def _words(result: TrainResult) -> str:
+    return (
+        f"{result.path}: {result.virtual_steps} virtual steps in {result.seconds:.1f} s"
+        f"{_imagined(result.imagined_return)}; next: surrogym evaluate {result.path}"
+    )
+
+
+def words_of(now: dict[str, Any]) -> str:
+    """One look at the training, from the fields of ``TrainProgress``."""
+    return f"{now['steps']} of {now['total_steps']} virtual steps{_imagined(now['imagined_return'])}"
+
+
+def _imagined(value: float | None) -> str:
+    return "" if value is None else f", imagined return {value:.1f}"

@@ -1,0 +1,1 @@
+"""The demo: three processes that talk over HTTP, and what a person sees of them."""

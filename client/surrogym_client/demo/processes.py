@@ -1,0 +1,113 @@
+"""Child processes that never outlive the demo: each in a group of its own, ended together, watching their parent."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from surrogym_client.cli.errors import CommandError
+
+STARTING_SECONDS = 120.0
+STOPPING_SECONDS = 10.0
+LOOK_SECONDS = 0.05
+
+
+@dataclass(frozen=True)
+class Child:
+    """One process and its log."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path
+
+    def check(self) -> None:
+        """Raises CommandError if the process has ended badly."""
+        code = self.process.poll()
+        if code:
+            raise CommandError(f"the {self.name} ended with exit code {code}: {self.last_words()} (log: {self.log})")
+
+    def last_words(self) -> str:
+        """The last line it has written."""
+        lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        return lines[-1] if lines else "it said nothing"
+
+
+class Children:
+    """The processes of one run. Leaving the context ends them all, whatever the reason."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._children: list[Child] = []
+
+    def start(self, name: str, module: str, arguments: Sequence[str]) -> Child:
+        """Start ``python -m module``; its output goes to a log in the run folder."""
+        log = self._folder / f"{name}.log"
+        with log.open("wb") as file:
+            process = subprocess.Popen(
+                [sys.executable, "-m", module, *arguments, "--exit-with-parent"],
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                env=_environment(),
+                start_new_session=True,
+            )
+        child = Child(name, process, log)
+        self._children.append(child)
+        return child
+
+    def check(self) -> None:
+        """Raises CommandError if any of them has ended badly."""
+        for child in self._children:
+            child.check()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Ask every group to end, newest first, so that nobody loses the server it talks to; then make sure."""
+        for child in reversed(self._children):
+            _signal(child, signal.SIGTERM)
+        deadline = time.monotonic() + STOPPING_SECONDS
+        for child in self._children:
+            with suppress(subprocess.TimeoutExpired):
+                child.process.wait(max(0.0, deadline - time.monotonic()))
+        for child in self._children:
+            _signal(child, signal.SIGKILL)
+            child.process.wait()
+
+
+def await_file(child: Child, path: Path) -> str:
+    """What a child writes into a file once it is ready.
+
+    Raises:
+        CommandError: it ended instead, or took too long.
+    """
+    deadline = time.monotonic() + STARTING_SECONDS
+    while not path.exists():
+        if child.process.poll() is not None or time.monotonic() > deadline:
+            raise CommandError(f"the {child.name} did not start: {child.last_words()} (log: {child.log})")
+        time.sleep(LOOK_SECONDS)
+    return path.read_text(encoding="utf-8").strip()
+
+
+def _signal(child: Child, number: signal.Signals) -> None:
+    """Signal the child's whole group, which may be there after the child itself has ended."""
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(child.process.pid, number)
+
+
+def _environment() -> dict[str, str]:
+    """The environment without settings of another server; one thread each, as the processes share the cores."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")}
+    return {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1", **kept}

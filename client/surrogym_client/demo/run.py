@@ -1,0 +1,237 @@
+"""The demo from its first process to its run folder."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from types import FrameType
+from typing import Any, Literal
+
+from surrogym_client.api import Api
+from surrogym_client.cli.output import progress, say
+from surrogym_client.cli.train import words_of
+from surrogym_client.connection import Retries
+from surrogym_client.demo.processes import Child, Children, await_file
+from surrogym_client.demo.report import metrics_of, table
+from surrogym_client.evaluate import Evaluation, EvaluationSettings, evaluate
+from surrogym_client.original import make
+from surrogym_client.original.episodes import open_episode
+from surrogym_client.policy_file import load_policy, read_card
+from surrogym_client.waiting import wait_for_design
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import SurrogateView
+
+PATIENCE_SECONDS = 3_600.0
+LOOK_SECONDS = 0.2
+
+
+@dataclass(frozen=True)
+class DemoTask:
+    """What a demo solves, and what the design may spend on it. Training derives everything else from the spec."""
+
+    environment: str
+    budget: int
+
+
+TASKS = {
+    "pendulum": DemoTask("Pendulum-v1", budget=30),
+    "cartpole": DemoTask("CartPole-v1", budget=30),
+    "mountaincar": DemoTask("MountainCarContinuous-v0", budget=40),
+    "acrobot": DemoTask("Acrobot-v1", budget=120),
+}
+
+
+@dataclass(frozen=True)
+class DemoSettings:
+    task: str = "pendulum"
+    seed: int = 0
+    budget: int | None = None
+    preset: Literal["default", "paper"] | None = None
+    steps: int | None = None
+    episodes: int = 100
+    keep: bool = False
+
+    def spec(self) -> EnvironmentSpec:
+        """The task's specification with these choices. Under ``paper`` the preset's own budget counts."""
+        task = TASKS[self.task]
+        budget = self.budget or (None if self.preset == "paper" else task.budget)
+        return make(task.environment, preset=self.preset, budget=budget, seed=self.seed).spec()
+
+
+def run_demo(settings: DemoSettings, out: Path | None = None, *, quiet: bool = False) -> dict[str, Any]:
+    """Run the whole loop; gives back the metrics that also lie in the run folder.
+
+    Raises:
+        CommandError: a process ended badly; says which, its last words and where its log is.
+        SurrogymClientError: the server refused, or the design failed.
+    """
+    folder = (out or _new_folder(settings)).resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    with _terminations_as_interrupts(), Children(folder) as children:
+        run = DemoRun(settings, folder, children, quiet=quiet)
+        metrics = run.whole()
+        if settings.keep:
+            say(f"the server stays at {run.api.url} until Ctrl-C")
+            _sleep_for_ever()
+    return metrics
+
+
+class DemoRun:
+    """One run: a server, a sampler and a trainer, phase by phase."""
+
+    def __init__(self, settings: DemoSettings, folder: Path, children: Children, *, quiet: bool) -> None:
+        self._settings = settings
+        self._folder = folder
+        self._children = children
+        self._quiet = quiet
+        self._started = time.monotonic()
+        self._spec = settings.spec()
+        self._seconds: dict[str, float] = {}
+        self.api = Api(self._serve(), token="", retries=Retries(seconds=10.0))
+
+    def whole(self) -> dict[str, Any]:
+        """Design, train, evaluate, report."""
+        trainer = self._employ()
+        with self._timed("design"):
+            self._design()
+        with self._timed("train"):
+            self._train(trainer)
+        with self._timed("evaluate"):
+            result = self._evaluate()
+        return self._report(result)
+
+    def _serve(self) -> str:
+        say("starting server, sampler and trainer", quiet=self._quiet)
+        ready = self._folder / "server.url"
+        ready.unlink(missing_ok=True)
+        database = self._folder / "surrogym.db"
+        database.unlink(missing_ok=True)
+        options = ["--port", "0", "--database", str(database), "--ready-file", str(ready), "--log-level", "warning"]
+        return await_file(self._children.start("server", "surrogym_server", ["serve", *options]), ready)
+
+    def _employ(self) -> Child:
+        """Sampler and trainer. The trainer imports what it needs while the design goes on."""
+        name, url, wait = self._settings.task, self.api.url, str(PATIENCE_SECONDS)
+        say(f"live server: {url}  (run folder: {self._folder})", quiet=self._quiet)
+        self.api.create_surrogate(name, self._spec)
+        common = [name, "--server", url, "--wait", wait]
+        self._children.start("sampler", "surrogym_client", ["sample", *common])
+        steps = [] if self._settings.steps is None else ["--steps", str(self._settings.steps)]
+        options = ["--out", str(self.policy), "--seed", str(self._settings.seed), *steps, "--quiet"]
+        self._curve.unlink(missing_ok=True)
+        return self._children.start(
+            "trainer", "surrogym_client", ["train", *common, *options, "--progress-file", str(self._curve)]
+        )
+
+    def _design(self) -> None:
+        with progress("design", quiet=self._quiet) as update:
+
+            def look(view: SurrogateView) -> None:
+                self._children.check()
+                share = 1.0 if view.phase in ("ready", "over_budget") else view.samples / view.budget
+                update(min(1.0, share), _design_words(view))
+
+            wait_for_design(self.api, self._settings.task, PATIENCE_SECONDS, look)
+
+    def _train(self, trainer: Child) -> None:
+        with progress("train", quiet=self._quiet) as update:
+            while trainer.process.poll() is None:
+                self._children.check()
+                for line in read_curve(self._curve)[-1:]:
+                    update(line["steps"] / line["total_steps"], words_of(line))
+                time.sleep(LOOK_SECONDS)
+            trainer.check()
+            update(1.0, f"{read_card(self.policy).virtual_steps} virtual steps")
+
+    def _evaluate(self) -> Evaluation:
+        episodes = EvaluationSettings(episodes=self._settings.episodes)
+        with progress("evaluate", quiet=self._quiet) as update:
+            update(0.0, "loading the policy")
+            predict = load_policy(self.policy, read_card(self.policy).algorithm)
+            name, spec = self._spec.environment, self._spec
+            opener = partial(open_episode, name, spec, partial(make, name, spec=spec))
+            result = evaluate(
+                predict, opener, episodes, lambda done, n: update(done / n, f"{done} of {n} real episodes")
+            )
+            update(1.0, f"{episodes.episodes} of {episodes.episodes} real episodes")
+        self.api.report_steps(self._settings.task, result.steps, episodes=episodes.episodes, note="demo")
+        return result
+
+    def _report(self, result: Evaluation) -> dict[str, Any]:
+        from surrogym_client.demo.pictures import draw_all
+
+        name = self._settings.task
+        view, samples = self.api.surrogate(name), list(self.api.samples(name))
+        for file_format in ("csv", "npz"):
+            content = self.api.export_samples(name, file_format)
+            (self._folder / f"samples.{file_format}").write_bytes(content)
+        (self._folder / "spec.json").write_text(view.spec.model_dump_json(indent=2) + "\n", encoding="utf-8")
+        draw_all(self._folder, view, samples, read_curve(self._curve), result)
+        seconds = {**self._seconds, "total": time.monotonic() - self._started}
+        metrics = metrics_of(name, self._settings.seed, view, read_card(self.policy), result, seconds)
+        metrics["demo"] = asdict(self._settings)
+        (self._folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+        say(table(metrics, self._folder), quiet=self._quiet)
+        return metrics
+
+    @property
+    def policy(self) -> Path:
+        return self._folder / "policy.zip"
+
+    @property
+    def _curve(self) -> Path:
+        return self._folder / "training.jsonl"
+
+    @contextmanager
+    def _timed(self, phase: str) -> Iterator[None]:
+        started = time.monotonic()
+        yield
+        self._seconds[phase] = time.monotonic() - started
+
+
+def read_curve(path: Path) -> list[dict[str, Any]]:
+    """The trainer's progress so far; a line that is being written is left for the next look."""
+    if not path.exists():
+        return []
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    return [json.loads(line) for line in lines if line.endswith("\n")]
+
+
+def _design_words(view: SurrogateView) -> str:
+    ledger = view.ledger
+    fidelity = "" if view.fidelity is None else f", confidence index {view.fidelity.confidence_index:.4f}"
+    return f"{ledger.total} of {view.budget} real steps ({ledger.adaptive} adaptive){fidelity}"
+
+
+def _new_folder(settings: DemoSettings) -> Path:
+    return Path("runs") / f"{settings.task}-seed{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+@contextmanager
+def _terminations_as_interrupts() -> Iterator[None]:
+    """A polite kill is taken like Ctrl-C, so that the children are ended on the way out."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _sleep_for_ever() -> None:
+    try:
+        while True:
+            time.sleep(3_600)
+    except KeyboardInterrupt:
+        return

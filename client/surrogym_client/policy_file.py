@@ -1,0 +1,94 @@
+"""A policy on disk: what Stable-Baselines3 wrote, and beside it a card that says what it is for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from surrogym_client.errors import SurrogymClientError
+from surrogym_client.evaluate import Predict
+from surrogym_shared.spec import EnvironmentSpec
+
+DEFAULT_ALGORITHM = "PPO"
+
+
+class UnusablePolicy(SurrogymClientError):
+    """The file is no policy of the algorithm, or its card is none."""
+
+
+class PolicyCard(BaseModel):
+    """What a policy is for and how it came about; a JSON file of the same name beside it."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)  # train() notes more than is read here
+
+    algorithm: str = DEFAULT_ALGORITHM
+    surrogate: str | None = None
+    server: str | None = None
+    spec: EnvironmentSpec | None = None
+    seed: int | None = None
+    virtual_steps: int | None = None
+    seconds: float | None = None
+    imagined_return: float | None = None
+    settings: dict[str, Any] = Field(default_factory=dict)
+    versions: dict[str, str] = Field(default_factory=dict)
+
+
+def card_path(policy: Path) -> Path:
+    """Where the card of a policy lies."""
+    return policy.with_suffix(".json")
+
+
+def write_card(policy: Path, card: PolicyCard) -> None:
+    """Write the card beside the policy."""
+    card_path(policy).write_text(card.model_dump_json(indent=2) + "\n", encoding="utf-8")
+
+
+def read_card(policy: Path) -> PolicyCard:
+    """The card of a policy; an empty one where there is none.
+
+    Raises:
+        UnusablePolicy: the card can't be read.
+        FileNotFoundError: there is no such policy.
+    """
+    if not policy.is_file():
+        raise FileNotFoundError(2, "no such policy file", str(policy))
+    if not card_path(policy).exists():
+        return PolicyCard()
+    try:
+        return PolicyCard.model_validate_json(card_path(policy).read_bytes())
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise UnusablePolicy(f"{card_path(policy)} is no card of a policy: {first['msg']}") from error
+
+
+def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM) -> Predict:
+    """The policy as a function of observations, its most probable action each.
+
+    Such a file is unpickled: load only what you trust.
+
+    Args:
+        path: what ``save`` of a Stable-Baselines3 algorithm wrote.
+        algorithm: name of its class.
+
+    Raises:
+        UnusablePolicy: no such algorithm, or the file is none of its policies.
+    """
+    import stable_baselines3
+
+    kind = getattr(stable_baselines3, algorithm, None)
+    if kind is None or not hasattr(kind, "load"):
+        raise UnusablePolicy(f"Stable-Baselines3 has no algorithm {algorithm!r}: expected for instance PPO, SAC or DQN")
+    try:
+        model = kind.load(path, device="cpu")
+    except Exception as error:  # unpickling somebody's file can raise anything
+        raise UnusablePolicy(f"{path} is no policy of {algorithm}: {error}") from error
+
+    def predict(observations: NDArray[np.float32]) -> NDArray[Any]:
+        actions: NDArray[Any] = model.predict(observations, deterministic=True)[0]
+        return actions
+
+    return predict
