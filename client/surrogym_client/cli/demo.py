@@ -36,8 +36,11 @@ def command(
 
     Example: surrogym demo pendulum --seed 0 --json metrics.json
     """
+    from surrogym_client.cli.errors import CommandError
     from surrogym_client.demo.run import DemoSettings, run_demo
 
+    if json_file is not None and not json_file.resolve().parent.is_dir():
+        raise CommandError(f"expected an existing folder for --json, got {json_file.parent}")
     settings = DemoSettings(
         task=task, seed=seed, budget=budget, preset=preset, steps=steps, episodes=episodes, keep=keep
     )

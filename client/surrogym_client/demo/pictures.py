@@ -46,7 +46,7 @@ def draw_samples(view: SurrogateView, samples: Sequence[SampleView]) -> Figure:
             chosen = [s.coordinates for s in samples if s.purpose == purpose]
             if chosen:
                 label = f"{purpose} ({len(chosen)})"
-                axes.scatter([q[i] for q in chosen], [q[j] for q in chosen], color=colour, label=label)
+                axes.scatter([q[i] for q in chosen], [q[j] for q in chosen], color=colour, label=label, clip_on=False)
         axes.set(xlabel=coordinates[i].name, ylabel=coordinates[j].name)
         axes.set(xlim=limits(coordinates[i].sampling), ylim=limits(coordinates[j].sampling))
         axes.legend(loc="upper right")

@@ -1,0 +1,148 @@
+"""The commands against a live server, in the order a person uses them."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from surrogym_client.api import Api
+
+OWN = """
+from surrogym_client.original import RealStep
+from surrogym_shared.spec import *
+
+class Cart:
+    def spec(self):
+        return EnvironmentSpec(
+            environment="own_line:Cart",
+            coordinates=(Coordinate(name="x", sampling=Uniform(low=-1, high=1)),),
+            observation=(ObservationEntry(name="x", term=Term.linear(x=1)),),
+            action=BoxAction(low=(-1.0,), high=(1.0,)),
+            start={"x": Uniform(low=-0.5, high=0.5)},
+            time_limit=20,
+            design=Design(initial=4, budget=4),
+        )
+
+    def step_from(self, coordinates, action):
+        return RealStep(coordinates, action, coordinates + 0.1 * action, reward=-abs(coordinates[0]))
+
+    def close(self):
+        pass
+"""
+
+
+@pytest.fixture
+def pendulum(on_server, name):
+    said = on_server("register", "Pendulum-v1", "--name", name, "--budget", "8", "--initial", "4", "--json")
+    assert said.code == 0
+    assert said.json["budget"] == 8
+    return name
+
+
+def test_register_tells_what_is_next(on_server, name):
+    said = on_server("register", "CartPole-v1", "--name", name)
+    assert said.code == 0
+    assert said.out == (
+        f"{name}: CartPole-v1, 4 coordinates, budget of {_budget(said)} real steps, target 0.999; "
+        f"next: surrogym sample {name}\n"
+    )
+
+
+def test_register_twice_is_harmless_and_another_specification_is_refused(on_server, pendulum):
+    again = on_server("register", "Pendulum-v1", "--name", pendulum, "--budget", "8", "--initial", "4")
+    assert again.code == 0
+    other = on_server("register", "CartPole-v1", "--name", pendulum)
+    assert other.code == 1
+    assert pendulum in other.err
+
+
+def test_print_spec_asks_no_server_and_gives_what_register_takes(surrogym, on_server, name, tmp_path):
+    said = surrogym("register", "Pendulum-v1", "--seed", "5", "--bins", "3", "--print-spec")
+    assert said.code == 0
+    assert said.json["design"]["seed"] == 5
+    (tmp_path / "spec.json").write_text(said.out)
+    registered = on_server("register", "--spec", "spec.json", "--name", name, "--json")
+    assert registered.json["spec"]["action"]["bins"] == [3]
+
+
+def test_status_lists_all_and_shows_one(on_server, pendulum):
+    everything = on_server("status", "--json").json
+    assert pendulum in [s["name"] for s in everything["surrogates"]]
+    assert f"{pendulum}" in on_server("status").out
+    one = on_server("status", pendulum)
+    assert f"{pendulum}: Pendulum-v1, sampling" in one.out or "collecting" in one.out
+    assert "0 initial, 0 adaptive, 0 manual, 0 of 8 in all" in one.out
+
+
+def test_sample_answers_queries_which_status_and_export_show(on_server, pendulum, tmp_path):
+    said = on_server("sample", pendulum, "--max-queries", "4", "--time-limit", "60", "--json")
+    assert said.code == 0
+    assert (said.json["answered"], said.json["failed"]) == (4, 0)
+    assert said.err.count("answered") == 4
+    assert "4 initial" in on_server("status", pendulum).out
+    assert on_server("export", pendulum, "--out", "samples.csv").code == 0
+    assert on_server("export", pendulum, "-o", "samples.npz", "--quiet").out == ""
+    with (tmp_path / "samples.csv").open() as file:
+        assert len(list(csv.reader(file))) == 5
+    with np.load(tmp_path / "samples.npz") as arrays:
+        assert all(len(arrays[key]) == 4 for key in arrays.files if arrays[key].ndim == 2)
+
+
+def test_improve_asks_for_more(on_server, pendulum):
+    assert on_server("improve", pendulum, "--queries", "3").code == 0
+
+
+def test_delete_asks_first(on_server, pendulum, monkeypatch):
+    monkeypatch.setattr("typer.confirm", _no)
+    assert on_server("delete", pendulum).code == 1
+    assert on_server("status", pendulum).code == 0
+    assert on_server("delete", pendulum, "--yes").out == f"{pendulum} deleted\n"
+    assert on_server("status", pendulum).code == 1
+
+
+def test_train_without_a_model_says_what_to_do(on_server, pendulum):
+    said = on_server("train", pendulum)
+    assert said.code == 1
+    assert f"run surrogym sample {pendulum}" in said.err
+
+
+def test_ones_own_environment_has_to_be_named_by_the_person(on_server, name, tmp_path, monkeypatch):
+    """The server's word is never enough to import a module."""
+    (tmp_path / "own_line.py").write_text(OWN)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert on_server("register", "own_line:Cart", "--name", name).code == 0
+    refused = on_server("sample", name, "--once")
+    assert refused.code == 1
+    assert "expected --env package.module:factory" in refused.err
+    said = on_server("sample", name, "--env", "own_line:Cart", "--max-queries", "4", "--time-limit", "60", "--json")
+    assert said.json["answered"] == 4
+
+
+@pytest.mark.slow
+def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum, tmp_path):
+    assert on_server("sample", pendulum, "--until-done", "--time-limit", "120", "--quiet").code == 0
+    trained = on_server("train", pendulum, "--steps", "2000", "--num-envs", "4", "--seed", "3", "--json", "--quiet")
+    assert trained.code == 0, trained.err
+    card = json.loads((tmp_path / "policy.json").read_text())
+    assert (card["surrogate"], card["seed"]) == (pendulum, 3)
+    assert card["virtual_steps"] == trained.json["virtual_steps"] >= 2000
+    evaluated = on_server("evaluate", "policy.zip", "--episodes", "3", "--json", "--quiet")
+    assert evaluated.code == 0, evaluated.err
+    assert evaluated.json["steps"] == 600
+    assert len(evaluated.json["per_episode"]) == 3
+    with Api(server_process.url) as api:
+        assert api.surrogate(pendulum).ledger.evaluation == 600
+    other = on_server("evaluate", "policy.zip", "--env", "CartPole-v1", "--episodes", "1")
+    assert other.code == 1
+    assert "error: the policy does not fit the environment" in other.err
+
+
+def _no(*_, **__):
+    import typer
+
+    raise typer.Abort
+
+
+def _budget(said):
+    return said.out.split("budget of ")[1].split()[0]

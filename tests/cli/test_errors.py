@@ -1,0 +1,87 @@
+"""What can't be done is told in one sentence, with a non-zero exit, never as a traceback."""
+
+import pytest
+
+NOBODY = ("--server", "http://127.0.0.1:9")
+
+
+@pytest.fixture
+def quickly(monkeypatch):
+    monkeypatch.setattr("surrogym_client.cli.options.QUICK", 0.0)
+
+
+def refused(said, code=1):
+    """One line on standard error, nothing on standard output."""
+    assert said.code == code
+    assert said.out == ""
+    assert said.err.startswith("error: ")
+    assert said.err.count("\n") == 1
+    return said.err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("register", "Pendulum-v1"),
+        ("sample", "pendulum"),
+        ("train", "pendulum"),
+        ("status",),
+        ("improve", "pendulum"),
+        ("export", "pendulum", "--out", "samples.csv"),
+        ("delete", "pendulum", "--yes"),
+    ],
+)
+def test_a_server_that_is_not_there(surrogym, quickly, arguments):
+    assert "no Surrogym server answers at http://127.0.0.1:9" in refused(surrogym(*arguments, *NOBODY))
+
+
+def test_an_address_that_is_none(surrogym):
+    assert "expected a server address" in refused(surrogym("status", "--server", "pendulum"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("register", "Nowhere-v1"), "no adapter knows the environment 'Nowhere-v1'"),
+        (("register", "nothing.at_all:here"), "No module named 'nothing'"),
+        (("register", "CartPole-v1", "--bins", "3"), "bins need a continuous action, got a discrete one"),
+        (("register", "Pendulum-v1", "--budget", "5", "--initial", "9"), "initial 9 exceeds the budget 5"),
+        (("register",), "expected an environment or --spec FILE, got neither"),
+        (("register", "--spec", "missing.json"), "missing.json: No such file or directory"),
+        (("register", "--spec", "broken.json"), "broken.json is no specification: "),
+        (("register", "--spec", "crossed.json"), "uniform range crosses: expected low < high, got [1.0, -1.0]"),
+        (("evaluate", "missing.zip", "--env", "Pendulum-v1"), "missing.zip: no such policy file"),
+        (("evaluate", "junk.zip", "--env", "Pendulum-v1"), "junk.zip is no policy of PPO"),
+        (("evaluate", "junk.zip"), "expected --env with the original environment, got none"),
+        (("evaluate", "junk.zip", "--env", "Nowhere-v1"), "no adapter knows the environment 'Nowhere-v1'"),
+        (
+            ("evaluate", "junk.zip", "--env", "Pendulum-v1", "--algorithm", "Magic"),
+            "Stable-Baselines3 has no algorithm 'Magic'",
+        ),
+        (("demo", "pendulum", "--json", "no/such/m.json"), "expected an existing folder for --json, got no/such"),
+        (("export", "pendulum", "--out", "samples.txt"), "expected a file ending in .csv or .npz, got '.txt'"),
+    ],
+)
+def test_what_is_not_there_or_wrong(surrogym, tmp_path, arguments, message):
+    (tmp_path / "broken.json").write_text("{")
+    (tmp_path / "crossed.json").write_text(
+        '{"coordinates": [{"name": "x", "sampling": {"kind": "uniform", "low": 1, "high": -1}}]}'
+    )
+    (tmp_path / "junk.zip").write_bytes(b"this is no zip file")
+    assert message in refused(surrogym(*arguments))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("status", "--nonsense"), ("unknown",), ("sample",), ("train", "x", "--steps", "many"), ("demo", "chess")],
+)
+def test_wrong_usage(surrogym, arguments):
+    said = surrogym(*arguments)
+    assert said.code == 2
+    assert "Traceback" not in said.err
+    assert said.err
+
+
+@pytest.mark.parametrize("command", ["sample", "train", "status", "improve"])
+def test_an_unknown_surrogate(on_server, command):
+    assert "nobody" in refused(on_server(command, "nobody"))
