@@ -1,0 +1,69 @@
+# make demo      solves Pendulum from a few real steps; make demo ARGS="--seed 1" passes options on
+# make test      everything that guards the project
+# make help      the rest
+
+PYTHON ?= python3
+WORKERS ?= 2
+ARGS ?=
+
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+PINS := pyproject.toml constraints.txt
+
+.DEFAULT_GOAL := help
+.PHONY: demo test format-check lint types imports unit format postgresql clean help
+
+demo: .venv/all  ## Solve Pendulum with server, sampler and trainer on this machine (ARGS="--seed 1")
+	@exec $(BIN)/surrogym demo pendulum $(ARGS)
+
+test: format-check lint types imports unit  ## Everything that guards the project
+
+format-check: .venv/dev
+	$(BIN)/ruff format --check
+
+lint: .venv/dev  ## Look for mistakes
+	$(BIN)/ruff check
+
+types: .venv/dev  ## Check the types
+	$(BIN)/mypy
+
+imports: .venv/dev  ## Check which room imports which
+	$(BIN)/lint-imports
+
+unit: .venv/dev postgresql  ## The tests alone (ARGS="-k pendulum")
+	$(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
+
+format: .venv/dev  ## Put the code into shape
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+postgresql:
+	@if ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1; then \
+	    :; \
+	elif [ -n "$$CI" ] && [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq postgresql >/dev/null; \
+	else \
+	    echo "PostgreSQL is not on this machine, so its tests are skipped. To run them: apt-get install postgresql"; \
+	fi
+
+clean:  ## Remove the virtual environment, caches and builds; run folders stay
+	rm -rf .venv build dist .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
+	find client server shared tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+help:  ## This list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+.venv/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	    { echo "Python 3.11 or newer is needed: make PYTHON=python3.12 ..."; exit 1; }
+	$(PYTHON) -m venv .venv
+
+.venv/all: $(PINS) | .venv/bin/python
+	@echo "installing into .venv; this takes some minutes the first time"
+	$(PIP) --editable ".[all]"
+	@touch $@
+
+.venv/dev: $(PINS) | .venv/bin/python
+	@echo "installing into .venv; this takes some minutes the first time"
+	$(PIP) --editable ".[dev]"
+	@touch $@ .venv/all

@@ -1,0 +1,52 @@
+"""A fresh install gets exactly what was tested: everything the extras need is pinned, to what is installed here."""
+
+from __future__ import annotations
+
+import re
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[2]
+PIN = re.compile(r"([A-Za-z0-9][A-Za-z0-9._-]*)==([A-Za-z0-9.!]+)")
+
+
+def lines() -> list[str]:
+    text = (ROOT / "constraints.txt").read_text(encoding="utf-8")
+    return [line for line in text.splitlines() if line and not line.startswith("#")]
+
+
+def needed(requirement: str, found: dict[str, set[str]]) -> dict[str, set[str]]:
+    """All installed distributions that a requirement leads to, with the extras asked of each."""
+    asked = Requirement(requirement)
+    name, extras = canonicalize_name(asked.name), set(asked.extras)
+    if name in found and extras <= found[name]:
+        return found
+    found.setdefault(name, set()).update(extras)
+    for line in distribution(name).requires or ():
+        marker = Requirement(line).marker
+        if marker is None or any(marker.evaluate({"extra": extra}) for extra in {"", *extras}):
+            needed(line, found)
+    return found
+
+
+def test_every_line_is_an_exact_pin_without_an_address_or_a_local_build() -> None:
+    assert [line for line in lines() if not PIN.fullmatch(line)] == []
+
+
+def test_no_package_is_pinned_twice() -> None:
+    names = [canonicalize_name(line.partition("==")[0]) for line in lines()]
+    assert len(names) == len(set(names))
+
+
+def test_everything_the_extras_need_is_pinned_to_the_installed_version() -> None:
+    pins = {canonicalize_name(name): version for name, version in (line.split("==") for line in lines())}
+    try:
+        names = needed("surrogym[dev]", {}).keys() - {"surrogym"}
+    except PackageNotFoundError as missing:
+        pytest.fail(f"not all of surrogym[dev] is installed here: {missing}")
+    installed = {name: distribution(name).version.partition("+")[0] for name in names}
+    assert {name: (pins.get(name), version) for name, version in installed.items() if pins.get(name) != version} == {}
