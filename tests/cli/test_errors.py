@@ -58,6 +58,7 @@ def test_an_address_that_is_none(surrogym):
             ("evaluate", "junk.zip", "--env", "Pendulum-v1", "--algorithm", "Magic"),
             "Stable-Baselines3 has no algorithm 'Magic'",
         ),
+        (("demo", "pendulum", "--out", "."), "expected an empty run folder, got ., where there is something already"),
         (("demo", "pendulum", "--json", "no/such/m.json"), "expected an existing folder for --json, got no/such"),
         (("export", "pendulum", "--out", "samples.txt"), "expected a file ending in .csv or .npz, got '.txt'"),
     ],

@@ -14,6 +14,7 @@ from types import FrameType
 from typing import Any, Literal
 
 from surrogym_client.api import Api
+from surrogym_client.cli.errors import CommandError
 from surrogym_client.cli.output import progress, say
 from surrogym_client.cli.train import words_of
 from surrogym_client.connection import Retries
@@ -68,11 +69,10 @@ def run_demo(settings: DemoSettings, out: Path | None = None, *, quiet: bool = F
     """Run the whole loop; gives back the metrics that also lie in the run folder.
 
     Raises:
-        CommandError: a process ended badly; says which, its last words and where its log is.
+        CommandError: the folder is not empty, or a process ended badly; says which, its last words and its log.
         SurrogymClientError: the server refused, or the design failed.
     """
-    folder = (out or _new_folder(settings)).resolve()
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = _empty_folder(out or _new_folder(settings))
     with _terminations_as_interrupts(), Children(folder) as children:
         run = DemoRun(settings, folder, children, quiet=quiet)
         metrics = run.whole()
@@ -108,10 +108,7 @@ class DemoRun:
 
     def _serve(self) -> str:
         say("starting server, sampler and trainer", quiet=self._quiet)
-        ready = self._folder / "server.url"
-        ready.unlink(missing_ok=True)
-        database = self._folder / "surrogym.db"
-        database.unlink(missing_ok=True)
+        ready, database = self._folder / "server.url", self._folder / "surrogym.db"
         options = ["--port", "0", "--database", str(database), "--ready-file", str(ready), "--log-level", "warning"]
         return await_file(self._children.start("server", "surrogym_server", ["serve", *options]), ready)
 
@@ -124,7 +121,6 @@ class DemoRun:
         self._children.start("sampler", "surrogym_client", ["sample", *common])
         steps = [] if self._settings.steps is None else ["--steps", str(self._settings.steps)]
         options = ["--out", str(self.policy), "--seed", str(self._settings.seed), *steps, "--quiet"]
-        self._curve.unlink(missing_ok=True)
         return self._children.start(
             "trainer", "surrogym_client", ["train", *common, *options, "--progress-file", str(self._curve)]
         )
@@ -211,6 +207,13 @@ def _design_words(view: SurrogateView) -> str:
 
 def _new_folder(settings: DemoSettings) -> Path:
     return Path("runs") / f"{settings.task}-seed{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def _empty_folder(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    if any(folder.iterdir()):
+        raise CommandError(f"expected an empty run folder, got {folder}, where there is something already")
+    return folder.resolve()
 
 
 @contextmanager
