@@ -5,11 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
+import torch
 
 from support.server import ServerProcess, running_server
 from support.teaching import teach
 from surrogym_client.api import Api
 from surrogym_client.original.classic import pendulum
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_thread() -> None:
+    """Small matrices gain nothing from more, and the server's processes want the other cores."""
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

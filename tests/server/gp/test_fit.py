@@ -1,0 +1,121 @@
+"""Hyperparameters: the gradient is that of the objective, the objective the evidence, and its optimum is found."""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, WhiteKernel
+
+from surrogym_server.gp import FitOptions, fit
+from surrogym_server.gp.fit import _Objective
+
+FLAT = (0.0, 1e4)  # a prior that says nothing
+WITHOUT_PRIORS = {f"{name}_prior": FLAT for name in ("lengthscale", "signal", "linear", "quadratic", "noise")}
+
+
+def draw(rng: np.random.Generator, n: int, lengths: list[float], noise: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """A draw from a squared exponential of unit variance."""
+    x = rng.normal(size=(n, len(lengths)))
+    k = RBF(np.array(lengths))(x) + noise * np.eye(n)
+    return torch.from_numpy(x), torch.from_numpy(np.linalg.cholesky(k) @ rng.normal(size=n))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    linear=st.booleans(),
+    quadratic=st.booleans(),
+    seed=st.integers(0, 2**32 - 1),
+    noise=st.floats(-6.0, 0.0),
+)
+def test_the_gradient_is_that_of_finite_differences(linear, quadratic, seed, noise):
+    rng = np.random.default_rng(seed)
+    x, y = draw(rng, 12, [1.0, 2.0], 0.1)
+    objective = _Objective(x, y, FitOptions(linear=linear, quadratic=quadratic))
+    theta = rng.uniform(-1.5, 1.5, len(objective.default_start))
+    theta[-1] = noise
+    _, gradient = objective(theta)
+    step = 1e-5
+    for i, direction in enumerate(np.eye(len(theta))):
+        difference = (objective(theta + step * direction)[0] - objective(theta - step * direction)[0]) / (2 * step)
+        assert gradient[i] == pytest.approx(difference, rel=1e-4, abs=1e-4)
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_without_priors_the_objective_is_scikit_learns_evidence(rng, linear):
+    x, y = draw(rng, 20, [0.7, 3.0], 1e-3)
+    kernel = ConstantKernel(1.4) * RBF([0.9, 2.0])
+    theta = [0.9, 2.0, 1.4]
+    if linear:
+        kernel += ConstantKernel(0.6) * DotProduct(1.0)
+        theta.append(0.6)
+    reference = GaussianProcessRegressor(kernel, alpha=1e-3, optimizer=None).fit(x.numpy(), y.numpy())
+    objective = _Objective(x, y, FitOptions(linear=linear, **WITHOUT_PRIORS))
+    constant = (len(theta) + 1) * math.log(1e4)
+    value, _ = objective(np.log([*theta, 1e-3]))
+    assert -(value - constant) == pytest.approx(reference.log_marginal_likelihood_value_, rel=1e-6)
+
+
+def test_priors_lower_the_score_by_their_log_density(rng):
+    x, y = draw(rng, 10, [1.0], 1e-2)
+    vague = _Objective(x, y, FitOptions(linear=False, **WITHOUT_PRIORS))
+    informed = _Objective(x, y, FitOptions(linear=False, **(WITHOUT_PRIORS | {"signal_prior": (0.5, 0.25)})))
+    theta = np.array([0.0, 1.0, -3.0])
+    expected = 0.5 * ((1.0 - 0.5) / 0.25) ** 2 + math.log(0.25) - math.log(1e4)
+    assert informed(theta)[0] - vague(theta)[0] == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_optimum_is_no_worse_than_scikit_learns(seed):
+    x, y = draw(np.random.default_rng(seed), 40, [0.7, 3.0], 1e-2)
+    kernel = ConstantKernel(1.0, (1e-8, 1e4)) * RBF([1.0, 1.0], (0.02, 1e3)) + WhiteKernel(1e-2, (1e-8, 2.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        regressor = GaussianProcessRegressor(kernel, alpha=0, n_restarts_optimizer=2, random_state=0)
+        theirs = regressor.fit(x.numpy(), y.numpy()).log_marginal_likelihood_value_
+    ours = fit(x, y, FitOptions(linear=False, **WITHOUT_PRIORS)).score + 4 * math.log(1e4)
+    assert ours >= theirs - 1e-3
+
+
+def test_known_length_scales_and_noise_are_recovered(rng):
+    x, y = draw(rng, 120, [0.7, 2.5], 1e-2)
+    hyper = fit(x, y, FitOptions(linear=False)).posterior.hyper
+    assert hyper.lengthscale.tolist() == pytest.approx([0.7, 2.5], rel=0.35)
+    assert hyper.noise_variance == pytest.approx(1e-2, rel=0.6)
+
+
+def test_an_irrelevant_input_gets_a_long_length_scale(rng):
+    x = torch.from_numpy(rng.normal(size=(40, 2)))
+    short, long = fit(x, torch.sin(3 * x[:, 0]), FitOptions(linear=False)).posterior.hyper.lengthscale.tolist()
+    assert long > 5 * short
+
+
+def test_a_linear_part_makes_a_linear_function_exact(rng):
+    x, at = (torch.from_numpy(rng.normal(size=(n, 3))) for n in (8, 50))
+    slope = torch.tensor([0.5, -0.3, 0.2], dtype=torch.float64)
+    fitted = fit(x, x @ slope, FitOptions())
+    assert fitted.posterior.hyper.kernel == "squared exponential + linear"
+    assert float((fitted.posterior.mean(at) - at @ slope).abs().max()) < 5e-3
+
+
+def test_a_warm_start_can_only_help(rng):
+    x, y = draw(rng, 15, [1.0, 1.0], 1e-3)
+    cold = fit(x, y, FitOptions())
+    assert fit(x, y, FitOptions(), [cold.theta]).score >= cold.score
+    assert fit(x, y, FitOptions(), [np.full_like(cold.theta, 50.0)]).score >= cold.score - 1e-9
+
+
+def test_a_constant_output_and_a_repeated_point_fit_to_finite_numbers(rng):
+    x = torch.from_numpy(rng.normal(size=(6, 2)))
+    for inputs, targets in ((x, torch.zeros(6, dtype=torch.float64)), (torch.cat([x, x]), torch.cat([x, x])[:, 0])):
+        fitted = fit(inputs, targets, FitOptions())
+        mean, variance = fitted.posterior.mean_and_variance(inputs)
+        assert math.isfinite(fitted.score)
+        assert torch.isfinite(mean).all()
+        assert torch.isfinite(variance).all()
+        torch.testing.assert_close(mean, targets, rtol=0, atol=1e-2)

@@ -1,0 +1,74 @@
+"""Models whose predictions are known exactly, in the shape of SurrogateModel, for the virtual environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import torch
+from torch import Tensor
+
+from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.surrogate.model import Transition, settle
+
+
+@dataclass(frozen=True)
+class ExactModel:
+    """``move`` gives q' of (q, u), ``pay`` the reward of (q, u); both deviate as told, in each output alike."""
+
+    definition: EnvironmentDefinition
+    move: Callable[[Tensor, Tensor], Tensor]
+    pay: Callable[[Tensor, Tensor], Tensor]
+    deviation: float = 0.0
+    reward_deviation: Callable[[Tensor], Tensor] = lambda q: torch.zeros(len(q), dtype=torch.float64)
+    reward: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(scale=1.0))
+
+    @property
+    def transitions(self) -> tuple[int, ...]:
+        return self.definition.moving
+
+    def transition(self, q: Tensor, u: Tensor, *, noise: Tensor | None = None, deviations: bool = False) -> Transition:
+        q_next, moving = self.move(q, u), list(self.definition.moving)
+        if noise is not None:
+            q_next[..., moving] += self.deviation * noise
+        deviation = torch.full((len(q), len(moving)), self.deviation, dtype=q.dtype)
+        return Transition(settle(self.definition, q_next), deviation if deviations else None)
+
+    def predict_reward(
+        self, q: Tensor, u: Tensor, q_next: Tensor, terminated: Tensor, *, deviations: bool = True
+    ) -> tuple[Tensor, Tensor | None]:
+        return self.pay(q, u), self.reward_deviation(q) if deviations else None
+
+
+def exact_pendulum() -> ExactModel:
+    """Gymnasium's Pendulum-v1: g = 10, m = l = 1, dt = 0.05."""
+
+    def move(q: Tensor, u: Tensor) -> Tensor:
+        speed = (q[:, 1] + (15 * q[:, 0].sin() + 3 * u[:, 0]) * 0.05).clamp(-8, 8)
+        return torch.stack([q[:, 0] + 0.05 * speed, speed], -1)
+
+    def pay(q: Tensor, u: Tensor) -> Tensor:
+        return -(q[:, 0].square() + 0.1 * q[:, 1].square() + 0.001 * u[:, 0].square())
+
+    return ExactModel(definition_from_spec(pendulum()), move, pay)
+
+
+def exact_cartpole() -> ExactModel:
+    """Gymnasium's CartPole-v1: explicit Euler, tau = 0.02."""
+
+    def move(q: Tensor, u: Tensor) -> Tensor:
+        _, velocity, pole, omega = q.unbind(-1)
+        force = 20 * u[:, 0] - 10
+        pushed = (force + 0.05 * omega.square() * pole.sin()) / 1.1
+        turned = (9.8 * pole.sin() - pole.cos() * pushed) / (0.5 * (4 / 3 - 0.1 * pole.cos().square() / 1.1))
+        driven = pushed - 0.05 * turned * pole.cos() / 1.1
+        rates = torch.stack([velocity, driven, omega, turned], -1)
+        return q + 0.02 * rates
+
+    def pay(q: Tensor, u: Tensor) -> Tensor:
+        return q.new_ones(len(q))
+
+    return ExactModel(definition_from_spec(cartpole()), move, pay)

@@ -1,0 +1,36 @@
+"""Real steps of Gymnasium's own environments as samples of the core, in this process."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surrogym_client.original.gymnasium import GymnasiumEnvironment
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.sampling.latin_hypercube import random_points
+from surrogym_server.surrogate.samples import Samples
+from surrogym_shared.spec import EnvironmentSpec
+
+
+def answer(spec: EnvironmentSpec, q: Tensor, u: Tensor) -> Samples:
+    """One real step from each of q (n, C) under u (n, F)."""
+    original = GymnasiumEnvironment(spec)
+    steps = [original.step_from(*point) for point in zip(q.numpy(), u.numpy(), strict=True)]
+    original.close()
+    return Samples(
+        q=torch.tensor(np.array([s.coordinates for s in steps])),
+        u=torch.tensor(np.array([s.action for s in steps])),
+        q_next=torch.tensor(np.array([s.next_coordinates for s in steps])),
+        reward=torch.tensor([s.reward for s in steps], dtype=torch.float64),
+        terminated=torch.tensor([s.terminated for s in steps]),
+    )
+
+
+def random_steps(spec: EnvironmentSpec, count: int, seed: int) -> Samples:
+    """Real steps from anywhere in the sampling range."""
+    return answer(spec, *random_points(definition_from_spec(spec), count, np.random.default_rng(seed)))
+
+
+def join(a: Samples, b: Samples) -> Samples:
+    return Samples(*(torch.cat([getattr(a, name), getattr(b, name)]) for name in a.__dataclass_fields__))
