@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict
 from typing import Any
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
@@ -49,19 +50,18 @@ def from_bytes(definition: EnvironmentDefinition, data: bytes) -> SurrogateModel
         header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["surrogym"])
         tensors = load(data)
         outputs = tuple(_output(entry, tensors, str(i)) for i, entry in enumerate(header["outputs"]))
+        stored, terminal_reward = header["format"], float(header["terminal_reward"])
+        samples, digest = int(header["samples"]), str(header["digest"])
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         raise InvalidInput(f"expected a Surrogym model in safetensors form, got {len(data)} bytes: {error}") from error
     names = tuple(output.name for output in outputs)
-    if header["format"] != FORMAT or names != definition.outputs:
+    if stored != FORMAT or names != definition.outputs:
         raise InvalidInput(
-            f"expected a model of format {FORMAT} with outputs {definition.outputs}, "
-            f"got format {header['format']} with {names}"
+            f"expected a model of format {FORMAT} with outputs {definition.outputs}, got format {stored} with {names}"
         )
     for output in outputs:
         _require_shapes(definition, output)
-    return SurrogateModel(
-        definition, outputs[:-1], outputs[-1], header["terminal_reward"], header["samples"], header["digest"]
-    )
+    return SurrogateModel(definition, outputs[:-1], outputs[-1], terminal_reward, samples, digest)
 
 
 def _header(output: OutputModel) -> dict[str, Any]:
@@ -108,14 +108,18 @@ def _output(entry: dict[str, Any], tensors: dict[str, Tensor], prefix: str) -> O
 def _require_shapes(definition: EnvironmentDefinition, output: OutputModel) -> None:
     if (posterior := output.posterior) is None:
         return
-    q = posterior.x.new_zeros(1, len(definition.coordinates))
-    u = posterior.x.new_zeros(1, definition.action.size)
+    q = torch.zeros(1, len(definition.coordinates))
+    u = torch.zeros(1, definition.action.size)
     lead = q.new_zeros(1, len(definition.coordinates))
     width, n = encode(definition, output.feature_map, q, u, lead).shape[1], len(posterior.y)
-    expected = {"x": (n, width), "factor": (n, n), "weights": (n,)}
-    for name, shape in expected.items():
-        if tuple(getattr(posterior, name).shape) != shape:
-            got = tuple(getattr(posterior, name).shape)
-            raise InvalidInput(f"output {output.name!r}: expected {name} of shape {shape}, got {got}")
-    if tuple(posterior.hyper.lengthscale.shape) != (width,):
-        raise InvalidInput(f"output {output.name!r}: expected {width} length scales")
+    expected = {
+        "x": (posterior.x, (n, width)),
+        "y": (posterior.y, (n,)),
+        "factor": (posterior.factor, (n, n)),
+        "weights": (posterior.weights, (n,)),
+        "lengthscale": (posterior.hyper.lengthscale, (width,)),
+    }
+    for name, (tensor, shape) in expected.items():
+        if tuple(tensor.shape) != shape or tensor.dtype != torch.float64:
+            got = f"{tensor.dtype} {tuple(tensor.shape)}"
+            raise InvalidInput(f"output {output.name!r}: expected {name} of torch.float64 {shape}, got {got}")
