@@ -41,10 +41,10 @@ class ObservationInverse:
 def _source(definition: EnvironmentDefinition, index: int) -> tuple[int, ...]:
     coordinate = definition.coordinates[index]
     unit = tuple(float(i == index) for i in range(len(definition.coordinates)))
-    direct = _entry(definition, Part("linear", 1.0, unit))
+    direct = _entry(definition, Part("linear", 1.0, unit), coordinate.sampling.low, coordinate.sampling.high)
     if direct is not None:
         return (direct,)
-    cosine, sine = _entry(definition, Part("cos", 1.0, unit)), _entry(definition, Part("sin", 1.0, unit))
+    cosine, sine = (_entry(definition, Part(f, 1.0, unit), -1.0, 1.0) for f in ("cos", "sin"))
     if coordinate.kind == "angle" and cosine is not None and sine is not None:
         return (cosine, sine)
     raise InvalidSpec(
@@ -53,8 +53,9 @@ def _source(definition: EnvironmentDefinition, index: int) -> tuple[int, ...]:
     )
 
 
-def _entry(definition: EnvironmentDefinition, part: Part) -> int | None:
+def _entry(definition: EnvironmentDefinition, part: Part, low: float, high: float) -> int | None:
+    """Where the observation has this part by itself, not clipped within [low, high]."""
     for position, term in enumerate(definition.observation_terms):
-        if term.parts == (part,):
+        if term.parts == (part,) and term.low <= low and term.high >= high:
             return position
     return None
