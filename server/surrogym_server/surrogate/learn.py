@@ -58,8 +58,8 @@ class _Learner:
     ) -> OutputModel:
         """The best of the feature maps ``inputs`` (n, d) for one output's targets (n,).
 
-        ``keep`` (n,) marks the samples that count. Maps that read the lead may use more, ``keep_lead``; all are compared
-        on the same points.
+        ``keep`` (n,) marks the samples that count. Maps that read the lead may use more, ``keep_lead``; all are
+        compared on the same points.
         """
         centre, scale = float(target[keep].mean()), float(target[keep].std(correction=0))
         if scale <= CONSTANT * (1 + abs(centre)):

@@ -63,7 +63,7 @@ def move_particles(
     mean, spread = model.predict_reward(q, action, transition.q_next, over.repeat_interleave(count))
     assert spread is not None
     weight = _weights(spread.reshape(lanes, count), model.reward.scale, weighting)
-    deviation = torch.cat([transition.deviation, spread[:, None]], -1).unflatten(0, (lanes, count))
+    deviation = torch.cat([transition.deviation, spread[:, None]], -1).reshape(lanes, count, -1)
     penalised = (mean - penalty * spread).reshape(lanes, count)
     return Moved(
         output,
