@@ -1,0 +1,111 @@
+"""A stored model predicts the same bits, and bytes that are not one are refused."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from safetensors.torch import load, save
+
+from surrogym_server.errors import InvalidInput
+from surrogym_server.surrogate.codec import from_bytes, to_bytes
+from surrogym_server.surrogate.model import SurrogateModel
+
+
+def header_of(data: bytes) -> dict:
+    return json.loads(json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]["surrogym"])
+
+
+def rewritten(data: bytes, header: dict | None = None, **tensors: torch.Tensor | None) -> bytes:
+    """The file with another header, and tensors replaced or (None) removed."""
+    kept = load(data) | {name.replace("_", ".", 1): tensor for name, tensor in tensors.items()}
+    return save({n: t for n, t in kept.items() if t is not None}, {"surrogym": json.dumps(header or header_of(data))})
+
+
+@pytest.fixture(params=["pendulum_model", "cartpole_model"])
+def model(request: pytest.FixtureRequest) -> SurrogateModel:
+    return request.getfixturevalue(request.param)
+
+
+@pytest.fixture
+def data(pendulum_model: SurrogateModel) -> bytes:
+    return to_bytes(pendulum_model)
+
+
+def test_predictions_survive_bit_for_bit(model):
+    loaded = from_bytes(model.definition, to_bytes(model))
+    generator = torch.manual_seed(1)
+    q = torch.rand(50, len(model.definition.coordinates), generator=generator, dtype=torch.float64)
+    u = torch.randint(0, 2, (50, 1), generator=generator).double()
+    noise = torch.randn(50, len(model.transitions), generator=generator, dtype=torch.float64)
+    for options in ({"deviations": True}, {"noise": noise}, {}):
+        ours, theirs = model.transition(q, u, **options), loaded.transition(q, u, **options)
+        assert torch.equal(ours.q_next, theirs.q_next)
+        assert ours.deviation is None or torch.equal(ours.deviation, theirs.deviation)
+    going = torch.zeros(50, dtype=torch.bool)
+    for a, b in zip(model.predict_reward(q, u, q, going), loaded.predict_reward(q, u, q, going), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_all_that_describes_a_model_survives(model):
+    loaded = from_bytes(model.definition, to_bytes(model))
+    assert loaded.description == model.description
+    assert (loaded.samples, loaded.digest, loaded.terminal_reward) == (
+        model.samples,
+        model.digest,
+        model.terminal_reward,
+    )
+    assert to_bytes(loaded) == to_bytes(model)
+
+
+@pytest.mark.parametrize("keep", [0, 7, 8, 100, -1])
+def test_truncated_bytes_are_refused(pendulum_definition, data, keep):
+    with pytest.raises(InvalidInput, match="safetensors"):
+        from_bytes(pendulum_definition, data[:keep])
+
+
+@pytest.mark.parametrize("place", [0, 7, 9, 200])
+def test_a_changed_byte_of_the_header_is_refused(pendulum_definition, data, place):
+    with pytest.raises(InvalidInput):
+        from_bytes(pendulum_definition, data[:place] + bytes([data[place] ^ 0xFF]) + data[place + 1 :])
+
+
+def test_a_missing_tensor_is_refused(pendulum_definition, data):
+    with pytest.raises(InvalidInput, match="safetensors"):
+        from_bytes(pendulum_definition, rewritten(data, **{"0_weights": None}))
+
+
+def test_a_tensor_of_another_precision_is_refused(pendulum_definition, data):
+    single = load(data)["0.x"].float()
+    with pytest.raises(InvalidInput, match=r"expected x of torch\.float64"):
+        from_bytes(pendulum_definition, rewritten(data, **{"0_x": single}))
+
+
+@pytest.mark.parametrize("name", ["0_x", "0_y", "0_factor", "1_weights", "2_lengthscale"])
+def test_a_tensor_of_another_shape_is_refused(pendulum_definition, data, name):
+    with pytest.raises(InvalidInput, match="expected"):
+        from_bytes(pendulum_definition, rewritten(data, **{name: torch.zeros(3, 2, dtype=torch.float64)}))
+
+
+def test_a_file_without_its_header_field_is_refused(pendulum_definition, data):
+    for field in ("outputs", "terminal_reward", "samples", "digest", "format"):
+        header = {k: v for k, v in header_of(data).items() if k != field}
+        with pytest.raises(InvalidInput):
+            from_bytes(pendulum_definition, rewritten(data, header))
+
+
+def test_another_format_or_environment_is_refused(pendulum_definition, cartpole_definition, data):
+    with pytest.raises(InvalidInput, match="format 1"):
+        from_bytes(pendulum_definition, rewritten(data, header_of(data) | {"format": 2}))
+    with pytest.raises(InvalidInput, match="outputs"):
+        from_bytes(cartpole_definition, data)
+    renamed = replace(pendulum_definition.coordinates[0], name="angle")
+    other = replace(pendulum_definition, coordinates=(renamed, pendulum_definition.coordinates[1]))
+    with pytest.raises(InvalidInput, match="angle"):
+        from_bytes(other, data)
+
+
+def test_a_foreign_safetensors_file_is_refused(pendulum_definition):
+    for metadata in (None, {"surrogym": "not json"}, {"surrogym": "[]"}, {"other": "{}"}):
+        with pytest.raises(InvalidInput):
+            from_bytes(pendulum_definition, save({"a": torch.zeros(1)}, metadata))

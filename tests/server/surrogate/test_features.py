@@ -1,0 +1,75 @@
+"""What the processes are shown: encodings of angles, actions, the lead and the paper's observation."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from surrogym_client.original.classic import acrobot, mountain_car_continuous, pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.surrogate.definition import ActionDefinition
+from surrogym_server.surrogate.features import FeatureMap, candidates, encode, leading
+from surrogym_shared.spec import Design
+
+
+def row(*values: float) -> torch.Tensor:
+    return torch.tensor([values], dtype=torch.float64)
+
+
+def assert_features(made: torch.Tensor, *expected: float) -> None:
+    torch.testing.assert_close(made, row(*expected), rtol=1e-12, atol=1e-12)
+
+
+def test_angles_speeds_and_torque_of_the_pendulum(pendulum_definition):
+    q, u = row(2.0, 4.0), row(1.0)
+    speed, torque, angle = 4 / (16 / math.sqrt(12)), 1 * math.sqrt(12) / 4, 2 * math.sqrt(3) / math.pi
+    for state, expected in (
+        ("cos_sin", [math.cos(2), math.sin(2), speed, torque]),
+        ("wrapped", [angle, speed, torque]),
+        ("both", [math.cos(2), math.sin(2), angle, speed, torque]),
+        ("observation", [math.cos(2), math.sin(2), 4.0, torque]),
+    ):
+        assert_features(encode(pendulum_definition, FeatureMap(state), q, u), *expected)
+
+
+def test_the_lead_is_one_more_input(pendulum_definition):
+    made = encode(pendulum_definition, FeatureMap("wrapped", lead=True), row(0, 0), row(0), row(8.0))
+    assert_features(made, 0, 0, 0, math.sqrt(3))
+
+
+def test_a_full_turn_changes_no_feature(pendulum_definition):
+    for state in ("cos_sin", "wrapped", "both"):
+        near, far = (encode(pendulum_definition, FeatureMap(state), row(a, 1), row(1)) for a in (1, 1 + 2 * math.pi))
+        torch.testing.assert_close(near, far)
+
+
+@pytest.mark.parametrize("count", [2, 3, 7])
+def test_discrete_actions_as_values_have_mean_zero_and_deviation_one(pendulum_definition, count):
+    definition = replace(pendulum_definition, action=ActionDefinition("discrete", nvec=(count,)))
+    u = torch.arange(count, dtype=torch.float64)[:, None]
+    column = encode(definition, FeatureMap(), torch.zeros(count, 2, dtype=torch.float64), u)[:, -1]
+    assert float(column.mean()) == pytest.approx(0, abs=1e-12)
+    assert float(column.std(correction=0)) == pytest.approx(1)
+
+
+def test_one_hot_actions(pendulum_definition):
+    definition = replace(pendulum_definition, action=ActionDefinition("multi_discrete", nvec=(3, 2)))
+    made = encode(definition, FeatureMap("wrapped", "one_hot"), row(0, 0), row(2, 1))
+    assert_features(made, 0, 0, 0, 0, 1, 1)
+
+
+def test_limited_speeds_lead_and_walls_do_not():
+    assert leading(definition_from_spec(pendulum())) == (1,)
+    assert leading(definition_from_spec(mountain_car_continuous())) == (1,)
+    assert leading(definition_from_spec(acrobot())) == (2, 3)
+
+
+def test_which_maps_are_compared(pendulum_definition, cartpole_definition):
+    assert len(candidates(pendulum_definition, follows=True)) == 6
+    assert len(candidates(pendulum_definition, follows=False)) == 3
+    assert candidates(cartpole_definition, follows=True) == (FeatureMap(),)
+    three_actions = candidates(definition_from_spec(acrobot()), follows=False)
+    assert {m.action for m in three_actions} == {"value", "one_hot"}
+    paper = definition_from_spec(pendulum().model_copy(update={"design": Design(preset="paper")}))
+    assert candidates(paper, follows=True) == (FeatureMap("observation"),)

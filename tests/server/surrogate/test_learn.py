@@ -1,0 +1,107 @@
+"""Learning: structure by evidence, samples cut by bounds left out, constants, and what an ending pays."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from support.real_steps import answer, join, random_steps
+from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.errors import InvalidInput
+from surrogym_server.surrogate.learn import learn
+from surrogym_server.surrogate.samples import Samples
+from surrogym_shared.spec import Design
+
+PAPER = pendulum().model_copy(update={"design": Design(preset="paper")})
+
+
+@pytest.fixture(scope="module")
+def half_saturated() -> Samples:
+    """Pendulum steps close to the speed limit, where half of them end."""
+    rng = torch.Generator().manual_seed(0)
+    angle, side, torque = (2 * torch.rand(20, generator=rng, dtype=torch.float64) - 1 for _ in range(3))
+    q = torch.stack([torch.pi * angle, 7.6 * side.sign()], -1)
+    return answer(pendulum(), q, 2 * torque[:, None])
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_reward_of_the_squared_angle_is_given_the_wrapped_angle(pendulum_definition, seed):
+    steps = random_steps(pendulum(), 24, seed=seed)
+    squared = replace(steps, reward=-steps.q[:, 0].square())
+    reward = learn(pendulum_definition, squared).model.reward
+    assert reward.feature_map.state == "wrapped"
+    scores = dict(reward.scores)
+    assert max(scores, key=scores.get) == str(reward.feature_map)
+
+
+def test_a_reward_of_the_cosine_is_given_cos_and_sin(pendulum_definition):
+    steps = random_steps(pendulum(), 24, seed=0)
+    reward = learn(pendulum_definition, replace(steps, reward=3 * steps.q[:, 0].cos() - 1)).model.reward
+    assert reward.feature_map.state == "cos_sin"
+
+
+def test_cut_increments_are_left_out_of_the_dynamics_and_kept_for_the_reward(pendulum_definition, half_saturated):
+    cut = int((half_saturated.q_next[:, 1].abs() >= 8).sum())
+    assert cut >= 5
+    model = learn(pendulum_definition, half_saturated).model
+    angle, speed = model.transitions
+    assert speed.left_out == cut
+    assert len(speed.posterior.y) == len(half_saturated) - cut
+    assert angle.feature_map.lead
+    assert angle.left_out == 0, "an angle that reads the clipped speed sees no kink"
+    assert model.reward.left_out == 0
+
+
+def test_where_every_sample_was_cut_they_are_all_that_is_known(pendulum_definition, half_saturated):
+    cut = half_saturated.q_next[:, 1].abs() >= 8
+    only = Samples(*(getattr(half_saturated, name)[cut] for name in half_saturated.__dataclass_fields__))
+    model = learn(pendulum_definition, only).model
+    assert [o.left_out for o in model.transitions] == [0, 0]
+
+
+def test_a_constant_output_has_no_process_and_no_deviation(cartpole_model):
+    assert cartpole_model.reward.posterior is None
+    mean, deviation = cartpole_model.reward.mean_and_deviation(torch.zeros(3, 5, dtype=torch.float64))
+    assert mean.tolist() == [1.0] * 3
+    assert deviation.tolist() == [0.0] * 3
+
+
+def test_an_ending_pays_what_it_paid_beyond_the_reward_process(cartpole_definition):
+    steps = random_steps(cartpole(), 60, seed=0)
+    assert bool(steps.terminated.any())
+    assert bool((~steps.terminated).any())
+    failing = replace(steps, reward=torch.where(steps.terminated, -9.0, 1.0).double())
+    few = Samples(*(getattr(failing, name)[:30] for name in failing.__dataclass_fields__))
+    model = learn(cartpole_definition, few).model
+    assert model.terminal_reward == pytest.approx(-10.0)
+    q, u = few.q[:1], few.u[:1]
+    for over, expected in ((True, -9.0), (False, 1.0)):
+        reward, _ = model.predict_reward(q, u, few.q_next[:1], torch.tensor([over]))
+        assert float(reward) == pytest.approx(expected)
+
+
+def test_without_an_ending_there_is_no_terminal_reward(pendulum_model):
+    assert pendulum_model.terminal_reward == 0.0
+
+
+def test_the_papers_preset_models_the_observation_by_squared_exponentials():
+    steps = random_steps(PAPER, 30, seed=0)
+    model = learn(definition_from_spec(PAPER), steps).model
+    assert [o.name for o in (*model.transitions, model.reward)] == ["cos", "sin", "speed", "reward"]
+    assert {o.posterior.hyper.kernel for o in (*model.transitions, model.reward)} == {"squared exponential"}
+    q_next = model.transition(steps.q, steps.u).q_next
+    assert float((q_next - steps.q_next)[:, 1].abs().max()) < 0.5
+
+
+def test_a_model_needs_two_samples(pendulum_definition):
+    steps = random_steps(pendulum(), 1, seed=0)
+    with pytest.raises(InvalidInput, match="at least 2 samples, got 1"):
+        learn(pendulum_definition, steps)
+    assert learn(pendulum_definition, join(steps, random_steps(pendulum(), 1, seed=1))).model.samples == 2
+
+
+def test_learning_the_same_samples_gives_the_same_model(pendulum_definition, pendulum_samples, pendulum_model):
+    again = learn(pendulum_definition, pendulum_samples).model
+    assert again.digest == pendulum_model.digest == pendulum_samples.digest
+    assert again.description == pendulum_model.description
