@@ -16,6 +16,8 @@ from surrogym_shared.spec import BoxAction, EnvironmentSpec, Success
 Array = NDArray[np.float64]
 Predict = Callable[[NDArray[np.float32]], NDArray[Any]]  # observations (N, D) -> actions (N,) or (N, F)
 
+Progress = Callable[[float, int], None]  # share done in [0, 1], episodes that terminated
+
 FIRST_SEED = 10_000
 LONGEST_EPISODE = 1_000  # where the specification has no time limit
 
@@ -77,7 +79,7 @@ def evaluate(
     policy: Predict,
     open_episode: Callable[[], Episode],
     settings: EvaluationSettings | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Evaluation:
     """Run N real episodes side by side; the policy is asked once for all that are still running.
 
@@ -85,7 +87,7 @@ def evaluate(
         policy: observations (N, D) to actions.
         open_episode: makes one episode; called N times.
         settings: how many, from which starts.
-        progress: called with the number of ended episodes and N.
+        progress: called after every step.
 
     Returns:
         returns and successes by episode, in the order of their seeds.
@@ -152,20 +154,21 @@ def _run(
     policy: Predict,
     episodes: Sequence[Episode],
     settings: EvaluationSettings,
-    progress: Callable[[int, int], None] | None,
+    progress: Progress | None,
 ) -> Evaluation:
     spec = episodes[0].spec
     tallies = [_Tally(_start(e, settings, i)) for i, e in enumerate(episodes)]
     start = tallies[0].moment.coordinates
     running = list(range(len(episodes)))
-    for _ in range(spec.time_limit or LONGEST_EPISODE):
+    limit = spec.time_limit or LONGEST_EPISODE
+    for step in range(1, limit + 1):
         observations = np.stack([tallies[i].moment.observation for i in running]).astype(np.float32)
         actions = decode_actions(spec, policy(observations), len(running))
         for i, action in zip(running, actions, strict=True):
             tallies[i].add(spec, action, episodes[i].step(action))
         running = [i for i in running if not tallies[i].moment.terminated]
         if progress is not None:
-            progress(len(episodes) - len(running), len(episodes))
+            progress(step / limit if running else 1.0, len(episodes) - len(running))
         if not running:
             break
     return _account(spec, tallies, start)

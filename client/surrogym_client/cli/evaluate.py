@@ -60,7 +60,12 @@ def command(
     predict = load_policy(policy, algorithm or card.algorithm)
     with progress("evaluate", quiet=quiet) as update:
         result = _checked(
-            lambda: evaluate(predict, opener, settings, lambda done, n: update(done / n, f"{done} of {n} ended"))
+            lambda: evaluate(
+                predict,
+                opener,
+                settings,
+                lambda share, ended: update(share, f"{episodes} real episodes, {ended} terminated"),
+            )
         )
     _enter(result, settings, surrogate or card.surrogate, server or card.server, token, quiet=quiet)
     summary = {"policy": str(policy), **_settings(settings), **result.summary()}

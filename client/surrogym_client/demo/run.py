@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import signal
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from types import FrameType
 from typing import Any, Literal
@@ -136,6 +138,7 @@ class DemoRun:
             wait_for_design(self.api, self._settings.task, PATIENCE_SECONDS, look)
 
     def _train(self, trainer: Child) -> None:
+        threading.Thread(target=_warm_up, daemon=True).start()
         with progress("train", quiet=self._quiet) as update:
             while trainer.process.poll() is None:
                 self._children.check()
@@ -152,10 +155,12 @@ class DemoRun:
             predict = load_policy(self.policy, read_card(self.policy).algorithm)
             name, spec = self._spec.environment, self._spec
             opener = partial(open_episode, name, spec, partial(make, name, spec=spec))
-            result = evaluate(
-                predict, opener, episodes, lambda done, n: update(done / n, f"{done} of {n} real episodes")
-            )
-            update(1.0, f"{episodes.episodes} of {episodes.episodes} real episodes")
+            n = episodes.episodes
+
+            def look(share: float, ended: int) -> None:
+                update(share, f"{n} real episodes, {ended} terminated")
+
+            result = evaluate(predict, opener, episodes, look)
         self.api.report_steps(self._settings.task, result.steps, episodes=episodes.episodes, note="demo")
         return result
 
@@ -197,6 +202,13 @@ def read_curve(path: Path) -> list[dict[str, Any]]:
         return []
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
     return [json.loads(line) for line in lines if line.endswith("\n")]
+
+
+def _warm_up() -> None:
+    """Import what evaluation and pictures need while there is nothing to do but wait."""
+    with suppress(ImportError):  # told by whoever needs it
+        for module in ("stable_baselines3", "surrogym_client.demo.pictures"):
+            import_module(module)
 
 
 def _design_words(view: SurrogateView) -> str:
