@@ -1,0 +1,106 @@
+"""Compose file and Dockerfile, without a container engine: nothing runs as root, nothing is open, commands exist."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from support.commands import parse
+
+ROOT = Path(__file__).parents[2]
+COMPOSE = ROOT / "docker" / "compose.yaml"
+DOCKERFILE = (ROOT / "docker" / "Dockerfile").read_text(encoding="utf-8")
+SERVICES: dict[str, dict[str, Any]] = yaml.safe_load(COMPOSE.read_text(encoding="utf-8"))["services"]
+DEFAULT = re.compile(r"\$\{\w+:-([^}]*)\}")
+
+
+def stages() -> dict[str, tuple[str, list[str]]]:
+    """Each stage of the Dockerfile: what it is built from, and its lines."""
+    found: dict[str, tuple[str, list[str]]] = {}
+    lines: list[str] = []
+    for line in DOCKERFILE.replace("\\\n", " ").splitlines():
+        if match := re.fullmatch(r"FROM (\S+) AS (\S+)", line):
+            lines = []
+            found[match[2]] = (match[1], lines)
+        else:
+            lines.append(line)
+    return found
+
+
+def whole(target: str) -> list[str]:
+    """All lines that lead to a target, those of the stages below it first."""
+    below, lines = stages()[target]
+    return [*(whole(below) if below in stages() else []), *lines]
+
+
+def last(target: str, instruction: str) -> str:
+    return [line.partition(" ")[2] for line in whole(target) if line.startswith(f"{instruction} ")][-1]
+
+
+@pytest.mark.parametrize("target", ["server", "sampler", "trainer"])
+def test_no_program_runs_as_root(target: str) -> None:
+    user = last(target, "USER")
+    assert any(f"useradd --uid 1000 --create-home {user}" in line for line in whole(target))
+    assert not [line for line in whole(target)[whole(target).index(f"USER {user}") :] if line.startswith("RUN ")]
+
+
+def test_the_server_says_whether_it_is_well() -> None:
+    assert "/healthz" in last("server", "HEALTHCHECK")
+
+
+def test_the_sampler_carries_no_torch() -> None:
+    assert not [line for line in whole("sampler") if "torch" in line]
+
+
+def test_every_install_is_pinned_and_no_image_keeps_a_cache() -> None:
+    installs = [line for line in DOCKERFILE.splitlines() if "pip install" in line]
+    assert installs
+    assert all("-c constraints.txt" in line or "--no-deps" in line for line in installs)
+    assert DOCKERFILE.count("PIP_NO_CACHE_DIR=1") == DOCKERFILE.count("FROM ${BASE_IMAGE}")
+
+
+def test_whatever_is_copied_is_there_and_not_ignored() -> None:
+    ignored = (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines()
+    copied = [line.split()[1:-1] for line in DOCKERFILE.splitlines() if line.startswith("COPY ")]
+    for source in (source for sources in copied for source in sources):
+        assert (ROOT / source).exists()
+        assert f"!{source}" in ignored
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_a_service_is_built_from_a_target_of_the_dockerfile(name: str) -> None:
+    build = SERVICES[name]["build"]
+    assert (COMPOSE.parent / build["context"] / build["dockerfile"]).samefile(ROOT / "docker" / "Dockerfile")
+    assert build["target"] in stages()
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_no_service_starts_without_a_token_of_ones_own(name: str) -> None:
+    assert SERVICES[name]["environment"]["SURROGYM_TOKEN"].startswith("${SURROGYM_TOKEN:?expected ")
+
+
+@pytest.mark.parametrize("name", ["register", "sampler", "trainer"])
+def test_a_client_gives_a_known_command_and_waits_by_itself(name: str) -> None:
+    values = parse([DEFAULT.sub(r"\1", word) for word in SERVICES[name]["command"]])
+    assert values["wait"] >= 60
+    assert SERVICES[name]["environment"]["SURROGYM_URL"] == "http://server:8000"
+
+
+def test_the_server_is_reachable_from_this_machine_alone() -> None:
+    assert [port.startswith("127.0.0.1:") for port in SERVICES["server"]["ports"]] == [True]
+
+
+def test_database_and_policy_lie_in_the_volume() -> None:
+    assert "SURROGYM_DATABASE=/data/" in last("server", "ENV")
+    trainer = SERVICES["trainer"]
+    policy = parse([DEFAULT.sub(r"\1", word) for word in trainer["command"]])["out"]
+    assert policy.parent == Path("/data")
+    assert SERVICES["server"]["volumes"] == trainer["volumes"] == ["data:/data"]
+
+
+def test_samplers_can_be_scaled() -> None:
+    assert not {"container_name", "ports"} & SERVICES["sampler"].keys()

@@ -1,0 +1,28 @@
+"""The ``surrogym`` command as a parser: whether a line that a person would type means anything."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import typer
+
+from surrogym_client.cli import build
+
+
+@cache
+def command_line() -> Any:
+    return typer.main.get_command(build())
+
+
+def parse(arguments: list[str]) -> dict[str, Any]:
+    """The values that ``surrogym ARGUMENTS`` gives its command, which is not run.
+
+    Raises:
+        KeyError: no such command.
+        Exception: the usage error that a person would see.
+    """
+    name, *rest = arguments
+    command = command_line().commands[name]
+    values: dict[str, Any] = command.make_context(name, rest).params
+    return values
