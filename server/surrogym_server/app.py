@@ -96,7 +96,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes)
     if settings.loopback and not settings.tokens:
         app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", settings.host}))
-    for room in (service, surrogates, queries, samples, models, events, sessions):
+    for room in (sessions, service, surrogates, queries, samples, models, events):  # routes are tried in this order
         app.include_router(room.router)
     _add_dashboard(app)
     return app
@@ -116,7 +116,7 @@ async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: 
     services, sweeper = _build_services(settings, design, storage, engine)
     engine.fits.start()
     restored = services.sessions.restore()
-    logger.info("%d sessions came back", restored)
+    logger.info("sessions that came back: %d", restored)
     tasks = [asyncio.create_task(services.designer.run()), asyncio.create_task(sweeper.run())]
     try:
         yield {"services": services}
@@ -127,7 +127,7 @@ async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: 
         await asyncio.gather(*tasks, return_exceptions=True)
         engine.threads.shutdown()
         await asyncio.to_thread(engine.fits.close)
-        logger.info("%d sessions were saved", services.sessions.save())
+        logger.info("sessions saved: %d", services.sessions.save())
         storage.close()
 
 

@@ -50,7 +50,6 @@ def serve(
 
     Example: surrogym serve --port 8000 --database surrogym.db
     """
-    from surrogym_server.cli import runner  # imports torch, which --help must not wait for
     from surrogym_server.settings import read_settings
 
     try:
@@ -66,6 +65,8 @@ def serve(
             session_idle_seconds=session_idle_seconds,
             log_level=log_level,
         )
+        from surrogym_server.cli import runner  # imports torch, which neither --help nor a refusal should wait for
+
         runner.run(settings, ready_file, exit_with_parent)
     except SurrogymError as error:
         typer.echo(f"error: {error}", err=True)
