@@ -1,0 +1,145 @@
+"""``surrogym serve`` as a process: says where it listens, ends cleanly, and forgets no session when it does."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from support import pendulum
+from support.server import running_server, start_server
+
+SERVE = [sys.executable, "-m", "surrogym_server", "serve"]
+PATIENCE = 60.0
+
+
+def serve(*options: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a server that is expected to refuse."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")}
+    return subprocess.run([*SERVE, *options], env=kept | environment, capture_output=True, text=True, timeout=PATIENCE)
+
+
+def refused(result: subprocess.CompletedProcess[str]) -> str:
+    """The one sentence of a refusal."""
+    assert result.returncode == 1
+    assert "Traceback" not in result.stderr
+    (line,) = result.stderr.strip().splitlines()
+    return line
+
+
+def test_a_taken_database_is_one_sentence(server_process: Any):
+    database = str(server_process.folder / "surrogym.db")
+    assert "surrogym.db" in refused(serve("--port", "0", "--database", database))
+
+
+def test_a_taken_port_is_one_sentence(server_process: Any, tmp_path: Path):
+    port = server_process.url.rpartition(":")[2]
+    assert f"port {port}" in refused(serve("--port", port, "--database", str(tmp_path / "other.db")))
+
+
+@pytest.mark.parametrize(
+    ("options", "environment", "said"),
+    [
+        (["--host", "0.0.0.0"], {}, "host 0.0.0.0 is not loopback: expected a token"),
+        (["--port", "70000"], {}, "setting port"),
+        (["--token-file", "/no/such/file"], {}, "/no/such/file"),
+        ([], {"WEB_CONCURRENCY": "4"}, "expected one worker process, got WEB_CONCURRENCY=4"),
+        (["--database", "mysql://x/y"], {}, "mysql"),
+        (["--database", "/dev/null/surrogym.db"], {}, "/dev/null"),
+    ],
+)
+def test_what_cannot_be_served(options: list[str], environment: dict[str, str], said: str):
+    assert said in refused(serve(*options, **environment))
+
+
+def test_help_has_an_example():
+    result = serve("--help")
+    assert result.returncode == 0
+    assert "surrogym serve --port" in result.stdout
+
+
+def test_a_clean_end_brings_the_sessions_back(tmp_path: Path):
+    server = start_server(tmp_path)
+    with httpx.Client(base_url=server.url, timeout=60) as client:
+        pendulum.teach(client, "p", budget=5)
+        sessions = [
+            client.post("/v1/surrogates/p/sessions", json={"num_envs": 2, "seed": 0}).json()["id"] for _ in range(2)
+        ]
+        for session in sessions:
+            client.post(f"/v1/sessions/{session}/reset", json={"seq": 1}).raise_for_status()
+        step = {"seq": 2, "action": [[0.5], [-0.5]]}
+        first = client.post(f"/v1/sessions/{sessions[0]}/step", json=step).content
+    assert server.stop() == 0
+    assert "Traceback" not in server.log
+    with running_server(tmp_path) as again, httpx.Client(base_url=again.url, timeout=60) as client:
+        replies = [client.post(f"/v1/sessions/{session}/step", json=step).content for session in sessions]
+    assert replies == [first, first], "a repeat of the last step, and the same step made only now"
+
+
+def test_a_clean_end_does_not_wait_for_long_polls_and_streams(tmp_path: Path):
+    server = start_server(tmp_path)
+    with httpx.Client(base_url=server.url, timeout=60) as client:
+        client.post("/v1/surrogates", json={"name": "p", "spec": pendulum.spec()}).raise_for_status()
+        with client.stream("GET", "/v1/surrogates/p/events") as stream:
+            next(stream.iter_lines())
+            start = time.monotonic()
+            assert server.stop(signal.SIGINT) == 0
+    assert "Traceback" not in server.log
+    assert time.monotonic() - start < PATIENCE / 2
+    assert "timeout graceful shutdown exceeded" not in server.log
+
+
+def test_killed_in_a_fit_leaves_no_process_behind(tmp_path: Path):
+    server = start_server(tmp_path)
+    children = _wait_for_children(server.process.pid)
+    server.stop(signal.SIGKILL)
+    deadline = time.monotonic() + PATIENCE
+    while any(_alive(child) for child in children):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_it_ends_with_its_parent(tmp_path: Path):
+    ready = tmp_path / "ready"
+    options = ["--port", "0", "--database", str(tmp_path / "p.db"), "--ready-file", str(ready), "--exit-with-parent"]
+    parent = "import subprocess, sys; print(subprocess.Popen(sys.argv[1:]).pid, flush=True); input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", parent, *SERVE, *options],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    ) as process:
+        assert process.stdout is not None
+        server = int(process.stdout.readline())
+        deadline = time.monotonic() + PATIENCE
+        while not ready.exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        process.kill()
+        process.wait()
+        while _alive(server):
+            assert time.monotonic() < deadline + PATIENCE
+            time.sleep(0.05)
+
+
+def _wait_for_children(pid: int) -> list[int]:
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        found = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True)
+        if children := [int(line) for line in found.stdout.split()]:
+            return children
+        time.sleep(0.05)
+    raise AssertionError("the server started no process for its fits")
+
+
+def _alive(pid: int) -> bool:
+    """Whether a process runs; one that ended and that nobody waits for does not."""
+    state = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True).stdout.strip()
+    return bool(state) and not state.startswith("Z")

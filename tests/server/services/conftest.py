@@ -1,0 +1,50 @@
+"""Services over a real SQLite file and a real model, with fits that a test decides on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from support import pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.engine.design_job import initial_queries
+from surrogym_server.services.definitions import Definitions
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import NewSample, NewSurrogate
+from surrogym_server.storage.sql import open_storage
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_shared.spec import EnvironmentSpec
+
+NAME = "pendulum"
+
+
+def define(spec: dict) -> EnvironmentDefinition:
+    return definition_from_spec(EnvironmentSpec.model_validate(spec))
+
+
+@pytest.fixture
+def storage(tmp_path: Path) -> Iterator[Storage]:
+    """With one surrogate whose initial queries are open."""
+    opened = open_storage(f"sqlite:///{tmp_path / 'surrogym.db'}")
+    spec = pendulum.spec()
+    state, q, u = initial_queries(define(spec), pendulum.BUDGET)
+    opened.surrogates.create(NewSurrogate(NAME, spec, pendulum.BUDGET, 0.999, state, q, u))
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def definitions(storage: Storage) -> Definitions:
+    return Definitions(storage, define)
+
+
+@pytest.fixture
+def answered(storage: Storage) -> Storage:
+    """Its initial queries are answered: a fit is due."""
+    for query in storage.queries.claim(NAME, "tester", 100, 60):
+        step = pendulum.real_step(list(query.coordinates), list(query.action))
+        sample = NewSample(**step, query_id=query.id, lease_token=query.token)
+        storage.samples.add(NAME, "tester", [sample])
+    return storage

@@ -1,0 +1,195 @@
+"""The designer: fits what is due, stores all of it at once, and a fit that fails or is cut short loses nothing."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from support import pendulum
+from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
+from surrogym_server.engine.models import ModelCache
+from surrogym_server.errors import InvalidInput, NumericalFailure
+from surrogym_server.services.definitions import Definitions
+from surrogym_server.services.designer import Designer, phase_after
+from surrogym_server.services.models import load_model
+from surrogym_server.services.notices import Notices
+from surrogym_server.storage.port import Storage
+
+NAME = "pendulum"
+
+
+class Runner:
+    """Does jobs here, or what a test puts in their place; remembers them."""
+
+    def __init__(self, function: Callable[[DesignJob], DesignResult] = run_design_job) -> None:
+        self.function = function
+        self.jobs: list[DesignJob] = []
+        self.hang = False
+
+    async def run(self, job: DesignJob) -> DesignResult:
+        self.jobs.append(job)
+        if self.hang:
+            await asyncio.sleep(3600)
+        return self.function(job)
+
+
+def refuse(error: Exception) -> Callable[[DesignJob], DesignResult]:
+    def function(_: DesignJob) -> DesignResult:
+        raise error
+
+    return function
+
+
+@pytest.fixture
+def runner() -> Runner:
+    return Runner()
+
+
+@pytest.fixture
+def cache(storage: Storage, definitions: Definitions) -> ModelCache:
+    return ModelCache(
+        lambda name, version: load_model(storage, definitions, name, version),
+        lambda name: storage.models.get(name).version,
+    )
+
+
+@pytest.fixture
+def designer(storage: Storage, definitions: Definitions, cache: ModelCache, runner: Runner):
+    """Makes a designer of the running event loop."""
+
+    def make() -> Designer:
+        return Designer(storage, definitions, runner, cache, Notices(), owner="here", threads=1, look_seconds=0.05)
+
+    return make
+
+
+def fit_all(designer: Callable[[], Designer]) -> None:
+    async def run() -> None:
+        await designer().fit_all_due()
+
+    asyncio.run(run())
+
+
+def test_nothing_is_fitted_while_queries_are_open(storage: Storage, designer, runner: Runner):
+    fit_all(designer)
+    assert runner.jobs == []
+    assert storage.surrogates.get(NAME).phase == "collecting"
+
+
+def test_a_fit_leaves_a_model_and_the_next_queries(answered: Storage, designer, cache: ModelCache):
+    fit_all(designer)
+    record = answered.surrogates.get(NAME)
+    assert (record.phase, record.round, record.state["round"]) == ("sampling", 1, 1)
+    adaptive = answered.queries.list(NAME, ("pending",))
+    assert 1 <= len(adaptive) <= pendulum.BUDGET - pendulum.INITIAL
+    assert {query.purpose for query in adaptive} == {"adaptive"}
+    assert cache.latest(NAME) == 1
+    assert answered.models.get(NAME).samples == pendulum.INITIAL
+
+
+def test_the_job_has_what_the_design_knows(answered: Storage, designer, runner: Runner):
+    answered.occupancy.put(NAME, "visited", np.ones((3, 2)))
+    answered.designs.ask(NAME, 2, checkpoint="visited")
+    fit_all(designer)
+    job = runner.jobs[0]
+    assert (len(job.reward), job.extra_queries, job.budget) == (pendulum.INITIAL, 2, pendulum.BUDGET)
+    np.testing.assert_array_equal(job.occupancy, np.ones((3, 2)))
+
+
+def test_occupancy_steers_nothing_unless_it_was_asked_for(answered: Storage, designer, runner: Runner):
+    answered.occupancy.put(NAME, "visited", np.ones((3, 2)))
+    fit_all(designer)
+    assert runner.jobs[0].occupancy is None
+
+
+def test_a_fit_that_fails_says_why_and_is_tried_again_with_new_samples(answered: Storage, designer, runner: Runner):
+    runner.function = refuse(NumericalFailure("no jitter repairs it"))
+    for _ in range(3):
+        fit_all(designer)
+    record = answered.surrogates.get(NAME)
+    assert (record.phase, record.error) == ("failed", "the fit failed: no jitter repairs it")
+    assert len(runner.jobs) == 1, "the same samples would fail again"
+    runner.function = run_design_job
+    answered.surrogates.change(NAME, paused=True)
+    answered.surrogates.change(NAME, paused=False)
+    fit_all(designer)
+    assert (answered.surrogates.get(NAME).phase, answered.surrogates.get(NAME).error) == ("sampling", None)
+
+
+def test_an_error_nobody_thought_of_fails_the_design_and_not_the_designer(answered: Storage, designer, runner: Runner):
+    runner.function = refuse(ZeroDivisionError("surprise"))
+    fit_all(designer)
+    assert answered.surrogates.get(NAME).error == "the fit failed: surprise"
+
+
+def test_a_fit_that_a_shutdown_cuts_short_stays_due(answered: Storage, designer, runner: Runner):
+    runner.hang = True
+
+    async def run() -> None:
+        task = asyncio.create_task(designer().run())
+        while not runner.jobs:
+            await asyncio.sleep(0.01)
+        assert answered.surrogates.get(NAME).phase == "fitting"
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    asyncio.run(run())
+    assert answered.designs.due() == [NAME]
+    assert answered.surrogates.get(NAME).phase != "failed"
+
+
+def test_a_surrogate_deleted_during_its_fit_is_no_failure(answered: Storage, designer, runner: Runner):
+    def delete(job: DesignJob) -> DesignResult:
+        answered.surrogates.delete(NAME)
+        return run_design_job(job)
+
+    runner.function = delete
+    fit_all(designer)
+    assert answered.surrogates.list() == []
+
+
+def test_the_designer_wakes_by_itself(answered: Storage, designer):
+    async def run() -> None:
+        task = asyncio.create_task(designer().run())
+        async with asyncio.timeout(60):
+            while answered.surrogates.get(NAME).phase != "sampling":
+                await asyncio.sleep(0.01)
+        task.cancel()
+
+    asyncio.run(run())
+
+
+def test_improve_takes_the_latest_occupancy_unless_one_is_named(answered: Storage, designer):
+    async def run() -> None:
+        improve = designer().improve
+        assert improve(NAME, 1, None, None).checkpoint is None
+        for checkpoint in ("first", "second"):
+            answered.occupancy.put(NAME, checkpoint, np.ones((1, 2)))
+        assert improve(NAME, 1, None, None).checkpoint == "second"
+        assert improve(NAME, 1, "first", None).checkpoint == "first"
+        with pytest.raises(InvalidInput, match="'third'"):
+            improve(NAME, 1, "third", None)
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize(
+    ("verdict", "queries", "phase"),
+    [
+        ("continue", 1, "sampling"),
+        ("ready", 0, "ready"),
+        ("ready", 2, "sampling"),
+        ("over_budget", 0, "over_budget"),
+        ("continue", 0, "over_budget"),
+    ],
+)
+def test_the_phase_after_a_fit(answered: Storage, designer, runner: Runner, verdict: str, queries: int, phase: str):
+    fit_all(designer)
+    result = run_design_job(runner.jobs[0])
+    changed = replace(result, verdict=verdict, query_coordinates=np.zeros((queries, 2)))
+    assert phase_after(changed) == phase

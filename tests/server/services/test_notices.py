@@ -1,0 +1,65 @@
+"""Notices: none is lost between a look and a wait, and a cancelled wait ends."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from surrogym_server.services.notices import Notices
+
+PATIENCE = 60.0
+
+
+def test_a_notice_before_the_wait_is_remembered():
+    async def run() -> None:
+        notices = Notices()
+        with notices.listen("a") as listener:
+            await asyncio.to_thread(notices.post, "a")
+            await asyncio.wait_for(listener.wait(3600), PATIENCE)
+
+    asyncio.run(run())
+
+
+def test_only_those_who_listen_are_woken():
+    async def run() -> list[bool]:
+        notices = Notices()
+        with notices.listen("a") as a, notices.listen("b") as b, notices.listen() as everything:
+            tasks = [asyncio.create_task(listener.wait(3600)) for listener in (a, b, everything)]
+            notices.post("a")
+            await asyncio.sleep(0.05)
+            done = [task.done() for task in tasks]
+            tasks[1].cancel()
+            return done
+
+    assert asyncio.run(run()) == [True, False, True]
+
+
+def test_a_wait_ends_by_its_time():
+    async def run() -> None:
+        with Notices().listen("a") as listener:
+            await listener.wait(0.01)
+            await listener.wait(-1)
+
+    asyncio.run(run())
+
+
+def test_a_wait_that_is_woken_and_cancelled_at_once_is_cancelled():
+    async def run() -> None:
+        notices = Notices()
+        with notices.listen("a") as listener:
+            task = asyncio.create_task(listener.wait(3600))
+            await asyncio.sleep(0)
+            notices.close()
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+
+    asyncio.run(run())
+
+
+def test_a_notice_after_the_end_of_the_loop_is_harmless():
+    async def make() -> Notices:
+        return Notices()
+
+    asyncio.run(make()).post("a")
