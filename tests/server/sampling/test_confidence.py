@@ -1,0 +1,104 @@
+"""Equations 8 to 10 and 12 against numbers worked out by hand from a table of the normal distribution.
+
+Phi(0.5) = 0.6914624613, Phi(1) = 0.8413447461, Phi(2) = 0.9772498681, Phi(5) = 0.9999997133.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import norm
+
+from support.real_steps import join
+from surrogym_server.sampling.acquisition import Candidates, acquisition
+from surrogym_server.sampling.confidence import (
+    certainty,
+    confidence,
+    deviations,
+    leave_one_out_error,
+    log_model_uncertainty,
+)
+from surrogym_server.sampling.occupancy import log_occupancy
+from surrogym_server.sampling.uncertainty import query_uncertainty
+from surrogym_server.surrogate.learn import learn
+
+
+def tensor(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def test_confidence_index_with_a_tolerance_and_as_the_paper_has_it(model):
+    made = confidence(model.reward, tensor(0.1, 0.05, 0.2), tolerance=0.1)
+    assert made.confidence_index == pytest.approx((0.8413447461 + 0.9772498681 + 0.6914624613) / 3, abs=1e-9)
+    assert made.confidence_index_paper == pytest.approx((1 + 1 + 0.9999997133) / 3, abs=1e-9)
+    assert made.coverage == pytest.approx(2 / 3)
+
+
+def test_confidence_of_the_papers_tolerance_is_the_papers(model):
+    made = confidence(model.reward, tensor(1.0, 2.0), tolerance=1.0)
+    assert made.confidence_index == made.confidence_index_paper == pytest.approx((0.8413447461 + 0.6914624613) / 2)
+
+
+def test_nothing_known_is_a_half_and_no_deviation_is_certain():
+    torch.testing.assert_close(certainty(tensor(1e12, 0.0), 0.1), tensor(0.5, 1.0))
+    assert log_model_uncertainty(tensor(0.0), 0.1).exp().item() == 0
+
+
+def test_model_uncertainty_is_what_certainty_leaves():
+    log_u = log_model_uncertainty(tensor(0.1, 0.05), 0.1)
+    torch.testing.assert_close(log_u.exp(), tensor(1 - 0.8413447461, 1 - 0.9772498681), rtol=1e-8, atol=0)
+
+
+def test_small_uncertainties_stay_ordered_where_one_minus_phi_is_zero():
+    deviation = tensor(1 / 9, 1 / 10, 1 / 20, 1 / 100)
+    assert torch.all(1 - certainty(deviation, 1.0) == 0)
+    log_u = log_model_uncertainty(deviation, 1.0)
+    assert torch.all(log_u.diff() < 0)
+    np.testing.assert_allclose(log_u.numpy(), norm.logsf([9, 10, 20, 100]), rtol=1e-9)
+
+
+def test_the_index_is_uncertainty_times_probability(model, points):
+    q, u = points
+    log_p = torch.linspace(-3, 0, len(q), dtype=torch.float64)
+    value = acquisition(model, Candidates(q, u, log_p), column=1, tolerance=0.02)
+    sigma = deviations(model, q, u)[:, 1].numpy()
+    expected = (1 - norm.cdf(0.02 / sigma)) * np.exp(log_p.numpy())
+    np.testing.assert_allclose(value.exp().numpy(), expected, rtol=1e-6)
+
+
+def test_acquisition_by_variance_looks_at_the_deviation_alone(model, points):
+    q, u = points
+    by_variance = replace(model.definition, design=replace(model.definition.design, acquisition="variance"))
+    log_p = torch.linspace(-9, 0, len(q), dtype=torch.float64)
+    value = acquisition(replace(model, definition=by_variance), Candidates(q, u, log_p), 2, 0.1)
+    torch.testing.assert_close(value, deviations(model, q, u)[:, 2].log())
+
+
+def test_leave_one_out_error_is_of_models_that_never_saw_the_point(definition, few, unseen):
+    samples = join(few, replace(unseen, **{n: getattr(unseen, n)[:5] for n in unseen.__dataclass_fields__}))
+    reward = learn(definition, samples).model.reward
+    posterior, errors = reward.posterior, []
+    for i in range(len(posterior.y)):
+        others = torch.arange(len(posterior.y)) != i
+        k = posterior.factor @ posterior.factor.T
+        weights = torch.linalg.solve(k[others][:, others], posterior.y[others])
+        errors.append(float(k[i, others] @ weights - posterior.y[i]))
+    expected = reward.scale * float(np.sqrt(np.mean(np.square(errors))))
+    assert leave_one_out_error(reward) == pytest.approx(expected, rel=1e-4)
+    assert leave_one_out_error(replace(reward, posterior=None)) == 0.0
+
+
+def test_query_uncertainty_says_all_of_it(model, points, unseen):
+    q, u = (t.numpy() for t in points)
+    tolerances = np.array([0.01, 0.02, 0.1])
+    made = query_uncertainty(model, q, u, tolerances)
+    np.testing.assert_allclose(made.deviation, deviations(model, *points).numpy())
+    np.testing.assert_allclose(made.model_uncertainty, norm.sf(tolerances / made.deviation), rtol=1e-9)
+    np.testing.assert_allclose(made.input_probability, 1)
+    np.testing.assert_allclose(made.mean, model.means(*points).numpy())
+    visited = query_uncertainty(model, q, u, tolerances, unseen.q.numpy())
+    p = log_occupancy(model.definition, unseen.q, points[0]).exp().numpy()
+    np.testing.assert_allclose(visited.input_probability, np.repeat(p[:, None], 3, 1))
+    index = visited.model_uncertainty * visited.input_probability
+    np.testing.assert_allclose(np.exp(visited.log_uncertainty_index), index, rtol=1e-9)

@@ -1,0 +1,237 @@
+"""The rounds of Algorithm 1: what is asked first, when it is enough, what is asked next, and on whose budget."""
+
+import json
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+
+from support.real_steps import answer, join, random_steps
+from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.sampling.acquisition import near
+from surrogym_server.sampling.confidence import OutputConfidence
+from surrogym_server.sampling.design import (
+    Decision,
+    DesignState,
+    Request,
+    advance,
+    default_tolerances,
+    initial_design,
+    judge,
+    monte_carlo,
+)
+from surrogym_server.surrogate.definition import wrap
+from surrogym_server.surrogate.samples import Samples
+from surrogym_shared.spec import Design, EnvironmentSpec
+
+NEVER = DesignState(1, (1e-12,) * 3)  # tolerances that no model reaches
+
+
+def designed(**design: object) -> EnvironmentSpec:
+    return pendulum().model_copy(update={"design": Design(**design)})
+
+
+def request(budget: int = 20, pending: Samples | None = None, **options: object) -> Request:
+    none = torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 1, dtype=torch.float64)
+    pending_q, pending_u = none if pending is None else (pending.q, pending.u)
+    return Request(budget, 0.999, pending_q, pending_u, **options)
+
+
+def first(samples: Samples, count: int) -> Samples:
+    return Samples(*(getattr(samples, name)[:count] for name in samples.__dataclass_fields__))
+
+
+@dataclass
+class Finished:
+    samples: Samples
+    initial: int
+    decisions: list[Decision]
+
+
+def design(spec: EnvironmentSpec, budget: int, state: DesignState | None = None) -> Finished:
+    """Rounds until the verdict, every query answered by the real environment."""
+    definition = definition_from_spec(spec)
+    samples, state = answer(spec, *initial_design(definition, budget)), state or DesignState()
+    finished = Finished(samples, len(samples), [])
+    while True:
+        decision = advance(definition, finished.samples, state, request(budget))
+        finished.decisions.append(decision)
+        if decision.verdict != "continue":
+            return finished
+        state = DesignState.from_json(json.loads(json.dumps(decision.state.to_json())))
+        finished.samples = join(finished.samples, answer(spec, decision.q, decision.u))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_real_pendulum_is_known_within_twenty_steps(seed, unseen):
+    finished = design(designed(seed=seed), budget=20)
+    last = finished.decisions[-1]
+    assert last.verdict == "ready"
+    assert len(finished.samples) <= 20
+    assert len(finished.samples) - finished.initial >= len(finished.samples) / 3, "a third of them adaptive"
+    assert len(last.q) == 0
+    q_next = last.model.transition(unseen.q, unseen.u).q_next
+    reward, _ = last.model.predict_reward(unseen.q, unseen.u, q_next, unseen.terminated)
+    error = torch.cat([q_next - unseen.q_next, (reward - unseen.reward)[:, None]], 1)
+    error[:, 0] = wrap(error[:, 0])
+    tolerances = torch.tensor(last.state.tolerances)
+    assert torch.all(error.abs().quantile(0.95, 0) < tolerances)
+    assert torch.all(error.square().mean(0).sqrt() < tolerances)
+
+
+def test_tolerances_are_frozen_after_the_first_round_and_rounds_are_counted(definition, few):
+    one = advance(definition, first(few, 4), DesignState(), request()).state
+    spread = torch.tensor([float(few.reward[:4].std(correction=0))])
+    assert one.tolerances[2] == pytest.approx(0.05 * float(spread))
+    two = advance(definition, random_steps(pendulum(), 8, seed=2), one, request()).state
+    assert two.tolerances == one.tolerances
+    assert (one.round, two.round) == (1, 2)
+    assert set(one.thetas) <= set(two.thetas)
+
+
+def test_a_state_survives_json(definition, few):
+    state = advance(definition, few, DesignState(), request()).state
+    again = DesignState.from_json(json.loads(json.dumps(state.to_json())))
+    assert (again.round, again.tolerances) == (state.round, state.tolerances)
+    assert all(np.array_equal(again.thetas[key], state.thetas[key]) for key in state.thetas)
+    assert DesignState.from_json({}) == DesignState()
+
+
+def test_the_budget_is_spent_and_never_overspent():
+    spec = designed(monte_carlo=64)
+    finished = design(spec, budget=7, state=NEVER)
+    assert finished.decisions[-1].verdict == "over_budget"
+    assert len(finished.samples) == 7
+    assert len(initial_design(definition_from_spec(spec), 3)[0]) == 3
+
+
+def test_pending_queries_count_against_the_budget(definition, few, unseen):
+    chosen = [len(advance(definition, few, NEVER, request(len(few) + 2, first(unseen, p))).q) for p in (0, 1, 2, 3)]
+    assert chosen == [2, 1, 0, 0]
+
+
+def test_pending_queries_are_not_asked_again(definition, few):
+    asked = advance(definition, few, NEVER, request())
+    pending = Samples(asked.q, asked.u, asked.q, few.reward[:0], few.terminated[:0])
+    again = advance(definition, few, NEVER, request(pending=pending))
+    assert len(again.q) == 3
+    assert not near(definition, again.q, again.u, asked.q, asked.u).any()
+
+
+def test_one_round_asks_once_for_each_unsure_output_and_never_twice_the_same(definition, few):
+    made = advance(definition, few, NEVER, request())
+    assert len(made.q) == 3
+    for i in range(3):
+        others = [j for j in range(3) if j != i]
+        assert not near(definition, made.q[i : i + 1], made.u[i : i + 1], made.q[others], made.u[others]).any()
+    assert not near(definition, made.q, made.u, few.q, few.u).any()
+
+
+def test_sure_outputs_are_not_asked_for(definition, few):
+    generous = DesignState(1, (1e3, 1e3, 1e-12))
+    assert len(advance(definition, few, generous, request()).q) == 1
+
+
+def test_where_nothing_distinct_is_left_to_ask_the_design_ends():
+    spec = designed(monte_carlo=16)
+    definition = definition_from_spec(spec)
+    samples = answer(spec, *monte_carlo(definition))
+    made = advance(definition, samples, NEVER, request(100))
+    assert len(made.q) == 0
+    assert made.verdict == "over_budget"
+
+
+@pytest.mark.parametrize(("budget", "verdict"), [(20, "ready"), (4, "ready")])
+def test_extra_queries_are_chosen_whatever_the_verdict(definition, few, unseen, budget, verdict):
+    generous = DesignState(1, (1e3,) * 3)
+    made = advance(definition, join(few, first(unseen, 4)), generous, request(budget, extra=5))
+    assert made.verdict == verdict
+    assert len(made.q) == 5
+
+
+def test_queries_go_where_policies_go(definition, few):
+    rng = np.random.default_rng(0)
+    states = torch.tensor(np.stack([rng.normal(1.0, 0.1, 200), rng.normal(-3, 0.3, 200)], 1))
+    near_policy = advance(definition, few, NEVER, request(states=states)).q
+    anywhere = advance(definition, few, NEVER, request()).q
+
+    def distance(q: torch.Tensor) -> float:
+        return float((q - torch.tensor([1.0, -3.0])).norm(dim=1).mean())
+
+    assert distance(near_policy) < 0.5 * distance(anywhere)
+
+
+def test_what_ending_pays_is_asked_for_first():
+    spec = cartpole()
+    definition = definition_from_spec(spec)
+    steps = random_steps(spec, 60, seed=0)
+    going = Samples(*(getattr(steps, n)[~steps.terminated][:8] for n in steps.__dataclass_fields__))
+    state = DesignState(1, (1e-12,) * 5)
+    none = torch.zeros(0, 4, dtype=torch.float64), torch.zeros(0, 1, dtype=torch.float64)
+    made = advance(definition, going, state, Request(50, 0.999, *none))
+    assert bool(definition.terminated(made.model.transition(made.q, made.u).q_next)[0])
+    assert not bool(definition.terminated(made.q)[0])
+
+
+def test_the_same_round_asks_the_same(definition, few):
+    one, two = (advance(definition, few, DesignState(), request()) for _ in range(2))
+    assert torch.equal(one.q, two.q)
+    assert torch.equal(one.u, two.u)
+
+
+def test_another_seed_is_another_design():
+    one, same, other = (initial_design(definition_from_spec(designed(seed=s)), 20)[0] for s in (0, 0, 1))
+    assert torch.equal(one, same)
+    assert not torch.equal(one, other)
+
+
+def test_the_paper_starts_with_ten_points_a_dimension_and_tolerance_one():
+    definition = definition_from_spec(designed(preset="paper"))
+    q, u = initial_design(definition, 125)
+    assert len(q) == len(u) == 10 * (3 + 1)
+    samples = answer(pendulum(), q, u)
+    assert default_tolerances(definition, samples) == (1.0,) * 4
+    made = advance(definition, samples, DesignState(), request(125))
+    assert [c.confidence_index for c in made.confidences] == [c.confidence_index_paper for c in made.confidences]
+
+
+def test_a_latin_hypercube_design_asks_for_its_whole_budget_at_once():
+    definition = definition_from_spec(designed(acquisition="latin_hypercube"))
+    assert len(initial_design(definition, 17)[0]) == 17
+
+
+def test_declared_tolerances_hold(few):
+    spec = pendulum().model_copy(update={"tolerances": {"speed": 0.5}})
+    tolerances = default_tolerances(definition_from_spec(spec), few)
+    assert tolerances[1] == 0.5
+    assert tolerances[0] != 0.5
+    still = replace(few, reward=torch.ones_like(few.reward))
+    assert default_tolerances(definition_from_spec(spec), still)[2] == 1e-9
+
+
+SURE = OutputConfidence(0.9995, 0.9995, 1.0, leave_one_out_error=0.5)
+UNSURE = OutputConfidence(0.9985, 0.9985, 1.0, leave_one_out_error=0.5)
+SURPRISED = replace(SURE, leave_one_out_error=1.5)
+
+
+@pytest.mark.parametrize(
+    ("preset", "confidences", "samples", "verdict"),
+    [
+        ("default", (SURE, SURE, SURE), 15, "ready"),
+        ("default", (SURE, UNSURE, SURE), 15, "continue"),
+        ("default", (SURE, SURPRISED, SURE), 15, "continue"),
+        ("default", (SURE, SURE, SURE), 14, "continue"),
+        ("default", (SURE, UNSURE, SURE), 20, "over_budget"),
+        ("default", (SURE, SURE, SURE), 20, "ready"),
+        ("paper", (SURE, SURPRISED, SURE), 10, "ready"),
+        ("paper", (SURE, UNSURE, SURE), 10, "continue"),
+        ("paper", (SURE, UNSURE, SURE), 21, "over_budget"),
+    ],
+)
+def test_verdicts(preset, confidences, samples, verdict):
+    definition = definition_from_spec(designed(preset=preset, initial=10))
+    assert math.ceil(1.5 * 10) == 15
+    assert judge(definition, confidences, (1.0,) * 3, samples, request(20)) == verdict
