@@ -1,1 +1,1 @@
-"""The Surrogym server: Gaussian-process surrogates, the adaptive design of queries, and virtual environments over HTTP."""
+"""The Surrogym server: Gaussian-process surrogates, the design of queries, and virtual environments over HTTP."""

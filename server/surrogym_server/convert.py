@@ -66,8 +66,8 @@ def definition_from_spec(spec: wire.EnvironmentSpec) -> core.EnvironmentDefiniti
 
 
 def default_budget(spec: wire.EnvironmentSpec) -> int:
-    """Real steps the design may take where the specification names none: ten per dimension for the default preset, three
-    times the initial design for the paper's (125 and 120 were the paper's own totals after 40 and 50)."""
+    """Real steps the design may take where the specification names none: ten per dimension for the default preset,
+    three times the initial design for the paper's (it took 125 and 120 in all after 40 and 50)."""
     if spec.design.budget is not None:
         return spec.design.budget
     initial = _design(spec).initial
@@ -218,9 +218,7 @@ def new_sample(sample: replies.NewSample) -> NewSample:
 
 
 def added_samples(added: Added) -> replies.AddedSamples:
-    return replies.AddedSamples(
-        sample_ids=list(added.ids), duplicates=added.duplicates, ledger=ledger(added.ledger)
-    )
+    return replies.AddedSamples(sample_ids=list(added.ids), duplicates=added.duplicates, ledger=ledger(added.ledger))
 
 
 def sample_view(record: SampleRecord) -> replies.SampleView:

@@ -8,10 +8,18 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surrogym_server.convert import definition_from_spec, opening, session_view
-from surrogym_server.engine.session import Session, open_session, reset_session, step_session
-from surrogym_server.errors import InvalidInput, UnknownModel, UnknownSession
+from surrogym_server.engine.session import (
+    Session,
+    check_opening,
+    digest_of,
+    open_session,
+    reset_session,
+    step_session,
+)
+from surrogym_server.errors import InvalidInput, NotReset, UnknownModel, UnknownSession
 from surrogym_server.services.sessions import resolved
 from surrogym_server.surrogate.actions import policy_actions
 from surrogym_server.surrogate.codec import from_bytes
@@ -59,6 +67,10 @@ class LocalSurrogate:
         if request.model not in ("latest", VERSION):
             raise UnknownModel(f"expected model 'latest' or {VERSION}, got {request.model}")
         asked, definition = opening(request), self._model.definition
+        digest = digest_of("open", asked)
+        for live in self._sessions.values():
+            if asked.key is not None and live.opened_by is not None and live.opened_by[0] == asked.key:
+                return session_view(check_opening(live, digest), float("inf"))
         session = open_session(
             secrets.token_urlsafe(8),
             "local",
@@ -68,6 +80,7 @@ class LocalSurrogate:
             model=asked.model,
             version=VERSION,
             occupancy=asked.occupancy,
+            opened_by=None if asked.key is None else (asked.key, digest),
         )
         self._sessions[session.id] = session
         return session_view(session, float("inf"))
@@ -96,12 +109,12 @@ class LocalSurrogate:
     def submit_occupancy(self, session: str, checkpoint: str) -> int:
         """There is no design here to weigh; says how many states there are. ``checkpoint`` is not kept."""
         del checkpoint
-        visited = self._get(session).visited
-        if visited is None:
-            raise InvalidInput("expected a session opened with occupancy=true, got one without")
-        return len(visited.states)
+        states = len(self.visited(session))
+        if not states:
+            raise NotReset("this session has visited no state yet: reset and step it first")
+        return states
 
-    def visited(self, session: str) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    def visited(self, session: str) -> NDArray[np.float64]:
         """The states that a session opened with occupancy visited, (v, C)."""
         visited = self._get(session).visited
         if visited is None:

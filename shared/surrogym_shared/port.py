@@ -44,8 +44,9 @@ class StepResult:
 class SurrogatePort(Protocol):
     """One surrogate, seen by a trainer.
 
-    Laws: a step happens once, however often the transport repeats it; a repeat gives the same reply, bit for bit; results
-    of one session depend on its seed and its requests alone; every error is one of ``surrogym_client.errors``.
+    Laws: a step happens once, however often the transport repeats it; a repeat gives the same reply, bit for bit;
+    results of one session depend on its seed and its requests alone; an error has the same class name in every
+    implementation's tree (``surrogym_client.errors``, ``surrogym_server.errors``).
     """
 
     def spec(self) -> EnvironmentSpec:
@@ -56,9 +57,7 @@ class SurrogatePort(Protocol):
         """Open a session of N lanes."""
         ...
 
-    def reset(
-        self, session: str, *, seed: int | Sequence[int] | None = None, mask: Bools | None = None
-    ) -> ResetResult:
+    def reset(self, session: str, *, seed: int | Sequence[int] | None = None, mask: Bools | None = None) -> ResetResult:
         """Start new episodes in all lanes, or those of the mask."""
         ...
 

@@ -1,7 +1,7 @@
 """EnvironmentSpec: what is known of an original environment before the first query.
 
-Symbols: coordinates ``q`` (n, C), observation ``o`` (n, D), action ``u`` (n, F). A specification is data: adapters make it
-for known environments, people write it as JSON or Python for their own, and no part of it is ever evaluated as code.
+Symbols: coordinates ``q`` (n, C), observation ``o`` (n, D), action ``u`` (n, F). A specification is data: adapters make
+it for known environments, people write it as JSON or Python for their own, and no part of it is ever evaluated as code.
 Every contradiction is refused here, with what was expected and what came.
 """
 
@@ -114,8 +114,8 @@ class Bounds(Frozen):
 class Coordinate(Frozen):
     """One entry of q: part of the state that the original environment is set to.
 
-    ``linear`` and ``angle`` (wrapped to [-pi, pi)) move with the dynamics; ``constant`` is drawn at the start of an episode
-    and stays (Reacher's target). ``sampling`` is the distribution of design queries.
+    ``linear`` and ``angle`` (wrapped to [-pi, pi)) move with the dynamics; ``constant`` is drawn at the start of an
+    episode and stays (Reacher's target). ``sampling`` is the distribution of design queries.
     """
 
     name: Name
@@ -130,14 +130,14 @@ class Coordinate(Frozen):
             _require(self.bounds is None, f"coordinate {self.name!r}: only a linear coordinate can have bounds")
         if self.bounds is not None:
             low, high = limits(self.sampling)
-            for bound, value, inside in (
-                ("low", self.bounds.low, lambda b: b <= low),
-                ("high", self.bounds.high, lambda b: b >= high),
-            ):
-                _require(
-                    value is None or inside(value),
-                    f"coordinate {self.name!r}: sampling range [{low}, {high}] leaves the {bound} bound {value}",
-                )
+            inside = (self.bounds.low is None or self.bounds.low <= low) and (
+                self.bounds.high is None or high <= self.bounds.high
+            )
+            _require(
+                inside,
+                f"coordinate {self.name!r}: sampling range [{low}, {high}] leaves its bounds "
+                f"[{self.bounds.low}, {self.bounds.high}]",
+            )
         return self
 
 
@@ -194,8 +194,10 @@ class Term(Frozen):
         return self.model_copy(update={"low": low, "high": high})
 
     def __add__(self, other: Term) -> Term:
-        _require(self.low is None and self.high is None and other.low is None and other.high is None,
-                 "clipped terms can't be added")
+        _require(
+            self.low is None and self.high is None and other.low is None and other.high is None,
+            "clipped terms can't be added",
+        )
         return Term(parts=self.parts + other.parts)
 
     def __mul__(self, factor: float) -> Term:
@@ -240,8 +242,10 @@ class BoxAction(Frozen):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        _require(len(self.low) == len(self.high),
-                 f"action low and high differ in length: {len(self.low)} and {len(self.high)}")
+        _require(
+            len(self.low) == len(self.high),
+            f"action low and high differ in length: {len(self.low)} and {len(self.high)}",
+        )
         for i, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
             _require(low < high, f"action {i} crosses: expected low < high, got [{low}, {high}]")
         if self.bins is not None:
@@ -286,7 +290,7 @@ Action = Annotated[BoxAction | DiscreteAction | MultiDiscreteAction, Field(discr
 class Reward(Frozen):
     """How the reward is learned.
 
-    ``timing``: ``before`` reads (q, u), as Gymnasium's classic control does; ``after`` reads (q', u), as the paper's text says.
+    ``timing``: ``before`` reads (q, u), as Gymnasium's Pendulum does; ``after`` reads (q', u), as the paper says.
     ``penalty``: k of eq. 14, reward = mean - k * deviation; None takes the preset's (default 0, paper 3).
     """
 
@@ -311,8 +315,8 @@ class Success(Frozen):
 class Design(Frozen):
     """The adaptive design of queries: what is chosen before the first one.
 
-    ``preset``: ``default`` or ``paper`` (the method as printed, repaired only where it cannot work). Every None takes the
-    preset's value. ``budget`` counts every real step of the design, initial ones included.
+    ``preset``: ``default`` or ``paper`` (the method as printed, repaired only where it cannot work). Every None takes
+    the preset's value. ``budget`` counts every real step of the design, initial ones included.
     """
 
     preset: Literal["default", "paper"] = "default"
@@ -325,7 +329,7 @@ class Design(Frozen):
 
 
 class EnvironmentSpec(Frozen):
-    """One original environment: coordinates, observation, action, start, termination, limits and the design of queries."""
+    """One original environment: coordinates, observation, action, start, termination, and the design of queries."""
 
     environment: str = Field(default="", max_length=256, description="Gymnasium id, or free text for one's own")
     coordinates: tuple[Coordinate, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
@@ -367,9 +371,11 @@ class EnvironmentSpec(Frozen):
                     _require_known(f"coordinate {c.name!r}: stops", (c.bounds.stops,), outputs)
                 low, high = limits(self.start[c.name])
                 inside = (c.bounds.low is None or low >= c.bounds.low) and (
-                    c.bounds.high is None or high <= c.bounds.high)
-                _require(inside, f"start of {c.name!r}, [{low}, {high}], leaves its bounds "
-                                 f"[{c.bounds.low}, {c.bounds.high}]")
+                    c.bounds.high is None or high <= c.bounds.high
+                )
+                _require(
+                    inside, f"start of {c.name!r}, [{low}, {high}], leaves its bounds [{c.bounds.low}, {c.bounds.high}]"
+                )
         for where, term in self._terms():
             for part in term.parts:
                 _require_known(f"{where}: term", part.weights, names)
@@ -378,8 +384,10 @@ class EnvironmentSpec(Frozen):
             high = math.inf if entry.high is None else entry.high
             _require(low < high, f"observation {entry.name!r} crosses: expected low < high, got [{low}, {high}]")
         if self.design.budget is not None and self.design.initial is not None:
-            _require(self.design.initial <= self.design.budget,
-                     f"design: initial {self.design.initial} exceeds the budget {self.design.budget}")
+            _require(
+                self.design.initial <= self.design.budget,
+                f"design: initial {self.design.initial} exceeds the budget {self.design.budget}",
+            )
         return self
 
     def _terms(self) -> Iterable[tuple[str, Term]]:

@@ -1,6 +1,6 @@
 """Request and reply models of every route (JSON form). Unknown fields are refused; numbers must be finite.
 
-Shapes: N lanes, D observation entries, C coordinates, F action entries, O model outputs (moving coordinates, then reward).
+Shapes: N lanes, D observation entries, C coordinates, F action entries, O model outputs (moving coordinates, reward).
 """
 
 from __future__ import annotations

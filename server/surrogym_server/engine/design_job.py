@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from surrogym_server.sampling.design import Decision, DesignState, Request, advance, initial_design
 from surrogym_server.surrogate.codec import to_bytes
@@ -36,7 +37,7 @@ class DesignJob:
     state: dict[str, Any]  # DesignState as JSON; {} before the first round
     budget: int  # real steps the design may take in all
     target: float  # confidence index
-    pending_coordinates: Array | None = None  # (p, C) queries asked and not yet answered
+    pending_coordinates: Array | None = None  # (p, C) queries asked and not answered: open, or set aside
     pending_action: Array | None = None  # (p, F)
     extra_queries: int = 0  # asked for with improve: chosen whatever the verdict
     occupancy: Array | None = None  # (m, C) states that policies visited
@@ -66,12 +67,10 @@ def initial_queries(definition: EnvironmentDefinition, budget: int) -> tuple[dic
 
 def run_design_job(job: DesignJob) -> DesignResult:
     """Fit, judge, choose. Raises InvalidInput or NumericalFailure."""
-    torch.set_num_threads(job.threads)
     started = time.perf_counter()
-    samples = Samples(
-        *(torch.from_numpy(a) for a in (job.coordinates, job.action, job.next_coordinates, job.reward, job.terminated))
-    )
-    decision = advance(job.definition, samples, DesignState.from_json(job.state), _request(job))
+    torch.set_num_threads(job.threads)
+    with threadpool_limits(job.threads):  # many small products: threads cost more than they give
+        decision, samples = _decide(job)
     return DesignResult(
         model=to_bytes(decision.model),
         description=decision.model.description,
@@ -83,6 +82,14 @@ def run_design_job(job: DesignJob) -> DesignResult:
         query_coordinates=decision.q.numpy(),
         query_action=decision.u.numpy(),
     )
+
+
+def _decide(job: DesignJob) -> tuple[Decision, Samples]:
+    samples = Samples(
+        *(torch.from_numpy(a) for a in (job.coordinates, job.action, job.next_coordinates, job.reward, job.terminated))
+    )
+    decision = advance(job.definition, samples, DesignState.from_json(job.state), _request(job))
+    return decision, samples
 
 
 def _request(job: DesignJob) -> Request:

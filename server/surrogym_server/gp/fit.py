@@ -22,6 +22,7 @@ from surrogym_server.gp.kernel import Hyperparameters
 from surrogym_server.gp.posterior import Posterior, condition
 
 NOISE_FLOOR = 1e-8  # of the output's variance
+MANY_POINTS = 24
 
 Array = NDArray[np.float64]
 
@@ -52,14 +53,14 @@ class Fitted:
     theta: Array
 
 
-def fit(x: Tensor, y: Tensor, options: FitOptions, starts: Sequence[Array] = ()) -> Fitted:
+def fit(x: Tensor, y: Tensor, options: FitOptions, warm: Array | None = None) -> Fitted:
     """Fit a process to x (n, d) and y (n,), both standardised.
 
-    The default start is always tried, so a warm start can only help. Raises NumericalFailure.
+    ``warm`` is the theta of an earlier fit. Raises NumericalFailure.
     """
     objective = _Objective(x, y, options)
     best: tuple[float, Array] | None = None
-    for start in (objective.default_start, *starts):
+    for start in _starts(objective.default_start, warm, len(y)):
         found = minimize(
             objective,
             np.clip(start, objective.lower, objective.upper),
@@ -72,6 +73,14 @@ def fit(x: Tensor, y: Tensor, options: FitOptions, starts: Sequence[Array] = ())
             best = (float(found.fun), found.x)
     assert best is not None
     return Fitted(condition(objective.hyper(best[1]), x, y), -best[0], best[1])
+
+
+def _starts(default: Array, warm: Array | None, points: int) -> Sequence[Array]:
+    """The default start, and a warm one. Few points have many optima, and a fit of them is cheap: both are tried; more
+    than ``MANY_POINTS`` leave a warm start by itself but for one fit in four."""
+    if warm is None:
+        return (default,)
+    return (warm,) if points > MANY_POINTS and points % 4 else (warm, default)
 
 
 class _Objective:

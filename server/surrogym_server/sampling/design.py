@@ -44,7 +44,11 @@ class DesignState:
 
 @dataclass(frozen=True)
 class Request:
-    """What a round is asked to do. Pending queries count as if they had been answered."""
+    """What a round is asked to do.
+
+    Pending queries, open or set aside, count as if they had been answered: against the budget, so that a design whose
+    every query fails comes to an end, and in the acquisition, so that the next ones go elsewhere.
+    """
 
     budget: int
     target: float
@@ -83,8 +87,8 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     confidences = tuple(confidence(o, deviation[:, i], tolerances[i]) for i, o in enumerate(outputs))
     verdict = judge(definition, confidences, tolerances, len(samples), request)
     chosen_q, chosen_u = _choose(learned.model, samples, (q, u), confidences, tolerances, verdict, request)
-    if verdict == "continue" and not len(chosen_q) and not len(request.pending_q):
-        verdict = "over_budget"  # nothing distinct is left to ask
+    if verdict == "continue" and not len(chosen_q):
+        verdict = "over_budget"  # the rest of the budget is pending, or nothing distinct is left to ask
     new_state = DesignState(state.round + 1, tolerances, learned.thetas)
     return Decision(learned.model, confidences, new_state, verdict, chosen_q, chosen_u)
 

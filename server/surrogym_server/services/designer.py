@@ -129,7 +129,7 @@ class Designer:
     def _job(self, lease: FitLease) -> DesignJob:
         name = lease.surrogate
         record, samples = self._storage.surrogates.get(name), self._storage.samples.arrays(name)
-        pending = self._storage.queries.list(name, OPEN_STATUSES)
+        pending = self._storage.queries.list(name, (*OPEN_STATUSES, "set_aside"))
         visited = None if lease.checkpoint is None else self._storage.occupancy.get(name, lease.checkpoint)
         return DesignJob(
             definition=self._definitions.get(name),

@@ -76,8 +76,7 @@ class _Learner:
 
     def _fit(self, key: str, x: Tensor, y: Tensor) -> Fitted:
         options = self._options(key)
-        warm = self.warm.get(key)
-        fitted = fit(x, y, options, [warm] if warm is not None else [])
+        fitted = fit(x, y, options, self.warm.get(key))
         self.thetas[key] = fitted.theta
         return fitted
 

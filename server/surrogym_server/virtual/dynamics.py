@@ -53,7 +53,7 @@ def move_particles(
     mean; the reward is the mean of their penalised rewards, weighted by 1/U with U the variance of eq. 7.
     """
     lanes, count, size = particles.shape
-    q, action = particles.reshape(-1, size), u.repeat_interleave(count, 0)
+    q, action = particles.flatten(0, 1), u.repeat_interleave(count, 0)
     flat_noise = None if noise is None else noise.flatten(0, 1)
     transition = model.transition(q, action, noise=flat_noise, deviations=True)
     assert transition.deviation is not None
@@ -63,7 +63,7 @@ def move_particles(
     mean, spread = model.predict_reward(q, action, transition.q_next, over.repeat_interleave(count))
     assert spread is not None
     weight = _weights(spread.reshape(lanes, count), model.reward.scale, weighting)
-    deviation = torch.cat([transition.deviation, spread[:, None]], -1).reshape(lanes, count, -1)
+    deviation = torch.cat([transition.deviation, spread[:, None]], -1).reshape(lanes, count, len(model.transitions) + 1)
     penalised = (mean - penalty * spread).reshape(lanes, count)
     return Moved(
         output,

@@ -84,7 +84,7 @@ def reset(
     seed each lane goes on to its next episode. Lanes outside the mask keep their state.
 
     Raises:
-        InvalidInput: mask or list of seeds of another length.
+        InvalidInput: mask or list of seeds of another length, or a seed that is negative or too large.
     """
     chosen = _mask(mask, len(lanes))
     if seed is not None:
@@ -182,6 +182,9 @@ def _begin(definition: EnvironmentDefinition, settings: VirtualSettings, lanes: 
 
 
 def _seeded(lanes: LaneState, seed: int | Sequence[int], chosen: Tensor) -> LaneState:
+    outside = [s for s in ([seed] if isinstance(seed, int) else seed) if not 0 <= s < 2**63]
+    if outside:
+        raise InvalidInput(f"seed: expected 0 to 2^63 - 1, got {outside[0]}")
     if isinstance(seed, int):
         seeds, numbers = torch.full_like(lanes.seed, seed), torch.arange(len(lanes))
     else:

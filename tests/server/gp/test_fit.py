@@ -106,8 +106,8 @@ def test_a_linear_part_makes_a_linear_function_exact(rng):
 def test_a_warm_start_can_only_help(rng):
     x, y = draw(rng, 15, [1.0, 1.0], 1e-3)
     cold = fit(x, y, FitOptions())
-    assert fit(x, y, FitOptions(), [cold.theta]).score >= cold.score
-    assert fit(x, y, FitOptions(), [np.full_like(cold.theta, 50.0)]).score >= cold.score - 1e-9
+    assert fit(x, y, FitOptions(), cold.theta).score >= cold.score
+    assert fit(x, y, FitOptions(), np.full_like(cold.theta, 50.0)).score >= cold.score - 1e-9
 
 
 def test_a_constant_output_and_a_repeated_point_fit_to_finite_numbers(rng):
