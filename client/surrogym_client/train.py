@@ -117,6 +117,7 @@ def train(
     try:
         statistics = observation_statistics(port, settings.seed)
         learner = _learner(algorithm, wrapped, settings, statistics, gamma)
+        total = _whole_rollouts(learner, total)
         report = _Report(total, progress)
         learner.learn(total, callback=report, reset_num_timesteps=True)
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -202,6 +203,12 @@ def _total_steps(algorithm: type[BaseAlgorithm], settings: TrainSettings) -> int
     if not 1 <= total <= MAX_STEPS:
         raise ValueError(f"virtual steps: expected 1 to {MAX_STEPS}, got {total}")
     return total
+
+
+def _whole_rollouts(learner: BaseAlgorithm, total: int) -> int:
+    """The steps of as many whole rollouts as the total allows, at least one: Stable-Baselines3 would round up."""
+    rollout = learner.n_envs * (learner.n_steps if isinstance(learner, OnPolicyAlgorithm) else 1)
+    return max(total // rollout, 1) * rollout
 
 
 class _Report(BaseCallback):
