@@ -148,3 +148,13 @@ def test_particles_moved_by_the_mean_keep_their_distance(cart, started):
     settings, lanes = started(cart, 1, variant="probabilistic", particles=5, propagation="mean")
     after, _ = step(cart, settings, lanes, np.full((1, 1), 0.5))
     torch.testing.assert_close(after.particles, lanes.particles + 0.5)
+
+
+def test_a_step_in_which_every_lane_resets_moves_no_particle(cart, started):
+    settings, lanes = started(cart, 2, variant="probabilistic", particles=3, time_limit=1)
+    lanes, ended = step(cart, settings, lanes, np.zeros((2, 1)), deviations=True)
+    lanes, begun = step(cart, settings, lanes, np.zeros((2, 1)), deviations=True)
+    assert ended.truncated.all()
+    assert begun.reset_lanes.all()
+    assert begun.deviation.tolist() == [[0.0, 0.0]] * 2
+    assert lanes.particles.shape == (2, 3, 1)

@@ -1,0 +1,153 @@
+"""Training over any port: settings from the specification alone, the cap on virtual steps, and what is written."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO, SAC
+
+from support.real_steps import random_steps
+from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_client.policies import PaperPolicy
+from surrogym_client.sb3 import SurrogateVecEnv
+from surrogym_client.train import (
+    MAX_STEPS,
+    TrainProgress,
+    TrainSettings,
+    algorithm_by_name,
+    observation_statistics,
+    suggested_gamma,
+    suggested_lanes,
+    train,
+)
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.local import LocalSurrogate
+from surrogym_server.surrogate.learn import learn
+
+SMALL = {"n_steps": 16, "batch_size": 32, "n_epochs": 2}
+
+
+def local(spec) -> LocalSurrogate:
+    return LocalSurrogate(spec, learn(definition_from_spec(spec), random_steps(spec, 8, seed=0)).model)
+
+
+@pytest.fixture(scope="module")
+def surrogate() -> LocalSurrogate:
+    return local(pendulum())
+
+
+def small(**settings) -> TrainSettings:
+    return TrainSettings(**{"total_steps": 256, "num_envs": 8, "hyperparameters": SMALL} | settings)
+
+
+def test_a_policy_and_what_it_was_trained_with_are_written(surrogate, tmp_path: Path):
+    out, seen = tmp_path / "new" / "policy.zip", []
+    result = train(surrogate, out, small(), seen.append)
+    loaded = PPO.load(out, device="cpu")
+    assert isinstance(loaded.policy, PaperPolicy)
+    action, _ = loaded.predict(np.zeros((5, 3), np.float32), deterministic=True)
+    assert np.abs(action).max() <= 2
+    assert result.virtual_steps == 256
+    assert result.lost_episodes == 0
+    written = json.loads(out.with_suffix(".json").read_text())
+    assert written["virtual_steps"] == 256
+    assert written["settings"]["gamma"] == 0.97
+    assert [p.steps for p in seen] == [128, 256]
+    assert all(isinstance(p, TrainProgress) and p.total_steps == 256 for p in seen)
+
+
+@pytest.mark.parametrize(("total", "taken"), [(128, 128), (255, 128), (300, 256), (1, 128)])
+def test_whole_rollouts_are_taken_and_no_more_than_the_total_allows(surrogate, tmp_path: Path, total, taken):
+    result = train(surrogate, tmp_path / "policy.zip", small(total_steps=total))
+    assert result.virtual_steps == result.settings["total_steps"] == taken
+
+
+def test_the_same_seed_gives_the_same_policy(surrogate, tmp_path: Path):
+    def weights(seed: int, name: str) -> np.ndarray:
+        train(surrogate, tmp_path / name, small(seed=seed, total_steps=128))
+        policy = PPO.load(tmp_path / name, device="cpu").policy
+        return np.concatenate([p.detach().numpy().ravel() for p in policy.parameters()])
+
+    one = weights(0, "a.zip")
+    np.testing.assert_array_equal(one, weights(0, "b.zip"))
+    assert not np.array_equal(one, weights(1, "c.zip"))
+
+
+def test_training_goes_on_from_a_saved_policy(surrogate, tmp_path: Path):
+    first, second = tmp_path / "first.zip", tmp_path / "second.zip"
+    train(surrogate, first, small(total_steps=128))
+    train(surrogate, second, small(total_steps=128, start_from=first))
+    env = SurrogateVecEnv.from_port(surrogate, 2)
+    fresh = PPO(PaperPolicy, env, device="cpu").policy
+    env.close()
+    one, two = (PPO.load(path, device="cpu").policy for path in (first, second))
+    assert 0 < distance(one, two) < 0.3 * distance(one, fresh)
+
+
+def distance(a: PaperPolicy, b: PaperPolicy) -> float:
+    pairs = zip(a.parameters(), b.parameters(), strict=True)
+    return sum(float((p - q).detach().square().sum()) for p, q in pairs) ** 0.5
+
+
+def test_a_penalty_is_reported(surrogate, tmp_path: Path):
+    shares = []
+    for penalty in (0.0, 3.0):
+        train(
+            surrogate,
+            tmp_path / "policy.zip",
+            small(session={"penalty": penalty}, total_steps=128),
+            lambda p: shares.append(p.penalty_share),
+        )
+    assert shares[0] == pytest.approx(0, abs=1e-6)
+    assert shares[1] > 1e-3
+
+
+def test_a_discrete_task_trains(tmp_path: Path):
+    result = train(local(cartpole()), tmp_path / "policy.zip", small())
+    assert result.virtual_steps == 256
+    assert result.imagined_return is not None
+    action, _ = PPO.load(result.path, device="cpu").predict(np.zeros((5, 4), np.float32), deterministic=True)
+    assert set(action.tolist()) <= {0, 1}
+
+
+@pytest.mark.parametrize("algorithm", ["A2C", "SAC", "TD3"])
+def test_other_algorithms_by_name(surrogate, tmp_path: Path, algorithm):
+    hyperparameters = {"n_steps": 8} if algorithm == "A2C" else {"learning_starts": 32, "batch_size": 16}
+    settings = small(algorithm=algorithm, num_envs=4, total_steps=64, hyperparameters=hyperparameters)
+    result = train(surrogate, tmp_path / "policy.zip", settings)
+    assert result.virtual_steps == 64
+    assert algorithm_by_name(algorithm).load(tmp_path / "policy.zip", device="cpu") is not None
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"algorithm": "DreamerV9"}, r"unknown algorithm 'DreamerV9': expected one of .*PPO"),
+        ({"algorithm": "VecEnv"}, "unknown algorithm"),
+        ({"algorithm": "DQN"}, "DQN can't be trained here"),
+        ({"hyperparameters": {"learning_speed": 1}}, "PPO can't be trained here"),
+        ({"total_steps": 0}, "expected 1 to 1000000, got 0"),
+        ({"total_steps": MAX_STEPS + 1}, "expected 1 to 1000000, got 1000001"),
+    ],
+)
+def test_what_can_not_be_trained_is_refused(surrogate, tmp_path: Path, settings, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        train(surrogate, tmp_path / "policy.zip", small(**settings))
+    assert not list(tmp_path.iterdir())
+    assert not surrogate._sessions, "every session was closed"
+
+
+def test_settings_follow_from_the_specification(surrogate):
+    assert suggested_gamma(pendulum()) == pytest.approx(0.97)
+    assert suggested_gamma(cartpole()) == pytest.approx(0.988)
+    assert suggested_gamma(pendulum().model_copy(update={"time_limit": 20})) == 0.9
+    assert suggested_gamma(pendulum().model_copy(update={"time_limit": None})) == pytest.approx(0.994)
+    assert suggested_lanes(PPO) > suggested_lanes(SAC)
+
+
+def test_statistics_are_of_the_sampling_range(surrogate):
+    mean, deviation = observation_statistics(surrogate, seed=0)
+    np.testing.assert_allclose(mean, [0, 0, 0], atol=0.5)
+    np.testing.assert_allclose(deviation, [0.5**0.5, 0.5**0.5, 16 / 12**0.5], rtol=0.1)
+    assert not surrogate._sessions

@@ -1,0 +1,71 @@
+"""One round as a job: picklable, the same again for the same job, and a model that is complete in its bytes."""
+
+import json
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from support.real_steps import answer
+from surrogym_client.original.classic import pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.engine.design_job import DesignJob, initial_queries, run_design_job
+from surrogym_server.surrogate.codec import from_bytes
+from surrogym_shared.spec import Design
+from surrogym_shared.wire import Fidelity
+
+SPEC = pendulum().model_copy(update={"design": Design(monte_carlo=64)})
+
+
+@pytest.fixture(scope="module")
+def job() -> DesignJob:
+    definition = definition_from_spec(SPEC)
+    state, q, u = initial_queries(definition, budget=20)
+    steps = answer(SPEC, torch.from_numpy(q), torch.from_numpy(u))
+    arrays = (steps.q, steps.u, steps.q_next, steps.reward, steps.terminated)
+    return DesignJob(definition, *(a.numpy() for a in arrays), state=state, budget=20, target=0.999)
+
+
+def test_the_same_job_in_another_process_form_gives_the_same_result(job):
+    one, two = run_design_job(job), run_design_job(pickle.loads(pickle.dumps(job)))
+    assert one.model == two.model
+    assert one.fidelity == two.fidelity
+    np.testing.assert_array_equal(one.query_coordinates, two.query_coordinates)
+    assert one.data_hash == two.data_hash
+
+
+def test_a_result_is_pickled_and_its_state_json(job):
+    result = pickle.loads(pickle.dumps(run_design_job(job)))
+    again = replace(job, state=json.loads(json.dumps(result.state)))
+    assert run_design_job(again).state["round"] == 2
+
+
+def test_the_model_is_complete_and_the_fidelity_is_the_wires(job):
+    result = run_design_job(job)
+    model = from_bytes(job.definition, result.model)
+    assert model.samples == len(job.coordinates) == result.fidelity["samples"]
+    assert model.digest == result.data_hash
+    fidelity = Fidelity.model_validate(result.fidelity)
+    assert [o.name for o in fidelity.outputs] == list(job.definition.outputs)
+    assert fidelity.confidence_index == min(o.confidence_index for o in fidelity.outputs)
+    assert fidelity.outputs[0].structure.startswith("squared exponential")
+
+
+def test_queries_are_inside_the_sampling_range(job):
+    result = run_design_job(replace(job, extra_queries=4))
+    assert result.query_coordinates.shape[1:] == (2,)
+    assert result.query_action.shape == (len(result.query_coordinates), 1)
+    assert np.abs(result.query_coordinates[:, 0]).max() <= np.pi
+    assert np.abs(result.query_coordinates[:, 1]).max() <= 8
+    assert np.abs(result.query_action).max() <= 2
+
+
+def test_pending_queries_and_occupancy_are_passed_on(job):
+    hungry = replace(job, budget=len(job.coordinates) + 2, state={"round": 1, "tolerances": [1e-12] * 3})
+    assert len(run_design_job(hungry).query_coordinates) == 2
+    pending = replace(hungry, pending_coordinates=np.array([[1.0, 1.0]]), pending_action=np.array([[0.0]]))
+    assert len(run_design_job(pending).query_coordinates) == 1
+    visited = replace(hungry, occupancy=np.random.default_rng(0).normal([1, -3], [0.5, 1.5], (100, 2)))
+    assert not np.array_equal(run_design_job(visited).query_coordinates, run_design_job(hungry).query_coordinates)
