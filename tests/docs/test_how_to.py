@@ -1,0 +1,56 @@
+"""The programs on the how-to pages run as they stand, each in a process of its own, against a real server."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from support.server import ServerProcess
+
+PAGES = Path(__file__).parents[2] / "docs" / "how-to"
+PRINTED_URL = "http://127.0.0.1:8000"
+
+
+def programs(page: str) -> list[str]:
+    text = (PAGES / page).read_text(encoding="utf-8")
+    return re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+
+
+def run(folder: Path, *arguments: str) -> str:
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    command = [sys.executable, *arguments]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize(("page", "number"), [("remote-gymnasium.md", 0), ("remote-gymnasium.md", 1)])
+def test_a_surrogate_is_stepped(server: ServerProcess, tmp_path: Path, page: str, number: int) -> None:
+    run(tmp_path, "-c", programs(page)[number].replace(PRINTED_URL, server.url))
+
+
+def test_a_policy_of_another_algorithm_is_trained_and_its_states_are_known(
+    server: ServerProcess, tmp_path: Path
+) -> None:
+    (program,) = programs("stable-baselines3.md")
+    run(tmp_path, "-c", program.replace(PRINTED_URL, server.url).replace("10_000", "500"))
+    assert (tmp_path / "mine.zip").exists()
+    improve = ["improve", "pendulum", "--queries", "1", "--checkpoint", "after-10k-steps", "--json"]
+    view = json.loads(run(tmp_path, "-m", "surrogym_client", *improve, "--server", server.url))
+    assert view["budget"] == 7
+
+
+def test_the_rail_is_registered_and_sampled(server: ServerProcess, tmp_path: Path) -> None:
+    (program,) = programs("own-environment.md")
+    (tmp_path / "rail.py").write_text(program, encoding="utf-8")
+    common = ["--server", server.url, "--json", "--quiet"]
+    run(tmp_path, "-m", "surrogym_client", "register", "rail:Rail", "--name", "rail", "--budget", "5", *common)
+    sample = ["sample", "rail", "--env", "rail:Rail", "--until-done"]
+    report = json.loads(run(tmp_path, "-m", "surrogym_client", *sample, *common))
+    assert (report["answered"], report["failed"]) == (5, 0)

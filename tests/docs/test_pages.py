@@ -1,0 +1,83 @@
+"""Every page is true to the tree: links lead somewhere, commands, options and targets exist, imports work."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from support.commands import command_line, parse
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
+SHELLS = "console|bash|sh|shell"
+each_page = pytest.mark.parametrize("page", PAGES, ids=NAMES)
+
+
+def fenced(text: str, languages: str) -> str:
+    return "\n".join(re.findall(rf"^```(?:{languages})\n(.*?)^```", text, re.DOTALL | re.MULTILINE))
+
+
+def commands(page: Path, program: str) -> Iterator[list[str]]:
+    """What a page tells people to type: lines of shell blocks, and code within a sentence."""
+    text = page.read_text(encoding="utf-8")
+    shell = fenced(text, SHELLS).replace("\\\n", " ")
+    lines = re.findall(rf"^(?:\$ )?(?:\w+=\S+ )*({program} .*)$", shell, re.MULTILINE)
+    inline = re.findall(rf"`({program} [^`]+)`", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE))
+    for line in (*lines, *inline):
+        words = shlex.split(line, comments=True)
+        yield words[1:-1] if words[-1] == "&" else words[1:]
+
+
+def anchors(page: Path) -> set[str]:
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@each_page
+def test_links_lead_somewhere(page: Path) -> None:
+    broken = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if re.match(r"\w+:", link):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path) if path else page
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            broken.append(link)
+    assert broken == []
+
+
+@each_page
+def test_commands_exist_with_their_options(page: Path) -> None:
+    for words in commands(page, "surrogym"):
+        alone = len(words) == 1 or words[-1] == "--help"
+        if alone:
+            assert words[0] in ("--help", "--version", *command_line().commands)
+        else:
+            parse(words)
+
+
+@each_page
+def test_targets_of_make_exist(page: Path) -> None:
+    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    named = {words[0] for words in commands(page, "make")}
+    assert named <= set(targets)
+
+
+@each_page
+def test_python_parses_and_its_imports_work(page: Path) -> None:
+    for block in re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE):
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("surrogym_"):
+                module = importlib.import_module(node.module)
+                assert [alias.name for alias in node.names if not hasattr(module, alias.name)] == []
+
+
+def test_there_are_pages() -> None:
+    assert {"README.md", "docs/architecture.md", "docs/http-api.md", "docs/notation.md"} <= set(NAMES)
