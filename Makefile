@@ -7,7 +7,7 @@ WORKERS ?= 2
 ARGS ?=
 
 BIN := .venv/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint constraints.txt
 PINS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
@@ -60,10 +60,10 @@ help:  ## This list
 
 .venv/all: $(PINS) | .venv/bin/python
 	@echo "installing into .venv; this takes some minutes the first time"
-	$(PIP) --editable ".[all]"
+	@$(PIP) --editable ".[all]"
 	@touch $@
 
 .venv/dev: $(PINS) | .venv/bin/python
 	@echo "installing into .venv; this takes some minutes the first time"
-	$(PIP) --editable ".[dev]"
+	@$(PIP) --editable ".[dev]"
 	@touch $@ .venv/all
