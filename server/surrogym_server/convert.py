@@ -307,6 +307,7 @@ def session_view(session: Session, idle_seconds: float) -> replies.SessionView:
         penalty=session.settings.penalty,
         observation_space=_box(session.definition.observation_low, session.definition.observation_high),
         action_space=_action_space(session.definition.action),
+        outputs=list(session.definition.outputs),
         idle_seconds=idle_seconds,
     )
 

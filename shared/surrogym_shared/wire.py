@@ -370,6 +370,7 @@ class SessionView(Reply):
     penalty: float
     observation_space: BoxSpace
     action_space: ActionSpace
+    outputs: list[str] = Field(description="what the model predicts, in the order of a step's deviations")
     idle_seconds: float = Field(description="the session expires when unused for so long")
 
 

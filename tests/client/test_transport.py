@@ -32,6 +32,7 @@ def view(seq: int = 0, protocol: int = wire.PROTOCOL) -> Answer:
         penalty=0.0,
         observation_space=wire.BoxSpace(low=[None, None], high=[None, None]),
         action_space=wire.BoxSpace(low=[-2.0], high=[2.0]),
+        outputs=["angle", "reward"],
         idle_seconds=60.0,
     )
     return reply(session.model_dump_json())

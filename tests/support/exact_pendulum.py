@@ -129,6 +129,7 @@ class ExactPendulum:
             penalty=0.0,
             observation_space=BoxSpace(low=[-h for h in HIGH], high=HIGH),
             action_space=BoxSpace(low=[-2.0], high=[2.0]),
+            outputs=["angle", "velocity", "reward"],
             idle_seconds=60.0,
         )
 

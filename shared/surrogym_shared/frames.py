@@ -1,0 +1,327 @@
+"""The binary form of reset, step and rollout: msgpack maps whose arrays are raw little-endian bytes.
+
+A frame names its operation in ``op`` and carries neither dtype nor shape: both sides know them from the
+session. The same frames are HTTP bodies of type ``MEDIA_TYPE`` and messages of the stream.
+
+========================================  ===========  ==============================
+field                                     shape        dtype
+========================================  ===========  ==============================
+action, actions                           (N, F)       float64; actions (T, N, F)
+mask, terminated, truncated               (N,)         bool: one byte, 0 or 1
+seed (of each lane)                       (N,)         int64
+observation                               (N, D)       float32
+reward, reward_mean                       (N,)         float64
+final_lanes, final_observation            (K,) (K, D)  int64, float32
+model_version                             (N,)         int64
+deviation                                 (N, O)       float64
+========================================  ===========  ==============================
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Self, TypeVar
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_shared.codes import Code
+from surrogym_shared.port import ResetResult, StepResult
+from surrogym_shared.wire import (
+    MAX_ROLLOUT,
+    ActionSpace,
+    BoxSpace,
+    DiscreteSpace,
+    MultiDiscreteSpace,
+    SessionView,
+)
+
+MEDIA_TYPE = "application/vnd.msgpack"
+
+Array = NDArray[Any]
+Bools = NDArray[np.bool_]
+
+FLOAT32, FLOAT64, INT64 = np.dtype("<f4"), np.dtype("<f8"), np.dtype("<i8")
+BOOL = np.dtype("?")
+
+Seq = Annotated[int, msgspec.Meta(ge=1)]
+Seed = Annotated[int, msgspec.Meta(ge=0)]
+
+
+class FrameError(ValueError):
+    """Bytes that are no frame, or arrays that don't fit the session; says what was expected and what came."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """Sizes of a session's arrays: N lanes, D observation entries, F action entries, O model outputs."""
+
+    lanes: int
+    observation: int
+    action: int
+    outputs: int
+
+    @classmethod
+    def of(cls, view: SessionView) -> Self:
+        return cls(
+            lanes=view.num_envs,
+            observation=len(view.observation_space.low),
+            action=_size(view.action_space),
+            outputs=len(view.outputs),
+        )
+
+
+class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, tag_field="op"):
+    """Base of all frames."""
+
+
+class ResetRequest(Frame, frozen=True, tag="reset"):
+    seq: Seq | None = None
+    seed: Seed | memoryview | None = None
+    mask: memoryview | None = None
+
+
+class StepRequest(Frame, frozen=True, tag="step", kw_only=True):
+    seq: Seq | None = None
+    action: memoryview
+    mask: memoryview | None = None
+    deviations: bool = False
+
+
+class RolloutRequest(Frame, frozen=True, tag="rollout", kw_only=True):
+    seq: Seq | None = None
+    actions: memoryview
+
+
+class Step(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """One step of N lanes."""
+
+    observation: memoryview
+    reward: memoryview
+    terminated: memoryview
+    truncated: memoryview
+    model_version: memoryview
+    reward_mean: memoryview
+    final_lanes: memoryview | None = None
+    final_observation: memoryview | None = None
+    deviation: memoryview | None = None
+
+
+class ResetReply(Frame, frozen=True, tag="reset"):
+    seq: Seq
+    observation: memoryview
+    model_version: memoryview
+
+
+class StepReply(Frame, frozen=True, tag="step"):
+    seq: Seq
+    step: Step
+
+
+class RolloutReply(Frame, frozen=True, tag="rollout"):
+    seq: Seq
+    steps: list[Step]
+
+
+class ProblemReply(Frame, frozen=True, tag="problem"):
+    """A problem body (RFC 9457) on the stream; ``seq`` is that of the refused request, if it had one."""
+
+    status: int
+    code: Code
+    title: str
+    detail: str
+    expected_seq: int | None = None
+    seq: int | None = None
+
+
+Request = ResetRequest | StepRequest | RolloutRequest
+Reply = ResetReply | StepReply | RolloutReply | ProblemReply
+T = TypeVar("T")
+
+_ENCODER = msgspec.msgpack.Encoder()
+_REQUEST: msgspec.msgpack.Decoder[Request] = msgspec.msgpack.Decoder(Request)
+_REPLY: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
+
+
+def encode(frame: Frame) -> bytes:
+    """A frame as bytes."""
+    return _ENCODER.encode(frame)
+
+
+def read_request(content: bytes) -> Request:
+    """A request from bytes; its arrays are views of them. Raises ``FrameError``."""
+    return _read(_REQUEST, content)
+
+
+def read_reply(content: bytes) -> Reply:
+    """A reply from bytes; its arrays are views of them. Raises ``FrameError``."""
+    return _read(_REPLY, content)
+
+
+# Requests
+
+
+def reset_request(seq: int | None, seed: int | Sequence[int] | None, mask: Bools | None) -> ResetRequest:
+    """Seed: one integer or one for each lane. Raises ``FrameError`` for a seed that int64 can't hold."""
+    several = None if seed is None or isinstance(seed, int) else _seeds(seed)
+    return ResetRequest(seq, seed if isinstance(seed, int) else several, None if mask is None else _flat(mask, BOOL))
+
+
+def step_request(seq: int | None, action: Array, mask: Bools | None, deviations: bool) -> StepRequest:
+    """Action (N, F)."""
+    packed = None if mask is None else _flat(mask, BOOL)
+    return StepRequest(seq=seq, action=_flat(action, FLOAT64), mask=packed, deviations=deviations)
+
+
+def rollout_request(seq: int | None, actions: Array) -> RolloutRequest:
+    """Actions (T, N, F)."""
+    return RolloutRequest(seq=seq, actions=_flat(actions, FLOAT64))
+
+
+def seed_of(request: ResetRequest, shape: Shape) -> int | list[int] | None:
+    """One seed, or those of the N lanes. Raises ``FrameError``."""
+    if not isinstance(request.seed, memoryview):
+        return request.seed
+    seeds: list[int] = _array("seed", request.seed, INT64, (shape.lanes,)).tolist()
+    return seeds
+
+
+def mask_of(request: ResetRequest | StepRequest, shape: Shape) -> Bools | None:
+    """The mask (N,). Raises ``FrameError``."""
+    return None if request.mask is None else _flags("mask", request.mask, shape.lanes)
+
+
+def action_of(request: StepRequest, shape: Shape) -> NDArray[np.float64]:
+    """The action (N, F), a view of the frame. Raises ``FrameError``."""
+    return _array("action", request.action, FLOAT64, (shape.lanes, shape.action))
+
+
+def actions_of(request: RolloutRequest, shape: Shape) -> NDArray[np.float64]:
+    """The actions (T, N, F), a view of the frame. Raises ``FrameError``."""
+    lanes, size, got = shape.lanes, shape.action, request.actions.nbytes
+    steps, rest = divmod(got, lanes * size * FLOAT64.itemsize)
+    if rest or not 1 <= steps <= MAX_ROLLOUT:
+        raise FrameError(f"actions: expected 1 to {MAX_ROLLOUT} steps of {lanes} x {size} float64, got {got} bytes")
+    return _array("actions", request.actions, FLOAT64, (steps, lanes, size))
+
+
+# Replies
+
+
+def reset_reply(seq: int, result: ResetResult) -> ResetReply:
+    return ResetReply(seq, _flat(result.observation, FLOAT32), _flat(result.model_version, INT64))
+
+
+def step_reply(seq: int, result: StepResult) -> StepReply:
+    return StepReply(seq, _step(result))
+
+
+def rollout_reply(seq: int, results: Sequence[StepResult]) -> RolloutReply:
+    return RolloutReply(seq, [_step(result) for result in results])
+
+
+def reset_result(reply: ResetReply, shape: Shape) -> ResetResult:
+    """Arrays of their own: aligned and writable, as a caller expects them. Raises ``FrameError``."""
+    lanes = shape.lanes
+    return ResetResult(
+        observation=_array("observation", reply.observation, FLOAT32, (lanes, shape.observation)).copy(),
+        model_version=_array("model_version", reply.model_version, INT64, (lanes,)).copy(),
+    )
+
+
+def step_result(step: Step, shape: Shape) -> StepResult:
+    """Arrays of their own: aligned and writable, as a caller expects them. Raises ``FrameError``."""
+    lanes = shape.lanes
+    final_lanes, final_observation = _final(step, shape)
+    deviation = None
+    if step.deviation is not None:
+        deviation = _array("deviation", step.deviation, FLOAT64, (lanes, shape.outputs)).copy()
+    return StepResult(
+        observation=_array("observation", step.observation, FLOAT32, (lanes, shape.observation)).copy(),
+        reward=_array("reward", step.reward, FLOAT64, (lanes,)).copy(),
+        terminated=_flags("terminated", step.terminated, lanes).copy(),
+        truncated=_flags("truncated", step.truncated, lanes).copy(),
+        final_lanes=final_lanes,
+        final_observation=final_observation,
+        model_version=_array("model_version", step.model_version, INT64, (lanes,)).copy(),
+        reward_mean=_array("reward_mean", step.reward_mean, FLOAT64, (lanes,)).copy(),
+        deviation=deviation,
+    )
+
+
+def _step(result: StepResult) -> Step:
+    ended = len(result.final_lanes) > 0
+    return Step(
+        _flat(result.observation, FLOAT32),
+        _flat(result.reward, FLOAT64),
+        _flat(result.terminated, BOOL),
+        _flat(result.truncated, BOOL),
+        _flat(result.model_version, INT64),
+        _flat(result.reward_mean, FLOAT64),
+        _flat(result.final_lanes, INT64) if ended else None,
+        _flat(result.final_observation, FLOAT32) if ended else None,
+        None if result.deviation is None else _flat(result.deviation, FLOAT64),
+    )
+
+
+def _final(step: Step, shape: Shape) -> tuple[Array, Array]:
+    """final_lanes (K,) and final_observation (K, D); a frame without them has none."""
+    if step.final_lanes is None or step.final_observation is None:
+        if step.final_lanes is not step.final_observation:
+            raise FrameError("expected final_lanes and final_observation together, got one of them")
+        return np.zeros(0, dtype=INT64), np.zeros((0, shape.observation), dtype=FLOAT32)
+    count = step.final_lanes.nbytes // INT64.itemsize
+    lanes = _array("final_lanes", step.final_lanes, INT64, (count,))
+    if count == 0 or lanes.min() < 0 or lanes.max() >= shape.lanes:
+        raise FrameError(f"final_lanes: expected some of 0..{shape.lanes - 1}, got {lanes[:8].tolist()}")
+    observation = _array("final_observation", step.final_observation, FLOAT32, (count, shape.observation))
+    return lanes.copy(), observation.copy()
+
+
+# Arrays
+
+
+def _size(space: ActionSpace) -> int:
+    match space:
+        case BoxSpace():
+            return len(space.low)
+        case DiscreteSpace():
+            return 1
+        case MultiDiscreteSpace():
+            return len(space.nvec)
+
+
+def _flat(array: Array, dtype: np.dtype[Any]) -> memoryview:
+    """The array's own memory where it is contiguous and of this dtype; else a copy's."""
+    return np.ascontiguousarray(array, dtype).data
+
+
+def _array(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
+    expected = math.prod(shape) * dtype.itemsize
+    if view.nbytes != expected:
+        raise FrameError(f"{name}: expected {expected} bytes, shape {shape} of {dtype.name}, got {view.nbytes} bytes")
+    return np.frombuffer(view, dtype).reshape(shape)
+
+
+def _flags(name: str, view: memoryview, lanes: int) -> Bools:
+    flags: Bools = _array(name, view, BOOL, (lanes,))
+    if bytes(view).strip(b"\x00\x01"):  # what is left begins with a byte that is neither
+        raise FrameError(f"{name}: expected bytes 0 and 1, got others")
+    return flags
+
+
+def _seeds(seed: Sequence[int]) -> memoryview:
+    try:
+        return np.array(seed, dtype=INT64).data
+    except (OverflowError, TypeError, ValueError) as error:
+        raise FrameError(f"seed: expected integers from 0 to 2^63 - 1, got {list(seed)[:8]}") from error
+
+
+def _read(decoder: msgspec.msgpack.Decoder[T], content: bytes) -> T:
+    try:
+        return decoder.decode(content)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise FrameError(f"expected a frame, got {len(content)} bytes that are none: {error}") from error
