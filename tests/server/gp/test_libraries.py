@@ -95,3 +95,10 @@ def test_gpytorch(rng, hyper):
 def test_the_prior_variance_is_the_covariances_diagonal(rng, hyper):
     x, _, _ = points(rng)
     torch.testing.assert_close(variance(hyper, x), covariance(hyper, x, x).diagonal(), rtol=1e-12, atol=0)
+
+
+def test_distances_keep_their_digits_far_from_the_origin(rng):
+    x = torch.from_numpy(np.round(rng.normal(size=(10, 2)) * 2**20) / 2**20)  # so that shifting by 1024 is exact
+    hyper = Hyperparameters(torch.tensor([0.02, 0.5], dtype=torch.float64), 1.0, 0.0, 0.0, 1e-8)
+    far, here = covariance(hyper, x + 1024, x + 1024), covariance(hyper, x, x)
+    torch.testing.assert_close(far, here, rtol=1e-12, atol=1e-15)
