@@ -17,7 +17,7 @@ from fastapi import FastAPI
 from fastapi.responses import Response
 
 from surrogym_server import dashboard
-from surrogym_server.api import events, models, problems, queries, samples, service, sessions, surrogates
+from surrogym_server.api import events, models, problems, queries, samples, service, sessions, steps, surrogates
 from surrogym_server.api.auth import Gate
 from surrogym_server.api.guards import BodyLimit, KnownHosts
 from surrogym_server.api.state import Services
@@ -96,7 +96,8 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes)
     if settings.loopback and not settings.tokens:
         app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", settings.host}))
-    for room in (sessions, service, surrogates, queries, samples, models, events):  # routes are tried in this order
+    # Routes are tried in this order.
+    for room in (steps, sessions, service, surrogates, queries, samples, models, events):
         app.include_router(room.router)
     _add_dashboard(app)
     return app

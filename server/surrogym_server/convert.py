@@ -31,6 +31,7 @@ from surrogym_server.surrogate import distributions, terms
 from surrogym_server.surrogate.describe import PointPrediction
 from surrogym_server.surrogate.recover import ObservationInverse
 from surrogym_server.virtual import VirtualSettings
+from surrogym_shared import frames
 from surrogym_shared import spec as wire
 from surrogym_shared import wire as replies
 from surrogym_shared.port import ResetResult, StepResult
@@ -365,6 +366,32 @@ def rollout_reply(answer: Answer) -> dict[str, Any]:
     """The fields of ``RolloutReply``; its steps all carry the one seq of the request."""
     assert isinstance(answer.outcome, tuple)
     return {"seq": answer.seq, "steps": [_step_fields(answer.seq, step) for step in answer.outcome]}
+
+
+def session_shape(session: Session) -> frames.Shape:
+    """What a session's frames leave out."""
+    definition = session.definition
+    return frames.Shape(
+        lanes=session.settings.num_envs,
+        observation=len(definition.observation_names),
+        action=definition.action.size,
+        outputs=len(definition.outputs),
+    )
+
+
+def reset_frame(answer: Answer) -> frames.ResetReply:
+    assert isinstance(answer.outcome, ResetResult)
+    return frames.reset_reply(answer.seq, answer.outcome)
+
+
+def step_frame(answer: Answer) -> frames.StepReply:
+    assert isinstance(answer.outcome, tuple)
+    return frames.step_reply(answer.seq, answer.outcome[0])
+
+
+def rollout_frame(answer: Answer) -> frames.RolloutReply:
+    assert isinstance(answer.outcome, tuple)
+    return frames.rollout_reply(answer.seq, answer.outcome)
 
 
 def _step_fields(seq: int, step: StepResult) -> dict[str, Any]:

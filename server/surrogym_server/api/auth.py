@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from starlette.datastructures import Headers
 
 from surrogym_server.errors import Forbidden, Unauthenticated
 from surrogym_shared.wire import Role
@@ -46,6 +47,12 @@ class Gate:
         role = self.role_of(token)
         if role not in (*allowed, "admin"):
             raise Forbidden(f"expected a token with role {' or '.join((*allowed, 'admin'))}, got {role}")
+
+
+def bearer_token(headers: Headers) -> str | None:
+    """The token of a request, for routes that read theirs themselves."""
+    scheme, _, token = headers.get("authorization", "").partition(" ")
+    return token.strip() if scheme.lower() == "bearer" else None
 
 
 def allow(*roles: Role) -> Any:

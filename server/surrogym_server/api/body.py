@@ -1,45 +1,58 @@
-"""Bodies: the fast path of the session routes, and what OpenAPI says of bodies that FastAPI does not read."""
+"""Bodies that FastAPI does not read: their route, their JSON, and what OpenAPI says of them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
-import msgspec
 from fastapi import Body, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
+from fastapi.routing import APIRoute
 from pydantic import BaseModel, ValidationError
-from starlette.exceptions import HTTPException
+
+from surrogym_server.api.auth import Gate, bearer_token
+from surrogym_shared import frames
 
 M = TypeVar("M", bound=BaseModel)
 
 JSON = "application/json"
+BINARY: dict[str, Any] = {frames.MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}}
 
 
-async def read_json(request: Request, model: type[M]) -> M:
-    """The body, parsed and checked in one pass over its bytes.
+class LeanRoute(APIRoute):
+    """A route on the path of every step: FastAPI describes it, and does not stand between it and the wire.
+
+    Its endpoint takes an id and the request. Only a token that may train gets there.
+    """
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        endpoint = self.endpoint
+
+        async def handle(request: Request) -> Response:
+            gate: Gate = request.app.state.gate
+            gate.check(bearer_token(request.headers), ("train",))
+            response: Response = await endpoint(request.path_params["id"], request)
+            return response
+
+        return handle
+
+
+def parse_json(model: type[M], content: bytes) -> M:
+    """A body, parsed and checked in one pass over its bytes.
 
     Raises:
-        HTTPException: 415, the content type is not JSON.
-        RequestValidationError: the body is not a ``model``.
+        RequestValidationError: it is not a ``model``.
     """
-    content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if content_type != JSON:
-        raise HTTPException(415, f"expected content type {JSON}, got {content_type or 'none'}")
     try:
-        return model.model_validate_json(await request.body())
+        return model.model_validate_json(content)
     except ValidationError as error:
         raise RequestValidationError(error.errors(include_url=False)) from error
 
 
-def write_json(reply: dict[str, Any]) -> Response:
-    """A reply as it is, without a second check of what was just computed."""
-    return Response(msgspec.json.encode(reply), media_type=JSON)
-
-
 def described(model: type[BaseModel], example: dict[str, Any]) -> dict[str, Any]:
-    """OpenAPI of a body that is read by ``read_json``."""
-    content = {JSON: {"schema": model.model_json_schema(), "example": example}}
+    """OpenAPI of a body that comes as JSON or as a frame."""
+    content = {JSON: {"schema": model.model_json_schema(), "example": example}, **BINARY}
     return {"requestBody": {"required": True, "content": content}}
 
 

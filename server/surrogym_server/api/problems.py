@@ -12,6 +12,7 @@ from starlette.exceptions import HTTPException
 
 from surrogym_server import errors
 from surrogym_shared.codes import PROBLEM_MEDIA_TYPE, STATUS, Code, Problem
+from surrogym_shared.frames import FrameError
 
 CODES: dict[type[errors.SurrogymError], Code] = {
     errors.InvalidInput: Code.INVALID_REQUEST,
@@ -54,7 +55,8 @@ SHOWN_CHARACTERS = 120
 
 def install(app: FastAPI) -> None:
     """Make every error reply of the app a problem body."""
-    app.add_exception_handler(errors.SurrogymError, _surrogym_error)
+    app.add_exception_handler(errors.SurrogymError, _refused)
+    app.add_exception_handler(FrameError, _refused)
     app.add_exception_handler(RequestValidationError, _request_invalid)
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(Exception, _unexpected)
@@ -65,6 +67,28 @@ def code_of(error: errors.SurrogymError) -> Code:
     return next(CODES[cls] for cls in type(error).__mro__ if cls in CODES)
 
 
+def problem_of(error: Exception) -> Problem:
+    """The problem body of an error; of one that nobody raised on purpose it says no more than that."""
+    match error:
+        case errors.SeqConflict():
+            return _problem(Code.SEQ_CONFLICT, str(error), expected_seq=error.expected)
+        case errors.SurrogymError():
+            return _problem(code_of(error), str(error))
+        case FrameError():
+            return _problem(Code.INVALID_REQUEST, str(error))
+    return _problem(Code.INTERNAL, "the server failed on this request; its log says more")
+
+
+def response_of(problem: Problem, headers: Mapping[str, str] | None = None) -> Response:
+    """A problem body as a reply; ``headers`` beside those that its code needs."""
+    return Response(
+        problem.model_dump_json(exclude_none=True),
+        status_code=problem.status,
+        headers={**_headers(problem.code), **(headers or {})},
+        media_type=PROBLEM_MEDIA_TYPE,
+    )
+
+
 def problem_response(
     code: Code,
     detail: str,
@@ -73,16 +97,8 @@ def problem_response(
     headers: Mapping[str, str] | None = None,
     **members: Any,
 ) -> Response:
-    """A problem body as a reply."""
-    status = STATUS[code] if status is None else status
-    title = code.value.replace("_", " ")
-    problem = Problem(title=title, status=status, code=code, detail=detail, **members)
-    return Response(
-        problem.model_dump_json(exclude_none=True),
-        status_code=status,
-        headers=dict(headers or {}),
-        media_type=PROBLEM_MEDIA_TYPE,
-    )
+    """A problem body as a reply, from its parts."""
+    return response_of(_problem(code, detail, status=status, **members), headers)
 
 
 def documented(*codes: Code) -> dict[int | str, dict[str, Any]]:
@@ -130,17 +146,19 @@ def _is_field(part: int | str) -> bool:
     return isinstance(part, int) or (part.isidentifier() and part not in NO_FIELDS)
 
 
+def _problem(code: Code, detail: str, *, status: int | None = None, **members: Any) -> Problem:
+    title = code.value.replace("_", " ")
+    return Problem(title=title, status=status or STATUS[code], code=code, detail=detail, **members)
+
+
 def _invalid(found: Sequence[Any]) -> Response:
     about_spec = "spec" in found[0]["loc"]
     code = Code.INVALID_SPEC if about_spec else Code.INVALID_REQUEST
     return problem_response(code, validation_detail(found), errors=_located(found))
 
 
-async def _surrogym_error(_: Request, error: Exception) -> Response:
-    assert isinstance(error, errors.SurrogymError)
-    code = code_of(error)
-    members = {"expected_seq": error.expected} if isinstance(error, errors.SeqConflict) else {}
-    return problem_response(code, str(error), headers=_headers(code), **members)
+async def _refused(_: Request, error: Exception) -> Response:
+    return response_of(problem_of(error))
 
 
 def _headers(code: Code) -> dict[str, str]:
@@ -169,4 +187,4 @@ async def _http_error(request: Request, error: Exception) -> Response:
 async def _unexpected(_: Request, error: Exception) -> Response:
     """Starlette logs the error itself."""
     assert not isinstance(error, errors.SurrogymError)
-    return problem_response(Code.INTERNAL, "the server failed on this request; its log says more")
+    return response_of(problem_of(error))

@@ -1,33 +1,22 @@
-"""Routes of sessions. reset, step and rollout are the path of every virtual step, so they read and write
-bytes directly.
-
-The binary frames and the stream of steps belong beside ``_JSON``: they differ from it in how a body becomes
-the arguments of one ``SessionService`` call and how its ``Answer`` becomes bytes, and in nothing else.
-"""
+"""Routes of sessions, from their opening to their end; ``api.steps`` is what happens in between."""
 
 from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter
 from fastapi.responses import Response
 
 from surrogym_server import convert
 from surrogym_server.api import examples
 from surrogym_server.api.auth import TRAIN
-from surrogym_server.api.body import described, example, read_json, write_json
+from surrogym_server.api.body import example
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
     OpenSession,
-    ResetReply,
-    ResetSession,
-    RolloutReply,
-    RolloutSession,
     SessionView,
-    StepReply,
-    StepSession,
     SubmitOccupancy,
     SubmittedOccupancy,
 )
@@ -35,9 +24,6 @@ from surrogym_shared.wire import (
 router = APIRouter(prefix="/v1", tags=["sessions"])
 
 SESSION_ERRORS = (Code.UNKNOWN_SESSION, Code.SESSION_EXPIRED, Code.INVALID_REQUEST)
-ADVANCE_ERRORS = documented(
-    *SESSION_ERRORS, Code.SEQ_CONFLICT, Code.NOT_RESET, Code.TOO_LARGE, Code.UNSUPPORTED_MEDIA_TYPE
-)
 
 
 @router.post(
@@ -78,53 +64,6 @@ async def close_session(id: str, use: Use) -> Response:
     """Closing one that has ended is harmless."""
     use.sessions.close(id)
     return Response(status_code=204)
-
-
-@router.post(
-    "/sessions/{id}/reset",
-    summary="Start new episodes",
-    response_model=ResetReply,
-    dependencies=[TRAIN],
-    openapi_extra=described(ResetSession, examples.RESET),
-    responses=ADVANCE_ERRORS,
-)
-async def reset(id: str, request: Request, use: Use) -> Response:
-    """In all lanes, or those of the mask. A seed starts them at episode 0; without one each goes on."""
-    body = await read_json(request, ResetSession)
-    answer = await use.sessions.reset(id, body.seq, body.seed, convert.lane_mask(body.mask))
-    return write_json(convert.reset_reply(answer))
-
-
-@router.post(
-    "/sessions/{id}/step",
-    summary="Step all lanes",
-    response_model=StepReply,
-    dependencies=[TRAIN],
-    openapi_extra=described(StepSession, examples.STEP),
-    responses=ADVANCE_ERRORS,
-)
-async def step(id: str, request: Request, use: Use) -> Response:
-    """Or those of the mask. The same ``seq`` with the same body gets the same reply, so a lost one may be
-    asked for again."""
-    body = await read_json(request, StepSession)
-    action = convert.numbers("action", body.action)
-    answer = await use.sessions.step(id, body.seq, action, convert.lane_mask(body.mask), body.deviations)
-    return write_json(convert.step_reply(answer))
-
-
-@router.post(
-    "/sessions/{id}/rollout",
-    summary="Step several times",
-    response_model=RolloutReply,
-    dependencies=[TRAIN],
-    openapi_extra=described(RolloutSession, examples.ROLLOUT),
-    responses=ADVANCE_ERRORS,
-)
-async def rollout(id: str, request: Request, use: Use) -> Response:
-    """With given actions, in one request; all steps or none."""
-    body = await read_json(request, RolloutSession)
-    answer = await use.sessions.rollout(id, body.seq, convert.numbers("actions", body.actions))
-    return write_json(convert.rollout_reply(answer))
 
 
 @router.post(

@@ -34,6 +34,9 @@ class Runner(uvicorn.Server):
             access_log=settings.log_level == "debug",
             server_header=False,
             timeout_graceful_shutdown=GRACE_SECONDS,
+            ws_max_size=settings.max_body_bytes,
+            ws_per_message_deflate=False,  # frames are numbers: packing them costs more than it saves
+            ws_ping_timeout=None,  # a trainer that learns for minutes answers no ping, and has not gone
         )
         super().__init__(config)
         self._app = app

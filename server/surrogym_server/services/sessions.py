@@ -121,7 +121,8 @@ class SessionService:
             stepped, result = self._step(session, u, mask, deviations)
             return stepped, (result,)
 
-        return await self._live.advance(id, seq, digest_of("step", action, mask, deviations), work)
+        digest = digest_of("step", _columns(action, 2), mask, deviations)
+        return await self._live.advance(id, seq, digest, work)
 
     async def rollout(self, id: str, seq: int | None, actions: Array) -> Answer:
         """T steps with a policy's actions (T, N, F) or (T, N), all or none. Raises as ``step``."""
@@ -136,7 +137,8 @@ class SessionService:
                 results.append(result)
             return session, tuple(results)
 
-        return await self._live.advance(id, seq, digest_of("rollout", actions), work, steps=len(actions))
+        digest = digest_of("rollout", _columns(actions, 3))
+        return await self._live.advance(id, seq, digest, work, steps=len(actions))
 
     async def submit_occupancy(self, id: str, checkpoint: str) -> int:
         """Store the states that a session visited under a name; returns how many.
@@ -208,6 +210,11 @@ class SessionService:
 
     def _latest(self, session: Session) -> int:
         return self._models.latest(session.surrogate) if session.model == "latest" else session.model
+
+
+def _columns(action: Array, dimensions: int) -> Array:
+    """Actions with their last axis, that some transports leave out where it has one entry; for the fingerprint."""
+    return action[..., None] if action.ndim == dimensions - 1 else action
 
 
 def resolved(opening: Opening, definition: EnvironmentDefinition) -> VirtualSettings:

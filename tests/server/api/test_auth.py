@@ -6,6 +6,8 @@ from collections.abc import Iterator
 
 import httpx
 import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from support import pendulum
 from support.server import running_server
@@ -17,6 +19,7 @@ BODIES = {
     "claim": ("POST", "/v1/surrogates/p/queries:claim", {"sampler": "s"}),
     "create": ("POST", "/v1/surrogates", {"name": "p", "spec": pendulum.spec()}),
     "open": ("POST", "/v1/surrogates/p/sessions", {}),
+    "step": ("POST", "/v1/sessions/none/step", {"action": [0.0]}),
     "list": ("GET", "/v1/surrogates", None),
     "improve": ("POST", "/v1/surrogates/p/improve", {"queries": 1}),
     "pause": ("PATCH", "/v1/surrogates/p", {"paused": True}),
@@ -28,6 +31,7 @@ ALLOWED = {
     "claim": {"sample"},
     "create": set(),
     "open": {"train"},
+    "step": {"train"},
     "list": {"read", "train", "sample"},
     "improve": {"train"},
     "pause": set(),
@@ -70,6 +74,25 @@ def test_without_a_known_token_nothing_but_health_and_the_page(guarded: httpx.Cl
         url = path.format(name="p", id="x", query_id=1, version=1)
         reply = guarded.request(method, url, headers=headers)
         assert (reply.status_code, reply.headers.get("www-authenticate")) == (401, "Bearer"), (method, path)
+
+
+@pytest.mark.parametrize(
+    ("header", "status"),
+    [
+        (None, 401),
+        ("Bearer wrong", 401),
+        (f"Bearer {TOKENS['sample']}", 403),
+        (f"Bearer {TOKENS['train']}", 404),
+        (f"Bearer {TOKENS['admin']}", 404),
+    ],
+)
+def test_a_stream_authenticates_in_its_handshake(guarded: httpx.Client, header: str | None, status: int):
+    """404, for there is no such session; a stranger is not told."""
+    url = f"{str(guarded.base_url).replace('http', 'ws', 1)}/v1/sessions/x/stream"
+    headers = {"Authorization": header} if header else {}
+    with pytest.raises(InvalidStatus) as refused, connect(url, additional_headers=headers):
+        pass
+    assert refused.value.response.status_code == status
 
 
 @pytest.mark.parametrize("path", sorted(PUBLIC))

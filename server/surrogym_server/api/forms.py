@@ -1,0 +1,67 @@
+"""reset, step and rollout in their two forms, JSON and frames: the body of a request in, that of its reply out."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+
+import msgspec
+
+from surrogym_server import convert
+from surrogym_server.api.body import JSON, parse_json
+from surrogym_server.services.sessions import SessionService
+from surrogym_shared import frames
+from surrogym_shared.wire import ResetSession, RolloutSession, StepSession
+
+Carry = Callable[[SessionService, str, bytes], Awaitable[bytes]]
+
+_JSON = msgspec.json.Encoder()
+
+
+async def reset_json(sessions: SessionService, id: str, content: bytes) -> bytes:
+    body = parse_json(ResetSession, content)
+    answer = await sessions.reset(id, body.seq, body.seed, convert.lane_mask(body.mask))
+    return _JSON.encode(convert.reset_reply(answer))
+
+
+async def step_json(sessions: SessionService, id: str, content: bytes) -> bytes:
+    body = parse_json(StepSession, content)
+    action = convert.numbers("action", body.action)
+    answer = await sessions.step(id, body.seq, action, convert.lane_mask(body.mask), body.deviations)
+    return _JSON.encode(convert.step_reply(answer))
+
+
+async def rollout_json(sessions: SessionService, id: str, content: bytes) -> bytes:
+    body = parse_json(RolloutSession, content)
+    answer = await sessions.rollout(id, body.seq, convert.numbers("actions", body.actions))
+    return _JSON.encode(convert.rollout_reply(answer))
+
+
+async def carry_out(sessions: SessionService, id: str, request: frames.Request) -> bytes:
+    """A frame's request, whatever carried it; raises ``FrameError`` where it does not fit the session."""
+    shape = convert.session_shape(sessions.get(id))
+    match request:
+        case frames.StepRequest():
+            action, mask = frames.action_of(request, shape), frames.mask_of(request, shape)
+            answer = await sessions.step(id, request.seq, action, mask, request.deviations)
+            return frames.encode(convert.step_frame(answer))
+        case frames.ResetRequest():
+            seed, mask = frames.seed_of(request, shape), frames.mask_of(request, shape)
+            return frames.encode(convert.reset_frame(await sessions.reset(id, request.seq, seed, mask)))
+        case frames.RolloutRequest():
+            answer = await sessions.rollout(id, request.seq, frames.actions_of(request, shape))
+            return frames.encode(convert.rollout_frame(answer))
+
+
+def _framed(kind: type[frames.Request]) -> Carry:
+    async def carry(sessions: SessionService, id: str, content: bytes) -> bytes:
+        request = frames.read_request(content)
+        if not isinstance(request, kind):
+            raise frames.FrameError(f"expected a {kind.__name__}, got a {type(request).__name__}")
+        return await carry_out(sessions, id, request)
+
+    return carry
+
+
+RESET: dict[str, Carry] = {JSON: reset_json, frames.MEDIA_TYPE: _framed(frames.ResetRequest)}
+STEP: dict[str, Carry] = {JSON: step_json, frames.MEDIA_TYPE: _framed(frames.StepRequest)}
+ROLLOUT: dict[str, Carry] = {JSON: rollout_json, frames.MEDIA_TYPE: _framed(frames.RolloutRequest)}

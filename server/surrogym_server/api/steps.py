@@ -1,0 +1,71 @@
+"""Routes on the path of every virtual step: reset, step and rollout, as JSON or frames, and the stream of frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from fastapi import APIRouter, Request
+from fastapi.responses import Response
+from pydantic import BaseModel
+from starlette.exceptions import HTTPException
+from starlette.routing import WebSocketRoute
+
+from surrogym_server.api import examples, forms
+from surrogym_server.api.auth import TRAIN
+from surrogym_server.api.body import BINARY, LeanRoute, described
+from surrogym_server.api.problems import documented
+from surrogym_server.api.stream import StepStream
+from surrogym_shared.codes import Code
+from surrogym_shared.wire import ResetReply, ResetSession, RolloutReply, RolloutSession, StepReply, StepSession
+
+router = APIRouter(prefix="/v1/sessions/{id}", tags=["sessions"], route_class=LeanRoute)
+router.routes.append(WebSocketRoute("/v1/sessions/{id}/stream", StepStream()))
+
+ERRORS = documented(
+    Code.UNKNOWN_SESSION,
+    Code.SESSION_EXPIRED,
+    Code.INVALID_REQUEST,
+    Code.SEQ_CONFLICT,
+    Code.NOT_RESET,
+    Code.TOO_LARGE,
+    Code.UNSUPPORTED_MEDIA_TYPE,
+)
+
+
+def _documented(body: type[BaseModel], example: dict[str, Any], reply: type[BaseModel]) -> dict[str, Any]:
+    return {
+        "response_model": reply,
+        "dependencies": [TRAIN],
+        "openapi_extra": described(body, example),
+        "responses": {200: {"content": BINARY}, **ERRORS},
+    }
+
+
+@router.post("/reset", summary="Start new episodes", **_documented(ResetSession, examples.RESET, ResetReply))
+async def reset(id: str, request: Request) -> Response:
+    """In all lanes, or those of the mask. A seed starts them at episode 0; without one each goes on."""
+    return await _carried(forms.RESET, id, request)
+
+
+@router.post("/step", summary="Step all lanes", **_documented(StepSession, examples.STEP, StepReply))
+async def step(id: str, request: Request) -> Response:
+    """Or those of the mask. The same ``seq`` with the same body gets the same reply, so a lost one may be
+    asked for again, over this or another transport."""
+    return await _carried(forms.STEP, id, request)
+
+
+@router.post("/rollout", summary="Step several times", **_documented(RolloutSession, examples.ROLLOUT, RolloutReply))
+async def rollout(id: str, request: Request) -> Response:
+    """With given actions, in one request; all steps or none."""
+    return await _carried(forms.ROLLOUT, id, request)
+
+
+async def _carried(by_type: Mapping[str, forms.Carry], id: str, request: Request) -> Response:
+    """The reply comes in the form of the request. Raises ``HTTPException`` 415 for a form there is none of."""
+    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    carry = by_type.get(media_type)
+    if carry is None:
+        raise HTTPException(415, f"expected content type {' or '.join(by_type)}, got {media_type or 'none'}")
+    content = await carry(request.state.services.sessions, id, await request.body())
+    return Response(content, media_type=media_type)

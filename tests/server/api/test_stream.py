@@ -1,0 +1,223 @@
+"""The stream and the binary bodies: the same frames, the same laws as JSON, and repeats that change their transport."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from support import pendulum
+from support.server import ServerProcess, start_server
+from surrogym_shared import frames, wire
+from surrogym_shared.codes import Code, Problem
+
+SHAPE = frames.Shape(lanes=2, observation=3, action=1, outputs=3)
+ACTION = np.array([[0.5], [-1.5]])
+BINARY = {"content-type": frames.MEDIA_TYPE}
+Exchange = Callable[[frames.Request], frames.Reply]
+
+
+def address(url: str, session: str) -> str:
+    return f"{url.replace('http', 'ws', 1)}/v1/sessions/{session}/stream"
+
+
+@pytest.fixture
+def stream(server_process: ServerProcess, session: str) -> Iterator[ClientConnection]:
+    with connect(address(server_process.url, session), compression=None) as connection:
+        yield connection
+
+
+def over_stream(stream: ClientConnection) -> Exchange:
+    def exchange(request: frames.Request) -> frames.Reply:
+        stream.send(frames.encode(request))
+        content = stream.recv(timeout=60)
+        assert isinstance(content, bytes)
+        return frames.read_reply(content)
+
+    return exchange
+
+
+def post(client: httpx.Client, session: str, request: frames.Request, what: str | None = None) -> httpx.Response:
+    what = what or type(request).__struct_config__.tag
+    return client.post(f"/v1/sessions/{session}/{what}", content=frames.encode(request), headers=BINARY)
+
+
+def over_http(client: httpx.Client, session: str) -> Exchange:
+    return lambda request: frames.read_reply(post(client, session, request).raise_for_status().content)
+
+
+REQUESTS = [
+    frames.reset_request(1, 5, None),
+    frames.step_request(2, ACTION, np.array([True, False]), True),
+    frames.rollout_request(3, np.stack([ACTION, ACTION])),
+]
+AS_JSON: list[tuple[str, dict[str, Any]]] = [
+    ("reset", {"seq": 1, "seed": 5}),
+    ("step", {"seq": 2, "action": ACTION.tolist(), "mask": [True, False], "deviations": True}),
+    ("rollout", {"seq": 3, "actions": [ACTION[:, 0].tolist()] * 2}),
+]
+
+
+def test_a_repeat_may_come_over_any_other_transport(client: httpx.Client, session: str, stream: ClientConnection):
+    """One session goes through three requests, each repeated over all transports: one reply each, bit for bit."""
+    first: list[Callable[[int], bytes]] = [
+        lambda i: frames.encode(over_stream(stream)(REQUESTS[i])),
+        lambda i: post(client, session, REQUESTS[i]).raise_for_status().content,
+        lambda i: json_as_frame(client, session, *AS_JSON[i]),
+    ]
+    for i in range(len(REQUESTS)):
+        assert len({transport(i) for transport in first}) == 1
+        first.append(first.pop(0))
+    assert client.get(f"/v1/sessions/{session}").json()["seq"] == 3
+
+
+def json_as_frame(client: httpx.Client, session: str, what: str, body: dict[str, Any]) -> bytes:
+    reply = client.post(f"/v1/sessions/{session}/{what}", json=body).raise_for_status().json()
+    if what == "reset":
+        result = frames.ResetResult(np.array(reply["observation"]), np.array(reply["model_version"]))
+        return frames.encode(frames.reset_reply(reply["seq"], result))
+    steps = [reply] if what == "step" else reply["steps"]
+    results = [frames.StepResult(**{k: listed(v) for k, v in step.items() if k != "seq"}) for step in steps]
+    if what == "step":
+        return frames.encode(frames.step_reply(reply["seq"], results[0]))
+    return frames.encode(frames.rollout_reply(reply["seq"], results))
+
+
+def listed(value: Any) -> Any:
+    return None if value is None else np.array(value)
+
+
+def test_seeds_of_each_lane_are_the_same_over_every_transport(client: httpx.Client, session: str):
+    seeds, mask = [2**63 - 1, 0], np.array([True, False])
+    client.post(f"/v1/sessions/{session}/reset", json={"seq": 1}).raise_for_status()
+    framed = over_http(client, session)(frames.reset_request(2, seeds, mask))
+    body = {"seq": 2, "seed": seeds, "mask": mask.tolist()}
+    again = client.post(f"/v1/sessions/{session}/reset", json=body).raise_for_status().json()
+    assert isinstance(framed, frames.ResetReply)
+    np.testing.assert_array_equal(frames.reset_result(framed, SHAPE).observation, np.float32(again["observation"]))
+
+
+def test_a_refused_request_is_a_problem_frame_and_the_stream_goes_on(stream: ClientConnection):
+    exchange = over_stream(stream)
+    refused = exchange(frames.step_request(1, ACTION, None, False))
+    assert isinstance(refused, frames.ProblemReply)
+    assert (refused.code, refused.status, refused.seq) == (Code.NOT_RESET, 409, 1)
+    assert isinstance(exchange(frames.reset_request(1, None, None)), frames.ResetReply)
+    ahead = exchange(frames.step_request(7, ACTION, None, False))
+    assert isinstance(ahead, frames.ProblemReply)
+    assert (ahead.code, ahead.expected_seq, ahead.seq) == (Code.SEQ_CONFLICT, 2, 7)
+    step = exchange(frames.step_request(2, ACTION, None, False))
+    assert isinstance(step, frames.StepReply)
+    assert frames.step_result(step.step, SHAPE).reward.shape == (2,)
+
+
+BAD: list[tuple[bytes, str]] = [
+    (b"no frame", "expected a frame, got 8 bytes that are none"),
+    (b"", "expected a frame, got 0 bytes"),
+    (frames.encode(frames.step_request(2, np.ones((3, 1)), None, False)), "action: expected 16 bytes"),
+    (frames.encode(frames.step_request(2, ACTION, np.ones(3, bool), False)), "mask: expected 2 bytes"),
+    (frames.encode(frames.step_request(2, ACTION * np.nan, None, False)), "expected finite numbers"),
+    (frames.encode(frames.step_request(2, ACTION * 1e9, None, False)), "expected entry 0 in [-2, 2]"),
+]
+
+
+@pytest.mark.parametrize(("content", "said"), BAD)
+def test_bad_bytes_change_nothing(
+    client: httpx.Client, session: str, stream: ClientConnection, content: bytes, said: str
+):
+    over_stream(stream)(frames.reset_request(1, None, None))
+    stream.send(content)
+    problem = frames.read_reply(stream.recv(timeout=60))
+    assert isinstance(problem, frames.ProblemReply)
+    assert (problem.code, problem.status) == (Code.INVALID_REQUEST, 422)
+    assert said in problem.detail
+    reply = client.post(f"/v1/sessions/{session}/step", content=content, headers=BINARY)
+    assert Problem.model_validate_json(reply.content).detail == problem.detail
+    assert (reply.status_code, reply.headers["content-type"]) == (422, "application/problem+json")
+    assert client.get(f"/v1/sessions/{session}").json()["seq"] == 1
+
+
+def test_text_is_no_frame(stream: ClientConnection):
+    stream.send('{"op": "reset"}')
+    problem = frames.read_reply(stream.recv(timeout=60))
+    assert isinstance(problem, frames.ProblemReply)
+    assert problem.detail == "expected a binary message, got text"
+
+
+def test_a_frame_belongs_to_its_route(client: httpx.Client, session: str):
+    reply = post(client, session, frames.reset_request(1, None, None), what="step")
+    assert (reply.status_code, reply.json()["detail"]) == (422, "expected a StepRequest, got a ResetRequest")
+
+
+def test_a_form_there_is_none_of_is_refused(client: httpx.Client, session: str):
+    reply = client.post(f"/v1/sessions/{session}/step", content=b"1", headers={"content-type": "text/csv"})
+    assert reply.json()["code"] == "unsupported_media_type"
+    assert "application/json or application/vnd.msgpack, got text/csv" in reply.json()["detail"]
+
+
+def test_no_stream_without_a_session(server_process: ServerProcess):
+    with pytest.raises(InvalidStatus) as refused, connect(address(server_process.url, "none")):
+        pass
+    problem = Problem.model_validate_json(refused.value.response.body)
+    assert (problem.code, refused.value.response.status_code) == (Code.UNKNOWN_SESSION, 404)
+
+
+def test_a_session_that_ends_ends_its_stream_with_a_problem(
+    client: httpx.Client, session: str, stream: ClientConnection
+):
+    client.delete(f"/v1/sessions/{session}")
+    problem = over_stream(stream)(frames.reset_request(1, None, None))
+    assert isinstance(problem, frames.ProblemReply)
+    assert problem.code is Code.UNKNOWN_SESSION
+
+
+def test_two_streams_of_one_session_step_once(server_process: ServerProcess, session: str):
+    def run(_: int) -> bytes:
+        with connect(address(server_process.url, session), compression=None) as stream:
+            return frames.encode(over_stream(stream)(frames.rollout_request(2, np.stack([ACTION] * 200))))
+
+    with connect(address(server_process.url, session)) as stream:
+        over_stream(stream)(frames.reset_request(1, None, None))
+    with ThreadPoolExecutor(3) as pool:
+        assert len(set(pool.map(run, range(3)))) == 1
+
+
+def test_a_page_of_another_host_gets_no_stream(server_process: ServerProcess, session: str):
+    url = address(server_process.url, session)
+    with connect(url, origin=server_process.url) as own:  # type: ignore[arg-type]
+        assert isinstance(over_stream(own)(frames.reset_request(1, None, None)), frames.ResetReply)
+    with pytest.raises(InvalidStatus) as refused, connect(url, origin="http://elsewhere.example"):  # type: ignore[arg-type]
+        pass
+    assert refused.value.response.status_code == 403
+    assert b"elsewhere.example" in refused.value.response.body
+
+
+def test_too_large_a_message_and_a_shutdown_end_the_stream(tmp_path: Path):
+    server = start_server(tmp_path, SURROGYM_MAX_BODY_BYTES="2048")
+    try:
+        with httpx.Client(base_url=server.url, timeout=60) as client:
+            pendulum.teach(client, "p")
+            session = client.post("/v1/surrogates/p/sessions", json=wire.OpenSession(num_envs=2).model_dump()).json()
+            with connect(address(server.url, session["id"]), compression=None) as stream:
+                stream.send(b"\0" * 4096)
+                with pytest.raises(ConnectionClosed) as closed:
+                    stream.recv(timeout=60)
+            assert closed.value.rcvd is not None
+            assert closed.value.rcvd.code == 1009
+            with connect(address(server.url, session["id"]), compression=None) as stream:
+                over_stream(stream)(frames.reset_request(1, None, None))
+                assert server.stop(signal.SIGTERM) == 0, "an open stream holds no shutdown up"
+                with pytest.raises(ConnectionClosed) as closed:
+                    stream.recv(timeout=60)
+            assert closed.value.rcvd is not None
+            assert closed.value.rcvd.code == 1012
+    finally:
+        server.stop(signal.SIGKILL)
