@@ -106,7 +106,7 @@ def train(
     settings = settings or TrainSettings()
     torch.set_num_threads(settings.threads)
     spec, algorithm = port.spec(), algorithm_by_name(settings.algorithm)
-    total = _total_steps(algorithm, settings)
+    total = planned_steps(settings)
     num_envs = settings.num_envs or suggested_lanes(algorithm)
     gamma = settings.hyperparameters.get("gamma", suggested_gamma(spec))
     env = SurrogateVecEnv.from_port(
@@ -197,7 +197,9 @@ def _learner(
         raise ValueError(f"{settings.algorithm} can't be trained here: {error}") from error
 
 
-def _total_steps(algorithm: type[BaseAlgorithm], settings: TrainSettings) -> int:
+def planned_steps(settings: TrainSettings) -> int:
+    """Virtual steps of a training. Raises ValueError where they exceed the cap, or for an unknown algorithm."""
+    algorithm = algorithm_by_name(settings.algorithm)
     suggested = ON_POLICY_STEPS if issubclass(algorithm, OnPolicyAlgorithm) else OFF_POLICY_STEPS
     total = suggested if settings.total_steps is None else settings.total_steps
     if not 1 <= total <= MAX_STEPS:

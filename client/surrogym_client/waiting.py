@@ -34,7 +34,12 @@ def wait_for_surrogate(api: Api, name: str, seconds: float) -> SurrogateView:
 
 
 def wait_for_design(
-    api: Api, name: str, seconds: float, progress: Callable[[SurrogateView], None] | None = None
+    api: Api,
+    name: str,
+    seconds: float,
+    progress: Callable[[SurrogateView], None] | None = None,
+    *,
+    after_round: int = 0,
 ) -> SurrogateView:
     """The surrogate, once its design has reached the target or the budget.
 
@@ -43,6 +48,7 @@ def wait_for_design(
         name: the surrogate.
         seconds: how long to wait.
         progress: called with every look.
+        after_round: the design counts as done only when it has had more rounds than these.
 
     Raises:
         DesignUnfinished: the design failed, or was not done within ``seconds``.
@@ -54,7 +60,7 @@ def wait_for_design(
         if view is not None:
             if progress is not None:
                 progress(view)
-            if view.phase in FINISHED and not _under_way(view):
+            if view.phase in FINISHED and view.round > after_round and not _under_way(view):
                 return view
             if view.phase == "failed":
                 raise DesignUnfinished(f"the design of {name!r} failed: {view.error}")

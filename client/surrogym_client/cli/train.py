@@ -44,6 +44,11 @@ def command(
         float | None, typer.Option(min=0, help="Deviations taken off the reward. [default: the specification's]")
     ] = None,
     start_from: Annotated[Path | None, typer.Option(help="Policy file to go on from.")] = None,
+    improve: Annotated[
+        int,
+        typer.Option(min=0, help="More real queries in each round, where the policy goes, until the design is ready."),
+    ] = 0,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds of --improve, at most.")] = 3,
     tensorboard: Annotated[Path | None, typer.Option(help="Folder for TensorBoard.")] = None,
     wait: Wait = 0.0,
     progress_file: Annotated[Path | None, typer.Option(hidden=True, help="Write progress as JSON lines.")] = None,
@@ -53,7 +58,7 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Train a policy in the virtual environment; no real step is taken.
+    """Train a policy in the virtual environment; no real step is taken, unless --improve asks a sampler for more.
 
     Example: surrogym train pendulum --out policy.zip --seed 0
     """
@@ -76,7 +81,8 @@ def command(
         session={key: value for key, value in options.items() if value is not None},
     )
     with progress("train", quiet=quiet) as update, _recording(progress_file, update) as record:
-        result = _train(url, token, surrogate, out, settings, record)
+        rounds_of = None if improve == 0 else (improve, rounds)
+        result = _train(url, token, surrogate, out, settings, rounds_of, record)
     summary = _write_card(result, surrogate, spec, url, seed)
     give(summary, lambda: _words(result), as_json=as_json, quiet=quiet)
 
@@ -119,15 +125,25 @@ def _recording(path: Path | None, update: Update) -> Iterator[Record]:
 
 
 def _train(
-    url: str, token: str | None, surrogate: str, out: Path, settings: TrainSettings, record: Record
+    url: str,
+    token: str | None,
+    surrogate: str,
+    out: Path,
+    settings: TrainSettings,
+    rounds: tuple[int, int] | None,
+    record: Record,
 ) -> TrainResult:
     from surrogym_client.cli.errors import CommandError
+    from surrogym_client.improve import ImproveSettings, train_and_improve
     from surrogym_client.train import train
-    from surrogym_client.transport import HttpSurrogate
+    from surrogym_client.transport import Api, HttpSurrogate
 
     with HttpSurrogate(url, surrogate, token) as port:
         try:
-            return train(port, out, settings, record)
+            if rounds is None:
+                return train(port, out, settings, record)
+            with Api(url, token) as api:
+                return train_and_improve(api, surrogate, port, out, settings, ImproveSettings(*rounds), record)
         except ValueError as error:
             raise CommandError(str(error)) from error
 

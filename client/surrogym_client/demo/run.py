@@ -32,21 +32,33 @@ from surrogym_shared.wire import SurrogateView
 
 PATIENCE_SECONDS = 3_600.0
 LOOK_SECONDS = 0.2
+MIN_DESIGN = 20
+ROUNDS = 3  # of the closed loop, while the design is not ready
 
 
 @dataclass(frozen=True)
 class DemoTask:
-    """What a demo solves, and what the design may spend on it. Training derives everything else from the spec."""
+    """What a demo solves, and the real steps it may spend. Training derives everything else from the spec."""
 
     environment: str
     budget: int
+
+    @property
+    def design_budget(self) -> int:
+        """What the design may spend before the first policy: two fifths, and not too few to begin with."""
+        return min(self.budget, max(MIN_DESIGN, 2 * self.budget // 5))
+
+    @property
+    def queries_a_round(self) -> int:
+        """What each round of the closed loop may spend."""
+        return max(1, (self.budget - self.design_budget) // ROUNDS)
 
 
 TASKS = {
     "pendulum": DemoTask("Pendulum-v1", budget=30),
     "cartpole": DemoTask("CartPole-v1", budget=30),
     "mountaincar": DemoTask("MountainCarContinuous-v0", budget=40),
-    "acrobot": DemoTask("Acrobot-v1", budget=120),
+    "acrobot": DemoTask("Acrobot-v1", budget=100),
 }
 
 
@@ -63,7 +75,7 @@ class DemoSettings:
     def spec(self) -> EnvironmentSpec:
         """The task's specification with these choices. Under ``paper`` the preset's own budget counts."""
         task = TASKS[self.task]
-        budget = self.budget or (None if self.preset == "paper" else task.budget)
+        budget = self.budget or (None if self.preset == "paper" else task.design_budget)
         return make(task.environment, preset=self.preset, budget=budget, seed=self.seed).spec()
 
 
@@ -122,10 +134,15 @@ class DemoRun:
         common = [name, "--server", url, "--wait", wait]
         self._children.start("sampler", "surrogym_client", ["sample", *common])
         steps = [] if self._settings.steps is None else ["--steps", str(self._settings.steps)]
-        options = ["--out", str(self.policy), "--seed", str(self._settings.seed), *steps, "--quiet"]
+        improve = [] if self._settings.budget or self._settings.preset == "paper" else self._rounds
+        options = [*improve, "--out", str(self.policy), "--seed", str(self._settings.seed), *steps, "--quiet"]
         return self._children.start(
             "trainer", "surrogym_client", ["train", *common, *options, "--progress-file", str(self._curve)]
         )
+
+    @property
+    def _rounds(self) -> list[str]:
+        return ["--improve", str(TASKS[self._settings.task].queries_a_round), "--rounds", str(ROUNDS)]
 
     def _design(self) -> None:
         with progress("design", quiet=self._quiet) as update:
@@ -143,7 +160,8 @@ class DemoRun:
             while trainer.process.poll() is None:
                 self._children.check()
                 for line in read_curve(self._curve)[-1:]:
-                    update(line["steps"] / line["total_steps"], words_of(line))
+                    real = self.api.surrogate(self._settings.task).ledger.total
+                    update(line["steps"] / line["total_steps"], f"{words_of(line)}, {real} real steps")
                 time.sleep(LOOK_SECONDS)
             trainer.check()
             update(1.0, f"{read_card(self.policy).virtual_steps} virtual steps")

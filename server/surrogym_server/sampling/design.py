@@ -86,7 +86,9 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     outputs = (*learned.model.transitions, learned.model.reward)
     confidences = tuple(confidence(o, deviation[:, i], tolerances[i]) for i, o in enumerate(outputs))
     verdict = judge(definition, confidences, tolerances, len(samples), request)
-    chosen_q, chosen_u = _choose(learned.model, samples, (q, u), confidences, tolerances, verdict, request)
+    points = _candidate_points(definition, q, u, request.states, state.round)
+    candidates = candidates_of(learned.model, *points, request.states)
+    chosen_q, chosen_u = _choose(learned.model, samples, candidates, confidences, tolerances, verdict, request)
     if verdict == "continue" and not len(chosen_q):
         verdict = "over_budget"  # the rest of the budget is pending, or nothing distinct is left to ask
     new_state = DesignState(state.round + 1, tolerances, learned.thetas)
@@ -96,6 +98,19 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
 def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
     """The Monte Carlo set of eq. 8, the same in every round: coordinates (m, C), actions (m, F)."""
     return random_points(definition, definition.design.monte_carlo, _rng(definition, "monte carlo"))
+
+
+def _candidate_points(
+    definition: EnvironmentDefinition, q: Tensor, u: Tensor, states: Tensor | None, round_number: int
+) -> tuple[Tensor, Tensor]:
+    """The Monte Carlo set q (m, C), u (m, F), and as many points again at states (v, C) that policies visited, under
+    random actions: few points of a set spread over the whole range lie where a policy goes."""
+    if states is None or not len(states) or definition.design.preset == "paper":
+        return q, u
+    rng = _rng(definition, f"visited {round_number}")
+    chosen = torch.from_numpy(rng.integers(len(states), size=len(q)))
+    _, actions = random_points(definition, len(q), rng)
+    return torch.cat([q, states[chosen]]), torch.cat([u, actions])
 
 
 def default_tolerances(definition: EnvironmentDefinition, samples: Samples) -> tuple[float, ...]:
@@ -134,7 +149,7 @@ def judge(
 def _choose(
     model: SurrogateModel,
     samples: Samples,
-    monte_carlo: tuple[Tensor, Tensor],
+    candidates: Candidates,
     confidences: tuple[OutputConfidence, ...],
     tolerances: tuple[float, ...],
     verdict: Verdict,
@@ -147,7 +162,6 @@ def _choose(
         wanted = below[: max(0, request.budget - len(samples) - len(request.pending_q))]
     else:
         wanted = [below[i % len(below)] for i in range(request.extra)]
-    candidates = candidates_of(model, *monte_carlo, request.states)
     for q, u in zip(request.pending_q, request.pending_u, strict=True):
         model = condition_on(model, q, u)
     taken = (torch.cat([samples.q, request.pending_q]), torch.cat([samples.u, request.pending_u]))

@@ -235,3 +235,19 @@ def test_verdicts(preset, confidences, samples, verdict):
     definition = definition_from_spec(designed(preset=preset, initial=10))
     assert math.ceil(1.5 * 10) == 15
     assert judge(definition, confidences, (1.0,) * 3, samples, request(20)) == verdict
+
+
+def test_queries_go_where_policies_went():
+    spec = designed(seed=0, initial=6)
+    definition = definition_from_spec(spec)
+    samples = answer(spec, *initial_design(definition, 6))
+    visited = torch.tensor([[2.0, 6.0]], dtype=torch.float64) + 0.2 * torch.randn(
+        400, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
+    wide = advance(definition, samples, NEVER, request())
+    near_them = advance(definition, samples, NEVER, request(states=visited))
+    distance = (near_them.q - torch.tensor([2.0, 6.0])).abs().max(0).values
+    assert len(near_them.q) == len(wide.q) == 3
+    assert distance[0] < 1
+    assert distance[1] < 1
+    assert (wide.q - torch.tensor([2.0, 6.0])).abs().max() > 2

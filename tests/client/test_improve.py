@@ -1,0 +1,75 @@
+"""The closed loop over a real server: queries between trainings, counted, and only while the design is unsure."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from uuid import uuid4
+
+import pytest
+
+from support.server import ServerProcess
+from support.teaching import answer
+from surrogym_client.api import Api
+from surrogym_client.improve import ImproveSettings, train_and_improve
+from surrogym_client.original.classic import pendulum
+from surrogym_client.original.gymnasium import GymnasiumEnvironment
+from surrogym_client.train import TrainProgress, TrainSettings
+from surrogym_client.transport import HttpSurrogate
+from surrogym_client.waiting import wait_for_design
+from surrogym_shared.spec import Design, EnvironmentSpec
+
+SETTINGS = TrainSettings(total_steps=400, num_envs=8, hyperparameters={"n_steps": 10, "batch_size": 40, "n_epochs": 1})
+ROUND_STEPS = 160 + 32 * 200  # two fifths of 400, and the visit: 32 lanes for a time limit of 200
+
+
+@contextmanager
+def sampling(url: str, name: str, spec: EnvironmentSpec) -> Iterator[None]:
+    """A sampler in a thread."""
+    over = threading.Event()
+
+    def work() -> None:
+        environment = GymnasiumEnvironment(spec)
+        with Api(url) as api:
+            while not over.is_set():
+                queries = api.claim(name, "thread", max_queries=8, wait_seconds=0.2).queries
+                if queries:
+                    api.add_samples(name, "thread", [answer(environment, query) for query in queries])
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+@pytest.mark.parametrize(
+    ("target", "initial", "real_steps", "rounds"),
+    [(0.9999999, 4, 4 + 2 * 3, 2), (0.501, 4, 6, 0)],
+    ids=["unsure", "ready"],
+)
+def test_rounds_go_on_until_the_design_is_ready(
+    server_process: ServerProcess, tmp_path: Path, target: float, initial: int, real_steps: int, rounds: int
+) -> None:
+    tight = {"theta": 1e-9, "speed": 1e-9, "reward": 1e-9} if rounds else {"theta": 1e3, "speed": 1e3, "reward": 1e3}
+    design = Design(initial=initial, budget=initial if rounds else 8, target=target, monte_carlo=64)
+    spec = pendulum().model_copy(update={"design": design, "tolerances": tight})
+    name, seen = f"improve-{uuid4().hex[:8]}", []
+    with Api(server_process.url) as api:
+        api.create_surrogate(name, spec)
+        with sampling(server_process.url, name, spec), HttpSurrogate(server_process.url, name) as port:
+            wait_for_design(api, name, 60)
+            improve = ImproveSettings(queries=3, rounds=2, patience_seconds=60)
+            result = train_and_improve(api, name, port, tmp_path / "p.zip", SETTINGS, improve, seen.append)
+        view = api.surrogate(name)
+    assert view.ledger.total == real_steps
+    assert view.ledger.initial == initial
+    assert result.virtual_steps == rounds * ROUND_STEPS + 400
+    assert result.path.exists()
+    steps = [now.steps for now in seen]
+    assert steps == sorted(steps)
+    assert all(isinstance(now, TrainProgress) and now.steps <= now.total_steps for now in seen)
