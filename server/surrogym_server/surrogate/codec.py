@@ -108,8 +108,8 @@ def _output(entry: dict[str, Any], tensors: dict[str, Tensor], prefix: str) -> O
 def _require_shapes(definition: EnvironmentDefinition, output: OutputModel) -> None:
     if (posterior := output.posterior) is None:
         return
-    q = torch.zeros(1, len(definition.coordinates))
-    u = torch.zeros(1, definition.action.size)
+    q = torch.zeros(1, len(definition.coordinates), dtype=torch.float64)
+    u = torch.zeros(1, definition.action.size, dtype=torch.float64)
     lead = q.new_zeros(1, len(definition.coordinates))
     width, n = encode(definition, output.feature_map, q, u, lead).shape[1], len(posterior.y)
     expected = {

@@ -41,3 +41,9 @@ def pendulum_model(pendulum_samples: Samples) -> SurrogateModel:
 @pytest.fixture(scope="session")
 def cartpole_model() -> SurrogateModel:
     return learn(definition_from_spec(cartpole()), random_steps(cartpole(), 12, seed=0)).model
+
+
+@pytest.fixture(scope="session")
+def paper_model(pendulum_samples: Samples) -> SurrogateModel:
+    design = pendulum().design.model_copy(update={"preset": "paper"})
+    return learn(definition_from_spec(pendulum().model_copy(update={"design": design})), pendulum_samples).model
