@@ -24,23 +24,32 @@ class ExactModel:
     pay: Callable[[Tensor, Tensor], Tensor]
     deviation: float = 0.0
     reward_deviation: Callable[[Tensor], Tensor] = lambda q: torch.zeros(len(q), dtype=torch.float64)
+    terminal_reward: float = 0.0
     reward: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(scale=1.0))
 
     @property
     def transitions(self) -> tuple[int, ...]:
         return self.definition.moving
 
-    def transition(self, q: Tensor, u: Tensor, *, noise: Tensor | None = None, deviations: bool = False) -> Transition:
+    def transition(
+        self,
+        q: Tensor,
+        u: Tensor,
+        *,
+        noise: Tensor | None = None,
+        deviations: bool = False,
+        reward_deviation: bool = False,
+    ) -> Transition:
         q_next, moving = self.move(q, u), list(self.definition.moving)
         if noise is not None:
             q_next[..., moving] += self.deviation * noise
         deviation = torch.full((len(q), len(moving)), self.deviation, dtype=q.dtype)
-        return Transition(settle(self.definition, q_next), deviation if deviations else None)
-
-    def predict_reward(
-        self, q: Tensor, u: Tensor, q_next: Tensor, terminated: Tensor, *, deviations: bool = True
-    ) -> tuple[Tensor, Tensor | None]:
-        return self.pay(q, u), self.reward_deviation(q) if deviations else None
+        return Transition(
+            settle(self.definition, q_next),
+            self.pay(q, u),
+            deviation if deviations else None,
+            self.reward_deviation(q) if reward_deviation else None,
+        )
 
 
 def exact_pendulum() -> ExactModel:

@@ -24,12 +24,10 @@ class OutputConfidence:
 
 def deviations(model: SurrogateModel, q: Tensor, u: Tensor) -> Tensor:
     """Latent deviation of every output, the reward last, at q (m, C) and u (m, F): (m, O)."""
-    transition = model.transition(q, u, deviations=True)
-    over = model.definition.terminated(transition.q_next)
-    _, reward = model.predict_reward(q, u, transition.q_next, over)
+    transition = model.transition(q, u, deviations=True, reward_deviation=True)
     assert transition.deviation is not None
-    assert reward is not None
-    return torch.cat([transition.deviation, reward[:, None]], -1)
+    assert transition.reward_deviation is not None
+    return torch.cat([transition.deviation, transition.reward_deviation[:, None]], -1)
 
 
 def certainty(deviation: Tensor, tolerance: Tensor | float) -> Tensor:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.surrogate.model import SurrogateModel, paid
 
 Array = NDArray[np.float64]
 
@@ -26,9 +26,9 @@ class PointPrediction:
 def predict_points(model: SurrogateModel, q: Array, u: Array) -> PointPrediction:
     """One mean step from each of q (n, C) under u (n, F)."""
     at, action = torch.from_numpy(q), torch.from_numpy(u)
-    q_next = model.transition(at, action).q_next
-    over = model.definition.terminated(q_next)
-    reward, deviation = model.predict_reward(at, action, q_next, over)
+    predicted = model.transition(at, action, reward_deviation=True)
+    q_next, deviation = predicted.q_next, predicted.reward_deviation
     assert deviation is not None
-    observation = model.definition.observe(q_next)
+    over = model.definition.terminated(q_next)
+    reward, observation = paid(model.terminal_reward, predicted.reward, over), model.definition.observe(q_next)
     return PointPrediction(*(t.numpy() for t in (q_next, observation, reward, deviation, over)))

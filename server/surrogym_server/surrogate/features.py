@@ -6,14 +6,15 @@ An output's map is chosen by evidence among ``candidates``; nothing here knows a
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import product
-from typing import Literal
+from itertools import groupby, product
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from surrogym_server.surrogate.definition import ActionDefinition, EnvironmentDefinition, wrap
+from surrogym_server.surrogate.definition import EnvironmentDefinition, wrap
 from surrogym_server.surrogate.distributions import scaling
 
 
@@ -57,47 +58,117 @@ def candidates(definition: EnvironmentDefinition, follows: bool) -> tuple[Featur
     return tuple(FeatureMap(s, a, lead) for s, a, lead in product(states, actions, leads))
 
 
+class Feature(NamedTuple):
+    """One input: a function of one entry of [q, u], of the lead, or one observation entry."""
+
+    function: Literal["affine", "cos", "sin", "wrapped", "equal", "observed", "lead"]
+    entry: int
+    centre: float = 0.0  # "equal": the value it is compared with
+    scale: float = 1.0
+
+
+def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tuple[Feature, ...]:
+    """The features of a map, in their order."""
+    made: list[Feature] = []
+    if feature_map.state == "observation":
+        made += [Feature("observed", entry) for entry in range(len(definition.observation_names))]
+    else:
+        for index in range(len(definition.coordinates)):
+            made += _of_coordinate(definition, feature_map, index)
+    for entry in range(definition.action.size):
+        made += _of_action(definition, feature_map, entry)
+    if feature_map.lead:
+        made += [
+            Feature("lead", place, *scaling(definition.coordinates[index].sampling))
+            for place, index in enumerate(leading(definition))
+        ]
+    return tuple(made)
+
+
 def encode(
     definition: EnvironmentDefinition, feature_map: FeatureMap, q: Tensor, u: Tensor, lead: Tensor | None = None
 ) -> Tensor:
     """Features of coordinates q (..., C), actions u (..., F) and, if the map reads it, the lead (..., L): (..., d)."""
-    if feature_map.state == "observation":
-        columns = list(definition.observe(q).unbind(-1))
-    else:
-        columns = _state_columns(definition, feature_map, q)
-    columns += _action_columns(definition.action, feature_map, u)
+    encoder = Encoder.of(definition, (feature_map,))
+    x = encoder(q, u)
     if feature_map.lead:
         assert lead is not None
-        for column, index in enumerate(leading(definition)):
-            centre, scale = scaling(definition.coordinates[index].sampling)
-            columns.append((lead[..., column] - centre) / scale)
-    return torch.stack(columns, -1)
+        x = encoder.with_lead(x, lead)
+    return x[..., list(encoder.inputs(feature_map))]
 
 
-def _state_columns(definition: EnvironmentDefinition, feature_map: FeatureMap, q: Tensor) -> list[Tensor]:
-    columns = []
-    for index, coordinate in enumerate(definition.coordinates):
-        value = q[..., index]
-        if coordinate.kind == "angle":
-            if feature_map.state in ("cos_sin", "both"):
-                columns += [value.cos(), value.sin()]
-            if feature_map.state in ("wrapped", "both"):
-                columns.append(wrap(value) * (math.sqrt(3) / math.pi))
-        else:
-            centre, scale = scaling(coordinate.sampling)
-            columns.append((value - centre) / scale)
-    return columns
+@dataclass(frozen=True)
+class Encoder:
+    """The features of several maps, each computed once and all of a function together."""
+
+    definition: EnvironmentDefinition
+    groups: tuple[tuple[str, slice | Tensor, Tensor, Tensor], ...]  # function, entries, centres, scales
+    columns: Mapping[Feature, int]
+
+    @classmethod
+    def of(cls, definition: EnvironmentDefinition, maps: Iterable[FeatureMap]) -> Encoder:
+        """Compile maps: their features by function, the lead's last."""
+        wanted = {feature for feature_map in maps for feature in features(definition, feature_map)}
+        ordered = sorted(wanted, key=lambda f: (f.function == "lead", f))
+        groups = tuple((function, *_group(tuple(same))) for function, same in groupby(ordered, lambda f: f.function))
+        return cls(definition, groups, {feature: column for column, feature in enumerate(ordered)})
+
+    def inputs(self, feature_map: FeatureMap) -> tuple[int, ...]:
+        """Columns of a map's features, in the map's order."""
+        return tuple(self.columns[feature] for feature in features(self.definition, feature_map))
+
+    def width(self, lead: bool) -> int:
+        """How many features there are, with or without the lead's."""
+        return sum(lead or feature.function != "lead" for feature in self.columns)
+
+    def __call__(self, q: Tensor, u: Tensor) -> Tensor:
+        """All features of coordinates q (..., C) and actions u (..., F) but those of the lead."""
+        raw = torch.cat([q, u], -1)
+        return torch.cat([self._values(*group, raw) for group in self.groups if group[0] != "lead"], -1)
+
+    def with_lead(self, x: Tensor, lead: Tensor) -> Tensor:
+        """All features: x (..., d) of a call, and those of the lead (..., L)."""
+        return torch.cat([x, *(self._values(*group, lead) for group in self.groups if group[0] == "lead")], -1)
+
+    def _values(self, function: str, entries: slice | Tensor, centre: Tensor, scale: Tensor, raw: Tensor) -> Tensor:
+        match function:
+            case "observed":
+                return self.definition.observe(raw[..., : len(self.definition.coordinates)])[..., entries]
+            case "cos":
+                return raw[..., entries].cos()
+            case "sin":
+                return raw[..., entries].sin()
+            case "wrapped":
+                return wrap(raw[..., entries]) * (math.sqrt(3) / math.pi)
+            case "equal":
+                return (raw[..., entries] == centre).to(raw.dtype)
+            case _:
+                return (raw[..., entries] - centre) / scale
 
 
-def _action_columns(action: ActionDefinition, feature_map: FeatureMap, u: Tensor) -> list[Tensor]:
-    columns = []
+def _of_coordinate(definition: EnvironmentDefinition, feature_map: FeatureMap, index: int) -> list[Feature]:
+    coordinate = definition.coordinates[index]
+    if coordinate.kind != "angle":
+        return [Feature("affine", index, *scaling(coordinate.sampling))]
+    circle = [Feature("cos", index), Feature("sin", index)] if feature_map.state in ("cos_sin", "both") else []
+    return circle + ([Feature("wrapped", index)] if feature_map.state in ("wrapped", "both") else [])
+
+
+def _of_action(definition: EnvironmentDefinition, feature_map: FeatureMap, entry: int) -> list[Feature]:
+    action, place = definition.action, len(definition.coordinates) + entry
     if action.kind == "box":
-        for entry, (low, high) in enumerate(zip(action.low, action.high, strict=True)):
-            columns.append((u[..., entry] - (low + high) / 2) * (math.sqrt(12) / (high - low)))
-        return columns
-    for entry, count in enumerate(action.nvec):
-        if feature_map.action == "one_hot" and count > 2:
-            columns += [(u[..., entry] == value).to(u.dtype) for value in range(count)]
-        else:
-            columns.append((2 * u[..., entry] / (count - 1) - 1) * math.sqrt(3 * (count - 1) / (count + 1)))
-    return columns
+        low, high = action.low[entry], action.high[entry]
+        return [Feature("affine", place, (low + high) / 2, (high - low) / math.sqrt(12))]
+    count = action.nvec[entry]
+    if feature_map.action == "one_hot" and count > 2:
+        return [Feature("equal", place, float(value)) for value in range(count)]
+    return [Feature("affine", place, (count - 1) / 2, math.sqrt((count**2 - 1) / 12))]
+
+
+def _group(same: tuple[Feature, ...]) -> tuple[slice | Tensor, Tensor, Tensor]:
+    """Entries, as a slice where they are neighbours, centres and scales."""
+    entries = [feature.entry for feature in same]
+    neighbours = entries == list(range(entries[0], entries[0] + len(entries)))
+    index = slice(entries[0], entries[-1] + 1) if neighbours else torch.tensor(entries)
+    centre, scale = torch.tensor([f[2:] for f in same], dtype=torch.float64).T
+    return index, centre, scale

@@ -6,16 +6,17 @@ Preset ``paper`` moves the observation instead, o' = o + f(o, u), and reads the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from surrogym_server.gp import Posterior
+from surrogym_server.gp import Output, Posterior, Serving, in_blocks
 from surrogym_server.surrogate.definition import EnvironmentDefinition, wrap
-from surrogym_server.surrogate.features import FeatureMap, encode, leading
+from surrogym_server.surrogate.features import Encoder, FeatureMap, leading
 from surrogym_server.surrogate.recover import ObservationInverse
 
 
@@ -50,10 +51,12 @@ class OutputModel:
 
 @dataclass(frozen=True)
 class Transition:
-    """Predicted step of m points: next coordinates (m, C) and, if asked for, the deviation of each output (m, M)."""
+    """Predicted step of m points."""
 
-    q_next: Tensor
-    deviation: Tensor | None
+    q_next: Tensor  # (m, C)
+    reward: Tensor  # (m,) mean, without penalty and without what a step that ends the episode pays; see ``paid``
+    deviation: Tensor | None  # (m, M) of each transition output, if asked for
+    reward_deviation: Tensor | None  # (m,) if asked for
 
 
 @dataclass(frozen=True)
@@ -73,66 +76,122 @@ class SurrogateModel:
         outputs = [_describe(o) for o in (*self.transitions, self.reward)]
         return {"outputs": outputs, "terminal_reward": self.terminal_reward, "samples": self.samples}
 
-    def transition(self, q: Tensor, u: Tensor, *, noise: Tensor | None = None, deviations: bool = False) -> Transition:
-        """Next coordinates of q (m, C) under u (m, F).
+    def transition(
+        self,
+        q: Tensor,
+        u: Tensor,
+        *,
+        noise: Tensor | None = None,
+        deviations: bool = False,
+        reward_deviation: bool = False,
+    ) -> Transition:
+        """The step from q (m, C) under u (m, F), in blocks of rows; variances only of what is asked for.
 
-        With ``noise`` (m, M), standard normal, each output is a draw, mean + deviation * noise, instead of its mean.
+        With ``noise`` (m, M), standard normal, each transition output is a draw, mean + deviation * noise, instead of
+        its mean.
         """
-        if self.definition.design.preset == "paper":
-            return self._observation_transition(q, u, noise, deviations)
-        return self._coordinate_transition(q, u, noise, deviations)
-
-    def predict_reward(
-        self, q: Tensor, u: Tensor, q_next: Tensor, terminated: Tensor, *, deviations: bool = True
-    ) -> tuple[Tensor, Tensor | None]:
-        """Mean and deviation (m,) of the reward of steps from q (m, C) under u (m, F) to q_next, before any penalty."""
-        state = q if self.definition.reward_timing == "before" else q_next
-        x = encode(self.definition, self.reward.feature_map, state, u)
-        bonus = self.terminal_reward * terminated
-        if not deviations:
-            return self.reward.mean(x) + bonus, None
-        mean, deviation = self.reward.mean_and_deviation(x)
-        return mean + bonus, deviation
+        wanted = self._columns if deviations or noise is not None else ()
+        wanted += (self._reward_column,) if reward_deviation else ()
+        rows = min(stage.serving.rows for stage in self._stages if stage)
+        q_next, mean, spread = in_blocks(rows, partial(self._step, wanted), q, u, noise)
+        return Transition(
+            q_next,
+            mean[:, -1],
+            spread[:, list(self._columns)] if deviations else None,
+            spread[:, -1] if reward_deviation else None,
+        )
 
     def means(self, q: Tensor, u: Tensor) -> Tensor:
         """Posterior mean of every output, increments and then the reward, at q (m, C) and u (m, F): (m, O)."""
-        q_next = self.transition(q, u).q_next
-        lead = q_next[..., leading(self.definition)]
-        changes = [o.mean(encode(self.definition, o.feature_map, q, u, lead)) for o in self.transitions]
-        reward, _ = self.predict_reward(q, u, q_next, self.definition.terminated(q_next), deviations=False)
-        return torch.stack([*changes, reward], -1)
+        q_next, mean, _ = self._step((), q, u, None)
+        reward = paid(self.terminal_reward, mean[:, -1], self.definition.terminated(q_next))
+        return torch.cat([mean[:, list(self._columns)], reward[:, None]], -1)
 
-    def _coordinate_transition(self, q: Tensor, u: Tensor, noise: Tensor | None, deviations: bool) -> Transition:
-        definition, q_next = self.definition, q.clone()
-        drawn: list[Tensor | None] = [None] * len(self.transitions)
-        encoded: dict[FeatureMap, Tensor] = {}
-        lead: Tensor | None = None
-        for column in self._order:
-            output, index = self.transitions[column], definition.moving[column]
-            if output.feature_map.lead and lead is None:
-                lead = clip(definition, q_next)[..., leading(definition)]
-            if output.feature_map not in encoded:
-                encoded[output.feature_map] = encode(definition, output.feature_map, q, u, lead)
-            change, drawn[column] = _change(output, encoded[output.feature_map], noise, column, deviations)
-            q_next[..., index] += change
-        q_next = settle(definition, q_next)
-        return Transition(q_next, torch.stack([d for d in drawn if d is not None], -1) if deviations else None)
+    def _step(
+        self, wanted: tuple[int, ...], q: Tensor, u: Tensor, noise: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Next coordinates, changes and reward (m, columns), and the deviations of the columns ``wanted``.
+
+        Each stage fills its own columns and leaves the others 0, so that they add up.
+        """
+        first, second, after = self._stages
+        kick = None if noise is None else self._in_columns(noise)
+        x = first.encoder(q, u)
+        mean, spread = first.predict(x, wanted, kick)
+        if second is not None:
+            lead = clip(self.definition, q + mean[:, :-1])[:, leading(self.definition)]
+            mean, spread = _sum((mean, spread), second.predict(first.encoder.with_lead(x, lead), wanted, kick))
+        q_next = self._moved(q, mean[:, :-1])
+        if after is not None:
+            mean, spread = _sum((mean, spread), after.predict(after.encoder(q_next, u), wanted, None))
+        return q_next, mean, spread
+
+    def _moved(self, q: Tensor, change: Tensor) -> Tensor:
+        if self.definition.design.preset == "paper":
+            return settle(self.definition, self._inverse(self.definition.observe(q) + change, q))
+        return settle(self.definition, q + change)
+
+    def _in_columns(self, noise: Tensor) -> Tensor:
+        placed = noise.new_zeros(len(noise), self._reward_column + 1)
+        placed[:, list(self._columns)] = noise
+        return placed
 
     @cached_property
-    def _order(self) -> tuple[int, ...]:
-        """Columns of the moving coordinates, those that read the lead last."""
-        return tuple(sorted(range(len(self.transitions)), key=lambda i: self.transitions[i].feature_map.lead))
+    def _columns(self) -> tuple[int, ...]:
+        """Where each transition output stands: at its coordinate; preset ``paper``: at its observation entry."""
+        paper = self.definition.design.preset == "paper"
+        return tuple(range(len(self.transitions))) if paper else self.definition.moving
 
-    def _observation_transition(self, q: Tensor, u: Tensor, noise: Tensor | None, deviations: bool) -> Transition:
-        x = encode(self.definition, self.transitions[0].feature_map, q, u)
-        changes = [_change(o, x, noise, i, deviations) for i, o in enumerate(self.transitions)]
-        o_next = self.definition.observe(q) + torch.stack([c for c, _ in changes], -1)
-        q_next = settle(self.definition, self._inverse(o_next, q))
-        return Transition(q_next, torch.stack([d for _, d in changes if d is not None], -1) if deviations else None)
+    @cached_property
+    def _reward_column(self) -> int:
+        paper = self.definition.design.preset == "paper"
+        return len(self.transitions) if paper else len(self.definition.coordinates)
+
+    @cached_property
+    def _stages(self) -> tuple[Stage, Stage | None, Stage | None]:
+        """What reads (q, u), what reads the lead as well, and a reward that reads the next state."""
+        after = self.definition.reward_timing == "after"
+        outputs = list(zip(self._columns, self.transitions, strict=True))
+        reward = [(self._reward_column, self.reward)]
+        outputs += [] if after else reward
+        leads = [o for o in outputs if o[1].feature_map.lead]
+        encoder = Encoder.of(self.definition, [o.feature_map for _, o in outputs])
+        width = self._reward_column + 1
+        return (
+            Stage.of(encoder, [o for o in outputs if not o[1].feature_map.lead], width),
+            Stage.of(encoder, leads, width) if leads else None,
+            Stage.of(Encoder.of(self.definition, [self.reward.feature_map]), reward, width) if after else None,
+        )
 
     @cached_property
     def _inverse(self) -> ObservationInverse:
         return ObservationInverse.of(self.definition)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Outputs predicted at once, from one set of features."""
+
+    encoder: Encoder
+    serving: Serving
+
+    @classmethod
+    def of(cls, encoder: Encoder, outputs: Sequence[tuple[int, OutputModel]], columns: int) -> Stage:
+        served = [Output(c, o.posterior, encoder.inputs(o.feature_map), o.centre, o.scale) for c, o in outputs]
+        lead = any(o.feature_map.lead for _, o in outputs)
+        return cls(encoder, Serving.of(served, columns, encoder.width(lead)))
+
+    def predict(self, x: Tensor, wanted: tuple[int, ...], kick: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Means at features x (m, d), moved by kick (m, O) deviations, and the deviations of the columns wanted."""
+        if not wanted:
+            return self.serving.mean(x), x.new_zeros(len(x), 0)
+        mean, spread = self.serving.mean_and_deviation(x, wanted)
+        return mean if kick is None else torch.addcmul(mean, spread, kick), spread
+
+
+def paid(terminal_reward: float, reward: Tensor, terminated: Tensor) -> Tensor:
+    """Rewards (m,), with what steps that end the episode, terminated (m,), pay beyond."""
+    return reward + terminal_reward * terminated if terminal_reward else reward
 
 
 def clip(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
@@ -155,15 +214,8 @@ def settle(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
     return inside
 
 
-def _change(
-    output: OutputModel, x: Tensor, noise: Tensor | None, column: int, deviations: bool
-) -> tuple[Tensor, Tensor | None]:
-    if noise is None and not deviations:
-        return output.mean(x), None
-    mean, deviation = output.mean_and_deviation(x)
-    if noise is not None:
-        mean = mean + deviation * noise[..., column]
-    return mean, deviation if deviations else None
+def _sum(one: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    return one[0] + other[0], one[1] + other[1]
 
 
 def _describe(output: OutputModel) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.surrogate.model import SurrogateModel, paid
 
 WEIGHT_FLOOR = 1e-12  # of the reward's variance, so that a certain particle's weight stays finite
 
@@ -28,10 +28,9 @@ class Moved:
 
 def move_mean(model: SurrogateModel, q: Tensor, u: Tensor, penalty: float, deviations: bool) -> Moved:
     """AUR-D: q (N, C) under u (N, F) goes to the mean of the next state."""
-    transition = model.transition(q, u, deviations=deviations)
-    over = model.definition.terminated(transition.q_next)
-    needs_deviation = deviations or penalty > 0
-    mean, spread = model.predict_reward(q, u, transition.q_next, over, deviations=needs_deviation)
+    transition = model.transition(q, u, deviations=deviations, reward_deviation=deviations or penalty > 0)
+    over, spread = model.definition.terminated(transition.q_next), transition.reward_deviation
+    mean = paid(model.terminal_reward, transition.reward, over)
     reward = mean if spread is None else mean - penalty * spread
     all_deviations = None
     if transition.deviation is not None and spread is not None:
@@ -55,13 +54,14 @@ def move_particles(
     lanes, count, size = particles.shape
     q, action = particles.flatten(0, 1), u.repeat_interleave(count, 0)
     flat_noise = None if noise is None else noise.flatten(0, 1)
-    transition = model.transition(q, action, noise=flat_noise, deviations=True)
+    transition = model.transition(q, action, noise=flat_noise, deviations=True, reward_deviation=True)
+    spread = transition.reward_deviation
     assert transition.deviation is not None
+    assert spread is not None
     moved = transition.q_next.reshape(lanes, count, size)
     output = mean_state(model.definition, moved)
     over = model.definition.terminated(output)
-    mean, spread = model.predict_reward(q, action, transition.q_next, over.repeat_interleave(count))
-    assert spread is not None
+    mean = paid(model.terminal_reward, transition.reward, over.repeat_interleave(count))
     weight = _weights(spread.reshape(lanes, count), model.reward.scale, weighting)
     deviation = torch.cat([transition.deviation, spread[:, None]], -1).reshape(lanes, count, len(model.transitions) + 1)
     penalised = (mean - penalty * spread).reshape(lanes, count)

@@ -1,14 +1,17 @@
 """Ill-conditioned data (noise 1e-8, near-duplicates, long length scales) against 60 digits of mpmath.
 
-The mean is within 1e-7 prior deviations, the variance within 1e-9 of the prior's plus 1e-3 of its own.
+The mean is within 1e-7 prior deviations, the variance within 1e-9 of the prior's plus 1e-3 of its own, whether by the
+posterior or compiled for serving, with exponents by products (whatever their bound says) or by differences.
 """
+
+import math
 
 import mpmath
 import numpy as np
 import pytest
 import torch
 
-from surrogym_server.gp import Hyperparameters, condition
+from surrogym_server.gp import Hyperparameters, Output, Posterior, Serving, condition, serving
 
 DIGITS = 60
 NOISE = 1e-8
@@ -41,9 +44,16 @@ def reference(hyper: Hyperparameters, x: np.ndarray, y: np.ndarray, at: np.ndarr
     return np.array([[float(v) for v in row] for row in rows])
 
 
+def served(posterior: Posterior, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    compiled = Serving.of([Output(0, posterior, (0, 1))], columns=1, width=2)
+    mean, deviation = compiled.mean_and_deviation(at, [0])
+    torch.testing.assert_close(compiled.mean(at), mean, rtol=0, atol=0)
+    return mean[:, 0], deviation[:, 0].square()
+
+
 @pytest.mark.parametrize("length", [0.5, 2.0, 20.0])
 @pytest.mark.parametrize(("linear", "quadratic"), [(0.0, 0.0), (0.7, 0.3)])
-def test_ill_conditioned(rng, length, linear, quadratic):
+def test_ill_conditioned(rng, monkeypatch, length, linear, quadratic):
     x = rng.normal(size=(12, 2))
     x = np.concatenate([x, x[:4] + 1e-4 * rng.normal(size=(4, 2)), x[:4] + 1e-6 * rng.normal(size=(4, 2))])
     y = np.sin(x[:, 0]) + 0.4 * x.sum(1) - 0.2 * x[:, 1] ** 2
@@ -52,7 +62,12 @@ def test_ill_conditioned(rng, length, linear, quadratic):
     with mpmath.workdps(DIGITS):
         mean, variance, prior = reference(hyper, x, y, at).T
     posterior = condition(hyper, torch.from_numpy(x), torch.from_numpy(y))
-    ours, latent = (t.numpy() for t in posterior.mean_and_variance(torch.from_numpy(at)))
     assert posterior.jitter == 0
-    assert np.max(np.abs(ours - mean) / np.sqrt(prior)) < 1e-7
-    assert np.all(np.abs(latent - variance) <= 1e-9 * prior + 1e-3 * variance)
+    predictions = [posterior.mean_and_variance(torch.from_numpy(at)), served(posterior, torch.from_numpy(at))]
+    for tolerance in (0.0, math.inf):
+        monkeypatch.setattr(serving, "MEAN_TOLERANCE", tolerance)
+        monkeypatch.setattr(serving, "VARIANCE_TOLERANCE", tolerance)
+        predictions.append(served(posterior, torch.from_numpy(at)))
+    for ours, latent in ((m.numpy(), v.numpy()) for m, v in predictions):
+        assert np.max(np.abs(ours - mean) / np.sqrt(prior)) < 1e-7
+        assert np.all(np.abs(latent - variance) <= 1e-9 * prior + 1e-3 * variance)

@@ -73,8 +73,8 @@ def test_a_real_pendulum_is_known_within_twenty_steps(seed, unseen):
     assert len(finished.samples) <= 20
     assert len(finished.samples) - finished.initial >= len(finished.samples) / 3, "a third of them adaptive"
     assert len(last.q) == 0
-    q_next = last.model.transition(unseen.q, unseen.u).q_next
-    reward, _ = last.model.predict_reward(unseen.q, unseen.u, q_next, unseen.terminated)
+    predicted = last.model.transition(unseen.q, unseen.u)
+    q_next, reward = predicted.q_next, predicted.reward
     error = torch.cat([q_next - unseen.q_next, (reward - unseen.reward)[:, None]], 1)
     error[:, 0] = wrap(error[:, 0])
     tolerances = torch.tensor(last.state.tolerances)

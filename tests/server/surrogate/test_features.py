@@ -9,7 +9,7 @@ import torch
 from surrogym_client.original.classic import acrobot, mountain_car_continuous, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.surrogate.definition import ActionDefinition
-from surrogym_server.surrogate.features import FeatureMap, candidates, encode, leading
+from surrogym_server.surrogate.features import Encoder, FeatureMap, candidates, encode, leading
 from surrogym_shared.spec import Design
 
 
@@ -73,3 +73,21 @@ def test_which_maps_are_compared(pendulum_definition, cartpole_definition):
     assert {m.action for m in three_actions} == {"value", "one_hot"}
     paper = definition_from_spec(pendulum().model_copy(update={"design": Design(preset="paper")}))
     assert candidates(paper, follows=True) == (FeatureMap("observation"),)
+
+
+@pytest.mark.parametrize("task", [pendulum, acrobot, mountain_car_continuous])
+def test_features_of_several_maps_at_once_are_those_of_each(task):
+    definition = definition_from_spec(task())
+    maps = candidates(definition, follows=True)
+    rng = torch.Generator().manual_seed(0)
+    q = torch.randn(6, len(definition.coordinates), generator=rng, dtype=torch.float64)
+    u = torch.randint(0, 2, (6, definition.action.size), generator=rng).double()
+    lead = torch.randn(6, len(leading(definition)), generator=rng, dtype=torch.float64)
+    encoder = Encoder.of(definition, maps)
+    x = encoder(q, u)
+    every = encoder.with_lead(x, lead)
+    assert (x.shape[1], every.shape[1]) == (encoder.width(False), encoder.width(True))
+    assert len(every.T.unique(dim=0)) == every.shape[1], "no feature is computed twice"
+    for feature_map in maps:
+        columns = list(encoder.inputs(feature_map))
+        assert torch.equal(every[:, columns], encode(definition, feature_map, q, u, lead))

@@ -10,6 +10,7 @@ from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
 from surrogym_server.surrogate.learn import learn
+from surrogym_server.surrogate.model import paid
 from surrogym_server.surrogate.samples import Samples
 from surrogym_shared.spec import Design
 
@@ -75,10 +76,8 @@ def test_an_ending_pays_what_it_paid_beyond_the_reward_process(cartpole_definiti
     few = Samples(*(getattr(failing, name)[:30] for name in failing.__dataclass_fields__))
     model = learn(cartpole_definition, few).model
     assert model.terminal_reward == pytest.approx(-10.0)
-    q, u = few.q[:1], few.u[:1]
-    for over, expected in ((True, -9.0), (False, 1.0)):
-        reward, _ = model.predict_reward(q, u, few.q_next[:1], torch.tensor([over]))
-        assert float(reward) == pytest.approx(expected)
+    reward = model.transition(few.q[:2], few.u[:2]).reward
+    assert paid(model.terminal_reward, reward, torch.tensor([True, False])).tolist() == pytest.approx([-9.0, 1.0])
 
 
 def test_without_an_ending_there_is_no_terminal_reward(pendulum_model):

@@ -63,7 +63,6 @@ def test_an_angle_that_reads_the_lead_follows_the_drawn_speed(pendulum_model):
     angle, speed = pendulum_model.transitions
     assert angle.feature_map.lead
     assert not speed.feature_map.lead
-    assert pendulum_model._order == (1, 0)
     q, u = torch.tensor([[0.5, 1.0]], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
     deviation = pendulum_model.transition(q, u, deviations=True).deviation
     kick = torch.tensor([[0.0, 1.0]], dtype=torch.float64) / deviation
@@ -77,12 +76,13 @@ def test_an_angle_that_reads_the_lead_follows_the_drawn_speed(pendulum_model):
 @pytest.mark.parametrize("timing", ["before", "after"])
 def test_the_reward_reads_the_state_that_its_timing_names(pendulum_model, timing):
     model = replace(pendulum_model, definition=replace(pendulum_model.definition, reward_timing=timing))
-    here, there = (torch.tensor([[a, 0.0]], dtype=torch.float64) for a in (0.0, 2.5))
-    u, going = torch.zeros(1, 1, dtype=torch.float64), torch.zeros(1, dtype=torch.bool)
-    reward, deviation = model.predict_reward(here, u, there, going)
-    assert float(reward) == pytest.approx(0.0 if timing == "before" else -6.25, abs=0.5)
-    assert float(deviation) > 0
-    assert model.predict_reward(here, u, there, going, deviations=False)[1] is None
+    q, u = torch.tensor([[0.0, 6.0]], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
+    predicted = model.transition(q, u, reward_deviation=True)
+    angle, speed = (q if timing == "before" else predicted.q_next)[0].tolist()
+    assert abs(predicted.q_next[0, 0] - q[0, 0]) > 0.2
+    assert float(predicted.reward) == pytest.approx(-(angle**2 + 0.1 * speed**2), abs=0.05)
+    assert float(predicted.reward_deviation) > 0
+    assert model.transition(q, u).reward_deviation is None
 
 
 def test_predicted_points_are_complete(pendulum_model, cartpole_model):

@@ -1,0 +1,210 @@
+"""Processes compiled for prediction: all outputs that read one set of inputs, in a few matrix products.
+
+The exponent of the squared exponential is linear in z(x) = [x, x^2, 1] (elementwise square):
+
+    -1/2 sum_j (x_j - X_ij)^2 / l_j^2 = sum_j x_j X_ij / l_j^2 - 1/2 sum_j x_j^2 / l_j^2 - 1/2 sum_j X_ij^2 / l_j^2,
+
+so exp(z A) holds the smooth covariances of all outputs with all their points. The polynomial parts are linear in z as
+well, z R, so their share of the mean collapses into z Q, Q = R beta, and all means are exp(z A) W + z Q.
+The variance, k(x, x) - |L^-1 k(X, x)|^2, is taken by a triangular solve for those outputs alone that it is asked of.
+
+The products lose digits that differences keep: |error of the exponent| <= (2 d + 2) eps (|x| + |X_i|)^2 / 2, inputs in
+length scales. ``of`` bounds what that does to the mean and the variance (see ``_error_bounds``), and where a bound is
+too large the exponent is taken by differences.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from surrogym_server.gp.blocks import in_blocks
+from surrogym_server.gp.kernel import Hyperparameters
+from surrogym_server.gp.posterior import Posterior
+
+BLOCK = 131_072  # covariances held at once: they stay in the cache, and memory is bounded at any batch size
+MIN_ROWS = 64
+MEAN_TOLERANCE = 1e-8  # of the prior's deviation
+VARIANCE_TOLERANCE = 5e-10  # of the prior's variance
+
+
+@dataclass(frozen=True)
+class Output:
+    """What one output is: centre + scale * process. Without a posterior it is constant.
+
+    ``inputs`` are the columns of x that its process reads, ``column`` is its place among the means.
+    """
+
+    column: int
+    posterior: Posterior | None
+    inputs: tuple[int, ...]
+    centre: float = 0.0
+    scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class _Process:
+    """One output's share of the products. D = 2 d + 1 entries of z, n points."""
+
+    span: slice  # its columns of A
+    inputs: Tensor  # columns of x
+    inverse_lengthscale: Tensor  # (d,)
+    scaled: Tensor  # (n, d) points in length scales
+    factor: Tensor  # (n, n) upper, L^T / sigma_f^2
+    polynomial: Tensor | None  # (D, n) R / sigma_f^2
+    prior: Tensor  # (D,) k(x, x) = z^2 prior
+    scale: float
+    mean_by_differences: bool
+    variance_by_differences: bool
+
+    def exponent(self, x: Tensor) -> Tensor:
+        """By differences, (m, n)."""
+        a = x.index_select(-1, self.inputs) * self.inverse_lengthscale
+        distance = torch.cdist(a, self.scaled, compute_mode="donot_use_mm_for_euclid_dist")
+        exponent: Tensor = distance.square_().mul_(-0.5)
+        return exponent
+
+    def deviation(self, x: Tensor, z: Tensor, smooth: Tensor) -> Tensor:
+        """Latent deviation (m,), in the output's unit."""
+        k = smooth[:, self.span]
+        if self.variance_by_differences and not self.mean_by_differences:
+            k = self.exponent(x).exp_()
+        if self.polynomial is not None:
+            k = torch.addmm(k, z, self.polynomial)
+        v = torch.linalg.solve_triangular(self.factor, k, upper=True, left=False)
+        variance = z.square() @ self.prior - torch.linalg.vector_norm(v, dim=1).square_()
+        deviation: Tensor = variance.clamp_min_(0).sqrt_().mul_(self.scale)
+        return deviation
+
+
+@dataclass(frozen=True)
+class Serving:
+    """Outputs over shared inputs x (m, d), ready to predict. O columns of means."""
+
+    exponents: Tensor  # A (D, S), S the points of all processes
+    weights: Tensor  # W (S, O), scales included
+    polynomials: Tensor  # Q (D, O), scales and centres included
+    processes: dict[int, _Process]  # by column; constant outputs have none
+
+    @classmethod
+    def of(cls, outputs: Sequence[Output], columns: int, width: int) -> Serving:
+        """Compile outputs for ``columns`` means of inputs (m, ``width``); columns without an output are 0."""
+        total = sum(len(o.posterior.y) for o in outputs if o.posterior is not None)
+        like = torch.zeros(0, dtype=torch.float64)
+        exponents, weights = like.new_zeros(2 * width + 1, total), like.new_zeros(total, columns)
+        polynomials = like.new_zeros(2 * width + 1, columns)
+        processes, begin = {}, 0
+        for output in outputs:
+            polynomials[-1, output.column] = output.centre
+            if (posterior := output.posterior) is None:
+                continue
+            span = slice(begin, begin := begin + len(posterior.y))
+            polynomial = _polynomial(posterior, output.inputs, width)
+            exponents[:, span] = _exponents(posterior, output.inputs, width)
+            weights[span, output.column] = output.scale * posterior.hyper.signal_variance * posterior.weights
+            polynomials[:, output.column] += output.scale * (polynomial @ posterior.weights)
+            processes[output.column] = _process(output, posterior, span, polynomial, width)
+        return cls(exponents, weights, polynomials, processes)
+
+    @property
+    def rows(self) -> int:
+        """How many rows are predicted at once."""
+        return max(MIN_ROWS, BLOCK // max(1, self.exponents.shape[1]))
+
+    def mean(self, x: Tensor) -> Tensor:
+        """Means at x (m, d), shape (m, O)."""
+        return in_blocks(self.rows, lambda rows: (self._means(*self._covariances(rows)),), x)[0]
+
+    def mean_and_deviation(self, x: Tensor, wanted: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Means at x (m, d), and the latent deviations of the columns ``wanted``, 0 in the others: (m, O) each."""
+
+        def block(rows: Tensor) -> tuple[Tensor, Tensor]:
+            z, smooth = self._covariances(rows)
+            mean = self._means(z, smooth)
+            deviation = torch.zeros_like(mean)
+            for column in self.processes.keys() & set(wanted):
+                deviation[:, column] = self.processes[column].deviation(rows, z, smooth)
+            return mean, deviation
+
+        mean, deviation = in_blocks(self.rows, block, x)
+        return mean, deviation
+
+    def _covariances(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """z (m, D), and the smooth covariances with the points of all processes, over their sigma_f^2, (m, S)."""
+        z = torch.cat([x, x * x, x.new_ones(len(x), 1)], -1)
+        exponent = z @ self.exponents
+        for process in self.processes.values():
+            if process.mean_by_differences:
+                exponent[:, process.span] = process.exponent(x)
+        return z, exponent.exp_()
+
+    def _means(self, z: Tensor, smooth: Tensor) -> Tensor:
+        return torch.addmm(z @ self.polynomials, smooth, self.weights)
+
+
+def _process(output: Output, posterior: Posterior, span: slice, polynomial: Tensor, width: int) -> _Process:
+    hyper = posterior.hyper
+    mean_error, variance_error = _error_bounds(posterior)
+    has_polynomial = hyper.linear_variance > 0 or hyper.quadratic_variance > 0
+    return _Process(
+        span=span,
+        inputs=torch.tensor(output.inputs),
+        inverse_lengthscale=1 / hyper.lengthscale,
+        scaled=posterior.x / hyper.lengthscale,
+        factor=posterior.factor.T / hyper.signal_variance,
+        polynomial=polynomial / hyper.signal_variance if has_polynomial else None,
+        prior=_prior(hyper, output.inputs, width),
+        scale=output.scale,
+        mean_by_differences=mean_error > MEAN_TOLERANCE,
+        variance_by_differences=variance_error > VARIANCE_TOLERANCE,
+    )
+
+
+def _exponents(posterior: Posterior, inputs: Sequence[int], width: int) -> Tensor:
+    """Columns of A, (D, n)."""
+    precision = posterior.hyper.lengthscale.square().reciprocal()
+    scaled = posterior.x / posterior.hyper.lengthscale
+    linear, quadratic = (posterior.x * precision).T, (-0.5 * precision)[:, None].expand(-1, len(scaled))
+    return _in_z(linear, quadratic, -0.5 * scaled.square().sum(1), inputs, width)
+
+
+def _polynomial(posterior: Posterior, inputs: Sequence[int], width: int) -> Tensor:
+    """Columns of R, (D, n)."""
+    hyper, x = posterior.hyper, posterior.x
+    constant = x.new_full((len(x),), hyper.linear_variance)
+    return _in_z(hyper.linear_variance * x.T, hyper.quadratic_variance * x.square().T, constant, inputs, width)
+
+
+def _prior(hyper: Hyperparameters, inputs: Sequence[int], width: int) -> Tensor:
+    """k(x, x) = z^2 p: the coefficients p (D,) of z^2 = [x^2, x^4, 1]."""
+    each = torch.ones(len(inputs), 1, dtype=hyper.lengthscale.dtype)
+    constant = each.new_full((1,), hyper.signal_variance + hyper.linear_variance)
+    return _in_z(hyper.linear_variance * each, hyper.quadratic_variance * each, constant, inputs, width)[:, 0]
+
+
+def _in_z(linear: Tensor, quadratic: Tensor, constant: Tensor, inputs: Sequence[int], width: int) -> Tensor:
+    """Coefficients of a function of some inputs, (d, n), (d, n) and (n,), as rows of z: (2 width + 1, n)."""
+    rows = linear.new_zeros(2 * width + 1, linear.shape[1])
+    at = torch.tensor(inputs)
+    rows[at], rows[width + at], rows[-1] = linear, quadratic, constant
+    return rows
+
+
+def _error_bounds(posterior: Posterior) -> tuple[float, float]:
+    """What taking the exponent by products may cost, for x up to twice as far from the origin as the farthest point.
+
+    With delta the largest error of an exponent, that of the mean is at most sigma_f^2 delta |beta|_1, in prior
+    deviations, and that of the variance 2 |L^-1 k| |L^-1 dk| <= 2 s sigma_f^2 delta sqrt(n) / sigma_n, in prior
+    variances; s^2 = sigma_f^2 + sigma_l^2 is the smallest prior variance.
+    """
+    hyper, (n, d) = posterior.hyper, posterior.x.shape
+    reach = float((posterior.x / hyper.lengthscale).square().sum(1).max())
+    delta = (2 * d + 2) * torch.finfo(posterior.x.dtype).eps * 4.5 * reach
+    s = math.sqrt(hyper.signal_variance + hyper.linear_variance)
+    mean = hyper.signal_variance * delta * float(posterior.weights.abs().sum()) / s
+    noise = math.sqrt(hyper.noise_variance + posterior.jitter)
+    return mean, 2 * hyper.signal_variance * delta * math.sqrt(n) / max(noise * s, 1e-300)
