@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import random
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from ipaddress import ip_address
-from typing import Any, Self
+from typing import Any, Self, TypeVar
+from urllib.request import getproxies, proxy_bypass
 
 import httpx
 from pydantic import ValidationError
@@ -22,13 +23,18 @@ from surrogym_client.errors import (
     Unavailable,
     error_from_problem,
 )
+from surrogym_client.stream import Stream, StreamUnavailable
 from surrogym_shared.codes import Problem
 
+T = TypeVar("T")
+
+JSON = "application/json"
 DEFAULT_URL = "http://127.0.0.1:8000"
 URL_VARIABLE = "SURROGYM_URL"
 TOKEN_VARIABLE = "SURROGYM_TOKEN"
 
-_NOT_SENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
+_NOT_SENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout, StreamUnavailable)
+_TIMEOUTS = (httpx.TimeoutException, TimeoutError)
 _GATEWAY_STATUSES = (502, 503, 504)
 _KEEPALIVE_SECONDS = 3.0  # shorter than the server's 5 s, so that a request rarely meets a closing connection
 
@@ -137,21 +143,59 @@ class Connection:
             ProtocolMismatch: what answered is no Surrogym server.
             ProblemError: the server refused; its subclass says why.
         """
-        client = self._open_client()
-        request = client.build_request(
-            method, self.url + path, content=body, params=params, timeout=self._timeout(timeout)
+        return self.persist(
+            self.attempt(method, path, body, params=params, timeout=timeout), repeatable=repeatable, retries=retries
         )
+
+    def attempt(
+        self,
+        method: str,
+        path: str,
+        body: bytes | None = None,
+        *,
+        params: Mapping[str, str | int] | None = None,
+        timeout: float | None = None,
+        media_type: str = JSON,
+    ) -> Callable[[], bytes]:
+        """One try of a request, for ``persist``; the arguments are those of ``send``."""
+
+        def send_once() -> bytes:
+            client = self._open_client()
+            request = client.build_request(
+                method,
+                self.url + path,
+                content=body,
+                params=params,
+                headers={"Content-Type": media_type, "Accept": media_type},
+                timeout=self._timeout(timeout),
+            )
+            return _body(client.send(request))
+
+        return send_once
+
+    def persist(self, attempt: Callable[[], T], *, repeatable: bool = True, retries: Retries | None = None) -> T:
+        """Try until it succeeds, is refused, or the retry budget is spent. Raises as ``send``."""
         delays: Iterator[float] | None = None
         while True:
             try:
-                return _body(client.send(request))
-            except (httpx.TransportError, Unavailable) as failure:
+                return attempt()
+            except (httpx.TransportError, OSError, Unavailable) as failure:
                 # A failed request's connection is closed with it, so a late reply answers nobody.
                 delays = (retries or self.retries).delays() if delays is None else delays
                 pause = next(delays, None) if _may_repeat(failure, repeatable) else None
                 if pause is None:
                     raise _given_up(failure, self.url) from failure
                 time.sleep(pause)
+
+    @property
+    def proxied(self) -> bool:
+        """Whether a proxy of the environment stands between; it carries HTTP alone."""
+        url = httpx.URL(self.url)
+        return not _is_loopback(self.url) and url.scheme in getproxies() and not proxy_bypass(url.host)
+
+    def stream_to(self, path: str) -> Stream:
+        """A stream of messages with this server, not connected yet."""
+        return Stream(self.url + path, self._token, self.timeouts.connect)
 
     @contextmanager
     def stream(self, path: str, headers: Mapping[str, str], idle_seconds: float) -> Iterator[Iterator[str]]:
@@ -192,9 +236,7 @@ def _checked(url: str) -> str:
 
 
 def _new_client(url: str, token: str | None) -> httpx.Client:
-    headers = {"Content-Type": "application/json", "Accept": "application/json"}
-    if token:
-        headers["Authorization"] = f"Bearer {token}"
+    headers = {"Authorization": f"Bearer {token}"} if token else {}
     limits = httpx.Limits(keepalive_expiry=_KEEPALIVE_SECONDS)
     return httpx.Client(headers=headers, limits=limits, trust_env=not _is_loopback(url))
 
@@ -232,6 +274,6 @@ def _given_up(failure: Exception, url: str) -> SurrogymClientError:
         return failure
     if isinstance(failure, _NOT_SENT):
         return ServerUnreachable(f"no Surrogym server answers at {url} ({failure})")
-    if isinstance(failure, httpx.TimeoutException):
+    if isinstance(failure, _TIMEOUTS):
         return RequestTimeout(f"the server at {url} did not answer in time")
     return ServerUnreachable(f"the connection to {url} was lost ({failure})")

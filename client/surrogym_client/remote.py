@@ -9,17 +9,25 @@ from __future__ import annotations
 from typing import Any
 
 from surrogym_client.env import RemoteEnv
-from surrogym_client.transport import HttpSurrogate
+from surrogym_client.transport import HttpSurrogate, Transport
 from surrogym_client.vector import RemoteVectorEnv
 
 
-def make_env(*, surrogate: str, url: str | None = None, token: str | None = None, **options: Any) -> RemoteEnv:
+def make_env(
+    *, surrogate: str, url: str | None = None, token: str | None = None, transport: Transport = "auto", **options: Any
+) -> RemoteEnv:
     """One lane of a surrogate; options are those of ``RemoteEnv``."""
-    return RemoteEnv(HttpSurrogate(url, surrogate, token), **options)
+    return RemoteEnv(HttpSurrogate(url, surrogate, token, transport=transport), **options)
 
 
 def make_vector_env(
-    *, num_envs: int, surrogate: str, url: str | None = None, token: str | None = None, **options: Any
+    *,
+    num_envs: int,
+    surrogate: str,
+    url: str | None = None,
+    token: str | None = None,
+    transport: Transport = "auto",
+    **options: Any,
 ) -> RemoteVectorEnv:
     """Many lanes of a surrogate; options are those of ``RemoteVectorEnv``."""
-    return RemoteVectorEnv(HttpSurrogate(url, surrogate, token), num_envs, **options)
+    return RemoteVectorEnv(HttpSurrogate(url, surrogate, token, transport=transport), num_envs, **options)

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 from surrogym_client.env import LOST
 from surrogym_client.lanes import Lanes, LaneStep, session_request
 from surrogym_client.spaces import space
-from surrogym_client.transport import HttpSurrogate, Retries, Timeouts
+from surrogym_client.transport import HttpSurrogate, Retries, Timeouts, Transport
 from surrogym_shared.port import SurrogatePort
 
 
@@ -31,6 +31,7 @@ class SurrogateVecEnv(VecEnv):
         token: bearer token; default ``SURROGYM_TOKEN``.
         timeouts: seconds per kind of request.
         retries: how long to go on after lost connections, lost replies and 503.
+        transport: how steps travel; see ``HttpSurrogate``.
         options: fields of ``OpenSession``: variant, seed, model, time_limit, penalty, occupancy, ...
 
     Raises:
@@ -50,9 +51,10 @@ class SurrogateVecEnv(VecEnv):
         token: str | None = None,
         timeouts: Timeouts | None = None,
         retries: Retries | None = None,
+        transport: Transport = "auto",
         **options: Any,
     ) -> None:
-        port = HttpSurrogate(url, surrogate, token, timeouts=timeouts, retries=retries)
+        port = HttpSurrogate(url, surrogate, token, timeouts=timeouts, retries=retries, transport=transport)
         self._open(port, num_envs, options)
 
     @classmethod

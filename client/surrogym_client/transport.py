@@ -1,56 +1,42 @@
-"""HttpSurrogate: the SurrogatePort over HTTP, in the JSON form of the step routes."""
+"""HttpSurrogate: the SurrogatePort of a server, over a stream of frames, or HTTP with frames or JSON."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import time
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any, Self, TypeVar
+from dataclasses import dataclass
+from typing import Literal, Self, TypeVar, get_args
 from urllib.parse import quote
 
-import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from surrogym_client.api import Api, check_protocol, new_key, parse
 from surrogym_client.connection import Connection, Retries, Timeouts
-from surrogym_client.errors import ProtocolMismatch, SessionLost, refused_here
+from surrogym_client.errors import ProtocolMismatch, SessionLost
+from surrogym_client.forms import UNREADABLE, BinaryForm, Form, JsonForm
+from surrogym_client.stream import Stream, StreamUnavailable
 from surrogym_shared import wire
-from surrogym_shared.codes import Code
+from surrogym_shared.frames import Shape
 from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult
 from surrogym_shared.spec import EnvironmentSpec
 
-__all__ = ["Api", "HttpSurrogate", "Retries", "Timeouts"]
+__all__ = ["Api", "HttpSurrogate", "Retries", "Timeouts", "Transport"]
+
+Transport = Literal["auto", "stream", "binary", "json"]
+T = TypeVar("T")
+
+_UPGRADE_PAUSE_SECONDS = 60.0  # until a stream is asked for again where HTTP alone gets through
 
 
-class _ResetBody(msgspec.Struct, forbid_unknown_fields=True):
-    """``wire.ResetReply``, decoded without validating each number again."""
+@dataclass
+class _Live:
+    """What is known of a session; ``seq`` is the last one answered."""
 
+    shape: Shape
     seq: int
-    observation: list[list[float]]
-    model_version: list[int]
-
-
-class _StepBody(msgspec.Struct, forbid_unknown_fields=True):
-    """``wire.StepReply``, decoded without validating each number again."""
-
-    seq: int
-    observation: list[list[float]]
-    reward: list[float]
-    terminated: list[bool]
-    truncated: list[bool]
-    model_version: list[int]
-    reward_mean: list[float]
-    final_lanes: list[int] = []
-    final_observation: list[list[float]] = []
-    deviation: list[list[float]] | None = None
-
-
-class _RolloutBody(msgspec.Struct, forbid_unknown_fields=True):
-    seq: int
-    steps: list[_StepBody]
-
-
-T = TypeVar("T", _ResetBody, _StepBody, _RolloutBody)
+    stream: Stream
 
 
 class HttpSurrogate:
@@ -67,8 +53,12 @@ class HttpSurrogate:
         token: bearer token; default ``SURROGYM_TOKEN``.
         timeouts: seconds per kind of request.
         retries: how long to go on after lost connections, lost replies and 503.
+        transport: how reset, step and rollout travel. ``stream`` is the fastest: frames over a WebSocket;
+            ``binary`` is frames over HTTP, ``json`` what a person can read. ``auto`` takes the stream, and
+            HTTP with frames where the stream does not get through.
 
     Raises:
+        ValueError: a transport there is none of.
         SurrogymClientError: every method; see ``surrogym_client.errors``.
 
     Example:
@@ -86,10 +76,16 @@ class HttpSurrogate:
         *,
         timeouts: Timeouts | None = None,
         retries: Retries | None = None,
+        transport: Transport = "auto",
     ) -> None:
+        if transport not in get_args(Transport):
+            raise ValueError(f"transport: expected one of {', '.join(get_args(Transport))}, got {transport!r}")
         self.surrogate = surrogate
         self.connection = Connection(url, token, timeouts, retries)
-        self._seq: dict[str, int] = {}
+        self.transport: Transport = transport
+        self._form: Form = JsonForm() if transport == "json" else BinaryForm()
+        self._live: dict[str, _Live] = {}
+        self._upgrade_after = math.inf if self.connection.proxied else 0.0  # by time.monotonic
         self._spec: EnvironmentSpec | None = None
 
     def __repr__(self) -> str:
@@ -103,6 +99,8 @@ class HttpSurrogate:
 
     def disconnect(self) -> None:
         """Close the sockets. Sessions stay, until ``close`` or their expiry; a later request connects anew."""
+        for live in list(self._live.values()):
+            live.stream.close()
         self.connection.close()
 
     def spec(self) -> EnvironmentSpec:
@@ -117,35 +115,37 @@ class HttpSurrogate:
         content = self.connection.send("POST", route, request.model_dump_json().encode())
         view = parse(wire.SessionView, content, route)
         check_protocol(view.protocol, self.connection.url)
-        self._seq[view.id] = view.seq
+        self._know(view)
         return view
 
     def reset(self, session: str, *, seed: int | Sequence[int] | None = None, mask: Bools | None = None) -> ResetResult:
-        body: dict[str, Any] = {}
-        if seed is not None:
-            body["seed"] = int(seed) if isinstance(seed, int | np.integer) else [int(s) for s in seed]
-        if mask is not None:
-            body["mask"] = np.asarray(mask, dtype=bool).tolist()
-        reply = self._in_sequence(session, "reset", body, _RESET, self.connection.timeouts.step)
-        return ResetResult(
-            observation=np.array(reply.observation, dtype=np.float32),
-            model_version=np.array(reply.model_version, dtype=np.int64),
+        return self._in_sequence(
+            session,
+            "reset",
+            lambda seq, shape: self._form.reset(seq, seed, mask, shape),
+            self._form.read_reset,
+            self.connection.timeouts.step,
         )
 
     def step(
         self, session: str, action: Floats | Ints, *, mask: Bools | None = None, deviations: bool = False
     ) -> StepResult:
-        body: dict[str, Any] = {"action": _sendable(action)}
-        if mask is not None:
-            body["mask"] = np.asarray(mask, dtype=bool).tolist()
-        if deviations:
-            body["deviations"] = True
-        return _step_result(self._in_sequence(session, "step", body, _STEP, self.connection.timeouts.step))
+        return self._in_sequence(
+            session,
+            "step",
+            lambda seq, shape: self._form.step(seq, action, mask, deviations, shape),
+            self._form.read_step,
+            self.connection.timeouts.step,
+        )
 
     def rollout(self, session: str, actions: Floats | Ints) -> list[StepResult]:
-        body = {"actions": _sendable(actions)}
-        reply = self._in_sequence(session, "rollout", body, _ROLLOUT, self.connection.timeouts.rollout)
-        return [_step_result(step) for step in reply.steps]
+        return self._in_sequence(
+            session,
+            "rollout",
+            lambda seq, shape: self._form.rollout(seq, np.asarray(actions), shape),
+            self._form.read_rollout,
+            self.connection.timeouts.rollout,
+        )
 
     def submit_occupancy(self, session: str, checkpoint: str) -> int:
         route = f"{_session(session)}/occupancy"
@@ -154,12 +154,12 @@ class HttpSurrogate:
 
     def close(self, session: str) -> None:
         """End the session; with the last one, the sockets are closed too."""
-        self._seq.pop(session, None)
+        self._forget(session)
         try:
             with suppress(SessionLost):
                 self.connection.send("DELETE", _session(session), retries=Retries(seconds=0))
         finally:
-            if not self._seq:
+            if not self._live:
                 self.disconnect()
 
     @property
@@ -167,62 +167,69 @@ class HttpSurrogate:
         return f"/v1/surrogates/{quote(self.surrogate, safe='')}"
 
     def _in_sequence(
-        self, session: str, what: str, body: dict[str, Any], decoder: msgspec.json.Decoder[T], timeout: float
+        self,
+        session: str,
+        what: str,
+        write: Callable[[int, Shape], bytes],
+        read: Callable[[bytes, Shape], tuple[int, T]],
+        timeout: float,
     ) -> T:
         """Send a request that changes the session under its next seq; an error leaves the seq as it was."""
-        seq = self._last_seq(session) + 1
-        route = f"{_session(session)}/{what}"
+        live = self._live.get(session) or self._look_up(session)
+        content = write(live.seq + 1, live.shape)
+        attempt = self._attempt(live, f"{_session(session)}/{what}", content, timeout)
         try:
-            content = self.connection.send("POST", route, _ENCODER.encode({"seq": seq, **body}), timeout=timeout)
-            reply = decoder.decode(content)
+            seq, result = self.connection.persist(lambda: read(attempt(), live.shape))
         except SessionLost:
-            del self._seq[session]
+            self._forget(session)
             raise
-        except msgspec.DecodeError as error:
-            raise ProtocolMismatch(f"unexpected answer of {route}: {error}") from error
-        self._seq[session] = reply.seq
-        return reply
+        except UNREADABLE as error:
+            live.stream.close()
+            raise ProtocolMismatch(f"unexpected answer of {_session(session)}/{what}: {error}") from error
+        if seq != live.seq + 1:
+            live.stream.close()
+            raise ProtocolMismatch(f"expected the answer to seq {live.seq + 1} of {session}, got {seq}")
+        live.seq = seq
+        return result
 
-    def _last_seq(self, session: str) -> int:
-        if session not in self._seq:
-            route = _session(session)
-            self._seq[session] = parse(wire.SessionView, self.connection.send("GET", route), route).seq
-        return self._seq[session]
+    def _attempt(self, live: _Live, route: str, content: bytes, timeout: float) -> Callable[[], bytes]:
+        """One try to get a request answered, to be called again after a failure."""
+        if self.transport == "stream":
+            return lambda: live.stream.exchange(content, timeout)
+        by_http = self.connection.attempt("POST", route, content, timeout=timeout, media_type=self._form.media_type)
+        if self.transport != "auto" or time.monotonic() < self._upgrade_after:
+            return by_http
+        first = True
 
+        def stream_first() -> bytes:
+            """A repeat goes by HTTP: what broke the stream may break it again, and HTTP says what it was."""
+            nonlocal first
+            if not first:
+                return by_http()
+            first = False
+            try:
+                return live.stream.exchange(content, timeout)
+            except StreamUnavailable:
+                answer = by_http()
+                self._upgrade_after = time.monotonic() + _UPGRADE_PAUSE_SECONDS
+                return answer
 
-_ENCODER = msgspec.json.Encoder()
-_RESET = msgspec.json.Decoder(_ResetBody)
-_STEP = msgspec.json.Decoder(_StepBody)
-_ROLLOUT = msgspec.json.Decoder(_RolloutBody)
+        return stream_first
+
+    def _look_up(self, session: str) -> _Live:
+        """A session that another client opened."""
+        route = _session(session)
+        return self._know(parse(wire.SessionView, self.connection.send("GET", route), route))
+
+    def _know(self, view: wire.SessionView) -> _Live:
+        stream = self.connection.stream_to(f"{_session(view.id)}/stream")
+        self._live[view.id] = _Live(Shape.of(view), view.seq, stream)
+        return self._live[view.id]
+
+    def _forget(self, session: str) -> None:
+        if live := self._live.pop(session, None):
+            live.stream.close()
 
 
 def _session(session: str) -> str:
     return f"/v1/sessions/{quote(session, safe='')}"
-
-
-def _sendable(action: NDArray[Any]) -> Any:
-    """Actions as nested lists; what JSON can't carry is refused here, the rest is the server's to judge."""
-    array = np.asarray(action)
-    if array.dtype.kind not in "biuf":
-        raise refused_here(Code.INVALID_REQUEST, f"action: expected an array of numbers, got dtype {array.dtype}")
-    if not np.isfinite(array).all():
-        place = np.argwhere(~np.isfinite(array))[0].tolist()
-        value = array[tuple(place)]
-        raise refused_here(Code.INVALID_REQUEST, f"action{place}: expected a finite number, got {value}")
-    return array.tolist()
-
-
-def _step_result(body: _StepBody) -> StepResult:
-    observation = np.array(body.observation, dtype=np.float32)
-    final = np.array(body.final_observation, dtype=np.float32)
-    return StepResult(
-        observation=observation,
-        reward=np.array(body.reward, dtype=np.float64),
-        terminated=np.array(body.terminated, dtype=bool),
-        truncated=np.array(body.truncated, dtype=bool),
-        final_lanes=np.array(body.final_lanes, dtype=np.int64),
-        final_observation=final.reshape(len(body.final_lanes), observation.shape[-1]),
-        model_version=np.array(body.model_version, dtype=np.int64),
-        reward_mean=np.array(body.reward_mean, dtype=np.float64),
-        deviation=None if body.deviation is None else np.array(body.deviation, dtype=np.float64),
-    )

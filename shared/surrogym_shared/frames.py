@@ -166,8 +166,9 @@ def read_reply(content: bytes) -> Reply:
 
 def reset_request(seq: int | None, seed: int | Sequence[int] | None, mask: Bools | None) -> ResetRequest:
     """Seed: one integer or one for each lane. Raises ``FrameError`` for a seed that int64 can't hold."""
-    several = None if seed is None or isinstance(seed, int) else _seeds(seed)
-    return ResetRequest(seq, seed if isinstance(seed, int) else several, None if mask is None else _flat(mask, BOOL))
+    packed = None if seed is None else _seeds(seed)
+    sent = int(seed) if isinstance(seed, int) else packed
+    return ResetRequest(seq, sent, None if mask is None else _flat(mask, BOOL))
 
 
 def step_request(seq: int | None, action: Array, mask: Bools | None, deviations: bool) -> StepRequest:
@@ -313,11 +314,11 @@ def _flags(name: str, view: memoryview, lanes: int) -> Bools:
     return flags
 
 
-def _seeds(seed: Sequence[int]) -> memoryview:
+def _seeds(seed: int | Sequence[int]) -> memoryview:
     try:
         return np.array(seed, dtype=INT64).data
     except (OverflowError, TypeError, ValueError) as error:
-        raise FrameError(f"seed: expected integers from 0 to 2^63 - 1, got {list(seed)[:8]}") from error
+        raise FrameError(f"seed: expected 0 to 2^63 - 1, got {seed}") from error
 
 
 def _read(decoder: msgspec.msgpack.Decoder[T], content: bytes) -> T:

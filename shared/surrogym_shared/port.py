@@ -1,6 +1,6 @@
 """SurrogatePort: what a trainer needs of a surrogate, whatever carries it.
 
-HTTP implements it now; the binary stream and the in-process surrogate implement the same laws, and one suite tests all.
+JSON and frames over HTTP, the stream of frames and the in-process surrogate implement it; one suite tests them all.
 Arrays are numpy: observation (N, D) float32, action (N, F) or (N,), reward (N,) float64, flags (N,) bool.
 """
 

@@ -57,7 +57,7 @@ def step(seq: int) -> Answer:
 
 
 def surrogate(server: ScriptedServer) -> HttpSurrogate:
-    return HttpSurrogate(server.url, "pendulum", retries=QUICK)
+    return HttpSurrogate(server.url, "pendulum", retries=QUICK, transport="json")
 
 
 def bodies(server: ScriptedServer) -> list[dict[str, object]]:
@@ -175,14 +175,13 @@ def test_an_answer_that_is_no_step_is_refused(body: str):
 
 
 def test_the_last_session_takes_its_sockets_with_it():
-    with scripted_server(view(), step(1), reply(""), step(5)) as server:
+    with scripted_server(view(), step(1), reply(""), view(seq=4), step(5)) as server:
         port = surrogate(server)
         port.open(wire.OpenSession(num_envs=2))
         port.step("abc", ACTION)
         port.close("abc")
         assert port.connection._client.is_closed
-        port._seq["def"] = 4  # a session goes on, and the client connects anew
-        port.step("def", ACTION)
+        port.step("def", ACTION)  # a session that another client opened: this one connects anew
         port.disconnect()
 
 

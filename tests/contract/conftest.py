@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -10,7 +11,7 @@ import pytest
 import surrogym_client.errors
 import surrogym_server.errors
 from surrogym_client.api import Api
-from surrogym_client.transport import HttpSurrogate
+from surrogym_client.transport import HttpSurrogate, Transport
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.surrogate.codec import from_bytes
@@ -27,9 +28,23 @@ class Harness:
 
 
 @pytest.fixture(scope="session")
-def http_harness(pendulum_server):
-    with HttpSurrogate(pendulum_server.url, "pendulum") as port:
-        yield Harness("http", port, surrogym_client.errors)
+def json_harness(pendulum_server):
+    yield from remote_harness(pendulum_server.url, "json")
+
+
+@pytest.fixture(scope="session")
+def binary_harness(pendulum_server):
+    yield from remote_harness(pendulum_server.url, "binary")
+
+
+@pytest.fixture(scope="session")
+def stream_harness(pendulum_server):
+    yield from remote_harness(pendulum_server.url, "stream")
+
+
+def remote_harness(url: str, transport: Transport) -> Iterator[Harness]:
+    with HttpSurrogate(url, "pendulum", transport=transport) as port:
+        yield Harness(transport, port, surrogym_client.errors)
 
 
 @pytest.fixture(scope="session")
@@ -41,7 +56,7 @@ def local_harness(pendulum_server):
     return Harness("local", port, surrogym_server.errors)
 
 
-@pytest.fixture(params=["http", "local"])
+@pytest.fixture(params=["local", "json", "binary", "stream"])
 def harness(request: pytest.FixtureRequest) -> Harness:
     """One implementation after the other; a new one adds its fixture above, and its name here."""
     return request.getfixturevalue(f"{request.param}_harness")

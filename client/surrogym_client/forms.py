@@ -1,0 +1,214 @@
+"""The two forms of reset, step and rollout: JSON, and the frames of ``surrogym_shared.frames``.
+
+A form turns arguments into the body of a request, and the body of a reply into ``(seq, result)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol, TypeVar
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.errors import error_from_problem, refused_here
+from surrogym_shared import frames
+from surrogym_shared.codes import Code, Problem
+from surrogym_shared.frames import FrameError, Shape
+from surrogym_shared.port import Bools, ResetResult, StepResult
+
+Array = NDArray[Any]
+Seeds = int | Sequence[int] | None
+
+UNREADABLE = (msgspec.DecodeError, FrameError)  # what the readers raise for what is no reply
+
+R = TypeVar("R", frames.ResetReply, frames.StepReply, frames.RolloutReply)
+
+
+class Form(Protocol):
+    """How requests and replies are written. Writers raise ``InvalidInput`` for what can't be sent."""
+
+    media_type: str
+
+    def reset(self, seq: int, seed: Seeds, mask: Bools | None, shape: Shape) -> bytes: ...
+
+    def step(self, seq: int, action: Array, mask: Bools | None, deviations: bool, shape: Shape) -> bytes: ...
+
+    def rollout(self, seq: int, actions: Array, shape: Shape) -> bytes: ...
+
+    def read_reset(self, content: bytes, shape: Shape) -> tuple[int, ResetResult]: ...
+
+    def read_step(self, content: bytes, shape: Shape) -> tuple[int, StepResult]: ...
+
+    def read_rollout(self, content: bytes, shape: Shape) -> tuple[int, list[StepResult]]: ...
+
+
+class BinaryForm:
+    """Frames: arrays travel as they lie in memory, so sizes are checked here, where they are still known."""
+
+    media_type = frames.MEDIA_TYPE
+
+    def reset(self, seq: int, seed: Seeds, mask: Bools | None, shape: Shape) -> bytes:
+        try:
+            return frames.encode(frames.reset_request(seq, _plain(seed), _mask(mask, shape)))
+        except FrameError as error:
+            raise refused_here(Code.INVALID_REQUEST, str(error)) from error
+
+    def step(self, seq: int, action: Array, mask: Bools | None, deviations: bool, shape: Shape) -> bytes:
+        rows = _rows("action", action, (shape.lanes, shape.action))
+        return frames.encode(frames.step_request(seq, rows, _mask(mask, shape), deviations))
+
+    def rollout(self, seq: int, actions: Array, shape: Shape) -> bytes:
+        rows = _rows("actions", actions, (len(actions), shape.lanes, shape.action))
+        return frames.encode(frames.rollout_request(seq, rows))
+
+    def read_reset(self, content: bytes, shape: Shape) -> tuple[int, ResetResult]:
+        reply = _reply(content, frames.ResetReply)
+        return reply.seq, frames.reset_result(reply, shape)
+
+    def read_step(self, content: bytes, shape: Shape) -> tuple[int, StepResult]:
+        reply = _reply(content, frames.StepReply)
+        return reply.seq, frames.step_result(reply.step, shape)
+
+    def read_rollout(self, content: bytes, shape: Shape) -> tuple[int, list[StepResult]]:
+        reply = _reply(content, frames.RolloutReply)
+        return reply.seq, [frames.step_result(step, shape) for step in reply.steps]
+
+
+class _ResetBody(msgspec.Struct, forbid_unknown_fields=True):
+    """``wire.ResetReply``, decoded without validating each number again."""
+
+    seq: int
+    observation: list[list[float]]
+    model_version: list[int]
+
+
+class _StepBody(msgspec.Struct, forbid_unknown_fields=True):
+    """``wire.StepReply``, decoded without validating each number again."""
+
+    seq: int
+    observation: list[list[float]]
+    reward: list[float]
+    terminated: list[bool]
+    truncated: list[bool]
+    model_version: list[int]
+    reward_mean: list[float]
+    final_lanes: list[int] = []
+    final_observation: list[list[float]] = []
+    deviation: list[list[float]] | None = None
+
+
+class _RolloutBody(msgspec.Struct, forbid_unknown_fields=True):
+    seq: int
+    steps: list[_StepBody]
+
+
+_ENCODER = msgspec.json.Encoder()
+_RESET = msgspec.json.Decoder(_ResetBody)
+_STEP = msgspec.json.Decoder(_StepBody)
+_ROLLOUT = msgspec.json.Decoder(_RolloutBody)
+
+
+class JsonForm:
+    """JSON: what a person can read, at several times the cost."""
+
+    media_type = "application/json"
+
+    def reset(self, seq: int, seed: Seeds, mask: Bools | None, shape: Shape) -> bytes:
+        del shape  # the server's to judge
+        body = {"seq": seq, "seed": _plain(seed), "mask": _listed(mask)}
+        return _ENCODER.encode({name: value for name, value in body.items() if value is not None})
+
+    def step(self, seq: int, action: Array, mask: Bools | None, deviations: bool, shape: Shape) -> bytes:
+        del shape
+        body = {"seq": seq, "action": _sendable(action), "mask": _listed(mask), "deviations": deviations or None}
+        return _ENCODER.encode({name: value for name, value in body.items() if value is not None})
+
+    def rollout(self, seq: int, actions: Array, shape: Shape) -> bytes:
+        del shape
+        return _ENCODER.encode({"seq": seq, "actions": _sendable(actions)})
+
+    def read_reset(self, content: bytes, shape: Shape) -> tuple[int, ResetResult]:
+        del shape
+        body = _RESET.decode(content)
+        observation = np.array(body.observation, dtype=np.float32)
+        return body.seq, ResetResult(observation, np.array(body.model_version, dtype=np.int64))
+
+    def read_step(self, content: bytes, shape: Shape) -> tuple[int, StepResult]:
+        body = _STEP.decode(content)
+        return body.seq, _step_result(body, shape)
+
+    def read_rollout(self, content: bytes, shape: Shape) -> tuple[int, list[StepResult]]:
+        body = _ROLLOUT.decode(content)
+        return body.seq, [_step_result(step, shape) for step in body.steps]
+
+
+def _reply(content: bytes, kind: type[R]) -> R:
+    """A frame of the kind that was asked for; raises the error that a problem frame stands for."""
+    reply = frames.read_reply(content)
+    if isinstance(reply, kind):
+        return reply
+    if isinstance(reply, frames.ProblemReply):
+        fields = msgspec.structs.asdict(reply)
+        del fields["seq"]
+        raise error_from_problem(Problem(**fields))
+    raise FrameError(f"expected a {kind.__name__}, got a {type(reply).__name__}")
+
+
+def _rows(what: str, raw: Array, expected: tuple[int, ...]) -> Array:
+    """Actions with all their axes; the last may be left out where it has one entry."""
+    array = np.asarray(raw)
+    _require_numbers(array)
+    if array.ndim == len(expected) - 1 and expected[-1] == 1:
+        array = array[..., None]
+    if array.shape != expected:
+        raise refused_here(Code.INVALID_REQUEST, f"{what}: expected shape {expected}, got {np.shape(raw)}")
+    return array
+
+
+def _mask(mask: Bools | None, shape: Shape) -> Bools | None:
+    if mask is not None and np.shape(mask) != (shape.lanes,):
+        raise refused_here(Code.INVALID_REQUEST, f"mask: expected {shape.lanes} entries, got shape {np.shape(mask)}")
+    return mask
+
+
+def _plain(seed: Seeds) -> int | list[int] | None:
+    if seed is None:
+        return None
+    return int(seed) if isinstance(seed, int | np.integer) else [int(s) for s in seed]
+
+
+def _listed(mask: Bools | None) -> list[bool] | None:
+    return None if mask is None else np.asarray(mask, dtype=bool).tolist()
+
+
+def _sendable(action: Array) -> Any:
+    """Actions as nested lists; what JSON can't carry is refused here, the rest is the server's to judge."""
+    array = np.asarray(action)
+    _require_numbers(array)
+    if not np.isfinite(array).all():
+        place = np.argwhere(~np.isfinite(array))[0].tolist()
+        value = array[tuple(place)]
+        raise refused_here(Code.INVALID_REQUEST, f"action{place}: expected a finite number, got {value}")
+    return array.tolist()
+
+
+def _require_numbers(array: Array) -> None:
+    if array.dtype.kind not in "biuf":
+        raise refused_here(Code.INVALID_REQUEST, f"action: expected an array of numbers, got dtype {array.dtype}")
+
+
+def _step_result(body: _StepBody, shape: Shape) -> StepResult:
+    final = np.array(body.final_observation, dtype=np.float32)
+    return StepResult(
+        observation=np.array(body.observation, dtype=np.float32),
+        reward=np.array(body.reward, dtype=np.float64),
+        terminated=np.array(body.terminated, dtype=bool),
+        truncated=np.array(body.truncated, dtype=bool),
+        final_lanes=np.array(body.final_lanes, dtype=np.int64),
+        final_observation=final.reshape(len(body.final_lanes), shape.observation),
+        model_version=np.array(body.model_version, dtype=np.int64),
+        reward_mean=np.array(body.reward_mean, dtype=np.float64),
+        deviation=None if body.deviation is None else np.array(body.deviation, dtype=np.float64),
+    )

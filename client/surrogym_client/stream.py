@@ -1,0 +1,168 @@
+"""A stream of binary messages to the server: WebSocket without threads, one message there and one back.
+
+The protocol is websockets' own; this is the blocking socket around it. A background thread, as a chat program
+needs, would add two switches between threads to every step.
+"""
+
+from __future__ import annotations
+
+import socket
+from threading import Lock
+from typing import Any
+from urllib.parse import urlsplit
+
+import httpx
+from pydantic import ValidationError
+from websockets.client import ClientProtocol
+from websockets.exceptions import InvalidHandshake, InvalidStatus, WebSocketException
+from websockets.frames import CloseCode, Frame, Opcode
+from websockets.http11 import Response
+from websockets.protocol import State
+from websockets.uri import parse_uri
+
+from surrogym_client.errors import error_from_problem, refused_here
+from surrogym_shared.codes import Code, Problem
+
+CHUNK_BYTES = 262_144
+NO_SUCH_ROUTE = (Code.NOT_FOUND, Code.METHOD_NOT_ALLOWED)
+DEFAULT_PORTS = {"http": 80, "https": 443}
+
+
+class StreamUnavailable(OSError):
+    """No stream: nothing listens, or what does knows none. Nothing was sent."""
+
+
+class StreamLost(OSError):
+    """The connection ended before the reply; the message may have been carried out."""
+
+
+class Stream:
+    """One connection, opened by its first message. Any failure closes it, so that a late reply finds nobody.
+
+    Threads take turns; a copy (it pickles) connects anew.
+
+    Args:
+        url: of the stream, beginning with http or https.
+        token: bearer token, sent with the handshake.
+        connect_seconds: limit of connecting and of the handshake.
+    """
+
+    def __init__(self, url: str, token: str | None, connect_seconds: float) -> None:
+        self._url = url
+        self._token = token
+        self._connect_seconds = connect_seconds
+        self._socket: socket.socket | None = None
+        self._protocol: ClientProtocol
+        self._turn = Lock()
+
+    def __reduce__(self) -> tuple[type[Stream], tuple[str, str | None, float]]:
+        return Stream, (self._url, self._token, self._connect_seconds)
+
+    def exchange(self, message: bytes, seconds: float) -> bytes:
+        """Send a message and wait for its reply.
+
+        Raises:
+            StreamUnavailable: there is no connection, and none could be made.
+            StreamLost: it ended; the next message connects anew.
+            TimeoutError: no reply for so many seconds.
+            ProblemError: the server refused the connection, or so large a message.
+        """
+        with self._turn:
+            try:
+                connected = self._socket or self._connect()
+                connected.settimeout(seconds)
+                self._protocol.send_binary(message)
+                self._flush(connected)
+                return self._receive(connected)
+            except WebSocketException as error:
+                self.close()
+                raise StreamLost(f"the stream broke: {error}") from error
+            except BaseException:
+                self.close()
+                raise
+
+    def close(self) -> None:
+        """Drop the connection; a later message makes another."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _connect(self) -> socket.socket:
+        try:
+            self._socket = _open_socket(self._url, self._connect_seconds)
+            self._shake_hands(self._socket)
+        except InvalidStatus as refusal:
+            raise _refused(refusal.response) from refusal
+        except (OSError, EOFError, InvalidHandshake) as error:
+            raise StreamUnavailable(str(error) or "no answer to the handshake") from error
+        return self._socket
+
+    def _shake_hands(self, connected: socket.socket) -> None:
+        self._protocol = ClientProtocol(parse_uri(self._url.replace("http", "ws", 1)), max_size=None)
+        request = self._protocol.connect()
+        if self._token:
+            request.headers["Authorization"] = f"Bearer {self._token}"
+        self._protocol.send_request(request)
+        self._flush(connected)
+        while self._protocol.state is State.CONNECTING and self._protocol.handshake_exc is None:
+            self._feed(connected)
+        if self._protocol.handshake_exc is not None:
+            raise self._protocol.handshake_exc
+        self._protocol.events_received()  # the response itself
+
+    def _receive(self, connected: socket.socket) -> bytes:
+        parts: list[Any] = []
+        while True:
+            for event in self._protocol.events_received():
+                assert isinstance(event, Frame)
+                if event.opcode is Opcode.CLOSE:
+                    raise self._closed()
+                if event.opcode in (Opcode.BINARY, Opcode.CONT):
+                    parts.append(event.data)
+                    if event.fin:
+                        return bytes(parts[0]) if len(parts) == 1 else b"".join(parts)
+            self._feed(connected)
+
+    def _feed(self, connected: socket.socket) -> None:
+        """Hand what arrives to the protocol, and send what it answers: pongs, and the end of a handshake."""
+        if chunk := connected.recv(CHUNK_BYTES):
+            self._protocol.receive_data(chunk)
+        else:
+            self._protocol.receive_eof()
+        self._flush(connected)
+        if not chunk and self._protocol.handshake_exc is None:
+            raise self._closed()
+
+    def _flush(self, connected: socket.socket) -> None:
+        for chunk in self._protocol.data_to_send():
+            if chunk:
+                connected.sendall(chunk)
+
+    def _closed(self) -> Exception:
+        close = self._protocol.close_rcvd
+        if close is None:
+            return StreamLost("the stream ended without a word")
+        if close.code == CloseCode.MESSAGE_TOO_BIG:
+            return refused_here(Code.TOO_LARGE, f"expected a smaller message: {close.reason}")
+        return StreamLost(f"the stream was closed with code {close.code}")
+
+
+def _refused(response: Response) -> Exception:
+    """What the answer to a handshake means: a problem with this session, or no stream at all."""
+    try:
+        problem = Problem.model_validate_json(response.body or b"")
+    except ValidationError:
+        return StreamUnavailable(f"the upgrade was refused with status {response.status_code}")
+    if problem.code in NO_SUCH_ROUTE:
+        return StreamUnavailable("the server knows no stream, or something on the way takes the upgrade out")
+    return error_from_problem(problem)
+
+
+def _open_socket(url: str, seconds: float) -> socket.socket:
+    parts = urlsplit(url)
+    assert parts.hostname is not None
+    opened = socket.create_connection((parts.hostname, parts.port or DEFAULT_PORTS[parts.scheme]), seconds)
+    opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    if parts.scheme == "https":
+        return httpx.create_ssl_context().wrap_socket(opened, server_hostname=parts.hostname)
+    return opened

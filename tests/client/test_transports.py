@@ -1,0 +1,209 @@
+"""Which transport a step takes: the stream where it gets through, HTTP where it does not, and for repeats."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import pickle
+from http.server import BaseHTTPRequestHandler
+
+import numpy as np
+import pytest
+
+from support.scripted_server import Answer, ScriptedServer, problem, reply, scripted_server
+from surrogym_client import errors
+from surrogym_client.connection import Connection, Retries
+from surrogym_client.transport import HttpSurrogate
+from surrogym_shared import frames, wire
+from surrogym_shared.codes import Code
+from surrogym_shared.port import StepResult
+
+QUICK = Retries(seconds=2.0, first_delay=0.01, longest_delay=0.05)
+ACTION = np.array([[0.5], [-0.5]])
+WEBSOCKET_KEY = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"  # RFC 6455, 1.3
+
+
+def view(seq: int = 0) -> Answer:
+    session = wire.SessionView(
+        id="abc",
+        surrogate="pendulum",
+        num_envs=2,
+        variant="deterministic",
+        seed=1,
+        autoreset_mode="same_step",
+        model="latest",
+        model_version=[1, 1],
+        seq=seq,
+        time_limit=200,
+        penalty=0.0,
+        observation_space=wire.BoxSpace(low=[None, None], high=[None, None]),
+        action_space=wire.BoxSpace(low=[-2.0], high=[2.0]),
+        outputs=["angle", "reward"],
+        idle_seconds=60.0,
+    )
+    return reply(session.model_dump_json())
+
+
+def step(seq: int) -> Answer:
+    result = StepResult(
+        observation=np.zeros((2, 2), dtype=np.float32),
+        reward=np.full(2, float(seq)),
+        terminated=np.zeros(2, dtype=bool),
+        truncated=np.zeros(2, dtype=bool),
+        final_lanes=np.zeros(0, dtype=np.int64),
+        final_observation=np.zeros((0, 2), dtype=np.float32),
+        model_version=np.ones(2, dtype=np.int64),
+        reward_mean=np.zeros(2),
+        deviation=None,
+    )
+    return binary(frames.encode(frames.step_reply(seq, result)))
+
+
+def binary(content: bytes) -> Answer:
+    def answer(handler: BaseHTTPRequestHandler) -> None:
+        handler.send_response(200)
+        handler.send_header("Content-Type", frames.MEDIA_TYPE)
+        handler.send_header("Content-Length", str(len(content)))
+        handler.end_headers()
+        handler.wfile.write(content)
+
+    return answer
+
+
+def upgrade_and_cut(handler: BaseHTTPRequestHandler) -> None:
+    """Accept the stream, take one message, and cut the connection."""
+    key = handler.headers["Sec-WebSocket-Key"].encode()
+    handler.send_response(101)
+    handler.send_header("Upgrade", "websocket")
+    handler.send_header("Connection", "Upgrade")
+    handler.send_header("Sec-WebSocket-Accept", base64.b64encode(hashlib.sha1(key + WEBSOCKET_KEY).digest()).decode())
+    handler.end_headers()
+    handler.rfile.read(2)
+    handler.close_connection = True
+
+
+def calls(server: ScriptedServer) -> list[tuple[str, str]]:
+    """Method and last part of the path, after the opening."""
+    return [(r.method, r.path.rpartition("/")[2]) for r in server.received[1:]]
+
+
+def seqs(server: ScriptedServer) -> list[int | None]:
+    return [frames.read_request(r.body).seq for r in server.received[1:] if r.method == "POST"]
+
+
+REFUSALS = [reply("<html>", 426, "text/html"), problem(Code.NOT_FOUND), reply("<html>", 502, "text/html")]
+
+
+@pytest.mark.parametrize("refusal", REFUSALS)
+def test_where_the_upgrade_is_refused_frames_go_by_http(refusal: Answer):
+    with (
+        scripted_server(view(), refusal, step(1), step(2)) as server,
+        HttpSurrogate(server.url, "pendulum", retries=QUICK) as port,
+    ):
+        port.open(wire.OpenSession(num_envs=2))
+        assert [port.step("abc", ACTION).reward[0] for _ in range(2)] == [1.0, 2.0]
+        assert calls(server) == [("GET", "stream"), ("POST", "step"), ("POST", "step")], "not asked for again at once"
+        assert server.received[-1].headers["Content-Type"] == frames.MEDIA_TYPE
+        assert seqs(server) == [1, 2]
+
+
+def test_a_step_lost_with_its_stream_is_repeated_by_http_under_its_seq():
+    script = [view(), upgrade_and_cut, step(1), upgrade_and_cut, step(2)]
+    with scripted_server(*script) as server, HttpSurrogate(server.url, "pendulum", retries=QUICK) as port:
+        port.open(wire.OpenSession(num_envs=2))
+        assert [port.step("abc", ACTION).reward[0] for _ in range(2)] == [1.0, 2.0]
+        assert calls(server) == [("GET", "stream"), ("POST", "step")] * 2, "the next step asks for a stream again"
+        assert seqs(server) == [1, 2]
+
+
+def test_the_stream_alone_is_tried_again_and_given_up():
+    with (
+        scripted_server(view(), reply("<html>", 426, "text/html")) as server,
+        HttpSurrogate(server.url, "pendulum", retries=Retries(seconds=0.2), transport="stream") as port,
+    ):
+        port.open(wire.OpenSession(num_envs=2))
+        with pytest.raises(errors.ServerUnreachable, match="refused with status 426"):
+            port.step("abc", ACTION)
+        assert len(calls(server)) > 1
+        assert set(calls(server)) == {("GET", "stream")}
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"no frame", "unexpected answer of /v1/sessions/abc/step: expected a frame"),
+        (
+            frames.encode(frames.ResetReply(1, memoryview(b""), memoryview(b""))),
+            "expected a StepReply, got a ResetReply",
+        ),
+    ],
+)
+def test_an_answer_that_is_no_step_is_refused(content: bytes, message: str):
+    with (
+        scripted_server(view(), binary(content)) as server,
+        HttpSurrogate(server.url, "pendulum", transport="binary") as port,
+    ):
+        port.open(wire.OpenSession(num_envs=2))
+        with pytest.raises(errors.ProtocolMismatch, match=message):
+            port.step("abc", ACTION)
+
+
+def test_an_answer_to_another_request_is_refused():
+    with (
+        scripted_server(view(), step(7)) as server,
+        HttpSurrogate(server.url, "pendulum", transport="binary") as port,
+    ):
+        port.open(wire.OpenSession(num_envs=2))
+        with pytest.raises(errors.ProtocolMismatch, match="expected the answer to seq 1 of abc, got 7"):
+            port.step("abc", ACTION)
+
+
+@pytest.mark.parametrize(
+    ("action", "mask", "message"),
+    [
+        (np.zeros((3, 1)), None, r"action: expected shape \(2, 1\), got \(3, 1\)"),
+        (np.zeros((1, 2)), None, r"action: expected shape \(2, 1\), got \(1, 2\)"),
+        (np.array([["left"], ["right"]]), None, r"expected an array of numbers, got dtype <U5"),
+        (ACTION, np.ones(3, dtype=bool), r"mask: expected 2 entries, got shape \(3,\)"),
+    ],
+)
+def test_what_a_frame_would_hide_is_refused_before_it_is_sent(action, mask, message: str):
+    with scripted_server(view()) as server, HttpSurrogate(server.url, "pendulum", transport="binary") as port:
+        port.open(wire.OpenSession(num_envs=2))
+        with pytest.raises(errors.InvalidInput, match=message):
+            port.step("abc", action, mask=mask)
+        assert len(server.received) == 1
+
+
+def test_there_are_four_transports():
+    with pytest.raises(ValueError, match="expected one of auto, stream, binary, json, got 'grpc'"):
+        HttpSurrogate(None, "pendulum", transport="grpc")  # type: ignore[arg-type]
+
+
+def test_by_itself_it_takes_the_stream(pendulum_server):
+    """No step goes by HTTP: the client's pool has seen none since the session was opened."""
+    with HttpSurrogate(pendulum_server.url, "pendulum") as port:
+        session = port.open(wire.OpenSession(num_envs=2)).id
+        port.connection.close()
+        port.reset(session)
+        port.step(session, ACTION)
+        assert port.connection._client.is_closed
+        copy = pickle.loads(pickle.dumps(port))
+        assert copy.step(session, ACTION).reward.shape == (2,)
+        assert not copy.connection._client._transport._pool.connections
+        copy.disconnect()
+        with pytest.raises(errors.SeqConflict):
+            port.step(session, -ACTION)
+        port.close(session)
+
+
+def test_no_stream_is_asked_for_through_a_proxy(monkeypatch: pytest.MonkeyPatch):
+    for name in ("http_proxy", "HTTP_PROXY", "no_proxy", "NO_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    assert not Connection("http://far.example").proxied
+    monkeypatch.setenv("http_proxy", "http://proxy.example:3128")
+    assert Connection("http://far.example").proxied
+    assert not Connection("https://far.example").proxied
+    assert not Connection("http://127.0.0.1:8000").proxied
+    monkeypatch.setenv("no_proxy", "far.example")
+    assert not Connection("http://far.example").proxied
