@@ -15,7 +15,7 @@ from surrogym_server.errors import InvalidInput, NotReset
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.model import SurrogateModel
 from surrogym_server.virtual.dynamics import Moved, move_mean, move_particles
-from surrogym_server.virtual.lanes import ENDED, NEW, RUNNING, LaneState
+from surrogym_server.virtual.lanes import ENDED, EVERY, NEW, RUNNING, Chosen, LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
 from surrogym_server.virtual.start import start_coordinates, start_particles
 
@@ -108,20 +108,17 @@ def step(
         NotReset: a lane that was never reset, or that ended under autoreset disabled.
     """
     definition = model.definition
-    chosen = _mask(mask, len(lanes))
-    waiting = _waiting(settings, lanes, chosen)
-    moving = chosen & ~waiting
+    moving, beginning = _divided(settings, lanes, _mask(mask, len(lanes)))
     moved = _move(model, settings, lanes.take(moving), torch.from_numpy(u)[moving], deviations)
-    after, truncated = _advanced(settings, lanes, moving, moved)
-    terminated = _scatter(moving, moved.terminated)
-    ended = moving & (terminated | truncated)
+    after, cut = _advanced(settings, lanes, moving, moved)
+    terminated, truncated = _scatter(moving, moved.terminated), _scatter(moving, cut)
     final_lanes = torch.zeros(0, dtype=torch.int64)
     final_observation = np.zeros((0, len(definition.observation_names)), dtype=np.float32)
-    beginning = waiting
-    if settings.autoreset_mode == "same_step" and bool(ended.any()):
-        final_lanes = ended.nonzero()[:, 0]
-        final_observation = _observe(definition, after.take(ended))
-        beginning = ended
+    if settings.autoreset_mode == "same_step":
+        beginning = terminated | truncated
+        if bool(beginning.any()):
+            final_lanes = beginning.nonzero()[:, 0]
+            final_observation = _observe(definition, after.take(beginning))
     after = _begin(definition, settings, after, beginning)
     return after, Transition(
         observation=_observe(definition, after),
@@ -136,17 +133,22 @@ def step(
     )
 
 
-def _waiting(settings: VirtualSettings, lanes: LaneState, chosen: Tensor) -> Tensor:
-    """Lanes (N,) that this step resets instead of moving."""
-    ended = chosen & (lanes.phase == ENDED)
-    refused = chosen & (lanes.phase == NEW)
-    if settings.autoreset_mode != "next_step":
-        refused = refused | ended
+def _divided(settings: VirtualSettings, lanes: LaneState, chosen: Chosen) -> tuple[Chosen, Tensor]:
+    """Which of the chosen lanes this step moves, and which (N,) it resets instead."""
+    running = lanes.phase == RUNNING
+    if bool(running.all()):
+        return chosen, torch.zeros_like(running)
+    if isinstance(chosen, slice):
+        chosen = torch.ones_like(running)
+    waiting = chosen & (lanes.phase == ENDED)
+    refused = chosen & ~running
+    if settings.autoreset_mode == "next_step":
+        refused = refused & ~waiting
     if bool(refused.any()):
         which = refused.nonzero()[:, 0].tolist()
         shown = f"{which[:8]}{' and more' if len(which) > 8 else ''}"
         raise NotReset(f"lanes {shown} have no running episode: reset them before stepping")
-    return ended
+    return chosen & ~waiting, waiting
 
 
 def _move(model: SurrogateModel, settings: VirtualSettings, lanes: LaneState, u: Tensor, deviations: bool) -> Moved:
@@ -158,18 +160,18 @@ def _move(model: SurrogateModel, settings: VirtualSettings, lanes: LaneState, u:
     return move_particles(model, lanes.particles, u, settings.penalty, noise, settings.weighting)
 
 
-def _advanced(settings: VirtualSettings, lanes: LaneState, moving: Tensor, moved: Moved) -> tuple[LaneState, Tensor]:
-    """Lanes after their move, and which were truncated (N,). As in Gymnasium, a step may end an episode both ways."""
+def _advanced(settings: VirtualSettings, lanes: LaneState, moving: Chosen, moved: Moved) -> tuple[LaneState, Tensor]:
+    """Lanes after their move, and which of those moved were truncated. As in Gymnasium, a step may end both ways."""
     before = lanes.take(moving)
     elapsed = before.elapsed + 1
     cut = torch.zeros_like(moved.terminated) if settings.time_limit is None else elapsed >= settings.time_limit
     phase = torch.where(moved.terminated | cut, ENDED, RUNNING).to(torch.int8)
     after = replace(before, elapsed=elapsed, phase=phase, q=moved.q, particles=moved.particles)
-    return lanes.put(moving, after), _scatter(moving, cut)
+    return lanes.put(moving, after), cut
 
 
-def _begin(definition: EnvironmentDefinition, settings: VirtualSettings, lanes: LaneState, chosen: Tensor) -> LaneState:
-    if not bool(chosen.any()):
+def _begin(definition: EnvironmentDefinition, settings: VirtualSettings, lanes: LaneState, chosen: Chosen) -> LaneState:
+    if not isinstance(chosen, slice) and not bool(chosen.any()):
         return lanes
     fresh = lanes.take(chosen)
     fresh = replace(fresh, episode=fresh.episode + 1, elapsed=torch.zeros_like(fresh.elapsed))
@@ -181,7 +183,7 @@ def _begin(definition: EnvironmentDefinition, settings: VirtualSettings, lanes: 
     return lanes.put(chosen, replace(fresh, phase=phase, q=q, particles=particles))
 
 
-def _seeded(lanes: LaneState, seed: int | Sequence[int], chosen: Tensor) -> LaneState:
+def _seeded(lanes: LaneState, seed: int | Sequence[int], chosen: Chosen) -> LaneState:
     outside = [s for s in ([seed] if isinstance(seed, int) else seed) if not 0 <= s < 2**63]
     if outside:
         raise InvalidInput(f"seed: expected 0 to 2^63 - 1, got {outside[0]}")
@@ -191,11 +193,12 @@ def _seeded(lanes: LaneState, seed: int | Sequence[int], chosen: Tensor) -> Lane
         if len(seed) != len(lanes):
             raise InvalidInput(f"seed: expected an integer or {len(lanes)} of them, got {len(seed)}")
         seeds, numbers = torch.tensor(list(seed), dtype=torch.int64), torch.zeros_like(lanes.lane)
+    replaced = torch.ones(len(lanes), dtype=torch.bool) if isinstance(chosen, slice) else chosen
     return replace(
         lanes,
-        seed=torch.where(chosen, seeds, lanes.seed),
-        lane=torch.where(chosen, numbers, lanes.lane),
-        episode=torch.where(chosen, -1, lanes.episode),
+        seed=torch.where(replaced, seeds, lanes.seed),
+        lane=torch.where(replaced, numbers, lanes.lane),
+        episode=torch.where(replaced, -1, lanes.episode),
     )
 
 
@@ -204,18 +207,18 @@ def _observe(definition: EnvironmentDefinition, lanes: LaneState) -> Floats:
     return observation
 
 
-def _mask(mask: Bools | None, count: int) -> Tensor:
+def _mask(mask: Bools | None, count: int) -> Chosen:
     if mask is None:
-        return torch.ones(count, dtype=torch.bool)
+        return EVERY
     if len(mask) != count:
         raise InvalidInput(f"mask: expected {count} entries, got {len(mask)}")
     return torch.as_tensor(mask, dtype=torch.bool)
 
 
-def _scatter(mask: Tensor, values: Tensor) -> Tensor:
-    """Values of the masked lanes among all N, zero elsewhere."""
-    if bool(mask.all()):
+def _scatter(chosen: Chosen, values: Tensor) -> Tensor:
+    """Values of the chosen lanes among all N, zero elsewhere."""
+    if isinstance(chosen, slice):
         return values
-    full = values.new_zeros(len(mask), *values.shape[1:])
-    full[mask] = values
+    full = values.new_zeros(len(chosen), *values.shape[1:])
+    full[chosen] = values
     return full

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 NEW, RUNNING, ENDED = 0, 1, 2  # phase of a lane
+EVERY = slice(None)  # in place of a mask of all lanes: nothing is copied
+Chosen = Tensor | slice  # a mask (N,), or EVERY
 
 
 @dataclass(frozen=True)
@@ -28,13 +30,17 @@ class LaneState:
     def __len__(self) -> int:
         return len(self.seed)
 
-    def take(self, index: NDArray[Any] | Tensor) -> LaneState:
+    def take(self, index: NDArray[Any] | Chosen) -> LaneState:
         """The lanes of an index or mask, in its order."""
+        if isinstance(index, slice):
+            return self
         at = torch.as_tensor(index)
         return LaneState(*(getattr(self, f.name)[at] for f in fields(self)))
 
-    def put(self, index: NDArray[Any] | Tensor, other: LaneState) -> LaneState:
+    def put(self, index: NDArray[Any] | Chosen, other: LaneState) -> LaneState:
         """These lanes with those of an index or mask replaced by ``other``."""
+        if isinstance(index, slice):
+            return other
         at = torch.as_tensor(index)
         replaced = []
         for f in fields(self):
