@@ -126,7 +126,7 @@ def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum
     assert trained.code == 0, trained.err
     card = json.loads((tmp_path / "policy.json").read_text())
     assert (card["surrogate"], card["seed"]) == (pendulum, 3)
-    assert card["virtual_steps"] == trained.json["virtual_steps"] >= 2000
+    assert 0 < card["virtual_steps"] == trained.json["virtual_steps"] <= 2000
     evaluated = on_server("evaluate", "policy.zip", "--episodes", "3", "--json", "--quiet")
     assert evaluated.code == 0, evaluated.err
     assert evaluated.json["steps"] == 600

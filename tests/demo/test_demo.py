@@ -84,7 +84,7 @@ def test_a_small_demo_from_start_to_run_folder(demo, tmp_path):
     assert queries["initial"] + queries["adaptive"] == queries["total"] <= 8
     assert 0 < metrics["confidence_index"] <= 1
     assert metrics["fidelity"]["confidence_index"] == metrics["confidence_index"]
-    assert metrics["virtual_steps"] >= 8000
+    assert 0 < metrics["virtual_steps"] <= 8000
     assert set(metrics["seconds"]) == {"design", "train", "evaluate", "total"}
     assert metrics["seconds"]["total"] >= metrics["seconds"]["train"]
     assert metrics["real_return"]["episodes"] == len(metrics["returns"]) == 3

@@ -97,7 +97,7 @@ def crossed(field: str, value: Any) -> dict[str, Any]:
         ("coordinates.0.sampling.low", 4.0, "uniform range crosses: expected low < high, got [4.0, 3.1416]"),
         ("coordinates.1.bounds.low", 9.0, "bounds cross"),
         ("action.low", [3.0], "action 0 crosses"),
-        ("coordinates.1.sampling.high", 9.0, "leaves the high bound 8.0"),
+        ("coordinates.1.sampling.high", 9.0, "leaves its bounds [-8.0, 8.0]"),
         ("coordinates.0.colour", "red", "Extra inputs are not permitted, got 'red'"),
         ("coordinates.0.sampling.low", float("nan"), "finite number, got nan"),
         ("start", {}, "start distribution lacks ['theta', 'theta_dot']"),
