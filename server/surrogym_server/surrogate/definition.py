@@ -122,37 +122,26 @@ class EnvironmentDefinition:
     def angles(self) -> tuple[int, ...]:
         return tuple(i for i, c in enumerate(self.coordinates) if c.kind == "angle")
 
-    @cached_property
-    def _termination_terms(self) -> TermSet:
-        terms = [i.term for group in self.termination_groups for i in group]
-        return compile_terms(terms, len(self.coordinates))
-
     def terminated(self, q: Tensor) -> Tensor:
         """Whether an episode ends at q (..., C), shape (...): any group all of whose inequalities hold."""
-        over = torch.zeros(q.shape[:-1], dtype=torch.bool, device=q.device)
         if not self.termination_groups:
-            return over
-        values = self._termination_terms(q)
-        column = 0
-        for group in self.termination_groups:
-            holds = torch.ones_like(over)
-            for inequality in group:
-                holds &= compare(values[..., column], inequality.relation, inequality.value)
-                column += 1
-            over |= holds
-        return over
+            return torch.zeros(q.shape[:-1], dtype=torch.bool, device=q.device)
+        terms, sign, threshold, membership = self._termination
+        holds = sign * terms(q) >= threshold
+        return ((~holds).to(membership.dtype) @ membership == 0).any(-1)
 
-
-def compare(value: Tensor, relation: Relation, bound: float) -> Tensor:
-    match relation:
-        case "<":
-            return value < bound
-        case "<=":
-            return value <= bound
-        case ">":
-            return value > bound
-        case ">=":
-            return value >= bound
+    @cached_property
+    def _termination(self) -> tuple[TermSet, Tensor, Tensor, Tensor]:
+        """Every inequality as sign * term >= threshold, exactly, (K,), and which group it belongs to, (K, G)."""
+        inequalities = [i for group in self.termination_groups for i in group]
+        groups = [g for g, group in enumerate(self.termination_groups) for _ in group]
+        sign = np.array([1.0 if i.relation in (">", ">=") else -1.0 for i in inequalities])
+        bound = sign * np.array([i.value for i in inequalities])
+        strict = np.array([i.relation in ("<", ">") for i in inequalities])
+        threshold = np.where(strict, np.nextafter(bound, np.inf), bound)
+        membership = np.eye(len(self.termination_groups))[groups]
+        terms = compile_terms([i.term for i in inequalities], len(self.coordinates))
+        return terms, torch.from_numpy(sign), torch.from_numpy(threshold), torch.from_numpy(membership)
 
 
 def wrap(angle: Tensor) -> Tensor:

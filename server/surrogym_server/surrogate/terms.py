@@ -1,13 +1,15 @@
-"""Terms: sums of c phi(q) with phi in {1, a.q, sin(a.q), cos(a.q)}, evaluated as three matrix products."""
+"""Terms: sums of c phi(q) with phi in {1, a.q, sin(a.q), cos(a.q)}, evaluated as two matrix products."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import torch
 from torch import Tensor
+from torch.nn.functional import linear
 
 Function = Literal["one", "linear", "sin", "cos"]
 
@@ -30,53 +32,48 @@ class Term:
 
 @dataclass(frozen=True)
 class TermSet:
-    """T terms over q (..., C), compiled: value = constant + q A + sin(q W) S + cos(q W) R, clipped."""
+    """T terms over q (..., C), compiled: value = constant + [q, sin(q W), cos(q W)] A, clipped."""
 
     constant: Tensor  # (T,)
-    linear: Tensor  # (C, T)
-    frequencies: Tensor  # (C, P)
-    sine: Tensor  # (P, T)
-    cosine: Tensor  # (P, T)
-    low: Tensor  # (T,)
-    high: Tensor  # (T,)
+    frequencies: Tensor  # W (C, P)
+    coefficients: Tensor  # A^T (T, C + 2 P)
+    low: Tensor | None  # (T,), None where no term is clipped
+    high: Tensor | None  # (T,)
 
     def __call__(self, q: Tensor) -> Tensor:
         """Values at q (..., C), shape (..., T)."""
-        value = self.constant + q @ self.linear
+        basis = q
         if self.frequencies.shape[1]:
             phase = q @ self.frequencies
-            value = value + phase.sin() @ self.sine + phase.cos() @ self.cosine
-        return torch.clamp(value, self.low, self.high)
+            basis = torch.cat([q, phase.sin(), phase.cos()], -1)
+        value = linear(basis, self.coefficients, self.constant)
+        return value if self.low is None else torch.clamp(value, self.low, self.high)
 
     def to(self, device: torch.device) -> TermSet:
-        return TermSet(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+        tensors = (getattr(self, field.name) for field in fields(self))
+        return TermSet(*(None if t is None else t.to(device) for t in tensors))  # type: ignore[arg-type]
 
 
 def compile_terms(terms: Sequence[Term], coordinates: int) -> TermSet:
     """Compile terms over C coordinates. Equal frequencies are computed once."""
-    count = len(terms)
-    constant = torch.zeros(count, dtype=torch.float64)
-    linear = torch.zeros(coordinates, count, dtype=torch.float64)
     frequencies = sorted({p.weights for t in terms for p in t.parts if p.function in ("sin", "cos")})
-    sine = torch.zeros(len(frequencies), count, dtype=torch.float64)
-    cosine = torch.zeros_like(sine)
-    for column, term in enumerate(terms):
+    first = {"sin": coordinates, "cos": coordinates + len(frequencies)}
+    constant = torch.zeros(len(terms), dtype=torch.float64)
+    coefficients = torch.zeros(len(terms), coordinates + 2 * len(frequencies), dtype=torch.float64)
+    for row, term in enumerate(terms):
         for part in term.parts:
-            match part.function:
-                case "one":
-                    constant[column] += part.coefficient
-                case "linear":
-                    linear[:, column] += part.coefficient * torch.tensor(part.weights, dtype=torch.float64)
-                case "sin":
-                    sine[frequencies.index(part.weights), column] += part.coefficient
-                case "cos":
-                    cosine[frequencies.index(part.weights), column] += part.coefficient
+            if part.function == "one":
+                constant[row] += part.coefficient
+            elif part.function == "linear":
+                weights = torch.tensor(part.weights, dtype=torch.float64)
+                coefficients[row, :coordinates] += part.coefficient * weights
+            else:
+                coefficients[row, first[part.function] + frequencies.index(part.weights)] += part.coefficient
+    clipped = any(math.isfinite(limit) for t in terms for limit in (t.low, t.high))
     return TermSet(
         constant,
-        linear,
         torch.tensor(frequencies, dtype=torch.float64).reshape(-1, coordinates).T.contiguous(),
-        sine,
-        cosine,
-        torch.tensor([t.low for t in terms], dtype=torch.float64),
-        torch.tensor([t.high for t in terms], dtype=torch.float64),
+        coefficients,
+        torch.tensor([t.low for t in terms], dtype=torch.float64) if clipped else None,
+        torch.tensor([t.high for t in terms], dtype=torch.float64) if clipped else None,
     )
