@@ -6,7 +6,7 @@ It is a pure function of its job, so it runs in a process of its own, and the sa
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -14,10 +14,10 @@ import torch
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from surrogym_server.engine.fidelity import fidelity_fields
 from surrogym_server.sampling.design import Decision, DesignState, Request, advance, initial_design
 from surrogym_server.surrogate.codec import to_bytes
 from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.surrogate.model import OutputModel
 from surrogym_server.surrogate.samples import Samples
 
 Array = NDArray[np.float64]
@@ -74,7 +74,7 @@ def run_design_job(job: DesignJob) -> DesignResult:
     return DesignResult(
         model=to_bytes(decision.model),
         description=decision.model.description,
-        fidelity=_fidelity(decision, job.target, len(samples)),
+        fidelity=fidelity_fields(decision.model, decision.confidences, decision.state.tolerances, job.target),
         data_hash=samples.digest,
         state=decision.state.to_json(),
         verdict=decision.verdict,
@@ -104,24 +104,3 @@ def _request(job: DesignJob) -> Request:
         extra=job.extra_queries,
         states=None if job.occupancy is None else torch.from_numpy(job.occupancy),
     )
-
-
-def _fidelity(decision: Decision, target: float, samples: int) -> dict[str, Any]:
-    outputs = (*decision.model.transitions, decision.model.reward)
-    rows = [
-        {"name": o.name, "structure": _structure(o), "tolerance": t, **asdict(c)}
-        for o, c, t in zip(outputs, decision.confidences, decision.state.tolerances, strict=True)
-    ]
-    return {
-        "confidence_index": min(c.confidence_index for c in decision.confidences),
-        "confidence_index_paper": min(c.confidence_index_paper for c in decision.confidences),
-        "target": target,
-        "samples": samples,
-        "outputs": rows,
-    }
-
-
-def _structure(output: OutputModel) -> str:
-    if output.posterior is None:
-        return "constant"
-    return f"{output.posterior.hyper.kernel} on {output.feature_map}"

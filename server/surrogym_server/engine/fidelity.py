@@ -1,4 +1,4 @@
-"""Fidelity of a model that came from elsewhere: the same figures that a round of the design gives its own."""
+"""Fidelity of a model as JSON: of the one a round of the design has just fitted, or of one that came from elsewhere."""
 
 from __future__ import annotations
 
@@ -6,40 +6,51 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from surrogym_server.sampling.confidence import confidence, deviations
+from surrogym_server.sampling.confidence import OutputConfidence, confidence, deviations
 from surrogym_server.sampling.design import TOLERANCE, monte_carlo
-from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.surrogate.model import OutputModel, SurrogateModel
 
 
-def fidelity_of(model: SurrogateModel, tolerances: Sequence[float], target: float) -> dict[str, Any]:
-    """The fields of ``wire.Fidelity``.
-
-    Args:
-        model: any model of the surrogate.
-        tolerances: (O,) frozen by the design; empty before its first round, and then taken from the spec and
-            the model's own scales.
-        target: confidence index the design aims at.
-    """
-    outputs = (*model.transitions, model.reward)
-    if not tolerances:
-        declared = dict(model.definition.tolerances)
-        tolerances = [declared.get(output.name, TOLERANCE * output.scale) for output in outputs]
-    deviation = deviations(model, *monte_carlo(model.definition))
-    rows = []
-    for index, (output, tolerance) in enumerate(zip(outputs, tolerances, strict=True)):
-        judged = confidence(output, deviation[:, index], tolerance)
-        rows.append(
-            {
-                "name": output.name,
-                "structure": str(output.feature_map),
-                "tolerance": tolerance,
-                **asdict(judged),
-            }
-        )
+def fidelity_fields(
+    model: SurrogateModel, confidences: Sequence[OutputConfidence], tolerances: Sequence[float], target: float
+) -> dict[str, Any]:
+    """The fields of ``wire.Fidelity``, from the confidence and tolerance of each output, (O,) each."""
+    rows = [
+        {"name": output.name, "structure": _structure(output), "tolerance": tolerance, **asdict(judged)}
+        for output, judged, tolerance in zip(_outputs(model), confidences, tolerances, strict=True)
+    ]
     return {
-        "confidence_index": min(row["confidence_index"] for row in rows),
-        "confidence_index_paper": min(row["confidence_index_paper"] for row in rows),
+        "confidence_index": min(c.confidence_index for c in confidences),
+        "confidence_index_paper": min(c.confidence_index_paper for c in confidences),
         "target": target,
         "samples": model.samples,
         "outputs": rows,
     }
+
+
+def fidelity_of(model: SurrogateModel, tolerances: Sequence[float], target: float) -> dict[str, Any]:
+    """The fields of ``wire.Fidelity`` of any model of the surrogate.
+
+    Args:
+        model: what to judge.
+        tolerances: (O,) frozen by the design; empty before its first round, and then taken from the specification and
+            the model's own scales.
+        target: confidence index the design aims at.
+    """
+    outputs = _outputs(model)
+    if not tolerances:
+        declared = dict(model.definition.tolerances)
+        tolerances = [declared.get(output.name, TOLERANCE * output.scale) for output in outputs]
+    deviation = deviations(model, *monte_carlo(model.definition))
+    confidences = [confidence(o, deviation[:, i], t) for i, (o, t) in enumerate(zip(outputs, tolerances, strict=True))]
+    return fidelity_fields(model, confidences, tolerances, target)
+
+
+def _outputs(model: SurrogateModel) -> tuple[OutputModel, ...]:
+    return (*model.transitions, model.reward)
+
+
+def _structure(output: OutputModel) -> str:
+    if output.posterior is None:
+        return "constant"
+    return f"{output.posterior.hyper.kernel} on {output.feature_map}"

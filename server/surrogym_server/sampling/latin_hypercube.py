@@ -19,10 +19,11 @@ def latin_hypercube(
     """A design of ``count`` points: coordinates (count, C) and actions (count, F).
 
     Each coordinate is stratified in probability, so truncated distributions keep their shape; discrete actions are
-    balanced. Of ``tries`` designs the one whose closest pair is farthest apart is taken.
+    balanced, no two counts differ by more than one. Of ``tries`` designs the one whose closest pair is farthest apart
+    is taken.
     """
     dimensions = len(definition.coordinates) + definition.action.size
-    designs = [_unit_hypercube(count, dimensions, rng) for _ in range(tries)]
+    designs = [_unit_hypercube(count, dimensions, rng, definition.action.nvec) for _ in range(tries)]
     best = max(designs, key=_closest_pair) if tries > 1 and count > 1 else designs[0]
     return from_unit(definition, torch.from_numpy(best))
 
@@ -44,9 +45,14 @@ def from_unit(definition: EnvironmentDefinition, p: Tensor) -> tuple[Tensor, Ten
     return q, low + (high - low) * u
 
 
-def _unit_hypercube(count: int, dimensions: int, rng: np.random.Generator) -> Array:
+def _unit_hypercube(count: int, dimensions: int, rng: np.random.Generator, nvec: tuple[int, ...]) -> Array:
+    """Points (count, dimensions) in [0, 1); the last columns are discrete actions, each in the middle of its share."""
     cells = np.stack([rng.permutation(count) for _ in range(dimensions)], 1)
-    return (cells + rng.random((count, dimensions))) / count
+    points = (cells + rng.random((count, dimensions))) / count
+    for column, n in enumerate(nvec, start=dimensions - len(nvec)):
+        value = (cells[:, column] * n // count + rng.integers(n)) % n
+        points[:, column] = (value + 0.5) / n
+    return points
 
 
 def _closest_pair(points: Array) -> float:
