@@ -54,7 +54,7 @@ class _Process:
     inputs: Tensor  # columns of x
     inverse_lengthscale: Tensor  # (d,)
     scaled: Tensor  # (n, d) points in length scales
-    factor: Tensor  # (n, n) upper, L^T / sigma_f^2
+    factor: Tensor  # (n, n) lower, L / sigma_f^2
     polynomial: Tensor | None  # (D, n) R / sigma_f^2
     prior: Tensor  # (D,) k(x, x) = z^2 prior
     scale: float
@@ -75,8 +75,8 @@ class _Process:
             k = self.exponent(x).exp_()
         if self.polynomial is not None:
             k = torch.addmm(k, z, self.polynomial)
-        v = torch.linalg.solve_triangular(self.factor, k, upper=True, left=False)
-        variance = z.square() @ self.prior - torch.linalg.vector_norm(v, dim=1).square_()
+        v = torch.linalg.solve_triangular(self.factor, k.T, upper=False)
+        variance = z.square() @ self.prior - torch.linalg.vector_norm(v, dim=0).square_()
         deviation: Tensor = variance.clamp_min_(0).sqrt_().mul_(self.scale)
         return deviation
 
@@ -155,7 +155,7 @@ def _process(output: Output, posterior: Posterior, span: slice, polynomial: Tens
         inputs=torch.tensor(output.inputs),
         inverse_lengthscale=1 / hyper.lengthscale,
         scaled=posterior.x / hyper.lengthscale,
-        factor=posterior.factor.T / hyper.signal_variance,
+        factor=posterior.factor / hyper.signal_variance,
         polynomial=polynomial / hyper.signal_variance if has_polynomial else None,
         prior=_prior(hyper, output.inputs, width),
         scale=output.scale,
