@@ -11,7 +11,7 @@ import typer
 
 from surrogym_client.cli.errors import sentence
 
-COMMANDS = ("register", "sample", "train", "evaluate", "status", "improve", "export", "delete", "demo")
+COMMANDS = ("register", "sample", "train", "evaluate", "status", "improve", "export", "delete", "demo", "reproduce")
 ENTRY_POINTS = "surrogym.commands"
 INTERRUPTED = 130
 
