@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cache
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
 from surrogym_server.gp.kernel import Hyperparameters
@@ -59,20 +60,29 @@ def fit(x: Tensor, y: Tensor, options: FitOptions, warm: Array | None = None) ->
     ``warm`` is the theta of an earlier fit. Raises NumericalFailure.
     """
     objective = _Objective(x, y, options)
-    best: tuple[float, Array] | None = None
-    for start in _starts(objective.default_start, warm, len(y)):
-        found = minimize(
-            objective,
-            np.clip(start, objective.lower, objective.upper),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=np.stack([objective.lower, objective.upper], 1),
-            options={"maxiter": options.max_iterations, "ftol": 1e-9, "gtol": 1e-5},
-        )
-        if best is None or found.fun < best[0]:
-            best = (float(found.fun), found.x)
-    assert best is not None
-    return Fitted(condition(objective.hyper(best[1]), x, y), -best[0], best[1])
+    with _blas().limit(limits=1):
+        found = [_minimum(objective, start) for start in _starts(objective.default_start, warm, len(y))]
+    value, theta = min(found, key=lambda pair: pair[0])
+    return Fitted(condition(objective.hyper(theta), x, y), -value, theta)
+
+
+def _minimum(objective: _Objective, start: Array) -> tuple[float, Array]:
+    found = minimize(
+        objective,
+        np.clip(start, objective.lower, objective.upper),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=np.stack([objective.lower, objective.upper], 1),
+        options={"maxiter": objective.options.max_iterations, "ftol": 1e-9, "gtol": 1e-5},
+    )
+    return float(found.fun), found.x
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """L-BFGS-B multiplies matrices of a dozen rows: with more than one thread it waits ten times as long as it works,
+    on a machine that does something else as well."""
+    return ThreadpoolController().select(user_api="blas")
 
 
 def _starts(default: Array, warm: Array | None, points: int) -> Sequence[Array]:
@@ -88,7 +98,7 @@ class _Objective:
 
     def __init__(self, x: Tensor, y: Tensor, options: FitOptions) -> None:
         self.y, self.options = y, options
-        self.squared = (x[None] - x[:, None]).square().permute(2, 0, 1).contiguous()  # (d, n, n)
+        self.squared = (x[None] - x[:, None]).square().permute(2, 0, 1).flatten(1)  # (d, n n)
         self.linear = 1 + x @ x.T
         self.quadratic = x.square() @ x.square().T
         n, d = x.shape
@@ -113,8 +123,9 @@ class _Objective:
 
     def __call__(self, theta: Array) -> tuple[float, Array]:
         hyper = self.hyper(theta)
-        scaled = self.squared / hyper.lengthscale.square()[:, None, None]
-        smooth = hyper.signal_variance * torch.exp(-0.5 * scaled.sum(0))
+        precision = hyper.lengthscale.square().reciprocal()
+        exponent = (-0.5 * precision) @ self.squared
+        smooth = hyper.signal_variance * exponent.exp_().reshape(self.n, self.n)
         k = smooth + hyper.linear_variance * self.linear + hyper.quadratic_variance * self.quadratic
         k.diagonal().add_(hyper.noise_variance)
         factor, info = torch.linalg.cholesky_ex(k)
@@ -123,18 +134,18 @@ class _Objective:
         weights = torch.cholesky_solve(self.y[:, None], factor)[:, 0]
         log_evidence = -0.5 * (self.y @ weights) - factor.diagonal().log().sum() - 0.5 * self.n * math.log(2 * math.pi)
         half = 0.5 * (torch.outer(weights, weights) - torch.cholesky_inverse(factor))
-        gradient = self._gradient(hyper, half, smooth, scaled)
+        gradient = self._gradient(hyper, half, smooth, precision)
         z = (theta - self.prior[:, 0]) / self.prior[:, 1]
         value = -float(log_evidence) + 0.5 * float(z @ z) + float(np.log(self.prior[:, 1]).sum())
         return value, z / self.prior[:, 1] - gradient
 
-    def _gradient(self, hyper: Hyperparameters, half: Tensor, smooth: Tensor, scaled: Tensor) -> Array:
-        weighted = half * smooth
-        parts: list[Any] = [(scaled * weighted).sum((1, 2)), weighted.sum()[None]]
+    def _gradient(self, hyper: Hyperparameters, half: Tensor, smooth: Tensor, precision: Tensor) -> Array:
+        weighted = (half * smooth).flatten()
+        parts = [precision * (self.squared @ weighted), weighted.sum()[None]]
         if self.options.linear:
-            parts.append(hyper.linear_variance * (half * self.linear).sum()[None])
+            parts.append(hyper.linear_variance * torch.vdot(half.flatten(), self.linear.flatten())[None])
         if self.options.quadratic:
-            parts.append(hyper.quadratic_variance * (half * self.quadratic).sum()[None])
-        parts.append(hyper.noise_variance * half.diagonal().sum()[None])
+            parts.append(hyper.quadratic_variance * torch.vdot(half.flatten(), self.quadratic.flatten())[None])
+        parts.append(hyper.noise_variance * half.trace()[None])
         gradient: Array = torch.cat(parts).cpu().numpy()
         return gradient
