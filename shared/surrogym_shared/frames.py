@@ -304,7 +304,7 @@ def _array(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int, 
     expected = math.prod(shape) * dtype.itemsize
     if view.nbytes != expected:
         raise FrameError(f"{name}: expected {expected} bytes, shape {shape} of {dtype.name}, got {view.nbytes} bytes")
-    return np.frombuffer(view, dtype).reshape(shape)
+    return np.ndarray(shape, dtype, view)
 
 
 def _flags(name: str, view: memoryview, lanes: int) -> Bools:

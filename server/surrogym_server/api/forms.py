@@ -36,9 +36,8 @@ async def rollout_json(sessions: SessionService, id: str, content: bytes) -> byt
     return _JSON.encode(convert.rollout_reply(answer))
 
 
-async def carry_out(sessions: SessionService, id: str, request: frames.Request) -> bytes:
-    """A frame's request, whatever carried it; raises ``FrameError`` where it does not fit the session."""
-    shape = convert.session_shape(sessions.get(id))
+async def carry_out(sessions: SessionService, id: str, shape: frames.Shape, request: frames.Request) -> bytes:
+    """A frame's request, whatever carried it; raises ``FrameError`` where it does not fit the session's shape."""
     match request:
         case frames.StepRequest():
             action, mask = frames.action_of(request, shape), frames.mask_of(request, shape)
@@ -57,7 +56,7 @@ def _framed(kind: type[frames.Request]) -> Carry:
         request = frames.read_request(content)
         if not isinstance(request, kind):
             raise frames.FrameError(f"expected a {kind.__name__}, got a {type(request).__name__}")
-        return await carry_out(sessions, id, request)
+        return await carry_out(sessions, id, convert.session_shape(sessions.get(id)), request)
 
     return carry
 

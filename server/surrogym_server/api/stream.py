@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers
 from starlette.types import Receive, Scope, Send
 
+from surrogym_server import convert
 from surrogym_server.api.auth import Gate, bearer_token
 from surrogym_server.api.forms import carry_out
 from surrogym_server.api.problems import problem_of, response_of
@@ -31,13 +32,14 @@ class StepStream:
         await receive()  # the client's wish to connect
         try:
             _admit(scope)
-            sessions.get(id)
+            shape = convert.session_shape(sessions.get(id))
         except SurrogymError as error:
             await response_of(problem_of(error))(scope, receive, send)
             return
         await send({"type": "websocket.accept"})
         while (message := await receive())["type"] == "websocket.receive":
-            await send({"type": "websocket.send", "bytes": await _reply(sessions, id, message.get("bytes"))})
+            reply = await _reply(sessions, id, shape, message.get("bytes"))
+            await send({"type": "websocket.send", "bytes": reply})
 
 
 def _admit(scope: Scope) -> None:
@@ -50,7 +52,7 @@ def _admit(scope: Scope) -> None:
     gate.check(bearer_token(headers), ("train",))
 
 
-async def _reply(sessions: SessionService, id: str, content: bytes | None) -> bytes:
+async def _reply(sessions: SessionService, id: str, shape: frames.Shape, content: bytes | None) -> bytes:
     """The reply to one message, as a frame; never raises but when it is cancelled."""
     seq = None
     try:
@@ -58,7 +60,7 @@ async def _reply(sessions: SessionService, id: str, content: bytes | None) -> by
             raise frames.FrameError("expected a binary message, got text")
         request = frames.read_request(content)
         seq = request.seq
-        return await carry_out(sessions, id, request)
+        return await carry_out(sessions, id, shape, request)
     except Exception as error:
         if not isinstance(error, SurrogymError | frames.FrameError):
             logger.exception("a request of the stream failed")
