@@ -1,0 +1,260 @@
+"""What a step costs over each transport, beside a bare echo of as many bytes in the same run.
+
+Run by ``make bench``. Rounds of every subject take turns, so that what else the machine does hits all alike;
+read the ratios, not the microseconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import numpy as np
+import torch
+from servers import TRIVIAL
+from websockets.sync.client import connect
+
+from support.teaching import teach
+from surrogym_client.api import Api
+from surrogym_client.connection import Connection, Retries
+from surrogym_client.forms import BinaryForm, Form, JsonForm
+from surrogym_client.original.classic import pendulum
+from surrogym_client.stream import Stream
+from surrogym_client.transport import HttpSurrogate, Transport
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.local import LocalSurrogate
+from surrogym_server.surrogate.codec import from_bytes
+from surrogym_shared import frames
+from surrogym_shared.port import StepResult, SurrogatePort
+from surrogym_shared.wire import OpenSession
+
+SERVERS = str(Path(__file__).with_name("servers.py"))
+LANES = (1, 16, 256, 1024)
+ROUNDS, CALLS, WARM_UP = 20, 40, 100
+SAMPLES = 50
+SECONDS = 1e6  # microseconds
+JSON_REPLY_BYTES = {1: 190, 16: 1_600, 256: 22_500, 1024: 89_000}  # about, of a Pendulum step
+
+Call = Callable[[], Any]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Microseconds of one call."""
+
+    p50: float
+    p99: float
+
+
+@contextmanager
+def process(*arguments: str, ready: Callable[[], bool]) -> Iterator[None]:
+    """A child process for the time of the context, once it is ready."""
+    child = subprocess.Popen([sys.executable, SERVERS, *arguments], stdout=subprocess.DEVNULL)
+    try:
+        while not ready():
+            if child.poll() is not None:
+                raise SystemExit(f"{arguments} ended with status {child.returncode}")
+            time.sleep(0.05)
+        yield
+    finally:
+        child.terminate()
+        child.wait(30)
+
+
+@contextmanager
+def echo_server() -> Iterator[str]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+
+    def listening() -> bool:
+        with socket.socket() as caller:
+            return caller.connect_ex(("127.0.0.1", port)) == 0
+
+    with process("echo", str(port), ready=listening):
+        yield f"http://127.0.0.1:{port}/echo"
+
+
+@contextmanager
+def surrogym_server() -> Iterator[str]:
+    """A server with a learned Pendulum, and the same under the name ``trivial``, whose steps do nothing."""
+    with tempfile.TemporaryDirectory() as folder:
+        ready = Path(folder, "ready")
+        options = ["--port", "0", "--database", str(Path(folder, "db")), "--ready-file", str(ready)]
+        with process("surrogym", *options, "--log-level", "warning", ready=ready.exists):
+            url = ready.read_text()
+            with Api(url) as api:
+                teach(api, "pendulum", pendulum(), queries=SAMPLES)
+                api.create_surrogate(TRIVIAL, pendulum())
+                api.import_model(TRIVIAL, api.export_model("pendulum", 1))
+            yield url
+
+
+def measure(subjects: dict[str, Call]) -> dict[str, Figures]:
+    """p50 and p99 of each; rounds take turns."""
+    for call in subjects.values():
+        for _ in range(WARM_UP):
+            call()
+    taken: dict[str, list[float]] = {name: [] for name in subjects}
+    for _ in range(ROUNDS):
+        for name, call in subjects.items():
+            for _ in range(CALLS):
+                start = time.perf_counter()
+                call()
+                taken[name].append(time.perf_counter() - start)
+    return {
+        name: Figures(*(float(q) for q in np.quantile(seconds, [0.5, 0.99]) * SECONDS))
+        for name, seconds in taken.items()
+    }
+
+
+def stepping(port: SurrogatePort, lanes: int) -> Call:
+    """Steps of a new session."""
+    session = port.open(OpenSession(num_envs=lanes, seed=0)).id
+    port.reset(session)
+    action = np.random.default_rng(0).uniform(-2, 2, (lanes, 1)).astype(np.float32)
+    return lambda: port.step(session, action)
+
+
+def remote(stack: ExitStack, url: str, surrogate: str, transport: Transport, lanes: int) -> Call:
+    return stepping(stack.enter_context(HttpSurrogate(url, surrogate, transport=transport)), lanes)
+
+
+def request(form: Form, lanes: int) -> bytes:
+    """A request as the client would send it."""
+    return form.step(9, np.random.default_rng(0).uniform(-2, 2, (lanes, 1)), None, False, frames.Shape(lanes, 3, 1, 3))
+
+
+def reply_bytes(lanes: int) -> int:
+    """Length of a reply of so many lanes of Pendulum."""
+    flags, zeros = np.zeros(lanes, dtype=bool), np.zeros(lanes)
+    nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 3), dtype=np.float32)
+    result = StepResult(np.zeros((lanes, 3)), zeros, flags, flags, *nothing, np.ones(lanes), zeros, None)
+    return len(frames.encode(frames.step_reply(9, result)))
+
+
+def stream_echo(stack: ExitStack, url: str, lanes: int) -> Call:
+    """Through the client's own stream."""
+    stream = Stream(f"{url}?{reply_bytes(lanes)}", None, 5.0)
+    stack.callback(stream.close)
+    content = request(BinaryForm(), lanes)
+    return lambda: stream.exchange(content, 60.0)
+
+
+def library_echo(stack: ExitStack, url: str, lanes: int) -> Call:
+    """Through the WebSocket library's ready client, which has a thread of its own."""
+    connection = stack.enter_context(
+        connect(f"{url.replace('http', 'ws', 1)}?{reply_bytes(lanes)}", compression=None, max_size=None)
+    )
+    content = request(BinaryForm(), lanes)
+
+    def exchange() -> Any:
+        connection.send(content)
+        return connection.recv()
+
+    return exchange
+
+
+def http_echo(stack: ExitStack, url: str, content: bytes, size: int) -> Call:
+    """Through the client's own HTTP."""
+    connection = stack.enter_context(Connection(url, retries=Retries(seconds=0)))
+    return lambda: connection.send("POST", f"?{size}", content)
+
+
+def round_trips(url: str, echo: str, lanes: int) -> dict[str, Figures]:
+    with ExitStack() as stack:
+        subjects = {
+            "echo, WebSocket": stream_echo(stack, echo, lanes),
+            "echo, WebSocket library": library_echo(stack, echo, lanes),
+            "trivial, stream": remote(stack, url, TRIVIAL, "stream", lanes),
+            "pendulum, stream": remote(stack, url, "pendulum", "stream", lanes),
+            "echo, HTTP": http_echo(stack, echo, request(BinaryForm(), lanes), reply_bytes(lanes)),
+            "trivial, binary": remote(stack, url, TRIVIAL, "binary", lanes),
+            "pendulum, binary": remote(stack, url, "pendulum", "binary", lanes),
+            "echo, HTTP JSON": http_echo(stack, echo, request(JsonForm(), lanes), JSON_REPLY_BYTES[lanes]),
+            "trivial, json": remote(stack, url, TRIVIAL, "json", lanes),
+            "pendulum, json": remote(stack, url, "pendulum", "json", lanes),
+        }
+        return measure(subjects)
+
+
+def in_process(url: str) -> LocalSurrogate:
+    with Api(url) as api:
+        spec, model = api.surrogate("pendulum").spec, api.export_model("pendulum", 1)
+    return LocalSurrogate(spec, from_bytes(definition_from_spec(spec), model))
+
+
+def throughput(url: str, lanes: int) -> dict[str, Figures]:
+    """The same model stepped in this process and over the stream."""
+    with ExitStack() as stack:
+        subjects = {
+            "in process": stepping(in_process(url), lanes),
+            "stream": remote(stack, url, "pendulum", "stream", lanes),
+        }
+        return measure(subjects)
+
+
+BESIDE = {"stream": "echo, WebSocket", "binary": "echo, HTTP", "json": "echo, HTTP JSON"}
+
+
+def show_trips(lanes: int, figures: dict[str, Figures]) -> None:
+    for name, found in figures.items():
+        echo = figures[BESIDE.get(name.partition(", ")[2], name)]
+        ratio = f"{found.p50 / echo.p50:8.2f}" if echo is not found else " " * 8
+        print(f"{lanes:6} {name:26}{found.p50:10.0f}{found.p99:10.0f}{ratio}")
+
+
+def show_throughput(lanes: int, figures: dict[str, Figures]) -> None:
+    share = figures["in process"].p50 / figures["stream"].p50
+    per_second = {name: lanes / found.p50 * SECONDS for name, found in figures.items()}
+    print(f"{lanes:6} " + "".join(f"{name} {rate:12,.0f}   " for name, rate in per_second.items()) + f"{share:6.1%}")
+
+
+def machine() -> dict[str, Any]:
+    return {
+        "cores": os.cpu_count(),
+        "load": os.getloadavg(),
+        "platform": platform.platform(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("build/benchmarks"), help="folder of the JSON file")
+    parser.add_argument("--lanes", type=int, nargs="*", choices=LANES, default=LANES)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    report: dict[str, Any] = {"machine": machine(), "round_trip_us": {}, "step_us": {}}
+    with echo_server() as echo, surrogym_server() as url:
+        print(f"{'N':>6} {'round trip':26}{'p50 us':>10}{'p99 us':>10}{'to echo':>8}")
+        for lanes in options.lanes:
+            figures = round_trips(url, echo, lanes)
+            show_trips(lanes, figures)
+            report["round_trip_us"][lanes] = {name: vars(found) for name, found in figures.items()}
+        print(f"\n{'N':>6} environment steps per second, and the stream's share of in process")
+        for lanes in options.lanes:
+            figures = throughput(url, lanes)
+            show_throughput(lanes, figures)
+            report["step_us"][lanes] = {name: vars(found) for name, found in figures.items()}
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "step.json").write_text(json.dumps(report, indent=1))
+
+
+if __name__ == "__main__":
+    main()

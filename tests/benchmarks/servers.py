@@ -1,0 +1,74 @@
+"""What the benchmarks measure against: echoes without any work, and a server whose surrogate ``trivial`` does none.
+
+Run as ``servers.py echo PORT`` or ``servers.py surrogym OPTIONS``, the options being those of ``surrogym serve``.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+
+TRIVIAL = "trivial"
+
+
+async def websocket_echo(scope: Any, receive: Any, send: Any) -> None:
+    """Answers each message with as many bytes as the query string says: nothing but uvicorn."""
+    reply = b"\0" * int(scope["query_string"])
+    await receive()
+    await send({"type": "websocket.accept"})
+    while (await receive())["type"] == "websocket.receive":
+        await send({"type": "websocket.send", "bytes": reply})
+
+
+def echo_app() -> Any:
+    """The WebSocket echo, and the same by HTTP as a Starlette route."""
+    from starlette.applications import Starlette
+    from starlette.requests import Request
+    from starlette.responses import Response
+    from starlette.routing import Route, WebSocketRoute
+
+    async def echo(request: Request) -> Response:
+        await request.body()
+        return Response(b"\0" * int(request.url.query))
+
+    class Echo:
+        __call__ = staticmethod(websocket_echo)
+
+    return Starlette(routes=[Route("/echo", echo, methods=["POST"]), WebSocketRoute("/echo", Echo())])
+
+
+def serve_echo(port: int) -> None:
+    import uvicorn
+
+    uvicorn.run(echo_app(), port=port, log_level="warning", access_log=False, ws_per_message_deflate=False)
+
+
+def serve_surrogym(options: list[str]) -> None:
+    """The server as it is, but for the model of one surrogate: its steps give zeros at once."""
+    from surrogym_client.cli import main
+    from surrogym_server.services import sessions
+    from surrogym_shared.port import StepResult
+
+    true_step = sessions.step_session
+
+    def step_session(session: Any, *arguments: Any) -> Any:
+        if session.surrogate != TRIVIAL:
+            return true_step(session, *arguments)
+        zeros, flags = np.zeros(len(session.versions)), np.zeros(len(session.versions), dtype=bool)
+        size = len(session.definition.observation_names)
+        nothing = np.zeros(0, dtype=np.int64), np.zeros((0, size), dtype=np.float32)
+        shown = np.zeros((len(zeros), size), dtype=np.float32)
+        return session, StepResult(shown, zeros, flags, flags, *nothing, session.versions, zeros, None)
+
+    sessions.step_session = step_session
+    sys.argv = ["surrogym", "serve", *options]
+    main()
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "echo":
+        serve_echo(int(sys.argv[2]))
+    else:
+        serve_surrogym(sys.argv[2:])
