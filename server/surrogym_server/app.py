@@ -96,8 +96,8 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes)
     if settings.loopback and not settings.tokens:
         app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", settings.host}))
-    # Routes are tried in this order.
-    for room in (steps, sessions, service, surrogates, queries, samples, models, events):
+    app.router.routes.extend(steps.router.routes)  # tried first, and directly: an included router is another search
+    for room in (sessions, service, surrogates, queries, samples, models, events):
         app.include_router(room.router)
     _add_dashboard(app)
     return app
