@@ -10,7 +10,7 @@ import typer
 
 from surrogym_client.cli.options import Preset, Quiet
 
-Task = Literal["pendulum", "cartpole", "mountaincar", "acrobot"]
+Task = Literal["pendulum", "cartpole", "mountaincar", "acrobot", "invertedpendulum", "reacher"]
 
 
 def register(app: typer.Typer) -> None:

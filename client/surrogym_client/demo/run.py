@@ -59,6 +59,8 @@ TASKS = {
     "cartpole": DemoTask("CartPole-v1", budget=30),
     "mountaincar": DemoTask("MountainCarContinuous-v0", budget=40),
     "acrobot": DemoTask("Acrobot-v1", budget=100),
+    "invertedpendulum": DemoTask("InvertedPendulum-v5", budget=20),
+    "reacher": DemoTask("Reacher-v5", budget=100),
 }
 
 
