@@ -70,7 +70,8 @@ class Stream:
         with self._turn:
             try:
                 connected = self._socket or self._connect()
-                connected.settimeout(seconds)
+                if seconds != connected.gettimeout():  # setting it is a call of the system
+                    connected.settimeout(seconds)
                 self._protocol.send_binary(message)
                 self._flush(connected)
                 return self._receive(connected)

@@ -6,6 +6,7 @@ before the next is read; the connection may be dropped at any moment, for the se
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from urllib.parse import urlsplit
 
@@ -40,6 +41,7 @@ class StepStream:
         while (message := await receive())["type"] == "websocket.receive":
             reply = await _reply(sessions, id, shape, message.get("bytes"))
             await send({"type": "websocket.send", "bytes": reply})
+            await asyncio.sleep(0)  # others' turn, also while this client has sent ahead
 
 
 def _admit(scope: Scope) -> None:

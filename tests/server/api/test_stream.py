@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -16,6 +18,8 @@ from websockets.sync.client import ClientConnection, connect
 
 from support import pendulum
 from support.server import ServerProcess, start_server
+from surrogym_server.api.auth import Gate
+from surrogym_server.api.stream import StepStream
 from surrogym_shared import frames, wire
 from surrogym_shared.codes import Code, Problem
 
@@ -177,6 +181,37 @@ def test_a_session_that_ends_ends_its_stream_with_a_problem(
     problem = over_stream(stream)(frames.reset_request(1, None, None))
     assert isinstance(problem, frames.ProblemReply)
     assert problem.code is Code.UNKNOWN_SESSION
+
+
+def test_a_client_that_sends_ahead_leaves_others_their_turns():
+    """Messages that are all there at once are answered with other work in between."""
+    waiting, answered, turns = 200, 0, 0
+    action = SimpleNamespace(size=1)
+    definition = SimpleNamespace(observation_names=("x",), action=action, outputs=("x", "reward"))
+    session = SimpleNamespace(definition=definition, settings=SimpleNamespace(num_envs=1))
+    services = SimpleNamespace(sessions=SimpleNamespace(get=lambda _: session))
+    app = SimpleNamespace(state=SimpleNamespace(gate=Gate({})))
+    scope = {"state": {"services": services}, "app": app, "path_params": {"id": "s"}, "headers": []}
+    messages = iter([{"type": "websocket.connect"}, *[{"type": "websocket.receive", "text": "x"}] * waiting])
+
+    async def receive() -> dict[str, Any]:
+        return next(messages, {"type": "websocket.disconnect"})
+
+    async def send(message: Any) -> None:
+        nonlocal answered
+        answered += message["type"] == "websocket.send"
+
+    async def other() -> None:
+        nonlocal turns
+        while answered < waiting:
+            turns += 1
+            await asyncio.sleep(0)
+
+    async def both() -> None:
+        await asyncio.gather(StepStream()(scope, receive, send), other())
+
+    asyncio.run(both())
+    assert turns >= waiting - 1
 
 
 def test_two_streams_of_one_session_step_once(server_process: ServerProcess, session: str):
