@@ -8,8 +8,10 @@ import torch
 from support.real_steps import random_steps
 from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
 from surrogym_server.convert import definition_from_spec
+from surrogym_server.gp import serving
 from surrogym_server.surrogate.definition import wrap
 from surrogym_server.surrogate.describe import predict_points
+from surrogym_server.surrogate.features import encode
 from surrogym_server.surrogate.learn import learn
 from surrogym_server.surrogate.model import settle
 
@@ -57,6 +59,43 @@ def test_a_draw_is_the_mean_plus_deviations(pendulum_model):
     assert mean.deviation.shape == (2, 2)
     quiet = pendulum_model.transition(q, u, noise=torch.zeros_like(noise))
     torch.testing.assert_close(quiet.q_next, mean.q_next)
+
+
+@pytest.mark.parametrize("timing", ["before", "after"])
+def test_a_step_in_blocks_of_rows_is_a_step_of_each(pendulum_model, monkeypatch, timing):
+    model = replace(pendulum_model, definition=replace(pendulum_model.definition, reward_timing=timing))
+    points = random_steps(pendulum(), 20, seed=3)
+    noise = torch.randn(20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    asked = {"deviations": True, "reward_deviation": True}
+    whole = model.transition(points.q, points.u, noise=noise, **asked)
+    monkeypatch.setattr(serving, "BLOCK", 1)
+    monkeypatch.setattr(serving, "MIN_ROWS", 7)
+    blocks = model.transition(points.q, points.u, noise=noise, **asked)
+    singles = [
+        model.transition(points.q[i : i + 1], points.u[i : i + 1], noise=noise[i : i + 1], **asked) for i in range(20)
+    ]
+    for name in ("q_next", "reward", "deviation", "reward_deviation"):
+        torch.testing.assert_close(getattr(blocks, name), getattr(whole, name), rtol=0, atol=1e-7)
+        alone = torch.cat([getattr(single, name) for single in singles])
+        torch.testing.assert_close(alone, getattr(whole, name), rtol=0, atol=1e-7)
+
+
+def test_a_model_predicts_what_its_processes_do(pendulum_model):
+    """Compiled, each output is the posterior that was fitted."""
+    points = random_steps(pendulum(), 50, seed=3)
+    predicted = pendulum_model.transition(points.q, points.u, deviations=True, reward_deviation=True)
+    angle, speed = pendulum_model.transitions
+    lead = predicted.q_next[:, 1:]
+    for output, change, deviation in (
+        (angle, wrap(predicted.q_next[:, 0] - points.q[:, 0]), predicted.deviation[:, 0]),
+        (speed, predicted.q_next[:, 1] - points.q[:, 1], predicted.deviation[:, 1]),
+        (pendulum_model.reward, predicted.reward, predicted.reward_deviation),
+    ):
+        x = encode(pendulum_model.definition, output.feature_map, points.q, points.u, lead)
+        mean, expected = output.mean_and_deviation(x)
+        inside = lead[:, 0].abs() < 8
+        torch.testing.assert_close(change[inside], mean[inside], rtol=0, atol=1e-7 * output.scale)
+        torch.testing.assert_close(deviation, expected, rtol=1e-3, atol=1e-4 * output.scale)
 
 
 def test_an_angle_that_reads_the_lead_follows_the_drawn_speed(pendulum_model):
