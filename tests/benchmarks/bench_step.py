@@ -46,7 +46,7 @@ SERVERS = str(Path(__file__).with_name("servers.py"))
 LANES = (1, 16, 256, 1024)
 ROUNDS, CALLS, WARM_UP = 20, 40, 100
 SAMPLES = 50
-SECONDS = 1e6  # microseconds
+MICROSECONDS = 1e6  # of a second
 JSON_REPLY_BYTES = {1: 190, 16: 1_600, 256: 22_500, 1024: 89_000}  # about, of a Pendulum step
 
 Call = Callable[[], Any]
@@ -117,7 +117,7 @@ def measure(subjects: dict[str, Call]) -> dict[str, Figures]:
                 call()
                 taken[name].append(time.perf_counter() - start)
     return {
-        name: Figures(*(float(q) for q in np.quantile(seconds, [0.5, 0.99]) * SECONDS))
+        name: Figures(*(float(q) for q in np.quantile(seconds, [0.5, 0.99]) * MICROSECONDS))
         for name, seconds in taken.items()
     }
 
@@ -220,7 +220,7 @@ def show_trips(lanes: int, figures: dict[str, Figures]) -> None:
 
 def show_throughput(lanes: int, figures: dict[str, Figures]) -> None:
     share = figures["in process"].p50 / figures["stream"].p50
-    per_second = {name: lanes / found.p50 * SECONDS for name, found in figures.items()}
+    per_second = {name: lanes / found.p50 * MICROSECONDS for name, found in figures.items()}
     print(f"{lanes:6} " + "".join(f"{name} {rate:12,.0f}   " for name, rate in per_second.items()) + f"{share:6.1%}")
 
 
@@ -240,7 +240,9 @@ def main() -> None:
     parser.add_argument("--lanes", type=int, nargs="*", choices=LANES, default=LANES)
     options = parser.parse_args()
     torch.set_num_threads(1)
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
     report: dict[str, Any] = {"machine": machine(), "round_trip_us": {}, "step_us": {}}
+    print(", ".join(f"{name} {value}" for name, value in report["machine"].items()))
     with echo_server() as echo, surrogym_server() as url:
         print(f"{'N':>6} {'round trip':26}{'p50 us':>10}{'p99 us':>10}{'to echo':>8}")
         for lanes in options.lanes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine
+from collections.abc import Awaitable, Callable
 from typing import Any, TypeVar
 
 from fastapi import Body, Request
@@ -10,6 +10,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from fastapi.routing import APIRoute
 from pydantic import BaseModel, ValidationError
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from surrogym_server.api.auth import Gate, bearer_token
 from surrogym_shared import frames
@@ -26,16 +27,20 @@ class LeanRoute(APIRoute):
     Its endpoint takes an id and the request. Only a token that may train gets there.
     """
 
-    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        endpoint = self.endpoint
+    def __init__(self, path: str, endpoint: Callable[..., Awaitable[Response]], **options: Any) -> None:
+        super().__init__(path, endpoint, **options)
+        self.app = _lean(endpoint)
 
-        async def handle(request: Request) -> Response:
-            gate: Gate = request.app.state.gate
-            gate.check(bearer_token(request.headers), ("train",))
-            response: Response = await endpoint(request.path_params["id"], request)
-            return response
 
-        return handle
+def _lean(endpoint: Callable[..., Awaitable[Response]]) -> ASGIApp:
+    async def app(scope: Scope, receive: Receive, send: Send) -> None:
+        request = Request(scope, receive)
+        gate: Gate = scope["app"].state.gate
+        gate.check(bearer_token(request.headers), ("train",))
+        response = await endpoint(scope["path_params"]["id"], request)
+        await response(scope, receive, send)
+
+    return app
 
 
 def parse_json(model: type[M], content: bytes) -> M:
