@@ -117,7 +117,8 @@ async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: 
     services, sweeper = _build_services(settings, design, storage, engine)
     engine.fits.start()
     restored = services.sessions.restore()
-    logger.info("sessions that came back: %d", restored)
+    if restored:
+        logger.info("sessions that came back: %d", restored)
     tasks = [asyncio.create_task(services.designer.run()), asyncio.create_task(sweeper.run())]
     try:
         yield {"services": services}

@@ -111,7 +111,8 @@ def test_ones_own_environment_has_to_be_named_by_the_person(on_server, name, tmp
     """The server's word is never enough to import a module."""
     (tmp_path / "own_line.py").write_text(OWN)
     monkeypatch.syspath_prepend(str(tmp_path))
-    assert on_server("register", "own_line:Cart", "--name", name).code == 0
+    registered = on_server("register", "own_line:Cart", "--name", name)
+    assert registered.out.endswith(f"next: surrogym sample {name} --env own_line:Cart\n")
     refused = on_server("sample", name, "--once")
     assert refused.code == 1
     assert "expected --env package.module:factory" in refused.err
@@ -133,6 +134,8 @@ def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum
     assert len(evaluated.json["per_episode"]) == 3
     with Api(server_process.url) as api:
         assert api.surrogate(pendulum).ledger.evaluation == 600
+    nothing = on_server("sample", pendulum, "--max-queries", "1", "--time-limit", "0.5")
+    assert "None" not in nothing.out
     other = on_server("evaluate", "policy.zip", "--env", "CartPole-v1", "--episodes", "1")
     assert other.code == 1
     assert "error: the policy does not fit the environment" in other.err

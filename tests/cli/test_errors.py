@@ -50,6 +50,7 @@ def test_an_address_that_is_none(surrogym):
         (("register", "--spec", "missing.json"), "missing.json: No such file or directory"),
         (("register", "--spec", "broken.json"), "broken.json is no specification: "),
         (("register", "--spec", "crossed.json"), "uniform range crosses: expected low < high, got [1.0, -1.0]"),
+        (("train", "pendulum", "--start-from", "missing.zip"), "missing.zip: no such policy file"),
         (("evaluate", "missing.zip", "--env", "Pendulum-v1"), "missing.zip: no such policy file"),
         (("evaluate", "junk.zip", "--env", "Pendulum-v1"), "junk.zip is no policy of PPO"),
         (("evaluate", "junk.zip"), "expected --env with the original environment, got none"),

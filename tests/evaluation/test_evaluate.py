@@ -15,6 +15,7 @@ from surrogym_client.evaluate import (
     interquartile_mean,
 )
 from surrogym_client.original.episodes import open_episode
+from surrogym_client.original.errors import NotPerturbable
 from surrogym_shared.spec import Success
 
 
@@ -124,6 +125,17 @@ def test_perturbation_changes_the_physics_and_settles_what_follows():
     env = episode._env
     assert env.total_mass == env.masscart + env.masspole != 1.1
     assert env.polemass_length == env.masspole * env.length
+
+
+def test_ones_own_environment_cant_be_perturbed():
+    """What its masses and lengths are, nobody here knows; that is no fault of the policy."""
+    settings = EvaluationSettings(episodes=1, perturb=0.1)
+    with pytest.raises(NotPerturbable):
+        evaluate(
+            lambda observation: np.zeros((len(observation), 1)),
+            lambda: open_episode("line", Line().spec(), Line),
+            settings,
+        )
 
 
 def test_ones_own_environment_is_evaluated_by_its_steps():

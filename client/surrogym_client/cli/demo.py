@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -22,7 +22,8 @@ def command(
     task: Annotated[Task, typer.Argument(help="What to solve.")] = "pendulum",
     seed: Annotated[int, typer.Option(min=0, help="Seed of design, policy and virtual environment.")] = 0,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the metrics to this file too; - is standard output.")
+        Path | None,
+        typer.Option("--json", help="Write the metrics to this file too; - prints them instead of the table."),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Run folder. [default: runs/TASK-seedSEED-TIME]")] = None,
     budget: Annotated[int | None, typer.Option(min=2, help="Real steps of the design. [default: the task's]")] = None,
@@ -37,6 +38,8 @@ def command(
     Example: surrogym demo pendulum --seed 0 --json metrics.json
     """
     from surrogym_client.cli.errors import CommandError
+    from surrogym_client.cli.output import give
+    from surrogym_client.demo.report import table
     from surrogym_client.demo.run import DemoSettings, run_demo
 
     if json_file is not None and not json_file.resolve().parent.is_dir():
@@ -44,8 +47,11 @@ def command(
     settings = DemoSettings(
         task=task, seed=seed, budget=budget, preset=preset, steps=steps, episodes=episodes, keep=keep
     )
-    metrics = run_demo(settings, out, quiet=quiet or json_file == Path("-"))
-    if json_file == Path("-"):
-        typer.echo(json.dumps(metrics, indent=2))
-    elif json_file is not None:
-        json_file.write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+    as_json = json_file == Path("-")
+
+    def tell(metrics: dict[str, Any], folder: Path) -> None:
+        if json_file is not None and not as_json:
+            json_file.write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+        give(metrics, lambda: table(metrics, folder), as_json=as_json, quiet=quiet)
+
+    run_demo(settings, out, tell, quiet=quiet)

@@ -60,8 +60,8 @@ def command(
         typer.echo(chosen.model_dump_json(indent=2))
         return
     with connect(server, token, wait) as api:
-        view = api.create_surrogate(name or default_name(chosen.environment), chosen)
-    give(view.model_dump(mode="json"), lambda: _words(view), as_json=as_json, quiet=quiet)
+        view = api.create_surrogate(name or default_name(chosen.environment or environment or ""), chosen)
+    give(view.model_dump(mode="json"), lambda: _words(view, environment or ""), as_json=as_json, quiet=quiet)
 
 
 def default_name(environment: str) -> str:
@@ -88,8 +88,9 @@ def _specification(environment: str | None, spec: EnvironmentSpec | None, **choi
     raise CommandError("expected an environment or --spec FILE, got neither")
 
 
-def _words(view: SurrogateView) -> str:
+def _words(view: SurrogateView, environment: str) -> str:
+    own = f" --env {environment}" if ":" in environment else ""
     return (
-        f"{view.name}: {view.environment}, {len(view.spec.coordinates)} coordinates, "
-        f"budget of {view.budget} real steps, target {view.target:g}; next: surrogym sample {view.name}"
+        f"{view.name}: {view.environment or 'own environment'}, {len(view.spec.coordinates)} coordinates, "
+        f"budget of {view.budget} real steps, target {view.target:g}; next: surrogym sample {view.name}{own}"
     )

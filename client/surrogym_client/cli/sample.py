@@ -110,4 +110,5 @@ def _tell(query: Query, outcome: Outcome, error: str) -> None:
 
 def _words(report: SamplerReport) -> str:
     failed = f", {report.failed} failed" if report.failed else ""
-    return f"{report.answered} queries answered{failed} in {report.seconds:.1f} s; the design is {report.phase}"
+    phase = "" if report.phase is None else f"; the design is {report.phase}"
+    return f"{report.answered} queries answered{failed} in {report.seconds:.1f} s{phase}"

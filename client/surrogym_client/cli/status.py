@@ -48,7 +48,14 @@ def _table(surrogates: Sequence[SurrogateSummary]) -> str:
         return "no surrogates yet; next: surrogym register Pendulum-v1 --name pendulum"
     heading = ("name", "environment", "phase", "samples", "model", "confidence index")
     rows = [
-        (s.name, s.environment, "paused" if s.paused else s.phase, s.samples, s.model_version, s.confidence_index)
+        (
+            s.name,
+            s.environment or "own",
+            "paused" if s.paused else s.phase,
+            s.samples,
+            s.model_version,
+            s.confidence_index,
+        )
         for s in surrogates
     ]
     return columns([heading, *rows])
@@ -59,7 +66,7 @@ def _detail(view: SurrogateView) -> str:
 
     ledger = view.ledger
     lines = [
-        f"{view.name}: {view.environment}, {'paused, ' if view.paused else ''}{view.phase}",
+        f"{view.name}: {view.environment or 'own environment'}, {'paused, ' if view.paused else ''}{view.phase}",
         f"real steps: {ledger.initial} initial, {ledger.adaptive} adaptive, {ledger.manual} manual, "
         f"{ledger.total} of {view.budget} in all; {ledger.evaluation} in evaluation, {ledger.unresolved} unresolved",
         f"queries: {view.queries.pending} pending, {view.queries.leased} leased, {view.queries.set_aside} set aside",

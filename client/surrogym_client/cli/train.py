@@ -33,7 +33,9 @@ def command(
     surrogate: Annotated[str, typer.Argument(help="Name of the surrogate.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write the policy to.")] = Path("policy.zip"),
     algorithm: Annotated[str, typer.Option(help="Algorithm of Stable-Baselines3.")] = "PPO",
-    steps: Annotated[int | None, typer.Option(min=1, help="Virtual steps. [default: from the specification]")] = None,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Virtual steps of the last training. [default: from the specification]")
+    ] = None,
     num_envs: Annotated[
         int | None, typer.Option(min=1, help="Lanes of the session. [default: from the specification]")
     ] = None,
@@ -62,11 +64,14 @@ def command(
 
     Example: surrogym train pendulum --out policy.zip --seed 0
     """
+    from surrogym_client.cli.errors import CommandError
     from surrogym_client.cli.output import give, progress
     from surrogym_client.lifetime import exit_with_parent as watch_parent
 
     if exit_with_parent:
         watch_parent()
+    if start_from is not None and not start_from.exists():
+        raise CommandError(f"{start_from}: no such policy file")
     spec, url = _trainable(surrogate, server, token, wait)
     from surrogym_client.train import TrainSettings  # torch; imported once there is something to train on
 

@@ -6,7 +6,7 @@ import json
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -21,7 +21,7 @@ from surrogym_client.cli.output import progress, say
 from surrogym_client.cli.train import words_of
 from surrogym_client.connection import Retries
 from surrogym_client.demo.processes import Child, Children, await_file
-from surrogym_client.demo.report import metrics_of, table
+from surrogym_client.demo.report import metrics_of
 from surrogym_client.evaluate import Evaluation, EvaluationSettings, evaluate
 from surrogym_client.original import make
 from surrogym_client.original.episodes import open_episode
@@ -81,21 +81,28 @@ class DemoSettings:
         return make(task.environment, preset=self.preset, budget=budget, seed=self.seed).spec()
 
 
-def run_demo(settings: DemoSettings, out: Path | None = None, *, quiet: bool = False) -> dict[str, Any]:
-    """Run the whole loop; gives back the metrics that also lie in the run folder.
+def run_demo(
+    settings: DemoSettings,
+    out: Path | None = None,
+    tell: Callable[[dict[str, Any], Path], None] | None = None,
+    *,
+    quiet: bool = False,
+) -> None:
+    """Run the whole loop, then ``tell`` the metrics, which also lie in the run folder, and where that is.
 
     Raises:
         CommandError: the folder is not empty, or a process ended badly; says which, its last words and its log.
         SurrogymClientError: the server refused, or the design failed.
     """
     folder = _empty_folder(out or _new_folder(settings))
-    with _terminations_as_interrupts(), Children(folder) as children:
+    with _terminations_as_interrupts(), _told_what_stays(folder), Children(folder) as children:
         run = DemoRun(settings, folder, children, quiet=quiet)
         metrics = run.whole()
+        if tell is not None:
+            tell(metrics, folder)
         if settings.keep:
             say(f"the server stays at {run.api.url} until Ctrl-C")
             _sleep_for_ever()
-    return metrics
 
 
 class DemoRun:
@@ -198,7 +205,6 @@ class DemoRun:
         metrics = metrics_of(name, self._settings.seed, view, read_card(self.policy), result, seconds)
         metrics["demo"] = asdict(self._settings)
         (self._folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-        say(table(metrics, self._folder), quiet=self._quiet)
         return metrics
 
     @property
@@ -262,6 +268,19 @@ def _terminations_as_interrupts() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def _told_what_stays(folder: Path) -> Iterator[None]:
+    """Say after an interruption what there is to go on with."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        database, policy = folder / "surrogym.db", folder / "policy.zip"
+        kept = [f"the real samples (surrogym serve --database {database})"] if database.exists() else []
+        kept += [f"the policy so far ({policy})"] if policy.exists() else []
+        say(f"interrupted; all processes have ended; kept in {folder}: {' and '.join(kept) or 'logs alone'}")
+        raise
 
 
 def _sleep_for_ever() -> None:

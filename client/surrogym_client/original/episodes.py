@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from surrogym_client.original.classic import TASKS
+from surrogym_client.original.errors import NotPerturbable
 from surrogym_client.original.gymnasium import native_action, task_for, wrapped
 from surrogym_client.original.mujoco import Joints, is_known, open_mujoco
 from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
@@ -155,7 +156,7 @@ class SteppedEpisode(Episode):
 
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
         del rng, sigma
-        raise ValueError("only environments with a built-in adapter can be perturbed")
+        raise NotPerturbable("only environments with a built-in adapter can be perturbed")
 
     def close(self) -> None:
         self._environment.close()

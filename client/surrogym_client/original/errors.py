@@ -2,6 +2,7 @@
 
 OriginalError
 ├── UnknownEnvironment      nothing can be made of this name, or no specification can express it
+├── NotPerturbable          its masses, lengths and limits are unknown here
 └── StepFailed              the environment did not give a step; the query fails, the worker goes on
     ├── StepTimedOut        it took longer than its limit and was killed; the next step starts a fresh one
     └── EnvironmentDied     its process ended; the next step starts a fresh one
@@ -16,6 +17,10 @@ class OriginalError(Exception):
 
 class UnknownEnvironment(OriginalError):
     """No original environment can be made of this name."""
+
+
+class NotPerturbable(OriginalError):
+    """Only environments with a built-in adapter can be perturbed."""
 
 
 class StepFailed(OriginalError):
