@@ -12,9 +12,10 @@ matplotlib.use("Agg")
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from surrogym_client.evaluate import Evaluation, Trace
-from surrogym_shared.spec import limits
+from surrogym_shared.spec import Coordinate, EnvironmentSpec, limits
 from surrogym_shared.wire import SampleView, SurrogateView
 
 COLOURS = {"initial": "#4c72b0", "adaptive": "#dd8452", "manual": "#55a868"}
@@ -32,7 +33,7 @@ def draw_all(
     _save(folder / "samples.png", draw_samples(view, samples))
     _save(folder / "learning.png", draw_learning(curve))
     _save(folder / "returns.png", draw_returns(result))
-    _save(folder / "rollout.png", draw_rollout(view.spec.coordinate_names, result.trace))
+    _save(folder / "rollout.png", draw_rollout(view.spec, result.trace))
 
 
 def draw_samples(view: SurrogateView, samples: Sequence[SampleView]) -> Figure:
@@ -47,10 +48,11 @@ def draw_samples(view: SurrogateView, samples: Sequence[SampleView]) -> Figure:
             if chosen:
                 label = f"{purpose} ({len(chosen)})"
                 axes.scatter([q[i] for q in chosen], [q[j] for q in chosen], color=colour, label=label, clip_on=False)
-        axes.set(xlabel=coordinates[i].name, ylabel=coordinates[j].name)
+        axes.set(xlabel=_with_unit(coordinates[i]), ylabel=_with_unit(coordinates[j]))
         axes.set(xlim=limits(coordinates[i].sampling), ylim=limits(coordinates[j].sampling))
-        axes.legend(loc="upper right")
-    figure.suptitle(f"{view.name}: real steps of the design")
+        if n == 0:
+            figure.legend(loc="outside upper right")
+    figure.suptitle(f"{view.name}: real steps of the design", x=0.02, ha="left")
     return figure
 
 
@@ -66,22 +68,28 @@ def draw_returns(result: Evaluation) -> Figure:
     """How the real returns spread."""
     figure, axes = _one("real return of an episode", "episodes", f"{len(result.returns)} real episodes")
     axes.hist(result.returns, bins=20)
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
 
 
-def draw_rollout(names: Sequence[str], trace: Trace) -> Figure:
+def draw_rollout(spec: EnvironmentSpec, trace: Trace) -> Figure:
     """The first real episode: coordinates, and the action."""
-    rows = len(names) + trace.action.shape[1]
-    figure = Figure(figsize=(WIDTH, 1.4 * rows), layout="constrained")
-    labels = [*names, *(f"action {i}" for i in range(trace.action.shape[1]))]
+    actions = trace.action.shape[1]
+    labels = [*map(_with_unit, spec.coordinates), *(f"action {i}" if actions > 1 else "action" for i in range(actions))]
     lines = [*trace.coordinates.T, *trace.action.T]
-    for n, (label, line) in enumerate(zip(labels, lines, strict=True)):
-        axes = figure.add_subplot(rows, 1, n + 1)
-        axes.plot(line)
+    figure = Figure(figsize=(1.5 * WIDTH, 1.4 * len(lines)), layout="constrained")
+    grid = figure.subplots(len(lines), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, label, line in zip(grid, labels, lines, strict=True):
+        axes.plot(line, linewidth=0.6, marker=".", markersize=2)
         axes.set(ylabel=label)
-    axes.set(xlabel="step")
+    grid[-1].set(xlabel="step")
+    figure.align_ylabels()
     figure.suptitle("the first real episode")
     return figure
+
+
+def _with_unit(coordinate: Coordinate) -> str:
+    return f"{coordinate.name} ({coordinate.unit})" if coordinate.unit else coordinate.name
 
 
 def _one(x: str, y: str, title: str) -> tuple[Figure, Axes]:

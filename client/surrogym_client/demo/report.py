@@ -62,7 +62,7 @@ def table(metrics: dict[str, Any], folder: Path) -> str:
         ),
         (
             f"real return, {returns['episodes']} starts",
-            f"mean {returns['mean']:.1f}, iqm {returns['iqm']:.1f}, min {returns['min']:.1f}, max {returns['max']:.1f}",
+            ", ".join(f"{key} {_number(returns[key])}" for key in ("mean", "iqm", "min", "max")),
         ),
         ("imagined return", _number(metrics["imagined_return"])),
         ("success", "-" if success is None else f"{100 * success:.0f} %"),
@@ -73,4 +73,7 @@ def table(metrics: dict[str, Any], folder: Path) -> str:
 
 
 def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f}"
+    """A return as people read it: small ones keep their digits."""
+    if value is None:
+        return "-"
+    return f"{value:.1f}" if abs(value) >= 10 else f"{value:.3g}"
