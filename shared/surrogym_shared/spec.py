@@ -11,12 +11,25 @@ import math
 from collections.abc import Iterable
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from surrogym_shared.checks import (
+    Count,
+    Finite,
+    Number,
+    Positive,
+    Width,
+    require,
+    require_known,
+    require_range,
+    require_unique,
+)
 
 MAX_DIMENSIONS = 64
 MAX_TERM_PARTS = 64
 MAX_DISCRETE_ACTIONS = 4096
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+MAX_INEQUALITIES = 16  # in a group, and groups
 REWARD = "reward"
 
 Name = Annotated[str, Field(min_length=1, max_length=64)]
@@ -35,12 +48,12 @@ class Uniform(Frozen):
     """Uniform on [low, high]."""
 
     kind: Literal["uniform"] = "uniform"
-    low: FiniteFloat
-    high: FiniteFloat
+    low: Number
+    high: Number
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        _require(self.low < self.high, f"uniform range crosses: expected low < high, got [{self.low}, {self.high}]")
+        require_range("uniform range", self.low, self.high)
         return self
 
 
@@ -48,17 +61,17 @@ class Normal(Frozen):
     """Normal, truncated to [low, high]; without limits it is truncated at three standard deviations."""
 
     kind: Literal["normal"] = "normal"
-    mean: FiniteFloat
-    std: PositiveFloat
-    low: FiniteFloat | None = None
-    high: FiniteFloat | None = None
+    mean: Number
+    std: Width
+    low: Number | None = None
+    high: Number | None = None
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         low, high = self.limits
-        _require(low < high, f"truncated range crosses: expected low < high, got [{low}, {high}]")
+        require_range("truncated range", low, high)
         z = max(low - self.mean, self.mean - high) / self.std
-        _require(z < 6, f"truncation [{low}, {high}] lies {z:.1f} standard deviations from the mean {self.mean}")
+        require(z < 6, f"truncation [{low}, {high}] lies {z:.1f} standard deviations from the mean {self.mean}")
         return self
 
     @property
@@ -72,7 +85,7 @@ class Fixed(Frozen):
     """One value; only for the start distribution."""
 
     kind: Literal["fixed"] = "fixed"
-    value: FiniteFloat
+    value: Number
 
 
 SamplingDistribution = Annotated[Uniform | Normal, Field(discriminator="kind")]
@@ -99,15 +112,15 @@ class Bounds(Frozen):
     ``stops`` names a coordinate that is set to zero when this one runs into the bound (a wall; MountainCar's left end).
     """
 
-    low: FiniteFloat | None = None
-    high: FiniteFloat | None = None
+    low: Number | None = None
+    high: Number | None = None
     stops: Name | None = None
 
     @model_validator(mode="after")
     def _some(self) -> Self:
-        _require(self.low is not None or self.high is not None, "bounds need a low or a high")
+        require(self.low is not None or self.high is not None, "bounds need a low or a high")
         if self.low is not None and self.high is not None:
-            _require(self.low < self.high, f"bounds cross: expected low < high, got [{self.low}, {self.high}]")
+            require_range("range of bounds", self.low, self.high)
         return self
 
 
@@ -127,13 +140,13 @@ class Coordinate(Frozen):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if self.kind != "linear":
-            _require(self.bounds is None, f"coordinate {self.name!r}: only a linear coordinate can have bounds")
+            require(self.bounds is None, f"coordinate {self.name!r}: only a linear coordinate can have bounds")
         if self.bounds is not None:
             low, high = limits(self.sampling)
             inside = (self.bounds.low is None or self.bounds.low <= low) and (
                 self.bounds.high is None or high <= self.bounds.high
             )
-            _require(
+            require(
                 inside,
                 f"coordinate {self.name!r}: sampling range [{low}, {high}] leaves its bounds "
                 f"[{self.bounds.low}, {self.bounds.high}]",
@@ -148,15 +161,15 @@ class Part(Frozen):
     """coefficient * phi(q), phi one of: ``one`` = 1, ``linear`` = a.q, ``sin`` = sin(a.q), ``cos`` = cos(a.q)."""
 
     function: Literal["one", "linear", "sin", "cos"]
-    coefficient: FiniteFloat = 1.0
-    weights: dict[Name, FiniteFloat] = Field(default_factory=dict, description="a, by coordinate name")
+    coefficient: Number = 1.0
+    weights: dict[Name, Number] = Field(default_factory=dict, description="a, by coordinate name")
 
     @model_validator(mode="after")
     def _weighted(self) -> Self:
         if self.function == "one":
-            _require(not self.weights, "a part with function 'one' takes no weights")
+            require(not self.weights, "a part with function 'one' takes no weights")
         else:
-            _require(bool(self.weights), f"a part with function {self.function!r} needs weights")
+            require(bool(self.weights), f"a part with function {self.function!r} needs weights")
         return self
 
 
@@ -164,13 +177,13 @@ class Term(Frozen):
     """A sum of parts, optionally clipped to [low, high]. Terms add with ``+`` and scale with ``*``."""
 
     parts: tuple[Part, ...] = Field(min_length=1, max_length=MAX_TERM_PARTS)
-    low: FiniteFloat | None = None
-    high: FiniteFloat | None = None
+    low: Number | None = None
+    high: Number | None = None
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         if self.low is not None and self.high is not None:
-            _require(self.low < self.high, f"term clip crosses: expected low < high, got [{self.low}, {self.high}]")
+            require(self.low < self.high, f"term clip crosses: expected low < high, got [{self.low}, {self.high}]")
         return self
 
     @classmethod
@@ -194,14 +207,14 @@ class Term(Frozen):
         return self.model_copy(update={"low": low, "high": high})
 
     def __add__(self, other: Term) -> Term:
-        _require(
+        require(
             self.low is None and self.high is None and other.low is None and other.high is None,
             "clipped terms can't be added",
         )
         return Term(parts=self.parts + other.parts)
 
     def __mul__(self, factor: float) -> Term:
-        _require(self.low is None and self.high is None, "a clipped term can't be scaled")
+        require(self.low is None and self.high is None, "a clipped term can't be scaled")
         parts = (p.model_copy(update={"coefficient": p.coefficient * factor}) for p in self.parts)
         return Term(parts=tuple(parts))
 
@@ -213,8 +226,8 @@ class ObservationEntry(Frozen):
 
     name: Name
     term: Term
-    low: FiniteFloat | None = None
-    high: FiniteFloat | None = None
+    low: Finite | None = None
+    high: Finite | None = None
 
 
 class Inequality(Frozen):
@@ -222,10 +235,10 @@ class Inequality(Frozen):
 
     term: Term
     relation: Literal["<", "<=", ">", ">="]
-    value: FiniteFloat
+    value: Number
 
 
-AllOf = Annotated[tuple[Inequality, ...], Field(min_length=1)]
+AllOf = Annotated[tuple[Inequality, ...], Field(min_length=1, max_length=MAX_INEQUALITIES)]
 
 
 # Actions
@@ -236,20 +249,20 @@ class BoxAction(Frozen):
     dimension (the paper's discretised control); the model and the sampler always see the continuous value."""
 
     kind: Literal["box"] = "box"
-    low: tuple[FiniteFloat, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
-    high: tuple[FiniteFloat, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
-    bins: tuple[Annotated[int, Field(ge=2, le=MAX_DISCRETE_ACTIONS)], ...] | None = None
+    low: tuple[Number, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
+    high: tuple[Number, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
+    bins: tuple[Annotated[int, Field(ge=2, le=MAX_DISCRETE_ACTIONS, strict=True)], ...] | None = None
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        _require(
+        require(
             len(self.low) == len(self.high),
             f"action low and high differ in length: {len(self.low)} and {len(self.high)}",
         )
         for i, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
-            _require(low < high, f"action {i} crosses: expected low < high, got [{low}, {high}]")
+            require_range(f"action {i}", low, high)
         if self.bins is not None:
-            _require(len(self.bins) == len(self.low), f"expected {len(self.low)} bins, got {len(self.bins)}")
+            require(len(self.bins) == len(self.low), f"expected {len(self.low)} bins, got {len(self.bins)}")
         return self
 
     @property
@@ -261,7 +274,7 @@ class DiscreteAction(Frozen):
     """One of n actions, 0 to n - 1."""
 
     kind: Literal["discrete"] = "discrete"
-    n: int = Field(ge=2, le=MAX_DISCRETE_ACTIONS)
+    n: int = Field(ge=2, le=MAX_DISCRETE_ACTIONS, strict=True)
 
     @property
     def size(self) -> int:
@@ -272,7 +285,7 @@ class MultiDiscreteAction(Frozen):
     """Several discrete actions at once; entry i is 0 to nvec[i] - 1."""
 
     kind: Literal["multi_discrete"] = "multi_discrete"
-    nvec: tuple[Annotated[int, Field(ge=2, le=MAX_DISCRETE_ACTIONS)], ...] = Field(
+    nvec: tuple[Annotated[int, Field(ge=2, le=MAX_DISCRETE_ACTIONS, strict=True)], ...] = Field(
         min_length=1, max_length=MAX_DIMENSIONS
     )
 
@@ -295,7 +308,7 @@ class Reward(Frozen):
     """
 
     timing: Literal["before", "after"] = "before"
-    penalty: Annotated[float, Field(ge=0, le=100)] | None = None
+    penalty: Annotated[float, Field(ge=0, le=100, strict=True)] | None = None
 
 
 class Success(Frozen):
@@ -305,11 +318,11 @@ class Success(Frozen):
     ``max_steps``: at most; ``terminated``: the episode ended (or did not end) by termination; ``min_return``.
     """
 
-    hold: tuple[Inequality, ...] = ()
-    hold_steps: PositiveInt = 1
-    min_steps: PositiveInt | None = None
+    hold: tuple[Inequality, ...] = Field(default=(), max_length=MAX_INEQUALITIES)
+    hold_steps: Count = 1
+    min_steps: Count | None = None
     terminated: bool | None = None
-    min_return: FiniteFloat | None = None
+    min_return: Number | None = None
 
 
 class Design(Frozen):
@@ -320,12 +333,12 @@ class Design(Frozen):
     """
 
     preset: Literal["default", "paper"] = "default"
-    budget: Annotated[int, Field(ge=2, le=100_000)] | None = None
-    initial: Annotated[int, Field(ge=2, le=100_000)] | None = None
-    target: Annotated[float, Field(gt=0.5, lt=1)] = 0.999
+    budget: Annotated[int, Field(ge=2, le=100_000, strict=True)] | None = None
+    initial: Annotated[int, Field(ge=2, le=100_000, strict=True)] | None = None
+    target: Annotated[float, Field(gt=0.5, lt=1, strict=True)] = 0.999
     acquisition: Literal["uncertainty_index", "variance", "latin_hypercube"] | None = None
-    monte_carlo: Annotated[int, Field(ge=16, le=100_000)] | None = None
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    monte_carlo: Annotated[int, Field(ge=16, le=100_000, strict=True)] | None = None
+    seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
 
 
 class EnvironmentSpec(Frozen):
@@ -336,10 +349,12 @@ class EnvironmentSpec(Frozen):
     observation: tuple[ObservationEntry, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
     action: Action
     start: dict[Name, StartDistribution]
-    termination: tuple[AllOf, ...] = Field(default=(), description="ends when any of these all-of groups holds at q'")
-    time_limit: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
+    termination: tuple[AllOf, ...] = Field(
+        default=(), max_length=MAX_INEQUALITIES, description="ends when any of these all-of groups holds at q'"
+    )
+    time_limit: Annotated[int, Field(ge=1, le=10_000_000, strict=True)] | None = None
     reward: Reward = Reward()
-    tolerances: dict[Name, PositiveFloat] = Field(
+    tolerances: dict[Name, Positive] = Field(
         default_factory=dict, description="by moving coordinate, or 'reward', in the output's own unit"
     )
     success: Success | None = None
@@ -356,39 +371,48 @@ class EnvironmentSpec(Frozen):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         names = self.coordinate_names
-        _require_unique("coordinate", names)
-        _require_unique("observation", self.observation_names)
-        _require(REWARD not in names, f"no coordinate may be called {REWARD!r}")
-        _require_known("start", self.start, names)
+        require_unique("coordinate", names)
+        require_unique("observation", self.observation_names)
+        outputs = names if self.design.preset == "default" else (*names, *self.observation_names)
+        require(REWARD not in outputs, f"nothing that is learned beside the reward may be called {REWARD!r}")
+        require_known("start", self.start, names)
         missing = [n for n in names if n not in self.start]
-        _require(not missing, f"start distribution lacks {missing}: expected every coordinate of {list(names)}")
-        outputs = [c.name for c in self.coordinates if c.kind != "constant"]
-        _require(bool(outputs), "expected at least one coordinate that moves (linear or angle)")
-        _require_known("tolerances", self.tolerances, (*outputs, REWARD))
+        require(not missing, f"start distribution lacks {missing}: expected every coordinate of {list(names)}")
+        moving = [c.name for c in self.coordinates if c.kind != "constant"]
+        require(bool(moving), "expected at least one coordinate that moves (linear or angle)")
+        require_known("tolerances", self.tolerances, (*moving, REWARD))
         for c in self.coordinates:
             if c.bounds is not None:
                 if c.bounds.stops is not None:
-                    _require_known(f"coordinate {c.name!r}: stops", (c.bounds.stops,), outputs)
+                    require_known(f"coordinate {c.name!r}: stops", (c.bounds.stops,), moving)
+                    self._require_stoppable(c.name, c.bounds.stops)
                 low, high = limits(self.start[c.name])
                 inside = (c.bounds.low is None or low >= c.bounds.low) and (
                     c.bounds.high is None or high <= c.bounds.high
                 )
-                _require(
+                require(
                     inside, f"start of {c.name!r}, [{low}, {high}], leaves its bounds [{c.bounds.low}, {c.bounds.high}]"
                 )
         for where, term in self._terms():
             for part in term.parts:
-                _require_known(f"{where}: term", part.weights, names)
+                require_known(f"{where}: term", part.weights, names)
         for entry in self.observation:
             low = -math.inf if entry.low is None else entry.low
             high = math.inf if entry.high is None else entry.high
-            _require(low < high, f"observation {entry.name!r} crosses: expected low < high, got [{low}, {high}]")
+            require(low < high, f"observation {entry.name!r} crosses: expected low < high, got [{low}, {high}]")
         if self.design.budget is not None and self.design.initial is not None:
-            _require(
+            require(
                 self.design.initial <= self.design.budget,
                 f"design: initial {self.design.initial} exceeds the budget {self.design.budget}",
             )
         return self
+
+    def _require_stoppable(self, name: str, stopped: str) -> None:
+        require(stopped != name, f"coordinate {name!r} stops itself: expected another one")
+        bounds = self.coordinates[self.coordinate_names.index(stopped)].bounds
+        if bounds is not None:
+            holds = (bounds.low is None or bounds.low <= 0) and (bounds.high is None or bounds.high >= 0)
+            require(holds, f"coordinate {name!r} sets {stopped!r} to 0, outside its [{bounds.low}, {bounds.high}]")
 
     def _terms(self) -> Iterable[tuple[str, Term]]:
         for entry in self.observation:
@@ -399,21 +423,3 @@ class EnvironmentSpec(Frozen):
         if self.success is not None:
             for inequality in self.success.hold:
                 yield "success", inequality.term
-
-
-def _require(condition: bool, message: str) -> None:
-    if not condition:
-        raise ValueError(message)
-
-
-def _require_unique(what: str, names: Iterable[str]) -> None:
-    seen: set[str] = set()
-    for name in names:
-        _require(name not in seen, f"{what} {name!r} is given twice")
-        seen.add(name)
-
-
-def _require_known(where: str, given: Iterable[str], known: Iterable[str]) -> None:
-    known = list(known)
-    unknown = [name for name in given if name not in known]
-    _require(not unknown, f"{where} names unknown {unknown}: expected some of {known}")

@@ -17,6 +17,7 @@ MAX_PARTICLES = 1_000_000
 MAX_CLAIM = 256
 MAX_BATCH = 65_536
 MAX_ROLLOUT = 100_000
+MAX_MEASURED = 1e30  # beyond it variances overflow, and one such sample would leave no model to serve
 
 Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "failed"]
 Purpose = Literal["initial", "adaptive", "manual"]
@@ -29,7 +30,8 @@ SurrogateName = Annotated[str, Field(pattern=NAME_PATTERN)]
 Key = Annotated[str, Field(min_length=1, max_length=128)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Seq = Annotated[int, Field(ge=1)]
-Vector = Annotated[list[FiniteFloat], Field(min_length=1, max_length=MAX_DIMENSIONS)]
+Measured = Annotated[float, Field(ge=-MAX_MEASURED, le=MAX_MEASURED, allow_inf_nan=False)]
+Vector = Annotated[list[Measured], Field(min_length=1, max_length=MAX_DIMENSIONS)]
 Matrix = Annotated[list[Vector], Field(min_length=1, max_length=MAX_BATCH)]
 
 
@@ -201,7 +203,7 @@ class NewSample(Request):
     coordinates: Vector
     action: Vector
     next_coordinates: Vector
-    reward: FiniteFloat
+    reward: Measured
     terminated: bool
     truncated: bool = False
     observation: Vector | None = None

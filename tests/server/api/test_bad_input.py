@@ -81,6 +81,11 @@ def test_an_unknown_session(client: httpx.Client, what: str):
 # Specifications
 
 
+UNIT = {"kind": "uniform", "low": 0, "high": 1}
+TWO = {"kind": "uniform", "low": 1, "high": 2}
+ONE = {"parts": [{"function": "one"}]}
+
+
 def crossed(field: str, value: Any) -> dict[str, Any]:
     spec = copy.deepcopy(pendulum.spec())
     target = spec
@@ -102,6 +107,13 @@ def crossed(field: str, value: Any) -> dict[str, Any]:
         ("coordinates.0.sampling.low", float("nan"), "finite number, got nan"),
         ("start", {}, "start distribution lacks ['theta', 'theta_dot']"),
         ("time_limit", 0, "greater than or equal to 1, got 0"),
+        ("time_limit", True, "valid integer, got True"),
+        ("action.low", ["-2"], "valid number, got '-2'"),
+        ("coordinates.0.sampling.high", 1e308, "less than or equal to 1000000000000, got 1e+308"),
+        ("coordinates.0.sampling", {"kind": "uniform", "low": 0, "high": 5e-324}, "too narrow"),
+        ("coordinates.0.sampling", {"kind": "uniform", "low": 1e10, "high": 1e10 + 1}, "too narrow"),
+        ("coordinates.1.bounds.stops", "theta_dot", "stops itself"),
+        ("termination", [[{"term": ONE, "relation": ">", "value": 0}]] * 17, "at most 16 items"),
     ],
 )
 def test_a_spec_that_contradicts_itself(client: httpx.Client, name: str, field: str, value: Any, said: str):
@@ -110,6 +122,16 @@ def test_a_spec_that_contradicts_itself(client: httpx.Client, name: str, field: 
     assert problem.model_extra is not None
     assert problem.model_extra["errors"][0]["field"].startswith("spec")
     refused(client.get(f"/v1/surrogates/{name}"), Code.UNKNOWN_SURROGATE)
+
+
+def test_a_stop_at_zero_that_the_bounds_exclude(client: httpx.Client, name: str):
+    """The model would set a coordinate where the environment never lets it be."""
+    spec = pendulum.spec()
+    spec["coordinates"].append({"name": "x", "sampling": UNIT, "bounds": {"low": 0, "high": 1, "stops": "gear"}})
+    spec["coordinates"].append({"name": "gear", "sampling": TWO, "bounds": {"low": 1, "high": 2}})
+    spec["start"] |= {"x": UNIT, "gear": TWO}
+    reply = post(client, "/v1/surrogates", {"name": name, "spec": spec})
+    refused(reply, Code.INVALID_SPEC, "'x' sets 'gear' to 0, outside its [1.0, 2.0]")
 
 
 def test_a_second_spec_under_the_same_name(client: httpx.Client, fresh: str):
@@ -138,6 +160,8 @@ def sample(**changes: Any) -> dict[str, Any]:
         ({"coordinates": [0.1]}, "samples.0.coordinates: expected (n, 2)"),
         ({"next_coordinates": [0.1, 0.2, 0.3]}, "samples.0.next_coordinates: expected (n, 2)"),
         ({"action": [0.1, 0.2]}, "action: expected shape (1, 1), got (1, 2)"),
+        ({"reward": 1e200}, "less than or equal to 1000"),
+        ({"next_coordinates": [0.1, -1e308]}, "greater than or equal to -1000"),
         ({"action": [2.5]}, "action: expected entry 0 in [-2, 2], got 2.5"),
         ({"observation": [1.0]}, "samples.0.observation: expected 3 entries, got 1"),
         ({"reward": float("nan")}, "samples.0.reward: Input should be a finite number, got nan"),
