@@ -22,6 +22,7 @@ from surrogym_server.surrogate.samples import Samples, increments
 Verdict = Literal["continue", "ready", "over_budget"]
 TOLERANCE = 0.05  # of the output's deviation over the initial design
 HYPERCUBE_TRIES = 50
+FEW_POINTS = 500  # more of them leave no gap worth a comparison of all pairs, whose memory grows with their square
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,8 @@ def initial_design(definition: EnvironmentDefinition, budget: int) -> tuple[Tens
     count = min(definition.design.initial, budget)
     if definition.design.acquisition == "latin_hypercube":
         count = budget
-    return latin_hypercube(definition, count, _rng(definition, "initial"), 1 if paper else HYPERCUBE_TRIES)
+    tries = 1 if paper or count > FEW_POINTS else HYPERCUBE_TRIES
+    return latin_hypercube(definition, count, _rng(definition, "initial"), tries)
 
 
 def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignState, request: Request) -> Decision:
@@ -168,10 +170,13 @@ def _choose(
     picks: list[int] = []
     reserved = _reserved(model, samples, candidates)
     for position, column in enumerate(wanted):
+        repeated = near(model.definition, candidates.q, candidates.u, *taken)
+        if bool(repeated.all()):
+            break
         value = acquisition(model, candidates, column, tolerances[column])
         if position == 0 and reserved is not None:
             value = torch.where(reserved, value, -torch.inf)
-        value[near(model.definition, candidates.q, candidates.u, *taken)] = -torch.inf
+        value[repeated] = -torch.inf
         pick = int(value.argmax())
         if value[pick] == -torch.inf:
             continue

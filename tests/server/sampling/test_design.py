@@ -11,7 +11,8 @@ import torch
 from support.real_steps import answer, join, random_steps
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.sampling.acquisition import near
+from surrogym_server.sampling import design as designing
+from surrogym_server.sampling.acquisition import acquisition, near
 from surrogym_server.sampling.confidence import OutputConfidence
 from surrogym_server.sampling.design import (
     Decision,
@@ -201,6 +202,26 @@ def test_the_paper_starts_with_ten_points_a_dimension_and_tolerance_one():
 def test_a_latin_hypercube_design_asks_for_its_whole_budget_at_once():
     definition = definition_from_spec(designed(acquisition="latin_hypercube"))
     assert len(initial_design(definition, 17)[0]) == 17
+
+
+def test_a_large_design_compares_no_pairs():
+    """A spec may ask for 100,000 initial queries; the distances of all pairs would take 40 GB."""
+    q, u = initial_design(definition_from_spec(designed(initial=30_000)), 30_000)
+    assert q.shape == (30_000, 2)
+    assert u.shape == (30_000, 1)
+
+
+def test_more_extra_queries_than_there_are_distinct_points_end_soon(definition, few, monkeypatch):
+    """Once nothing distinct is left, nothing more is computed for the rest of an ``improve`` of thousands."""
+    calls = []
+
+    def counted(*arguments):
+        calls.append(arguments)
+        return acquisition(*arguments)
+
+    monkeypatch.setattr(designing, "acquisition", counted)
+    decision = advance(definition, few, DesignState(), request(budget=len(few), extra=10_000))
+    assert len(calls) == len(decision.q)
 
 
 def test_declared_tolerances_hold(few):
