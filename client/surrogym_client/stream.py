@@ -75,7 +75,7 @@ class Stream:
                 self._protocol.send_binary(message)
                 self._flush(connected)
                 return self._receive(connected)
-            except WebSocketException as error:
+            except (WebSocketException, ConnectionError) as error:
                 self.close()
                 raise StreamLost(f"the stream broke: {error}") from error
             except BaseException:
