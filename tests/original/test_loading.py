@@ -56,6 +56,15 @@ def test_a_given_specification_replaces_the_adapters_own():
     assert original.make("Pendulum-v1", spec=spec).spec() == spec
 
 
+def test_a_specification_of_another_environment_is_refused():
+    """Otherwise the wrong --env would be ignored, or answer from the wrong machine."""
+    pendulum = original.make("Pendulum-v1").spec()
+    with pytest.raises(UnknownEnvironment, match=r"expected a specification of CartPole-v1, got one of Pendulum-v1"):
+        original.make("CartPole-v1", spec=pendulum)
+    nameless = pendulum.model_copy(update={"environment": ""})
+    assert original.make("Pendulum-v1", spec=nameless).spec() == pendulum
+
+
 def test_choices_that_contradict_are_refused():
     with pytest.raises(ValueError, match="initial 20 exceeds the budget 10"):
         original.make("Pendulum-v1", budget=10, initial=20)

@@ -85,7 +85,10 @@ def _known(name: str, spec: EnvironmentSpec | None, design: dict[str, Any], bins
     from surrogym_client.original.gymnasium import GymnasiumEnvironment, task_for
     from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
 
+    if spec is not None and spec.environment not in ("", name):
+        raise UnknownEnvironment(f"expected a specification of {name}, got one of {spec.environment}")
     if name in classic.TASKS:
+        spec = spec and spec.model_copy(update={"environment": name})
         base = spec or task_for(name, design.get("preset", "default")).spec()
         return GymnasiumEnvironment(with_choices(base, design, bins))
     if mujoco.is_known(name):
