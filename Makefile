@@ -35,6 +35,7 @@ unit: .venv/dev postgresql  ## The tests alone (ARGS="-k pendulum")
 
 bench: .venv/dev  ## What a step costs on this machine, beside bare echoes (ARGS="--lanes 1 16")
 	$(BIN)/python tests/benchmarks/bench_step.py $(ARGS)
+	$(BIN)/python tests/benchmarks/bench_predict.py
 
 format: .venv/dev  ## Put the code into shape
 	$(BIN)/ruff check --fix
