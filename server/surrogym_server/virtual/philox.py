@@ -31,7 +31,7 @@ def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor, Te
 
 def uniforms(words: Tensor) -> Tensor:
     """Uniform numbers in (0, 1), float64, from words in [0, 2^32)."""
-    return (words.to(torch.float64) + 0.5) * 2.0**-32
+    return words.to(torch.float64).add_(0.5).mul_(2.0**-32)
 
 
 def normals(words: Tensor) -> Tensor:
@@ -44,4 +44,4 @@ def normals(words: Tensor) -> Tensor:
 
 def _multiply(a: int, b: Tensor) -> tuple[Tensor, Tensor]:
     product = b * a
-    return (product >> 32) & MASK, product & MASK
+    return (product >> 32).bitwise_and_(MASK), product.bitwise_and_(MASK)
