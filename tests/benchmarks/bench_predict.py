@@ -90,7 +90,7 @@ def products(serving: Serving, rows: int, wanted: Sequence[int]) -> Call:
         for process in (serving.processes[c] for c in wanted if c in serving.processes):
             covariance = k[:, process.span]
             if process.polynomial is not None:
-                covariance = torch.addmm(covariance, z, process.polynomial)
+                covariance.addmm_(z, process.polynomial)
             covariance @ process.factor
         return (mean,)
 

@@ -26,7 +26,7 @@ from surrogym_server.gp.blocks import in_blocks
 from surrogym_server.gp.kernel import Hyperparameters
 from surrogym_server.gp.posterior import Posterior
 
-BLOCK = 131_072  # covariances held at once: they stay in the cache, and memory is bounded at any batch size
+BLOCK = 262_144  # covariances held at once: they stay in the cache, and memory is bounded at any batch size
 MIN_ROWS = 64
 MEAN_TOLERANCE = 1e-8  # of the prior's deviation
 VARIANCE_TOLERANCE = 5e-10  # of the prior's variance
@@ -68,15 +68,15 @@ class _Process:
         exponent: Tensor = distance.square_().mul_(-0.5)
         return exponent
 
-    def deviation(self, x: Tensor, z: Tensor, smooth: Tensor) -> Tensor:
-        """Latent deviation (m,), in the output's unit."""
+    def deviation(self, x: Tensor, z: Tensor, squared: Tensor, smooth: Tensor) -> Tensor:
+        """Latent deviation (m,), in the output's unit. Its columns of ``smooth`` (m, S) are used up."""
         k = smooth[:, self.span]
         if self.variance_by_differences and not self.mean_by_differences:
             k = self.exponent(x).exp_()
         if self.polynomial is not None:
-            k = torch.addmm(k, z, self.polynomial)
+            k.addmm_(z, self.polynomial)
         v = torch.linalg.solve_triangular(self.factor, k.T, upper=False)
-        variance = z.square() @ self.prior - torch.linalg.vector_norm(v, dim=0).square_()
+        variance = squared @ self.prior - torch.linalg.vector_norm(v, dim=0).square_()
         deviation: Tensor = variance.clamp_min_(0).sqrt_().mul_(self.scale)
         return deviation
 
@@ -124,10 +124,10 @@ class Serving:
 
         def block(rows: Tensor) -> tuple[Tensor, Tensor]:
             z, smooth = self._covariances(rows)
-            mean = self._means(z, smooth)
+            mean, squared = self._means(z, smooth), z.square()
             deviation = torch.zeros_like(mean)
             for column in self.processes.keys() & set(wanted):
-                deviation[:, column] = self.processes[column].deviation(rows, z, smooth)
+                deviation[:, column] = self.processes[column].deviation(rows, z, squared, smooth)
             return mean, deviation
 
         mean, deviation = in_blocks(self.rows, block, x)
