@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from support.commands import command_line, parse
+from support.commands import command_line, options, parse
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
@@ -56,9 +56,10 @@ def test_links_lead_somewhere(page: Path) -> None:
 @each_page
 def test_commands_exist_with_their_options(page: Path) -> None:
     for words in commands(page, "surrogym"):
-        alone = len(words) == 1 or words[-1] == "--help"
-        if alone:
+        if len(words) == 1 or words[-1] == "--help":
             assert words[0] in ("--help", "--version", *command_line().commands)
+        elif any(word.isupper() for word in words):  # stands for what a person fills in
+            assert {word for word in words if word.startswith("--")} <= options(words[0])
         else:
             parse(words)
 

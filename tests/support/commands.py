@@ -15,6 +15,11 @@ def command_line() -> Any:
     return typer.main.get_command(build())
 
 
+def options(name: str) -> set[str]:
+    """All spellings of a command's options. Raises KeyError for no such command."""
+    return {spelling for parameter in command_line().commands[name].params for spelling in parameter.opts}
+
+
 def parse(arguments: list[str]) -> dict[str, Any]:
     """The values that ``surrogym ARGUMENTS`` gives its command, which is not run.
 
