@@ -34,8 +34,8 @@ STREAM = "text/event-stream"
 async def events(
     name: str,
     use: Use,
-    after: Annotated[int | None, Query(ge=0)] = None,
-    last_event_id: Annotated[int | None, Header(ge=0)] = None,
+    after: Annotated[int | None, Query(ge=0, le=2**63 - 1)] = None,
+    last_event_id: Annotated[int | None, Header(ge=0, le=2**63 - 1)] = None,
 ) -> StreamingResponse:
     """Queries, samples, fits and phases as they come. ``Last-Event-ID`` or ``after`` goes on behind a known
     event; without either the stream begins with what happens from now on."""

@@ -41,7 +41,7 @@ class FitOptions:
     signal_prior: tuple[float, float] = (0.0, 2.0)
     linear_prior: tuple[float, float] = (0.0, 2.0)
     quadratic_prior: tuple[float, float] = (-2.0, 2.0)
-    noise_prior: tuple[float, float] = (math.log(1e-7), 3.0)
+    noise_prior: tuple[float, float] = (math.log(1e-7), 6.0)
     max_iterations: int = 100
 
 

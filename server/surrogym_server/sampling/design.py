@@ -116,18 +116,18 @@ def _candidate_points(
 
 
 def default_tolerances(definition: EnvironmentDefinition, samples: Samples) -> tuple[float, ...]:
-    """Tolerance of each output: the declared one, else 5 % of the output's deviation over the samples at hand.
+    """Tolerance of each output: the declared one, else 5 % of the output's deviation over the samples at hand
+    (of its size, if it never varied).
 
     Preset ``paper`` has 1 in raw units for all.
     """
     if definition.design.preset == "paper":
         return (1.0,) * len(definition.outputs)
     targets = torch.cat([increments(definition, samples), samples.reward[:, None]], -1)
-    spread = targets.std(0, correction=0)
+    spread, mean = targets.std(0, correction=0), targets.mean(0).abs()
+    size = torch.where(spread > 0, spread, torch.where(mean > 0, mean, 1.0))
     declared = dict(definition.tolerances)
-    return tuple(
-        declared.get(name, max(TOLERANCE * float(spread[i]), 1e-9)) for i, name in enumerate(definition.outputs)
-    )
+    return tuple(declared.get(name, TOLERANCE * float(size[i])) for i, name in enumerate(definition.outputs))
 
 
 def judge(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from safetensors import SafetensorError
@@ -14,10 +15,16 @@ from torch import Tensor
 from surrogym_server.errors import InvalidInput
 from surrogym_server.gp import Hyperparameters, Posterior
 from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.surrogate.features import FeatureMap, encode
+from surrogym_server.surrogate.features import Encoding, FeatureMap, State, encode
 from surrogym_server.surrogate.model import OutputModel, SurrogateModel
 
 FORMAT = 1
+KNOWN_MAPS = frozenset(
+    FeatureMap(state, action, lead)
+    for state in get_args(State)
+    for action in get_args(Encoding)
+    for lead in (False, True)
+)
 
 
 def to_bytes(model: SurrogateModel) -> bytes:
@@ -52,15 +59,18 @@ def from_bytes(definition: EnvironmentDefinition, data: bytes) -> SurrogateModel
         outputs = tuple(_output(entry, tensors, str(i)) for i, entry in enumerate(header["outputs"]))
         stored, terminal_reward = header["format"], float(header["terminal_reward"])
         samples, digest = int(header["samples"]), str(header["digest"])
-    except (SafetensorError, ValueError, KeyError, TypeError) as error:
+    except (SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise InvalidInput(f"expected a Surrogym model in safetensors form, got {len(data)} bytes: {error}") from error
     names = tuple(output.name for output in outputs)
     if stored != FORMAT or names != definition.outputs:
         raise InvalidInput(
             f"expected a model of format {FORMAT} with outputs {definition.outputs}, got format {stored} with {names}"
         )
+    if not math.isfinite(terminal_reward) or samples < 1:
+        raise InvalidInput(f"expected a finite terminal reward and samples, got {terminal_reward} and {samples}")
     for output in outputs:
         _require_shapes(definition, output)
+        _require_numbers(output)
     return SurrogateModel(definition, outputs[:-1], outputs[-1], terminal_reward, samples, digest)
 
 
@@ -92,17 +102,38 @@ def _output(entry: dict[str, Any], tensors: dict[str, Tensor], prefix: str) -> O
         arrays = {n: tensors[f"{prefix}.{n}"] for n in ("x", "y", "factor", "weights", "lengthscale")}
         hyper = Hyperparameters(
             arrays["lengthscale"],
-            stored["signal_variance"],
-            stored["linear_variance"],
-            stored["quadratic_variance"],
-            stored["noise_variance"],
+            float(stored["signal_variance"]),
+            float(stored["linear_variance"]),
+            float(stored["quadratic_variance"]),
+            float(stored["noise_variance"]),
         )
-        posterior = Posterior(hyper, arrays["x"], arrays["y"], arrays["factor"], arrays["weights"], stored["jitter"])
+        posterior = Posterior(
+            hyper, arrays["x"], arrays["y"], arrays["factor"], arrays["weights"], float(stored["jitter"])
+        )
     scores = tuple((name, score) for name, score in entry["scores"])
     feature_map = FeatureMap(**entry["feature_map"])
-    return OutputModel(
-        entry["name"], feature_map, posterior, entry["centre"], entry["scale"], entry["left_out"], scores
-    )
+    if feature_map not in KNOWN_MAPS:
+        raise ValueError(f"unknown feature map {feature_map}")
+    centre, scale = float(entry["centre"]), float(entry["scale"])
+    return OutputModel(str(entry["name"]), feature_map, posterior, centre, scale, int(entry["left_out"]), scores)
+
+
+def _require_numbers(output: OutputModel) -> None:
+    """Every number finite, and positive where only that makes sense."""
+    finite, positive, least_zero, tensors = [output.centre], [output.scale], [0.0], []
+    if (posterior := output.posterior) is not None:
+        hyper = posterior.hyper
+        tensors = [posterior.x, posterior.y, posterior.factor, posterior.weights]
+        positive += [hyper.signal_variance, hyper.noise_variance, *hyper.lengthscale.tolist()]
+        positive += posterior.factor.diagonal().tolist()
+        least_zero += [hyper.linear_variance, hyper.quadratic_variance, posterior.jitter]
+    if not (
+        all(math.isfinite(v) for v in (*finite, *positive, *least_zero))
+        and min(positive) > 0
+        and min(least_zero) >= 0
+        and all(bool(torch.isfinite(t).all()) for t in tensors)
+    ):
+        raise InvalidInput(f"output {output.name!r}: expected finite numbers, scales and variances above 0")
 
 
 def _require_shapes(definition: EnvironmentDefinition, output: OutputModel) -> None:
@@ -111,7 +142,7 @@ def _require_shapes(definition: EnvironmentDefinition, output: OutputModel) -> N
     q = torch.zeros(1, len(definition.coordinates), dtype=torch.float64)
     u = torch.zeros(1, definition.action.size, dtype=torch.float64)
     lead = q.new_zeros(1, len(definition.coordinates))
-    width, n = encode(definition, output.feature_map, q, u, lead).shape[1], len(posterior.y)
+    width, n = encode(definition, output.feature_map, q, u, lead).shape[1], posterior.y.numel()
     expected = {
         "x": (posterior.x, (n, width)),
         "y": (posterior.y, (n,)),

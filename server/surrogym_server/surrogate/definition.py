@@ -15,6 +15,7 @@ from surrogym_server.surrogate.distributions import Distribution
 from surrogym_server.surrogate.terms import Term, TermSet, compile_terms
 
 REWARD = "reward"
+REACH = 1e6
 Array = NDArray[np.float64]
 Preset = Literal["default", "paper"]
 Kind = Literal["linear", "angle", "constant"]
@@ -117,6 +118,15 @@ class EnvironmentDefinition:
         """Saturation bounds, (C,) each."""
         low = torch.tensor([c.low for c in self.coordinates], dtype=torch.float64)
         return low, torch.tensor([c.high for c in self.coordinates], dtype=torch.float64)
+
+    @cached_property
+    def reach(self) -> tuple[Tensor, Tensor]:
+        """Saturation bounds, (C,) each; where there is none, ``REACH`` widths of the sampling range beyond it, so that
+        a model that diverges stays finite."""
+        low, high = self.bounds
+        ends = torch.tensor([(c.sampling.low, c.sampling.high) for c in self.coordinates], dtype=torch.float64)
+        room = REACH * (ends[:, 1] - ends[:, 0])
+        return torch.maximum(low, ends[:, 0] - room), torch.minimum(high, ends[:, 1] + room)
 
     @cached_property
     def angles(self) -> tuple[int, ...]:

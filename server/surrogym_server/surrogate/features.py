@@ -17,6 +17,9 @@ from torch import Tensor
 from surrogym_server.surrogate.definition import EnvironmentDefinition, wrap
 from surrogym_server.surrogate.distributions import scaling
 
+State = Literal["cos_sin", "wrapped", "both", "observation"]
+Encoding = Literal["value", "one_hot"]  # of discrete actions
+
 
 @dataclass(frozen=True)
 class FeatureMap:
@@ -27,8 +30,8 @@ class FeatureMap:
     saturating coordinates is an input as well, so that what follows from it (an angle from its speed) sees no kink.
     """
 
-    state: Literal["cos_sin", "wrapped", "both", "observation"] = "cos_sin"
-    action: Literal["value", "one_hot"] = "value"
+    state: State = "cos_sin"
+    action: Encoding = "value"
     lead: bool = False
 
     def __str__(self) -> str:
@@ -48,10 +51,10 @@ def candidates(definition: EnvironmentDefinition, follows: bool) -> tuple[Featur
     """Maps worth comparing for one output; ``follows`` says that it may read the lead."""
     if definition.design.preset == "paper":
         return (FeatureMap(state="observation"),)
-    states: list[Literal["cos_sin", "wrapped", "both"]] = ["cos_sin"]
+    states: list[State] = ["cos_sin"]
     if definition.angles:
         states += ["wrapped", "both"]
-    actions: list[Literal["value", "one_hot"]] = ["value"]
+    actions: list[Encoding] = ["value"]
     if any(n > 2 for n in definition.action.nvec):
         actions.append("one_hot")
     leads = [False, True] if follows and leading(definition) else [False]

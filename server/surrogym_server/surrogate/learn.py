@@ -19,7 +19,7 @@ from surrogym_server.surrogate.model import OutputModel, SurrogateModel
 from surrogym_server.surrogate.samples import Samples, increments, saturated
 
 Thetas = Mapping[str, NDArray[np.float64]]  # "output|feature map" -> hyperparameters, for warm starts
-CONSTANT = 1e-9  # outputs whose deviation is below this share of their size never varied
+CONSTANT = 1e-9  # an output whose deviation is below this share of its own size never varied
 MIN_POINTS = 2
 
 
@@ -62,7 +62,7 @@ class _Learner:
         compared on the same points.
         """
         centre, scale = float(target[keep].mean()), float(target[keep].std(correction=0))
-        if scale <= CONSTANT * (1 + abs(centre)):
+        if scale <= CONSTANT * abs(centre):
             return OutputModel(name, next(iter(inputs)), None, centre, 1.0, int((~keep).sum()))
         y = (target - centre) / scale
         fits = {m: self._fit(f"{name}|{m}", x[keep], y[keep]) for m, x in inputs.items()}

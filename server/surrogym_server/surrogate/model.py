@@ -195,8 +195,8 @@ def paid(terminal_reward: float, reward: Tensor, terminated: Tensor) -> Tensor:
 
 
 def clip(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
-    """Coordinates q (..., C) inside their saturation bounds."""
-    low, high = definition.bounds
+    """Coordinates q (..., C) inside their saturation bounds, and a diverging model's within its reach."""
+    low, high = definition.reach
     return torch.clamp(q, low.to(q.device), high.to(q.device))
 
 

@@ -119,3 +119,12 @@ def test_a_constant_output_and_a_repeated_point_fit_to_finite_numbers(rng):
         assert torch.isfinite(mean).all()
         assert torch.isfinite(variance).all()
         torch.testing.assert_close(mean, targets, rtol=0, atol=1e-2)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_noise_of_a_fifth_of_the_variance_is_seen(seed):
+    rng = np.random.default_rng(seed)
+    x = torch.tensor(rng.uniform(-1.7, 1.7, (60, 3)))
+    y = x[:, 1] + torch.tensor(0.5 * rng.standard_normal(60))
+    y = (y - y.mean()) / y.std(correction=0)
+    assert 0.05 < fit(x, y, FitOptions()).posterior.hyper.noise_variance < 0.5

@@ -1,6 +1,7 @@
 """A stored model predicts the same bits, and bytes that are not one are refused."""
 
 import json
+import math
 from dataclasses import replace
 
 import pytest
@@ -9,6 +10,7 @@ from safetensors.torch import load, save
 
 from surrogym_server.errors import InvalidInput
 from surrogym_server.surrogate.codec import from_bytes, to_bytes
+from surrogym_server.surrogate.features import FeatureMap
 from surrogym_server.surrogate.model import SurrogateModel
 
 
@@ -108,3 +110,28 @@ def test_a_foreign_safetensors_file_is_refused(pendulum_definition):
     for metadata in (None, {"surrogym": "not json"}, {"surrogym": "[]"}, {"other": "{}"}):
         with pytest.raises(InvalidInput):
             from_bytes(pendulum_definition, save({"a": torch.zeros(1)}, metadata))
+
+
+def test_numbers_that_no_model_has_are_refused(pendulum_definition, pendulum_model):
+    reward = pendulum_model.reward
+    nowhere = replace(reward.posterior, weights=torch.full_like(reward.posterior.weights, math.nan))
+    for bad in (
+        replace(pendulum_model, terminal_reward=math.nan),
+        replace(pendulum_model, samples=-5),
+        replace(pendulum_model, reward=replace(reward, scale=0.0)),
+        replace(pendulum_model, reward=replace(reward, posterior=nowhere)),
+        replace(pendulum_model, reward=replace(reward, feature_map=FeatureMap(action="zzz"))),
+        replace(
+            pendulum_model,
+            reward=replace(
+                reward, posterior=replace(reward.posterior, hyper=replace(reward.posterior.hyper, signal_variance=-1.0))
+            ),
+        ),
+    ):
+        with pytest.raises(InvalidInput):
+            from_bytes(pendulum_definition, to_bytes(bad))
+
+
+def test_a_header_without_end_is_refused(pendulum_definition):
+    with pytest.raises(InvalidInput):
+        from_bytes(pendulum_definition, (200_000).to_bytes(8, "little") + b"[" * 200_000)
