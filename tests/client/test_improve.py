@@ -10,7 +10,7 @@ from uuid import uuid4
 
 import pytest
 
-from support.server import ServerProcess
+from support.server import ServerProcess, running_server
 from support.teaching import answer
 from surrogym_client.api import Api
 from surrogym_client.improve import ImproveSettings, train_and_improve
@@ -23,6 +23,13 @@ from surrogym_shared.spec import Design, EnvironmentSpec
 
 SETTINGS = TrainSettings(total_steps=400, num_envs=8, hyperparameters={"n_steps": 10, "batch_size": 40, "n_epochs": 1})
 ROUND_STEPS = 160 + 32 * 200  # two fifths of 400, and the visit: 32 lanes for a time limit of 200
+
+
+@pytest.fixture(scope="module")
+def own_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
+    """A server whose one process for fits is not busy with another test's surrogate."""
+    with running_server(tmp_path_factory.mktemp("improve")) as server:
+        yield server
 
 
 @contextmanager
@@ -53,15 +60,15 @@ def sampling(url: str, name: str, spec: EnvironmentSpec) -> Iterator[None]:
     ids=["unsure", "ready"],
 )
 def test_rounds_go_on_until_the_design_is_ready(
-    server_process: ServerProcess, tmp_path: Path, target: float, initial: int, real_steps: int, rounds: int
+    own_server: ServerProcess, tmp_path: Path, target: float, initial: int, real_steps: int, rounds: int
 ) -> None:
     tight = {"theta": 1e-9, "speed": 1e-9, "reward": 1e-9} if rounds else {"theta": 1e3, "speed": 1e3, "reward": 1e3}
     design = Design(initial=initial, budget=initial if rounds else 8, target=target, monte_carlo=64)
     spec = pendulum().model_copy(update={"design": design, "tolerances": tight})
     name, seen = f"improve-{uuid4().hex[:8]}", []
-    with Api(server_process.url) as api:
+    with Api(own_server.url) as api:
         api.create_surrogate(name, spec)
-        with sampling(server_process.url, name, spec), HttpSurrogate(server_process.url, name) as port:
+        with sampling(own_server.url, name, spec), HttpSurrogate(own_server.url, name) as port:
             wait_for_design(api, name, 60)
             improve = ImproveSettings(queries=3, rounds=2, patience_seconds=60)
             result = train_and_improve(api, name, port, tmp_path / "p.zip", SETTINGS, improve, seen.append)
