@@ -11,7 +11,7 @@ import numpy as np
 
 from surrogym_server.engine.design_job import DesignJob, DesignResult
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.errors import InvalidInput, SurrogymError, Unavailable
+from surrogym_server.errors import InvalidInput, SurrogymError, Unavailable, UnknownSurrogate
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
@@ -77,6 +77,8 @@ class Designer:
                     await self.fit_all_due()
                 except Unavailable as error:
                     logger.warning("storage is away, the design waits: %s", error)
+                except Exception:  # one surrogate's trouble must not end the design of all others
+                    logger.exception("a look for what is due failed; the next one follows")
                 await listener.wait(self._look_seconds)
 
     async def fit_all_due(self) -> None:
@@ -174,9 +176,10 @@ class Designer:
     def _give_up_hopeless(self) -> None:
         """Fail the designs whose initial queries were all set aside: nothing to fit, and nothing to wait for."""
         for record in self._storage.surrogates.list():
-            if record.phase == "collecting" and not record.paused and (error := self._hopeless(record.name)):
-                self._storage.surrogates.set_phase(record.name, "failed", error)
-                self._notices.post(record.name)
+            with suppress(UnknownSurrogate):  # deleted meanwhile
+                if record.phase == "collecting" and not record.paused and (error := self._hopeless(record.name)):
+                    self._storage.surrogates.set_phase(record.name, "failed", error)
+                    self._notices.post(record.name)
 
     def _hopeless(self, name: str) -> str | None:
         counts = self._storage.queries.counts(name)

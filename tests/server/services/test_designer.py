@@ -193,3 +193,12 @@ def test_the_phase_after_a_fit(answered: Storage, designer, runner: Runner, verd
     result = run_design_job(runner.jobs[0])
     changed = replace(result, verdict=verdict, query_coordinates=np.zeros((queries, 2)))
     assert phase_after(changed) == phase
+
+
+def test_a_surrogate_deleted_under_its_eyes_does_not_end_the_designer(answered: Storage, designer, runner, monkeypatch):
+    gone, listed = answered.surrogates.get(NAME), answered.surrogates.list
+    monkeypatch.setattr(
+        answered.surrogates, "list", lambda: [*listed(), replace(gone, name="gone", phase="collecting")]
+    )
+    fit_all(designer)
+    assert len(runner.jobs) == 1
