@@ -42,7 +42,7 @@ def model_actions(action: ActionDefinition, raw: NDArray[Any]) -> Array:
 
 def decode_bins(action: ActionDefinition, rows: Array) -> Array:
     """Continuous values (n, F) of equally spaced bins, numbers (n, F)."""
-    low, high = np.array(action.low), np.array(action.high)
+    low, high = action.limits
     values: Array = low + rows * (high - low) / (np.array(action.bins) - 1)
     return values
 
@@ -70,7 +70,7 @@ def _require_counts(rows: Array, counts: tuple[int, ...]) -> None:
 
 
 def _in_box(action: ActionDefinition, rows: Array) -> Array:
-    low, high = np.array(action.low), np.array(action.high)
+    low, high = action.limits
     slack = FLOAT32_SLACK * (high - low)  # a policy's float32 bound may round to just outside
     bad = (rows < low - slack) | (rows > high + slack)
     if bad.any():

@@ -47,6 +47,11 @@ class ActionDefinition:
     bins: tuple[int, ...] | None = None
     nvec: tuple[int, ...] = ()
 
+    @cached_property
+    def limits(self) -> tuple[Array, Array]:
+        """``low`` and ``high`` as arrays, (F,) each, made once: every step of a policy is checked against them."""
+        return np.array(self.low), np.array(self.high)
+
     @property
     def size(self) -> int:
         return len(self.low) or len(self.nvec)
