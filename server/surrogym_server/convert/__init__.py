@@ -1,0 +1,62 @@
+"""Wire <-> core, in pairs."""
+
+from surrogym_server.convert.definitions import default_budget, definition_from_spec
+from surrogym_server.convert.numbers import numbers
+from surrogym_server.convert.resources import (
+    added_samples,
+    claimed,
+    event,
+    ledger,
+    model_view,
+    new_sample,
+    prediction,
+    query_list,
+    query_view,
+    sample_page,
+    sample_view,
+    surrogate_summary,
+    surrogate_view,
+    uncertainty,
+)
+from surrogym_server.convert.sessions import (
+    lane_mask,
+    opening,
+    reset_frame,
+    reset_reply,
+    rollout_frame,
+    rollout_reply,
+    session_shape,
+    session_view,
+    step_frame,
+    step_reply,
+)
+
+__all__ = [
+    "added_samples",
+    "claimed",
+    "default_budget",
+    "definition_from_spec",
+    "event",
+    "lane_mask",
+    "ledger",
+    "model_view",
+    "new_sample",
+    "numbers",
+    "opening",
+    "prediction",
+    "query_list",
+    "query_view",
+    "reset_frame",
+    "reset_reply",
+    "rollout_frame",
+    "rollout_reply",
+    "sample_page",
+    "sample_view",
+    "session_shape",
+    "session_view",
+    "step_frame",
+    "step_reply",
+    "surrogate_summary",
+    "surrogate_view",
+    "uncertainty",
+]

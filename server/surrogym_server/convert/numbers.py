@@ -1,0 +1,31 @@
+"""Arrays out of rows, rows out of arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_server.errors import InvalidInput
+
+
+def numbers(what: str, rows: Sequence[Any]) -> NDArray[np.float64]:
+    """Nested lists as an array.
+
+    Raises:
+        InvalidInput: rows of different lengths.
+    """
+    try:
+        return np.array(rows, dtype=np.float64)
+    except (ValueError, TypeError) as error:
+        raise InvalidInput(f"{what}: expected rows of one length, got different ones") from error
+
+
+def as_tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def with_lists(values: dict[str, Any]) -> dict[str, Any]:
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}

@@ -1,0 +1,143 @@
+"""Surrogates, queries, samples, models and events: records to replies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from surrogym_server.convert.numbers import as_tuple, with_lists
+from surrogym_server.sampling.uncertainty import UncertaintyResult
+from surrogym_server.services.models import Said
+from surrogym_server.services.queries import Claim
+from surrogym_server.services.samples import Added
+from surrogym_server.services.surrogates import SurrogateStatus
+from surrogym_server.storage.records import (
+    EventRecord,
+    LedgerRecord,
+    ModelRecord,
+    NewSample,
+    QueryRecord,
+    SampleRecord,
+)
+from surrogym_server.surrogate.describe import PointPrediction
+from surrogym_shared import spec as wire
+from surrogym_shared import wire as replies
+
+
+def surrogate_summary(status: SurrogateStatus) -> replies.SurrogateSummary:
+    return replies.SurrogateSummary(**_summary_fields(status))
+
+
+def surrogate_view(status: SurrogateStatus) -> replies.SurrogateView:
+    record, model = status.record, status.model
+    return replies.SurrogateView(
+        **_summary_fields(status),
+        spec=wire.EnvironmentSpec.model_validate(record.spec),
+        budget=record.budget,
+        target=record.target,
+        outputs=list(status.outputs),
+        fidelity=None if model is None else replies.Fidelity.model_validate(model.fidelity),
+        ledger=ledger(status.ledger),
+        queries=replies.QueryCounts(**asdict(status.queries)),
+        error=record.error,
+    )
+
+
+def _summary_fields(status: SurrogateStatus) -> dict[str, Any]:
+    record, model = status.record, status.model
+    return {
+        "name": record.name,
+        "environment": record.spec["environment"],
+        "phase": record.phase,
+        "paused": record.paused,
+        "round": record.round,
+        "samples": status.samples,
+        "model_version": None if model is None else model.version,
+        "confidence_index": None if model is None else model.fidelity["confidence_index"],
+        "created_at": record.created_at,
+    }
+
+
+def ledger(record: LedgerRecord) -> replies.Ledger:
+    return replies.Ledger(**asdict(record), total=record.total)
+
+
+def claimed(claim: Claim, lease_seconds: float) -> replies.ClaimedQueries:
+    queries = [
+        replies.Query(
+            id=query.id,
+            purpose=query.purpose,
+            coordinates=list(query.coordinates),
+            action=list(query.action),
+            attempt=query.attempt,
+            lease_token=query.token,
+            lease_seconds=lease_seconds,
+        )
+        for query in claim.queries
+    ]
+    return replies.ClaimedQueries(queries=queries, phase=claim.phase, paused=claim.paused)
+
+
+def query_list(records: Iterable[QueryRecord]) -> replies.QueryList:
+    return replies.QueryList(queries=[query_view(record) for record in records])
+
+
+def query_view(record: QueryRecord) -> replies.QueryView:
+    return replies.QueryView.model_validate(with_lists(asdict(record)))
+
+
+def new_sample(sample: replies.NewSample) -> NewSample:
+    return NewSample(**{key: as_tuple(value) for key, value in sample})
+
+
+def added_samples(added: Added) -> replies.AddedSamples:
+    return replies.AddedSamples(sample_ids=list(added.ids), duplicates=added.duplicates, ledger=ledger(added.ledger))
+
+
+def sample_view(record: SampleRecord) -> replies.SampleView:
+    fields = with_lists(asdict(record))
+    return replies.SampleView(**{name: fields[name] for name in replies.SampleView.model_fields})
+
+
+def sample_page(records: Sequence[SampleRecord], limit: int) -> replies.SamplePage:
+    more = len(records) == limit
+    return replies.SamplePage(
+        samples=[sample_view(record) for record in records], next_after=records[-1].id if more else None
+    )
+
+
+def model_view(record: ModelRecord) -> replies.ModelView:
+    return replies.ModelView.model_validate(asdict(record))
+
+
+def uncertainty(said: Said[UncertaintyResult]) -> replies.Uncertainty:
+    result = said.result
+    return replies.Uncertainty(
+        model_version=said.version,
+        outputs=list(said.outputs),
+        mean=result.mean.tolist(),
+        deviation=result.deviation.tolist(),
+        model_uncertainty=result.model_uncertainty.tolist(),
+        input_probability=result.input_probability.tolist(),
+        log_uncertainty_index=result.log_uncertainty_index.tolist(),
+        uncertainty_index=np.exp(result.log_uncertainty_index).tolist(),
+    )
+
+
+def prediction(said: Said[PointPrediction]) -> replies.Prediction:
+    result = said.result
+    return replies.Prediction(
+        model_version=said.version,
+        next_coordinates=result.next_coordinates.tolist(),
+        next_observation=result.next_observation.tolist(),
+        reward=result.reward.tolist(),
+        reward_deviation=result.reward_deviation.tolist(),
+        terminated=result.terminated.tolist(),
+    )
+
+
+def event(record: EventRecord) -> replies.Event:
+    return replies.Event(**asdict(record))

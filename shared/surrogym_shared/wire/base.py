@@ -1,0 +1,44 @@
+"""What all requests and replies share: limits, words, base classes."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from surrogym_shared.spec import MAX_DIMENSIONS, NAME_PATTERN
+
+PROTOCOL = 1
+MAX_LANES = 65_536
+MAX_PARTICLES = 1_000_000
+MAX_CLAIM = 256
+MAX_BATCH = 65_536
+MAX_ROLLOUT = 100_000
+MAX_MEASURED = 1e30  # beyond it variances overflow, and one such sample would leave no model to serve
+
+Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "failed"]
+Purpose = Literal["initial", "adaptive", "manual"]
+QueryStatus = Literal["pending", "leased", "answered", "set_aside"]
+Variant = Literal["deterministic", "probabilistic"]
+AutoresetMode = Literal["next_step", "same_step", "disabled"]
+Role = Literal["read", "train", "sample", "admin"]
+
+SurrogateName = Annotated[str, Field(pattern=NAME_PATTERN)]
+Key = Annotated[str, Field(min_length=1, max_length=128)]
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Seq = Annotated[int, Field(ge=1)]
+Measured = Annotated[float, Field(ge=-MAX_MEASURED, le=MAX_MEASURED, allow_inf_nan=False)]
+Vector = Annotated[list[Measured], Field(min_length=1, max_length=MAX_DIMENSIONS)]
+Matrix = Annotated[list[Vector], Field(min_length=1, max_length=MAX_BATCH)]
+
+
+class Request(BaseModel):
+    """Base of what a client sends: unknown fields are refused, booleans and strings are not numbers."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class Reply(BaseModel):
+    """Base of what the server sends."""
+
+    model_config = ConfigDict(extra="forbid")

@@ -1,0 +1,27 @@
+"""The service itself: health and events."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from surrogym_shared.wire.base import PROTOCOL, Reply
+
+
+class Health(Reply):
+    status: Literal["ok"] = "ok"
+    version: str
+    protocol: int = PROTOCOL
+
+
+class Ready(Reply):
+    status: Literal["ready", "not_ready"]
+    storage: str
+
+
+class Event(Reply):
+    """One server-sent event of a surrogate; ``id`` grows, so a reader goes on with Last-Event-ID."""
+
+    id: int
+    kind: Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger"]
+    created_at: float
+    body: dict[str, Any]

@@ -1,0 +1,147 @@
+"""Sessions: open, reset, step, rollout, occupancy."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, FiniteFloat
+
+from surrogym_shared.spec import MAX_DIMENSIONS
+from surrogym_shared.wire.base import (
+    MAX_LANES,
+    MAX_PARTICLES,
+    MAX_ROLLOUT,
+    PROTOCOL,
+    AutoresetMode,
+    Key,
+    Reply,
+    Request,
+    Seed,
+    Seq,
+    Variant,
+)
+
+
+class OpenSession(Request):
+    """One trainer's virtual environment. None takes the preset's value."""
+
+    num_envs: Annotated[int, Field(ge=1, le=MAX_LANES)] = 1
+    variant: Variant = "deterministic"
+    seed: Seed | None = Field(default=None, description="None draws one; the reply says which")
+    autoreset_mode: AutoresetMode = "next_step"
+    model: Literal["latest"] | Annotated[int, Field(ge=1)] = "latest"
+    time_limit: Annotated[int, Field(ge=1, le=10_000_000)] | None = Field(default=None, description="None: the spec's")
+    penalty: Annotated[float, Field(ge=0, le=100)] | None = Field(default=None, description="k of eq. 14")
+    start_box: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.0, description="share of episodes that start anywhere in the sampling range"
+    )
+    particles: Annotated[int, Field(ge=1, le=MAX_PARTICLES)] = 1_000
+    propagation: Literal["mean", "sample"] = "sample"
+    weighting: Literal["inverse_variance", "uniform"] = "inverse_variance"
+    spread: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.01, description="initial deviation of particles, as a share of each coordinate's sampling range"
+    )
+    occupancy: bool = Field(default=False, description="collect visited coordinates, to be submitted at checkpoints")
+    idempotency_key: Key | None = None
+
+
+class BoxSpace(Reply):
+    kind: Literal["box"] = "box"
+    low: list[float | None] = Field(description="null is unbounded")
+    high: list[float | None]
+    dtype: Literal["float32"] = "float32"
+
+
+class DiscreteSpace(Reply):
+    kind: Literal["discrete"] = "discrete"
+    n: int
+
+
+class MultiDiscreteSpace(Reply):
+    kind: Literal["multi_discrete"] = "multi_discrete"
+    nvec: list[int]
+
+
+ActionSpace = Annotated[BoxSpace | DiscreteSpace | MultiDiscreteSpace, Field(discriminator="kind")]
+
+
+class SessionView(Reply):
+    protocol: int = PROTOCOL
+    id: str
+    surrogate: str
+    num_envs: int
+    variant: Variant
+    seed: int
+    autoreset_mode: AutoresetMode
+    model: Literal["latest"] | int
+    model_version: list[int] = Field(description="(N,) the version each lane's episode runs under")
+    seq: int = Field(description="the last seq answered; the next request carries seq + 1")
+    time_limit: int | None
+    penalty: float
+    observation_space: BoxSpace
+    action_space: ActionSpace
+    outputs: list[str] = Field(description="what the model predicts, in the order of a step's deviations")
+    idle_seconds: float = Field(description="the session expires when unused for so long")
+
+
+class ResetSession(Request):
+    seq: Seq | None = None
+    seed: Seed | Annotated[list[Seed], Field(max_length=MAX_LANES)] | None = None
+    mask: Annotated[list[bool], Field(max_length=MAX_LANES)] | None = Field(
+        default=None, description="(N,) lanes to reset; None is all"
+    )
+
+
+class ResetReply(Reply):
+    seq: int
+    observation: list[list[float]] = Field(description="(N, D); lanes outside the mask show their last observation")
+    model_version: list[int]
+
+
+ActionRow = FiniteFloat | Annotated[list[FiniteFloat], Field(max_length=MAX_DIMENSIONS)]
+Actions = Annotated[list[ActionRow], Field(min_length=1, max_length=MAX_LANES)]
+
+
+class StepSession(Request):
+    seq: Seq | None = None
+    action: Actions = Field(description="(N, F), or (N,) where the action is one number")
+    mask: Annotated[list[bool], Field(max_length=MAX_LANES)] | None = Field(
+        default=None, description="(N,) lanes to step; None is all. Other lanes keep their state, with reward 0"
+    )
+    deviations: bool = Field(default=False, description="send the deviation of each output along")
+
+
+class StepReply(Reply):
+    """``final`` holds the last observation of lanes that ended and were reset within this very step (same_step)."""
+
+    seq: int
+    observation: list[list[float]]
+    reward: list[float]
+    terminated: list[bool]
+    truncated: list[bool]
+    final_lanes: list[int] = Field(default_factory=list, description="indices of lanes with a final observation")
+    final_observation: list[list[float]] = Field(default_factory=list, description="(len(final_lanes), D)")
+    model_version: list[int]
+    reward_mean: list[float] = Field(description="(N,) before the penalty")
+    deviation: list[list[float]] | None = Field(default=None, description="(N, O), when asked for")
+
+
+class RolloutSession(Request):
+    seq: Seq | None = None
+    actions: Annotated[list[Actions], Field(min_length=1, max_length=MAX_ROLLOUT)] = Field(
+        description="(T, N, F): T steps in one request"
+    )
+
+
+class RolloutReply(Reply):
+    seq: int
+    steps: list[StepReply]
+
+
+class SubmitOccupancy(Request):
+    checkpoint: Key
+
+
+class SubmittedOccupancy(Reply):
+    checkpoint: str
+    states: int = Field(description="how many visited coordinates were stored")

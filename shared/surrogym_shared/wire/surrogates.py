@@ -1,0 +1,92 @@
+"""Surrogates: what is created, listed, changed."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import ConfigDict, Field
+
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire.base import Phase, Reply, Request, SurrogateName
+
+
+class CreateSurrogate(Request):
+    model_config = ConfigDict(extra="forbid", strict=False)  # the specification brings its own strictness
+
+    name: SurrogateName
+    spec: EnvironmentSpec
+
+
+class PatchSurrogate(Request):
+    """What may change while the design runs; None leaves a field as it is."""
+
+    paused: bool | None = None
+    budget: Annotated[int, Field(ge=2, le=100_000)] | None = None
+    target: Annotated[float, Field(gt=0.5, lt=1)] | None = None
+
+
+class OutputFidelity(Reply):
+    """How good the model of one output is; ``unit`` is the output's own."""
+
+    name: str
+    structure: str = Field(description="Chosen inputs and kernel, in words.")
+    confidence_index: float = Field(description="mean Phi(tolerance / deviation) over the Monte Carlo set (eq. 8, 9)")
+    confidence_index_paper: float = Field(description="mean Phi(1 / deviation): the paper's, in raw units")
+    tolerance: float
+    coverage: float = Field(description="share of the Monte Carlo set whose deviation is below the tolerance")
+    leave_one_out_error: float = Field(description="root mean square, in the output's unit")
+
+
+class Fidelity(Reply):
+    confidence_index: float = Field(description="smallest over outputs, with tolerances")
+    confidence_index_paper: float = Field(description="smallest over outputs, as printed in the paper")
+    target: float
+    samples: int
+    outputs: list[OutputFidelity]
+
+
+class Ledger(Reply):
+    """Acknowledged real steps by purpose. ``total`` is what the design cost: initial + adaptive + manual; evaluation is
+    apart, and ``unresolved`` counts leases that began and were never answered, so the true number of real steps lies
+    between total and total + unresolved."""
+
+    initial: int = 0
+    adaptive: int = 0
+    manual: int = 0
+    total: int = 0
+    evaluation: int = 0
+    unresolved: int = 0
+
+
+class QueryCounts(Reply):
+    pending: int = 0
+    leased: int = 0
+    answered: int = 0
+    set_aside: int = 0
+
+
+class SurrogateSummary(Reply):
+    name: str
+    environment: str
+    phase: Phase
+    paused: bool
+    round: int = Field(description="fits so far")
+    samples: int
+    model_version: int | None
+    confidence_index: float | None
+    created_at: float = Field(description="seconds since 1970, the server's clock")
+
+
+class SurrogateView(SurrogateSummary):
+    spec: EnvironmentSpec
+    budget: int
+    target: float
+    outputs: list[str]
+    fidelity: Fidelity | None
+    ledger: Ledger
+    queries: QueryCounts
+    error: str | None = Field(default=None, description="why the phase is failed, or the last query was set aside")
+
+
+class SurrogateList(Reply):
+    surrogates: list[SurrogateSummary]
