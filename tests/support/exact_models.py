@@ -31,6 +31,9 @@ class ExactModel:
     def transitions(self) -> tuple[int, ...]:
         return self.definition.moving
 
+    def terminated(self, q: Tensor) -> Tensor:
+        return self.definition.terminated(q)
+
     def transition(
         self,
         q: Tensor,

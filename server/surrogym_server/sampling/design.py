@@ -192,8 +192,8 @@ def _reserved(model: SurrogateModel, samples: Samples, candidates: Candidates) -
     definition = model.definition
     if not definition.termination_groups or bool(samples.terminated.any()):
         return None
-    ends = definition.terminated(model.transition(candidates.q, candidates.u).q_next)
-    ends &= ~definition.terminated(candidates.q)
+    ends = model.terminated(model.transition(candidates.q, candidates.u).q_next)
+    ends &= ~model.terminated(candidates.q)
     return ends if bool(ends.any()) else None
 
 

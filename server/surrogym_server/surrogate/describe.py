@@ -29,6 +29,6 @@ def predict_points(model: SurrogateModel, q: Array, u: Array) -> PointPrediction
     predicted = model.transition(at, action, reward_deviation=True)
     q_next, deviation = predicted.q_next, predicted.reward_deviation
     assert deviation is not None
-    over = model.definition.terminated(q_next)
+    over = model.terminated(q_next)
     reward, observation = paid(model.terminal_reward, predicted.reward, over), model.definition.observe(q_next)
     return PointPrediction(*(t.numpy() for t in (q_next, observation, reward, deviation, over)))

@@ -101,10 +101,14 @@ class SurrogateModel:
             spread[:, -1] if reward_deviation else None,
         )
 
+    def terminated(self, q: Tensor) -> Tensor:
+        """Whether an episode ends on arriving at q (..., C), shape (...)."""
+        return self.definition.terminated(q)
+
     def means(self, q: Tensor, u: Tensor) -> Tensor:
         """Posterior mean of every output, increments and then the reward, at q (m, C) and u (m, F): (m, O)."""
         q_next, mean, _ = self._step((), q, u, None)
-        reward = paid(self.terminal_reward, mean[:, -1], self.definition.terminated(q_next))
+        reward = paid(self.terminal_reward, mean[:, -1], self.terminated(q_next))
         return torch.cat([mean[:, list(self._columns)], reward[:, None]], -1)
 
     def _step(

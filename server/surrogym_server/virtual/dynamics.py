@@ -29,7 +29,7 @@ class Moved:
 def move_mean(model: SurrogateModel, q: Tensor, u: Tensor, penalty: float, deviations: bool) -> Moved:
     """AUR-D: q (N, C) under u (N, F) goes to the mean of the next state."""
     transition = model.transition(q, u, deviations=deviations, reward_deviation=deviations or penalty > 0)
-    over, spread = model.definition.terminated(transition.q_next), transition.reward_deviation
+    over, spread = model.terminated(transition.q_next), transition.reward_deviation
     mean = paid(model.terminal_reward, transition.reward, over)
     reward = mean if spread is None else mean - penalty * spread
     all_deviations = None
@@ -60,7 +60,7 @@ def move_particles(
     assert spread is not None
     moved = transition.q_next.reshape(lanes, count, size)
     output = mean_state(model.definition, moved)
-    over = model.definition.terminated(output)
+    over = model.terminated(output)
     mean = paid(model.terminal_reward, transition.reward, over.repeat_interleave(count))
     weight = _weights(spread.reshape(lanes, count), model.reward.scale, weighting)
     deviation = torch.cat([transition.deviation, spread[:, None]], -1).reshape(lanes, count, len(model.transitions) + 1)
