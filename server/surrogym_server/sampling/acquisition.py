@@ -56,7 +56,7 @@ def condition_on(model: SurrogateModel, q: Tensor, u: Tensor) -> SurrogateModel:
     definition = model.definition
     q_next = model.transition(q[None], u[None]).q_next
     lead = q_next[:, leading(definition)]
-    state = q[None] if definition.reward_timing == "before" else q_next
+    state = q_next if model.reward.feature_map.after else q[None]
 
     def extended(output: OutputModel, at: Tensor) -> OutputModel:
         if output.posterior is None:
