@@ -84,7 +84,8 @@ class Designs(ABC):
     def ask(self, name: str, queries: int, *, checkpoint: str | None = None, key: str | None = None) -> SurrogateRecord:
         """Ask the next fit for ``queries`` more, whatever its verdict; a fit becomes due.
 
-        The budget is raised to hold them, beside the samples, the open queries and what was asked before.
+        Counted in real steps: a rollout's are as many as its actions. The budget is raised to hold them, beside the
+        samples, the open queries and what was asked before.
         """
 
     @abstractmethod
@@ -135,8 +136,17 @@ class Queries(ABC):
     """
 
     @abstractmethod
-    def enqueue(self, name: str, coordinates: Array, action: Array, *, key: str | None = None) -> list[int]:
-        """Queue queries by hand: coordinates (m, C), action (m, F), purpose ``manual``; returns their ids."""
+    def enqueue(
+        self,
+        name: str,
+        coordinates: Array,
+        action: Array,
+        rollouts: Sequence[Array] = (),
+        *,
+        key: str | None = None,
+    ) -> list[int]:
+        """Queue queries by hand, purpose ``manual``: steps from coordinates (m, C) under action (m, F), and rollouts
+        of action sequences, each (T, F); returns their ids."""
 
     @abstractmethod
     def claim(self, name: str, sampler: str, limit: int, seconds: float) -> list[LeasedQuery]:
@@ -189,11 +199,13 @@ class Samples(ABC):
 
         A sample takes the purpose of its query, or ``manual``. Under a lease that has ended (by its time or a
         failure) it is kept and flagged late; it still answers the query unless another lease of it is live.
-        Under one lease there is one sample: the same again is a duplicate and gets the same id.
+        Under one lease there is one answer: a sample, or the first samples of a rollout, ``step`` 0, 1, ... up to the
+        query's ``steps``. The same again is a duplicate and gets the same id.
 
         Raises:
             UnknownQuery: no such query.
             ForeignLease: a lease token that was never given out for the query, or none.
+            InvalidInput: an answer that lacks a step, or has more than the query asked for.
             IdempotencyConflict: the same lease token, or key, with another sample.
         """
 

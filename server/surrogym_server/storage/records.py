@@ -20,6 +20,7 @@ Vector = tuple[float, ...]
 Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "failed"]
 Purpose = Literal["initial", "adaptive", "manual"]
 QueryStatus = Literal["pending", "leased", "answered", "set_aside"]
+QueryKind = Literal["step", "rollout"]
 EventKind = Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger"]
 
 OPEN_STATUSES: tuple[QueryStatus, ...] = ("pending", "leased")
@@ -43,6 +44,7 @@ class NewSurrogate:
     state: JSON = field(default_factory=dict)  # of the design
     query_coordinates: Array = field(default_factory=no_rows)  # (m, C)
     query_action: Array = field(default_factory=no_rows)  # (m, F)
+    query_rollouts: tuple[Array, ...] = ()  # action sequences from a reset, each (T, F)
 
 
 @dataclass(frozen=True)
@@ -105,30 +107,42 @@ class NewDesign:
     phase: Phase
     query_coordinates: Array = field(default_factory=no_rows)  # (m, C)
     query_action: Array = field(default_factory=no_rows)  # (m, F)
+    query_rollouts: tuple[Array, ...] = ()  # action sequences from a reset, each (T, F)
 
 
 # Queries and samples
 
 
 @dataclass(frozen=True)
-class QueryRecord:
+class Asked:
+    """What a query asks for: one real step from given coordinates, or an action sequence from a reset."""
+
+    kind: QueryKind
+    coordinates: Vector  # (C,) of a step; () of a rollout
+    action: Vector  # (F,) of a step; (T * F,) of a rollout, action after action
+    steps: int  # T: real steps it may take; 1 of a step
+
+    @property
+    def actions(self) -> Array:
+        """(T, F)."""
+        return np.array(self.action).reshape(self.steps, -1)
+
+
+@dataclass(frozen=True)
+class QueryRecord(Asked):
     id: int
     purpose: Purpose
     status: QueryStatus
     round: int
-    coordinates: Vector  # (C,)
-    action: Vector  # (F,)
     attempts: int  # leases given out so far
     sampler: str | None  # the last one to claim it
     error: str | None  # of the last attempt that failed
 
 
 @dataclass(frozen=True)
-class LeasedQuery:
+class LeasedQuery(Asked):
     id: int
     purpose: Purpose
-    coordinates: Vector  # (C,)
-    action: Vector  # (F,)
     attempt: int  # 1 for the first lease of this query
     token: str
     expires: float
@@ -160,6 +174,7 @@ class NewSample:
     next_observation: Vector | None = None  # (D,)
     query_id: int | None = None
     lease_token: str | None = None
+    step: int = 0  # place in the rollout that it is part of
 
 
 @dataclass(frozen=True)
@@ -178,7 +193,9 @@ class SampleRecord:
     sampler: str
     attempt: int  # 0 without a query
     late: bool  # answered under a lease that had ended
-    requested_coordinates: Vector | None  # (C,)
+    trajectory: int | None  # equal for the samples of one rollout, each beginning where the one before ended
+    step: int  # place in it
+    requested_coordinates: Vector | None  # (C,); None without a query, and in a rollout
     coordinates: Vector  # (C,)
     action: Vector  # (F,)
     next_coordinates: Vector  # (C,)
@@ -206,7 +223,8 @@ class SampleArrays:
 
 @dataclass(frozen=True)
 class LedgerRecord:
-    """Acknowledged real steps by purpose; ``unresolved`` leases that expired, never answered or failed."""
+    """Acknowledged real steps by purpose; ``unresolved`` counts the steps that leases which expired, never answered or
+    failed, may have taken."""
 
     initial: int = 0
     adaptive: int = 0

@@ -119,10 +119,11 @@ def answer() -> Callable[..., NewSample]:
     """The sample that answers a leased query."""
 
     def sample_for(query: LeasedQuery, **changes: Any) -> NewSample:
+        coordinates = query.coordinates or (0.0, 1.0)
         values: dict[str, Any] = {
-            "coordinates": query.coordinates,
-            "action": query.action,
-            "next_coordinates": tuple(q + 0.1 for q in query.coordinates),
+            "coordinates": coordinates,
+            "action": tuple(query.actions[changes.get("step", 0)]),
+            "next_coordinates": tuple(q + 0.1 for q in coordinates),
             "reward": -1.25,
             "terminated": False,
             "query_id": query.id,

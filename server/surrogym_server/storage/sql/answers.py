@@ -1,18 +1,29 @@
-"""Which lease a reported sample answers, and what becomes of its query."""
+"""Which lease a reported sample answers, and what becomes of its query.
+
+Under one lease there is one answer: one sample, or the first samples of a rollout. It comes whole in one batch.
+"""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
-from surrogym_server.errors import InvalidInput
+from surrogym_server.errors import IdempotencyConflict, InvalidInput
 from surrogym_server.storage.records import NewSample, Purpose
 from surrogym_server.storage.sql.leases import foreign_lease, set_outcome, unknown_query
 from surrogym_server.storage.sql.tables import leases, queries, samples
+
+
+class Reported(NamedTuple):
+    """A sample that is stored already."""
+
+    sample_id: int
+    fingerprint: str
 
 
 @dataclass(frozen=True)
@@ -22,23 +33,30 @@ class Answered:
     lease_id: int
     query_id: int
     purpose: Purpose
+    steps: int  # that the query asked for
     attempt: int
     live: bool
     contested: bool  # another lease of the query is live
-    sample_id: int | None  # what was reported under it before
-    fingerprint: str | None
+    reported: dict[int, Reported]  # by step: what was reported under it before
 
 
 def read_answered(connection: Connection, held: Row[Any], batch: Sequence[NewSample]) -> list[Answered | None]:
     """For each sample the lease it was reported under, or None; locks their queries.
 
     Raises:
-        UnknownQuery, ForeignLease: as ``Samples.add`` says.
+        UnknownQuery, ForeignLease, InvalidInput, IdempotencyConflict: as ``Samples.add`` says.
     """
     named = {sample.query_id for sample in batch if sample.query_id is not None}
-    purposes = _lock_queries(connection, held, named)
-    by_token = _leases(connection, held, purposes)
-    return [_lease_of(sample, purposes, by_token) for sample in batch]
+    asked = _lock_queries(connection, held, named)
+    by_token = _leases(connection, held, asked)
+    answered = [_lease_of(sample, asked, by_token) for sample in batch]
+    steps: dict[int, set[int]] = defaultdict(set)
+    for sample, lease in zip(batch, answered, strict=True):
+        if lease is not None:
+            steps[lease.lease_id].add(sample.step)
+    for lease in {lease.lease_id: lease for lease in answered if lease}.values():
+        _check_steps(lease, steps[lease.lease_id])
+    return answered
 
 
 def settle(connection: Connection, answered: Iterable[Answered]) -> None:
@@ -53,54 +71,74 @@ def settle(connection: Connection, answered: Iterable[Answered]) -> None:
         connection.execute(update.values(status="answered", error=None))
 
 
-def _lock_queries(connection: Connection, held: Row[Any], named: set[int]) -> dict[int, Purpose]:
+def _check_steps(lease: Answered, steps: set[int]) -> None:
+    """Refuse an answer with a gap, one that is too long, and one that grows after it was given."""
+    if lease.reported:
+        if more := steps - lease.reported.keys():
+            raise IdempotencyConflict(
+                f"expected the {len(lease.reported)} samples first reported for query {lease.query_id}, "
+                f"got step {min(more)} as well"
+            )
+    elif steps != set(range(len(steps))) or len(steps) > lease.steps:
+        raise InvalidInput(
+            f"expected steps 0, 1, ... of query {lease.query_id}, {lease.steps} at most, got {sorted(steps)}"
+        )
+
+
+def _lock_queries(connection: Connection, held: Row[Any], named: set[int]) -> dict[int, Row[Any]]:
     if not named:
         return {}
+    columns: list[Any] = [queries.c.id, queries.c.purpose, queries.c.steps]
     wanted = (
-        sa.select(queries.c.id, queries.c.purpose)
+        sa.select(*columns)
         .where(queries.c.surrogate_id == held.id, queries.c.id.in_(named))
         .order_by(queries.c.id)
         .with_for_update()
     )
-    return {row.id: row.purpose for row in connection.execute(wanted)}
+    return {row.id: row for row in connection.execute(wanted)}
 
 
-def _leases(connection: Connection, held: Row[Any], purposes: dict[int, Purpose]) -> dict[tuple[int, str], Answered]:
+def _leases(connection: Connection, held: Row[Any], asked: dict[int, Row[Any]]) -> dict[tuple[int, str], Answered]:
     """All leases of these queries, by query and token."""
-    if not purposes:
+    if not asked:
         return {}
     live = ((leases.c.outcome == "open") & (leases.c.expires > held.now)).label("live")
     columns = (leases.c.id, leases.c.query_id, leases.c.token, leases.c.attempt, live)
-    reported = samples.c.lease_id == leases.c.id
-    rows = connection.execute(
-        sa.select(*columns, samples.c.id.label("sample_id"), samples.c.fingerprint)
-        .select_from(leases.outerjoin(samples, reported))
-        .where(leases.c.query_id.in_(list(purposes)))
-    ).all()
+    rows = connection.execute(sa.select(*columns).where(leases.c.query_id.in_(list(asked)))).all()
+    reported = _reported(connection, [row.id for row in rows])
     live_ids = {row.query_id: row.id for row in rows if row.live}
     return {
         (row.query_id, row.token): Answered(
             lease_id=row.id,
             query_id=row.query_id,
-            purpose=purposes[row.query_id],
+            purpose=asked[row.query_id].purpose,
+            steps=asked[row.query_id].steps,
             attempt=row.attempt,
             live=bool(row.live),
             contested=live_ids.get(row.query_id, row.id) != row.id,
-            sample_id=row.sample_id,
-            fingerprint=row.fingerprint,
+            reported=reported[row.id],
         )
         for row in rows
     }
 
 
+def _reported(connection: Connection, lease_ids: Sequence[int]) -> dict[int, dict[int, Reported]]:
+    """What is stored under each of these leases."""
+    columns = (samples.c.lease_id, samples.c.step, samples.c.id, samples.c.fingerprint)
+    reported: dict[int, dict[int, Reported]] = defaultdict(dict)
+    for lease_id, step, *stored in connection.execute(sa.select(*columns).where(samples.c.lease_id.in_(lease_ids))):
+        reported[lease_id][step] = Reported(*stored)
+    return reported
+
+
 def _lease_of(
-    sample: NewSample, purposes: dict[int, Purpose], by_token: dict[tuple[int, str], Answered]
+    sample: NewSample, asked: dict[int, Row[Any]], by_token: dict[tuple[int, str], Answered]
 ) -> Answered | None:
     if sample.query_id is None:
         if sample.lease_token is not None:
             raise InvalidInput("expected a query_id beside lease_token, got none")
         return None
-    if sample.query_id not in purposes:
+    if sample.query_id not in asked:
         raise unknown_query(sample.query_id)
     lease = by_token.get((sample.query_id, sample.lease_token or ""))
     if lease is None:

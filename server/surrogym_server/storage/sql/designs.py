@@ -75,7 +75,7 @@ class SqlDesigns(port.Designs):
             held = _hold_right(connection, lease)
             version = insert_model(connection, held, design.model)
             _finish(connection, held, lease, design)
-            chosen = (design.query_coordinates, design.query_action)
+            chosen = (design.query_coordinates, design.query_action, design.query_rollouts)
             insert_queries(connection, held, "adaptive", held.round + 1, *chosen)
             append_event(connection, held, "phase", phase=design.phase, error=None)
             return version
@@ -135,9 +135,9 @@ def _phase_after(held: Row[Any], error: str | None) -> Phase:
 
 
 def _spoken_for(connection: Connection, surrogate_id: int) -> int:
-    """Samples there are, and queries that will each become one."""
+    """Samples there are, and those that open queries may become."""
     taken = sa.select(sa.func.count()).where(samples.c.surrogate_id == surrogate_id)
-    awaited = sa.select(sa.func.count()).where(
+    awaited = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0)).where(
         queries.c.surrogate_id == surrogate_id, queries.c.status.in_(OPEN_STATUSES)
     )
     return int(connection.execute(sa.select(taken.scalar_subquery() + awaited.scalar_subquery())).scalar_one())

@@ -29,8 +29,10 @@ def begin(
         LeasedQuery(
             id=row.id,
             purpose=row.purpose,
+            kind=row.kind,
             coordinates=row.coordinates,
             action=row.action,
+            steps=row.steps,
             attempt=row.attempts + 1,
             token=secrets.token_urlsafe(16),
             expires=held.now + seconds,

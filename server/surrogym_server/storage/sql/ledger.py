@@ -9,7 +9,7 @@ from surrogym_server.storage import port
 from surrogym_server.storage.records import LedgerRecord, fingerprint
 from surrogym_server.storage.sql.database import Database, clock
 from surrogym_server.storage.sql.rows import append_event, find, hold, recall, remember
-from surrogym_server.storage.sql.tables import evaluations, leases, samples
+from surrogym_server.storage.sql.tables import evaluations, leases, queries, samples
 
 OPERATION = "report_steps"
 
@@ -42,8 +42,10 @@ def _read(connection: Connection, surrogate_id: int) -> LedgerRecord:
         evaluations.c.surrogate_id == surrogate_id
     )
     unswept = (leases.c.outcome == "open") & (leases.c.expires <= clock(connection))
-    unresolved = sa.select(sa.func.count()).where(
-        leases.c.surrogate_id == surrogate_id, (leases.c.outcome == "expired") | unswept
+    unresolved = (
+        sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0))
+        .select_from(leases.join(queries, queries.c.id == leases.c.query_id))
+        .where(leases.c.surrogate_id == surrogate_id, (leases.c.outcome == "expired") | unswept)
     )
     row = connection.execute(
         sa.select(

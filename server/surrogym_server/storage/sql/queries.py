@@ -25,7 +25,7 @@ from surrogym_server.storage.sql.tables import leases, queries, surrogates
 COLUMNS = [
     getattr(queries.c, name)
     for name in (
-        *("id", "purpose", "status", "round", "coordinates", "action"),
+        *("id", "purpose", "status", "round", "kind", "coordinates", "action", "steps"),
         *("attempts", "sampler", "error"),
     )
 ]
@@ -35,14 +35,22 @@ class SqlQueries(port.Queries):
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def enqueue(self, name: str, coordinates: Array, action: Array, *, key: str | None = None) -> list[int]:
-        body = fingerprint(coordinates.tolist(), action.tolist())
+    def enqueue(
+        self,
+        name: str,
+        coordinates: Array,
+        action: Array,
+        rollouts: Sequence[Array] = (),
+        *,
+        key: str | None = None,
+    ) -> list[int]:
+        body = fingerprint(coordinates.tolist(), action.tolist(), *(actions.tolist() for actions in rollouts))
         with self._database.write() as connection:
             held = hold(connection, name)
             before: list[int] | None = recall(connection, held, "enqueue", key, body)
             if before is not None:
                 return before
-            ids = insert_queries(connection, held, "manual", held.round, coordinates, action)
+            ids = insert_queries(connection, held, "manual", held.round, coordinates, action, rollouts)
             remember(connection, held, "enqueue", key, body, ids)
             return ids
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -82,22 +83,33 @@ def remember(connection: Connection, held: Row[Any], operation: str, key: str | 
 
 
 def insert_queries(
-    connection: Connection, held: Row[Any], purpose: Purpose, round: int, coordinates: Array, action: Array
+    connection: Connection,
+    held: Row[Any],
+    purpose: Purpose,
+    round: int,
+    coordinates: Array,
+    action: Array,
+    rollouts: Sequence[Array] = (),
 ) -> list[int]:
-    """Queue coordinates (m, C) with action (m, F); returns the ids in order.
+    """Queue coordinates (m, C) with action (m, F), then action sequences, each (T, F); returns the ids in order.
 
     Raises:
         InvalidInput: not as many rows in the one as in the other.
     """
     if len(coordinates) != len(action):
         raise InvalidInput(f"expected one action for each query, got {len(coordinates)} and {len(action)}")
-    if len(coordinates) == 0:
-        return []
-    common = {"surrogate_id": held.id, "purpose": purpose, "round": round, "status": "pending", "attempts": 0}
-    rows = [
-        {**common, "coordinates": q, "action": u}
+    asked = [
+        {"kind": "step", "coordinates": q, "action": u, "steps": 1}
         for q, u in zip(np.asarray(coordinates), np.asarray(action), strict=True)
     ]
+    asked += [
+        {"kind": "rollout", "coordinates": (), "action": np.ravel(actions), "steps": len(actions)}
+        for actions in rollouts
+    ]
+    if not asked:
+        return []
+    common = {"surrogate_id": held.id, "purpose": purpose, "round": round, "status": "pending", "attempts": 0}
+    rows = [common | query for query in asked]
     insert = sa.insert(queries).returning(queries.c.id, sort_by_parameter_order=True)
     ids = [int(id) for id in connection.execute(insert, rows).scalars()]
     append_event(connection, held, "queries", count=len(ids), purpose=purpose, round=round)

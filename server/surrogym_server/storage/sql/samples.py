@@ -29,11 +29,14 @@ from surrogym_server.storage.sql.tables import queries, samples
 COLUMNS = [
     getattr(samples.c, name)
     for name in (
-        *("id", "purpose", "query_id", "sampler", "attempt", "late", "coordinates", "action"),
+        *("id", "purpose", "query_id", "sampler", "attempt", "late", "step", "coordinates", "action"),
         *("next_coordinates", "reward", "terminated", "truncated", "observation", "next_observation"),
         "created_at",
     )
 ]
+
+
+Identity = tuple[int | None, int]
 
 
 class SqlSamples(port.Samples):
@@ -41,7 +44,7 @@ class SqlSamples(port.Samples):
         self._database = database
 
     def add(self, name: str, sampler: str, samples: Sequence[NewSample], *, key: str | None = None) -> AddedSamples:
-        body = fingerprint(sampler, [asdict(sample) for sample in samples])
+        body = fingerprint(sampler, [_body(sample) for sample in samples])
         with self._database.write() as connection:
             held = hold(connection, name)
             before: list[int] | None = recall(connection, held, "add_samples", key, body)
@@ -69,8 +72,10 @@ class SqlSamples(port.Samples):
     def page(self, name: str, after: int, limit: int) -> list[SampleRecord]:
         with self._database.read() as connection:
             own = samples.c.surrogate_id == find(connection, name)
+            requested = sa.case((queries.c.kind == "step", queries.c.coordinates))
+            trajectory = sa.case((queries.c.kind == "rollout", samples.c.lease_id))
             rows = connection.execute(
-                sa.select(*COLUMNS, queries.c.coordinates.label("requested_coordinates"))
+                sa.select(*COLUMNS, requested.label("requested_coordinates"), trajectory.label("trajectory"))
                 .select_from(samples.outerjoin(queries, samples.c.query_id == queries.c.id))
                 .where(own, samples.c.id > after)
                 .order_by(samples.c.id)
@@ -91,11 +96,12 @@ def _store(
     batch: Sequence[NewSample],
     answered: Sequence[Answered | None],
 ) -> AddedSamples:
-    """Insert what is new of the batch. What was reported under one lease is one sample."""
-    identities = [lease.lease_id if lease else -1 - place for place, lease in enumerate(answered)]
-    ids = {lease.lease_id: lease.sample_id for lease in answered if lease and lease.sample_id is not None}
-    prints = {lease.lease_id: lease.fingerprint for lease in answered if lease and lease.lease_id in ids}
-    new: dict[int, dict[str, Any]] = {}
+    """Insert what is new of the batch. A step reported under one lease is one sample."""
+    identities = [_identity(place, *told) for place, told in enumerate(zip(batch, answered, strict=True))]
+    known = {(lease.lease_id, step): sample for lease in answered if lease for step, sample in lease.reported.items()}
+    ids: dict[Identity, int] = {identity: sample.sample_id for identity, sample in known.items()}
+    prints: dict[Identity, str] = {identity: sample.fingerprint for identity, sample in known.items()}
+    new: dict[Identity, dict[str, Any]] = {}
     for identity, sample, lease in zip(identities, batch, answered, strict=True):
         row = _row(held, sampler, sample, lease)
         if prints.setdefault(identity, row["fingerprint"]) != row["fingerprint"]:
@@ -103,8 +109,18 @@ def _store(
         if identity not in ids:
             new.setdefault(identity, row)
     ids |= dict(zip(new, _insert(connection, held, sampler, list(new.values())), strict=True))
-    settle(connection, [lease for lease in answered if lease and lease.lease_id in new])
+    settle(connection, [lease for lease in answered if lease and not lease.reported])
     return AddedSamples(tuple(ids[identity] for identity in identities), len(batch) - len(new))
+
+
+def _identity(place: int, sample: NewSample, lease: Answered | None) -> Identity:
+    """The lease and the step; without a lease nothing but its place in the batch."""
+    return (lease.lease_id, sample.step) if lease else (None, place)
+
+
+def _body(sample: NewSample) -> dict[str, Any]:
+    """What a repeat has to repeat. The step is known apart, and fingerprints are older than it."""
+    return {name: value for name, value in asdict(sample).items() if name != "step"}
 
 
 def _insert(connection: Connection, held: Row[Any], sampler: str, rows: list[dict[str, Any]]) -> list[int]:
@@ -126,6 +142,7 @@ def _row(held: Row[Any], sampler: str, sample: NewSample, lease: Answered | None
         "purpose": lease.purpose if lease else "manual",
         "sampler": sampler,
         "attempt": lease.attempt if lease else 0,
+        "step": sample.step,
         "late": lease is not None and not lease.live,
         "coordinates": sample.coordinates,
         "action": sample.action,
@@ -135,7 +152,7 @@ def _row(held: Row[Any], sampler: str, sample: NewSample, lease: Answered | None
         "truncated": sample.truncated,
         "observation": sample.observation,
         "next_observation": sample.next_observation,
-        "fingerprint": fingerprint(asdict(sample)),
+        "fingerprint": fingerprint(_body(sample)),
         "created_at": held.now,
     }
 

@@ -34,7 +34,7 @@ class SqlSurrogates(port.Surrogates):
                 return _same(read(connection, new.name), new), False
             held = hold(connection, new.name)
             append_event(connection, held, "created", name=new.name)
-            insert_queries(connection, held, "initial", 0, new.query_coordinates, new.query_action)
+            insert_queries(connection, held, "initial", 0, new.query_coordinates, new.query_action, new.query_rollouts)
             return read(connection, new.name), True
 
     def get(self, name: str) -> SurrogateRecord:

@@ -97,8 +97,10 @@ queries = sa.Table(
     sa.Column("purpose", sa.Text, nullable=False),
     sa.Column("status", sa.Text, nullable=False),
     sa.Column("round", sa.Integer, nullable=False),
-    sa.Column("coordinates", Floats, nullable=False),
-    sa.Column("action", Floats, nullable=False),
+    sa.Column("kind", sa.Text, nullable=False, server_default="step"),
+    sa.Column("coordinates", Floats, nullable=False),  # empty for a rollout
+    sa.Column("action", Floats, nullable=False),  # for a rollout one after the other
+    sa.Column("steps", sa.Integer, nullable=False, server_default="1"),
     sa.Column("attempts", sa.Integer, nullable=False),
     sa.Column("sampler", sa.Text),
     sa.Column("error", sa.Text),
@@ -135,7 +137,8 @@ samples = sa.Table(
     _id(),
     _owner(),
     sa.Column("query_id", Id, sa.ForeignKey("queries.id", ondelete="CASCADE"), index=True),
-    sa.Column("lease_id", Id, sa.ForeignKey("leases.id", ondelete="CASCADE"), unique=True),
+    sa.Column("lease_id", Id, sa.ForeignKey("leases.id", ondelete="CASCADE")),
+    sa.Column("step", sa.Integer, nullable=False, server_default="0"),
     sa.Column("purpose", sa.Text, nullable=False),
     sa.Column("sampler", sa.Text, nullable=False),
     sa.Column("attempt", sa.Integer, nullable=False),
@@ -150,6 +153,7 @@ samples = sa.Table(
     sa.Column("next_observation", Floats),
     sa.Column("fingerprint", sa.Text, nullable=False),
     sa.Column("created_at", sa.Double, nullable=False),
+    sa.UniqueConstraint("lease_id", "step"),
     sa.Index(None, "surrogate_id", "id"),
     sqlite_autoincrement=True,
 )

@@ -1,0 +1,167 @@
+"""Rollouts: an action sequence is one query, its answer any number of samples, and every one of them is counted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import sqlalchemy as sa
+from alembic import command
+from alembic.config import Config
+
+from surrogym_server.errors import IdempotencyConflict, InvalidInput
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import LeasedQuery, LedgerRecord, NewDesign, NewSample, QueryCounts
+from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql.database import connect
+from surrogym_server.storage.sql.migrate import SCRIPTS
+
+LONG = 60.0
+SHORT = 0.02
+ACTIONS = (np.array([[0.5], [-0.5], [1 / 3]]), np.array([[2.0]]))  # two rollouts, of three steps and of one
+Wait = Callable[[Callable[[], bool]], None]
+Answer = Callable[..., NewSample]
+
+
+@pytest.fixture
+def name(make: Callable[..., str]) -> str:
+    return make(queries=0, query_rollouts=ACTIONS)
+
+
+@pytest.fixture
+def long(storage: Storage, name: str) -> LeasedQuery:
+    return storage.queries.claim(name, "a", 1, LONG)[0]
+
+
+def test_an_action_sequence_comes_back_bit_for_bit(storage: Storage, name: str) -> None:
+    long, short = storage.queries.claim(name, "a", 2, LONG)
+    assert [(q.kind, q.coordinates, q.steps) for q in (long, short)] == [("rollout", (), 3), ("rollout", (), 1)]
+    assert [q.actions.tobytes() for q in (long, short)] == [a.tobytes() for a in ACTIONS]
+    assert storage.queries.get(name, long.id).actions.tolist() == ACTIONS[0].tolist()
+
+
+def test_rollouts_by_hand_wait_beside_steps(storage: Storage, make: Callable[..., str]) -> None:
+    name = make(queries=0)
+    step, rollout = storage.queries.enqueue(name, np.ones((1, 2)), np.ones((1, 1)), ACTIONS[:1], key="k")
+    assert storage.queries.enqueue(name, np.ones((1, 2)), np.ones((1, 1)), ACTIONS[:1], key="k") == [step, rollout]
+    assert [q.kind for q in storage.queries.list(name)] == ["step", "rollout"]
+    with pytest.raises(IdempotencyConflict):
+        storage.queries.enqueue(name, np.ones((1, 2)), np.ones((1, 1)), ACTIONS[1:], key="k")
+
+
+def test_every_step_of_a_rollout_is_a_sample_of_one_trajectory(
+    storage: Storage, name: str, long: LeasedQuery, answer: Answer
+) -> None:
+    added = storage.samples.add(name, "a", [answer(long, step=i, reward=float(i)) for i in range(3)])
+    samples = storage.samples.page(name, 0, 10)
+    assert [(s.id, s.query_id, s.step, s.reward) for s in samples] == [
+        (id, long.id, i, float(i)) for i, id in enumerate(added.ids)
+    ]
+    assert len({s.trajectory for s in samples}) == 1
+    assert samples[0].trajectory is not None
+    assert samples[0].requested_coordinates is None
+    assert storage.queries.counts(name) == QueryCounts(pending=1, answered=1)
+    assert storage.ledger.read(name) == LedgerRecord(initial=3)
+
+
+def test_a_step_query_is_no_trajectory(storage: Storage, make: Callable[..., str], answer: Answer) -> None:
+    [query] = storage.queries.claim(make(queries=1), "a", 1, LONG)
+    storage.samples.add("pendulum", "a", [answer(query)])
+    [sample] = storage.samples.page("pendulum", 0, 1)
+    assert (sample.trajectory, sample.step) == (None, 0)
+
+
+def test_an_episode_that_ends_early_answers_its_query_and_gives_the_rest_of_its_steps_back(
+    storage: Storage, name: str, long: LeasedQuery, answer: Answer
+) -> None:
+    assert storage.designs.ask(name, 30).budget == 3 + 1 + 30, "open rollouts are spoken for with all their steps"
+    storage.samples.add(name, "a", [answer(long, step=0), answer(long, step=1, terminated=True)])
+    assert storage.queries.get(name, long.id).status == "answered"
+    assert storage.designs.ask(name, 1).budget == 34, "2 taken, 1 open, 31 asked for: the third step is free again"
+    assert storage.ledger.read(name).total == 2
+
+
+def test_the_same_answer_again_is_harmless_and_another_refused(
+    storage: Storage, name: str, long: LeasedQuery, answer: Answer
+) -> None:
+    batch = [answer(long, step=0), answer(long, step=1)]
+    first = storage.samples.add(name, "a", batch)
+    again = storage.samples.add(name, "a", batch)
+    assert (again.ids, again.duplicates) == (first.ids, 2)
+    with pytest.raises(IdempotencyConflict, match="2 samples first reported"):
+        storage.samples.add(name, "a", [*batch, answer(long, step=2)])
+    with pytest.raises(IdempotencyConflict, match="got another"):
+        storage.samples.add(name, "a", [batch[0], answer(long, step=1, reward=7.0)])
+    assert storage.samples.count(name) == 2
+
+
+@pytest.mark.parametrize("steps", [(1,), (0, 2), (0, 1, 2, 3)], ids=["no start", "a gap", "too many"])
+def test_an_answer_with_a_gap_or_too_many_steps_is_refused(
+    storage: Storage, name: str, long: LeasedQuery, answer: Answer, steps: tuple[int, ...]
+) -> None:
+    batch = [answer(long, reward=float(i)) for i in steps]
+    batch = [NewSample(**vars(sample) | {"step": i}) for sample, i in zip(batch, steps, strict=True)]
+    with pytest.raises(InvalidInput, match=rf"steps 0, 1, ... of query {long.id}, 3 at most"):
+        storage.samples.add(name, "a", batch)
+    assert storage.samples.count(name) == 0
+    assert storage.queries.get(name, long.id).status == "leased"
+
+
+def test_a_sampler_that_dies_in_a_rollout_may_have_taken_all_its_steps(
+    storage: Storage, name: str, answer: Answer, until: Wait
+) -> None:
+    [lost] = storage.queries.claim(name, "dead", 1, SHORT)
+    until(lambda: storage.ledger.read(name).unresolved == 3)
+    [again] = storage.queries.claim(name, "next", 1, LONG)
+    assert (again.id, again.attempt) == (lost.id, 2)
+    storage.samples.add(name, "next", [answer(again, step=0)])
+    assert storage.ledger.read(name) == LedgerRecord(initial=1, unresolved=3)
+    storage.samples.add(name, "dead", [answer(lost, step=0), answer(lost, step=1)])
+    assert storage.ledger.read(name) == LedgerRecord(initial=3), "it was not dead, and its two steps are true ones"
+    first, *late = storage.samples.page(name, 0, 10)
+    assert [(s.late, s.step) for s in late] == [(True, 0), (True, 1)]
+    assert {s.trajectory for s in late} != {first.trajectory}
+
+
+def test_a_design_asks_for_rollouts(
+    storage: Storage, name: str, answer: Answer, design: Callable[..., NewDesign]
+) -> None:
+    for query in storage.queries.claim(name, "a", 2, LONG):
+        storage.samples.add(name, "a", [answer(query)])
+    lease = storage.designs.begin(name, "server", LONG)
+    assert lease is not None
+    storage.designs.commit(lease, design(query_rollouts=ACTIONS[:1]))
+    [query] = storage.queries.claim(name, "a", 5, LONG)
+    assert (query.purpose, query.actions.tolist()) == ("adaptive", ACTIONS[0].tolist())
+
+
+def test_a_database_from_before_rollouts_keeps_its_queries_samples_and_ids(
+    url: str, make: Callable[..., str], storage: Storage, answer: Answer
+) -> None:
+    gone = make(queries=2, name="gone")
+    kept = make(queries=3, name="kept")
+    for name in (kept, gone):  # the highest id is one of a surrogate that is deleted
+        for query in storage.queries.claim(name, "a", 2, LONG):
+            [last] = storage.samples.add(name, "a", [answer(query)]).ids
+    storage.surrogates.delete(gone)
+    before = (storage.samples.page(kept, 0, 10), storage.queries.list(kept))
+    storage.close()
+    _to(url, "0001")
+    again = open_storage(url)
+    assert (again.samples.page(kept, 0, 10), again.queries.list(kept)) == before
+    [query] = again.queries.claim(kept, "a", 1, LONG)
+    assert again.samples.add(kept, "a", [answer(query)]).ids > (last,), "ids are never used twice"
+    again.close()
+
+
+def _to(url: str, revision: str) -> None:
+    """Take a database back to an older schema."""
+    config = Config()
+    config.set_main_option("script_location", str(SCRIPTS))
+    database = connect(url)
+    with database.write() as connection:
+        config.attributes["connection"] = connection
+        command.downgrade(config, revision)
+        assert sa.inspect(connection).has_table("samples")
+    database.close()
