@@ -303,12 +303,11 @@ Action = Annotated[BoxAction | DiscreteAction | MultiDiscreteAction, Field(discr
 class Reward(Frozen):
     """How the reward is learned.
 
-    ``timing``: ``before`` reads (q, u), as Gymnasium's Pendulum does; ``after`` reads (q', u), as the paper says;
-    ``auto`` takes, at each fit, the one that the evidence favours.
+    ``timing``: ``before`` reads (q, u), as Gymnasium's Pendulum does; ``after`` reads (q', u), as the paper says.
     ``penalty``: k of eq. 14, reward = mean - k * deviation; None takes the preset's (default 0, paper 3).
     """
 
-    timing: Literal["before", "after", "auto"] = "before"
+    timing: Literal["before", "after"] = "before"
     penalty: Annotated[float, Field(ge=0, le=100, strict=True)] | None = None
 
 
@@ -337,7 +336,7 @@ class Design(Frozen):
     budget: Annotated[int, Field(ge=2, le=100_000, strict=True)] | None = None
     initial: Annotated[int, Field(ge=2, le=100_000, strict=True)] | None = None
     target: Annotated[float, Field(gt=0.5, lt=1, strict=True)] = 0.999
-    acquisition: Literal["uncertainty_index", "variance", "latin_hypercube"] | None = None
+    acquisition: Literal["uncertainty_index", "variance", "integrated_variance", "latin_hypercube"] | None = None
     monte_carlo: Annotated[int, Field(ge=16, le=100_000, strict=True)] | None = None
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
 

@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from surrogym_server.engine.fidelity import fidelity_fields
 from surrogym_server.sampling.design import Decision, DesignState, Request, advance, initial_design
+from surrogym_server.sampling.outlook import Points
 from surrogym_server.surrogate.codec import to_bytes
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.samples import Samples
@@ -99,8 +100,10 @@ def _request(job: DesignJob) -> Request:
     return Request(
         budget=job.budget,
         target=job.target,
-        pending_q=rows(job.pending_coordinates, len(job.definition.coordinates)),
-        pending_u=rows(job.pending_action, job.definition.action.size),
+        pending=Points(
+            rows(job.pending_coordinates, len(job.definition.coordinates)),
+            rows(job.pending_action, job.definition.action.size),
+        ),
         extra=job.extra_queries,
         states=None if job.occupancy is None else torch.from_numpy(job.occupancy),
     )

@@ -16,8 +16,20 @@ beta      ``weights`` (n,)        (K + sigma_n^2 I)^-1 y
 
 from surrogym_server.gp.blocks import in_blocks
 from surrogym_server.gp.fit import FitOptions, Fitted, fit
+from surrogym_server.gp.joint import Joint
 from surrogym_server.gp.kernel import Hyperparameters
 from surrogym_server.gp.posterior import Posterior, condition
 from surrogym_server.gp.serving import Output, Serving
 
-__all__ = ["FitOptions", "Fitted", "Hyperparameters", "Output", "Posterior", "Serving", "condition", "fit", "in_blocks"]
+__all__ = [
+    "FitOptions",
+    "Fitted",
+    "Hyperparameters",
+    "Joint",
+    "Output",
+    "Posterior",
+    "Serving",
+    "condition",
+    "fit",
+    "in_blocks",
+]

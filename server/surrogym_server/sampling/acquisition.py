@@ -1,77 +1,89 @@
-"""Which point to query next (eq. 12 and 13), over a candidate set, in logarithms."""
+"""Which points to query next (eq. 12 and 13), over a candidate set: criteria, and greedy batches of them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from surrogym_server.sampling.confidence import deviations, log_model_uncertainty
-from surrogym_server.sampling.occupancy import log_occupancy
+from surrogym_server.sampling.candidates import Candidates
+from surrogym_server.sampling.confidence import log_model_uncertainty
+from surrogym_server.sampling.outlook import Outlook, OutputOutlook, Points
 from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.surrogate.features import FeatureMap, encode, leading
-from surrogym_server.surrogate.model import OutputModel, SurrogateModel
+from surrogym_server.surrogate.features import FeatureMap, encode
+from surrogym_server.surrogate.model import SurrogateModel
 
 NEAR = 0.02  # queries closer than this, in deviations of the sampling range, are near-duplicates
 
 
-@dataclass(frozen=True)
-class Candidates:
-    """Points to choose from, and their occupancy."""
+def choose(
+    model: SurrogateModel,
+    candidates: Candidates,
+    taken: Points,
+    assumed: Points,
+    wanted: Sequence[int],
+    tolerances: Sequence[float],
+    reserved: Tensor | None = None,
+) -> list[int]:
+    """A greedy batch: for each output in ``wanted`` the best candidate, as if those before it had been answered.
 
-    q: Tensor  # (m, C)
-    u: Tensor  # (m, F)
-    log_p: Tensor  # (m,) log P_i
+    Args:
+        model: its deviations are what is to be lowered.
+        candidates: what to choose from.
+        taken: queries so far, answered or not: none of them is all but repeated.
+        assumed: queries asked and not answered, which count as if they had been.
+        wanted: for the sake of which output each query is, by number.
+        tolerances: (O,) in each output's unit.
+        reserved: (m,) bool, candidates that the first query is taken from.
 
-
-def candidates_of(model: SurrogateModel, q: Tensor, u: Tensor, states: Tensor | None) -> Candidates:
-    """Candidates q (m, C), u (m, F) with P_i from visited states (v, C).
-
-    Without any, preset ``paper`` takes the density of the predicted next states at each candidate's own, and the
-    default calls every state equally likely.
+    Returns:
+        Indices of candidates; fewer than wanted where nothing distinct is left.
     """
-    definition = model.definition
-    if states is not None and len(states):
-        return Candidates(q, u, log_occupancy(definition, states, q))
-    if definition.design.preset == "paper":
-        arrived = model.transition(q, u).q_next
-        return Candidates(q, u, log_occupancy(definition, arrived, arrived, floor=1e-12))
-    return Candidates(q, u, q.new_zeros(len(q)))
+    definition, points = model.definition, candidates.points
+    integrates = definition.design.acquisition == "integrated_variance"
+    reference = candidates.reference if integrates else candidates.reference[:0]  # its covariances cost the most
+    outlook = Outlook.of(model, points, reference, assumed)
+    distance = nearest(definition, points, taken)
+    picks: list[int] = []
+    for column in wanted:
+        output, allowed = outlook.outputs[column], distance >= NEAR
+        if not bool(allowed.any()):
+            break
+        value = distance if output is None else acquisition(definition, output, candidates, tolerances[column])
+        if reserved is not None and not picks:
+            allowed &= reserved
+        elif output is not None:
+            allowed &= output.counts
+        pick = int(torch.where(allowed, value, -torch.inf).argmax())
+        if allowed[pick]:
+            picks.append(pick)
+            outlook = outlook.observe(pick)
+            distance = torch.minimum(distance, nearest(definition, points, points[pick : pick + 1]))
+    return picks
 
 
-def acquisition(model: SurrogateModel, candidates: Candidates, column: int, tolerance: float) -> Tensor:
+def acquisition(
+    definition: EnvironmentDefinition, output: OutputOutlook, candidates: Candidates, tolerance: float
+) -> Tensor:
     """Value of querying each candidate for the sake of one output, (m,); only its order counts.
 
-    ``uncertainty_index``: log U = log Phi(-tau / sigma) + log P (eq. 12). ``variance``: log sigma.
+    ``uncertainty_index``: log U = log Phi(-tau / sigma) + log P (eq. 12). ``variance``: sigma.
+    ``integrated_variance``: by how much the answer lowers the variance over the reference.
     """
-    deviation = deviations(model, candidates.q, candidates.u)[:, column]
-    if model.definition.design.acquisition == "variance":
-        return deviation.log()
-    return log_model_uncertainty(deviation, tolerance) + candidates.log_p
+    match definition.design.acquisition:
+        case "integrated_variance":
+            return output.reduction(candidates.weights)
+        case "variance":
+            return output.deviation
+        case _:
+            return log_model_uncertainty(output.deviation, tolerance) + candidates.log_p
 
 
-def condition_on(model: SurrogateModel, q: Tensor, u: Tensor) -> SurrogateModel:
-    """The model as if q (C,), u (F,) had been answered as predicted: variances shrink, means stay (greedy batches)."""
-    definition = model.definition
-    q_next = model.transition(q[None], u[None]).q_next
-    lead = q_next[:, leading(definition)]
-    state = q_next if model.reward.feature_map.after else q[None]
-
-    def extended(output: OutputModel, at: Tensor) -> OutputModel:
-        if output.posterior is None:
-            return output
-        x = encode(definition, output.feature_map, at, u[None], lead)
-        return replace(output, posterior=output.posterior.extend(x[0], output.posterior.mean(x)[0]))
-
-    transitions = tuple(extended(o, q[None]) for o in model.transitions)
-    return replace(model, transitions=transitions, reward=extended(model.reward, state))
-
-
-def near(definition: EnvironmentDefinition, q: Tensor, u: Tensor, taken_q: Tensor, taken_u: Tensor) -> Tensor:
-    """Which of q (m, C), u (m, F) all but repeat one of taken_q (t, C), taken_u (t, F): (m,) bool."""
-    if not len(taken_q):
-        return torch.zeros(len(q), dtype=torch.bool)
+def nearest(definition: EnvironmentDefinition, points: Points, taken: Points) -> Tensor:
+    """Distance of m points to the nearest of those taken, in deviations of the sampling range, (m,)."""
+    if not len(taken):
+        return points.q.new_full((len(points),), torch.inf)
     plain = FeatureMap()
-    distance = torch.cdist(encode(definition, plain, q, u), encode(definition, plain, taken_q, taken_u))
-    return (distance < NEAR).any(1)
+    a, b = (encode(definition, plain, p.q, p.u) for p in (points, taken))
+    return torch.cdist(a, b).amin(1)

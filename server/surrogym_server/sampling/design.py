@@ -11,9 +11,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from surrogym_server.sampling.acquisition import Candidates, acquisition, candidates_of, condition_on, near
+from surrogym_server.sampling.acquisition import choose
+from surrogym_server.sampling.candidates import Candidates, candidates_of, ending
 from surrogym_server.sampling.confidence import OutputConfidence, confidence, deviations
 from surrogym_server.sampling.latin_hypercube import latin_hypercube, random_points
+from surrogym_server.sampling.outlook import Points
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.learn import learn
 from surrogym_server.surrogate.model import SurrogateModel
@@ -53,8 +55,7 @@ class Request:
 
     budget: int
     target: float
-    pending_q: Tensor  # (p, C)
-    pending_u: Tensor  # (p, F)
+    pending: Points  # p
     extra: int = 0  # queries to choose whatever the verdict
     states: Tensor | None = None  # (v, C) visited by policies
 
@@ -83,36 +84,23 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     """One round. Raises InvalidInput or NumericalFailure as ``learn`` does."""
     learned = learn(definition, samples, state.thetas)
     tolerances = state.tolerances or default_tolerances(definition, samples)
-    q, u = monte_carlo(definition)
-    deviation = deviations(learned.model, q, u)
+    points = Points(*monte_carlo(definition))
+    deviation = deviations(learned.model, points.q, points.u)
     outputs = (*learned.model.transitions, learned.model.reward)
     confidences = tuple(confidence(o, deviation[:, i], tolerances[i]) for i, o in enumerate(outputs))
     verdict = judge(definition, confidences, tolerances, len(samples), request)
-    points = _candidate_points(definition, q, u, request.states, state.round)
-    candidates = candidates_of(learned.model, *points, request.states)
-    chosen_q, chosen_u = _choose(learned.model, samples, candidates, confidences, tolerances, verdict, request)
-    if verdict == "continue" and not len(chosen_q):
+    rng = _rng(definition, f"visited {state.round}")
+    candidates = candidates_of(learned.model, points, request.states, rng)
+    chosen = _choose(learned.model, samples, candidates, confidences, tolerances, verdict, request)
+    if verdict == "continue" and not len(chosen):
         verdict = "over_budget"  # the rest of the budget is pending, or nothing distinct is left to ask
     new_state = DesignState(state.round + 1, tolerances, learned.thetas)
-    return Decision(learned.model, confidences, new_state, verdict, chosen_q, chosen_u)
+    return Decision(learned.model, confidences, new_state, verdict, chosen.q, chosen.u)
 
 
 def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
     """The Monte Carlo set of eq. 8, the same in every round: coordinates (m, C), actions (m, F)."""
     return random_points(definition, definition.design.monte_carlo, _rng(definition, "monte carlo"))
-
-
-def _candidate_points(
-    definition: EnvironmentDefinition, q: Tensor, u: Tensor, states: Tensor | None, round_number: int
-) -> tuple[Tensor, Tensor]:
-    """The Monte Carlo set q (m, C), u (m, F), and as many points again at states (v, C) that policies visited, under
-    random actions: few points of a set spread over the whole range lie where a policy goes."""
-    if states is None or not len(states) or definition.design.preset == "paper":
-        return q, u
-    rng = _rng(definition, f"visited {round_number}")
-    chosen = torch.from_numpy(rng.integers(len(states), size=len(q)))
-    _, actions = random_points(definition, len(q), rng)
-    return torch.cat([q, states[chosen]]), torch.cat([u, actions])
 
 
 def default_tolerances(definition: EnvironmentDefinition, samples: Samples) -> tuple[float, ...]:
@@ -156,45 +144,17 @@ def _choose(
     tolerances: tuple[float, ...],
     verdict: Verdict,
     request: Request,
-) -> tuple[Tensor, Tensor]:
-    """One query for each output below its target, least confident first, as if those before had been answered."""
+) -> Points:
+    """One query for each output below its target, least confident first."""
     order = sorted(range(len(confidences)), key=lambda i: confidences[i].confidence_index)
     below = [i for i in order if confidences[i].confidence_index < request.target] or order[:1]
     if verdict == "continue":
-        wanted = below[: max(0, request.budget - len(samples) - len(request.pending_q))]
+        wanted = below[: max(0, request.budget - len(samples) - len(request.pending))]
     else:
         wanted = [below[i % len(below)] for i in range(request.extra)]
-    for q, u in zip(request.pending_q, request.pending_u, strict=True):
-        model = condition_on(model, q, u)
-    taken = (torch.cat([samples.q, request.pending_q]), torch.cat([samples.u, request.pending_u]))
-    picks: list[int] = []
-    reserved = _reserved(model, samples, candidates)
-    for position, column in enumerate(wanted):
-        repeated = near(model.definition, candidates.q, candidates.u, *taken)
-        if bool(repeated.all()):
-            break
-        value = acquisition(model, candidates, column, tolerances[column])
-        if position == 0 and reserved is not None:
-            value = torch.where(reserved, value, -torch.inf)
-        value[repeated] = -torch.inf
-        pick = int(value.argmax())
-        if value[pick] == -torch.inf:
-            continue
-        picks.append(pick)
-        q, u = candidates.q[pick], candidates.u[pick]
-        model = condition_on(model, q, u)
-        taken = (torch.cat([taken[0], q[None]]), torch.cat([taken[1], u[None]]))
-    return candidates.q[picks], candidates.u[picks]
-
-
-def _reserved(model: SurrogateModel, samples: Samples, candidates: Candidates) -> Tensor | None:
-    """Candidates predicted to end an episode, as long as no sample has: what ending pays must be seen once."""
-    definition = model.definition
-    if not definition.termination_groups or bool(samples.terminated.any()):
-        return None
-    ends = model.terminated(model.transition(candidates.q, candidates.u).q_next)
-    ends &= ~model.terminated(candidates.q)
-    return ends if bool(ends.any()) else None
+    taken = Points.joined([Points(samples.q, samples.u), request.pending])
+    reserved = ending(model, samples, candidates.points)
+    return candidates.points[choose(model, candidates, taken, request.pending, wanted, tolerances, reserved)]
 
 
 def _rng(definition: EnvironmentDefinition, purpose: str) -> np.random.Generator:

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from surrogym_server.sampling.acquisition import candidates_of
+from surrogym_server.sampling.candidates import input_probability
 from surrogym_server.sampling.confidence import deviations, log_model_uncertainty
+from surrogym_server.sampling.outlook import Points
 from surrogym_server.surrogate.model import SurrogateModel
 
 Array = NDArray[np.float64]
@@ -33,7 +34,7 @@ def query_uncertainty(
     at, action = torch.from_numpy(q), torch.from_numpy(u)
     states = None if occupancy is None else torch.from_numpy(occupancy)
     mean, deviation = model.means(at, action), deviations(model, at, action)
-    log_p = candidates_of(model, at, action, states).log_p[:, None].expand_as(deviation)
+    log_p = input_probability(model, Points(at, action), states)[:, None].expand_as(deviation)
     log_u_m = log_model_uncertainty(deviation, torch.from_numpy(tolerances))
     parts = (mean, deviation, log_u_m.exp(), log_p.exp(), log_u_m + log_p)
     return UncertaintyResult(*(p.numpy() for p in parts))

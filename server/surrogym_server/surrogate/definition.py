@@ -75,7 +75,7 @@ class DesignDefinition:
 
     preset: Preset
     initial: int
-    acquisition: Literal["uncertainty_index", "variance", "latin_hypercube"]
+    acquisition: Literal["uncertainty_index", "variance", "integrated_variance", "latin_hypercube"]
     monte_carlo: int
     seed: int
 
@@ -92,7 +92,7 @@ class EnvironmentDefinition:
     action: ActionDefinition
     termination_groups: tuple[tuple[Inequality, ...], ...]
     time_limit: int | None
-    reward_timing: Literal["before", "after", "auto"]
+    reward_timing: Literal["before", "after"]
     penalty: float
     tolerances: tuple[tuple[str, float], ...]
     design: DesignDefinition

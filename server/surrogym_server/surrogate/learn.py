@@ -14,7 +14,7 @@ from torch import Tensor
 from surrogym_server.errors import InvalidInput
 from surrogym_server.gp import FitOptions, Fitted, fit
 from surrogym_server.surrogate.definition import REWARD, EnvironmentDefinition
-from surrogym_server.surrogate.features import FeatureMap, candidates, encode, leading, reward_candidates
+from surrogym_server.surrogate.features import FeatureMap, candidates, encode, leading
 from surrogym_server.surrogate.model import OutputModel, SurrogateModel
 from surrogym_server.surrogate.samples import Samples, increments, saturated
 
@@ -111,6 +111,15 @@ def _transitions(learner: _Learner, samples: Samples) -> tuple[OutputModel, ...]
     return tuple(outputs)
 
 
+def usable(definition: EnvironmentDefinition, column: int, q_next: Tensor, feature_map: FeatureMap) -> Tensor:
+    """Which samples that end at q_next (m, C) the transition output ``column`` learns from under a map, (m,) bool."""
+    if definition.design.preset == "paper":
+        return torch.ones(len(q_next), dtype=torch.bool)
+    if feature_map.lead:
+        return ~_saturates(definition, definition.moving[column], q_next)
+    return ~saturated(definition, q_next)
+
+
 def _saturates(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Tensor:
     """Samples (n,) in which anything but the lead ended at a bound, coordinate ``index`` included."""
     others = q_next.clone()
@@ -122,10 +131,9 @@ def _saturates(definition: EnvironmentDefinition, index: int, q_next: Tensor) ->
 def _reward(learner: _Learner, samples: Samples) -> tuple[OutputModel, float]:
     """The reward process of steps that go on, and what a step that ends the episode pays beyond it."""
     definition = learner.definition
-    inputs = {
-        m: encode(definition, m, samples.q_next if m.after else samples.q, samples.u)
-        for m in reward_candidates(definition)
-    }
+    state = samples.q if definition.reward_timing == "before" else samples.q_next
+    maps = candidates(definition, follows=False)
+    inputs = {m: encode(definition, m, state, samples.u) for m in maps}
     going = (
         ~samples.terminated if int((~samples.terminated).sum()) >= MIN_POINTS else torch.ones_like(samples.terminated)
     )

@@ -1,69 +1,115 @@
-"""Candidates: where their probability comes from, what an assumed answer changes, and what all but repeats a point."""
+"""Criteria against their definitions, and batches: distinct, greedy, and ended where nothing is left."""
 
 from dataclasses import replace
 
+import numpy as np
+import pytest
 import torch
+from scipy.stats import norm
 
-from support.real_steps import random_steps
-from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_client.original.classic import cartpole
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.sampling.acquisition import NEAR, candidates_of, condition_on, near
+from surrogym_server.sampling.acquisition import NEAR, acquisition, choose, nearest
+from surrogym_server.sampling.candidates import Candidates
 from surrogym_server.sampling.confidence import deviations
-from surrogym_server.sampling.occupancy import log_occupancy
-from surrogym_server.surrogate.learn import learn
-from surrogym_shared.spec import Design
+from surrogym_server.sampling.outlook import Outlook, Points
+from surrogym_server.surrogate.model import SurrogateModel
+
+TOLERANCES = (0.01, 0.02, 0.1)
+CRITERIA = ("uncertainty_index", "variance", "integrated_variance")
 
 
-def test_without_visited_states_every_state_is_as_likely(model, points):
-    assert (candidates_of(model, *points, states=None).log_p == 0).all()
-    assert (candidates_of(model, *points, states=torch.zeros(0, 2).double()).log_p == 0).all()
+def by(model: SurrogateModel, criterion: str) -> SurrogateModel:
+    design = replace(model.definition.design, acquisition=criterion)
+    return replace(model, definition=replace(model.definition, design=design))
 
 
-def test_visited_states_are_what_is_weighed_by(model, points, unseen):
-    made = candidates_of(model, *points, unseen.q)
-    torch.testing.assert_close(made.log_p, log_occupancy(model.definition, unseen.q, points[0]))
+@pytest.fixture
+def candidates(points) -> Candidates:
+    log_p = torch.linspace(-3, 0, len(points[0]), dtype=torch.float64)
+    weights = torch.full((60,), 1 / 60, dtype=torch.float64)
+    return Candidates(Points(*points), log_p, Points(*points), weights)
 
 
-def test_the_paper_takes_the_density_of_predicted_next_states(points):
-    spec = pendulum().model_copy(update={"design": Design(preset="paper")})
-    model = learn(definition_from_spec(spec), random_steps(spec, 12, seed=0)).model
-    arrived = model.transition(*points).q_next
-    expected = log_occupancy(model.definition, arrived, arrived, floor=1e-12)
-    torch.testing.assert_close(candidates_of(model, *points, states=None).log_p, expected)
-    assert float(expected.std()) > 0.05
+def value(model: SurrogateModel, candidates: Candidates, criterion: str, column: int) -> torch.Tensor:
+    points = candidates.points
+    outlook = Outlook.of(model, points, candidates.reference, points[:0])
+    return acquisition(by(model, criterion).definition, outlook.outputs[column], candidates, TOLERANCES[column])
 
 
-def test_an_assumed_answer_shrinks_deviations_and_moves_no_mean(model, points):
-    q, u = points
-    assumed = condition_on(model, q[0], u[0])
-    before, after = deviations(model, q, u), deviations(assumed, q, u)
-    assert torch.all(after <= before * (1 + 1e-6) + 1e-9)
-    assert torch.all(after[0] < 0.1 * before[0].clamp_min(1e-3))
-    torch.testing.assert_close(assumed.means(q, u), model.means(q, u), rtol=0, atol=1e-5)
-    assert [len(o.posterior.y) for o in model.transitions] == [len(o.posterior.y) - 1 for o in assumed.transitions]
+def test_the_index_is_uncertainty_times_probability(model, candidates):
+    sigma = deviations(model, candidates.points.q, candidates.points.u)[:, 1].numpy()
+    expected = (1 - norm.cdf(0.02 / sigma)) * np.exp(candidates.log_p.numpy())
+    np.testing.assert_allclose(value(model, candidates, "uncertainty_index", 1).exp().numpy(), expected, rtol=1e-4)
 
 
-def test_an_assumed_answer_leaves_constant_outputs_alone():
-    model = learn(definition_from_spec(cartpole()), random_steps(cartpole(), 8, seed=0)).model
-    assumed = condition_on(model, torch.zeros(4).double(), torch.ones(1).double())
-    assert assumed.reward is model.reward
+def test_variance_looks_at_the_deviation_alone(model, candidates):
+    said = value(model, candidates, "variance", 2)
+    torch.testing.assert_close(
+        said, deviations(model, candidates.points.q, candidates.points.u)[:, 2], rtol=1e-6, atol=0
+    )
+
+
+def test_integrated_variance_prefers_what_is_good_for_many_points(model, candidates):
+    """A candidate far from the reference lowers nothing there, however uncertain it is."""
+    here = (candidates.points.q[:, 1] > 0).double()
+    only_here = replace(candidates, weights=here / here.sum())
+    pick = int(value(model, only_here, "integrated_variance", 1).argmax())
+    assert here[pick]
+    only_there = replace(candidates, weights=(1 - here) / (1 - here).sum())
+    assert not here[int(value(model, only_there, "integrated_variance", 1).argmax())]
+
+
+@pytest.mark.parametrize("criterion", CRITERIA)
+def test_a_batch_is_what_one_after_the_other_would_have_been(model, candidates, criterion):
+    """Choosing three at once is choosing one three times, with those before assumed."""
+    points, nothing = candidates.points, candidates.points[:0]
+    model = by(model, criterion)
+    batch = choose(model, candidates, nothing, nothing, [2, 1, 2], TOLERANCES)
+    picks: list[int] = []
+    for column in (2, 1, 2):
+        picks += choose(model, candidates, points[picks], points[picks], [column], TOLERANCES)
+    assert batch == picks
+    assert len(set(batch)) == 3
+
+
+def test_what_was_asked_is_not_asked_again(model, candidates):
+    points = candidates.points
+    all_but_two = points[: len(points) - 2]
+    assert set(choose(model, candidates, all_but_two, points[:0], [0, 1, 2, 0, 1], TOLERANCES)) == {58, 59}
+
+
+def test_the_first_of_a_batch_is_taken_from_the_reserved(model, candidates):
+    reserved = torch.zeros(60, dtype=torch.bool)
+    reserved[[7, 31]] = True
+    nothing = candidates.points[:0]
+    batch = choose(model, candidates, nothing, nothing, [0, 0, 0], TOLERANCES, reserved)
+    assert batch[0] in (7, 31)
+    assert len(batch) == 3
+
+
+def test_an_output_that_never_varied_is_tried_far_from_what_was_asked(model, candidates):
+    """It has no deviation to choose by, and only something unlike the samples could prove it wrong."""
+    constant = replace(model, reward=replace(model.reward, posterior=None))
+    taken = candidates.points[:30]
+    (pick,) = choose(constant, candidates, taken, taken[:0], [2], TOLERANCES)
+    assert pick == int(nearest(model.definition, candidates.points, taken).argmax())
 
 
 def test_near_is_measured_in_deviations_of_the_sampling_range(definition):
-    taken_q, taken_u = torch.tensor([[3.14, 1.0]]).double(), torch.tensor([[0.5]]).double()
+    taken = Points(torch.tensor([[3.14, 1.0]]).double(), torch.tensor([[0.5]]).double())
     deviation = 16 / 12**0.5
     q = torch.tensor([[3.14, 1.0]] * 2).double()
     q[0, 1] += 0.9 * NEAR * deviation
     q[1, 1] += 1.1 * NEAR * deviation
-    assert near(definition, q, taken_u.expand(2, 1), taken_q, taken_u).tolist() == [True, False]
-    turned = torch.tensor([[3.14 - 2 * torch.pi, 1.0]]).double()
-    assert near(definition, turned, taken_u, taken_q, taken_u).tolist() == [True]
-    assert near(definition, taken_q, taken_u + 0.5, taken_q, taken_u).tolist() == [False]
-    nothing = torch.zeros(0, 2).double(), torch.zeros(0, 1).double()
-    assert near(definition, q, taken_u.expand(2, 1), *nothing).tolist() == [False, False]
+    assert (nearest(definition, Points(q, taken.u.expand(2, 1)), taken) / NEAR).tolist() == pytest.approx([0.9, 1.1])
+    turned = Points(torch.tensor([[3.14 - 2 * torch.pi, 1.0]]).double(), taken.u)
+    assert nearest(definition, turned, taken).tolist() == pytest.approx([0], abs=1e-6)
+    assert nearest(definition, Points(taken.q, taken.u + 0.5), taken)[0] > NEAR
+    assert torch.isinf(nearest(definition, taken, taken[:0])).all()
 
 
 def test_another_discrete_action_is_another_query(definition):
     discrete = replace(definition, action=definition_from_spec(cartpole()).action)
     q, left, right = torch.zeros(1, 2).double(), torch.zeros(1, 1).double(), torch.ones(1, 1).double()
-    assert near(discrete, q, left, q, right).tolist() == [False]
+    assert nearest(discrete, Points(q, left), Points(q, right))[0] > NEAR

@@ -11,7 +11,6 @@ import torch
 from scipy.stats import norm
 
 from support.real_steps import join
-from surrogym_server.sampling.acquisition import Candidates, acquisition
 from surrogym_server.sampling.confidence import (
     certainty,
     confidence,
@@ -56,23 +55,6 @@ def test_small_uncertainties_stay_ordered_where_one_minus_phi_is_zero():
     log_u = log_model_uncertainty(deviation, 1.0)
     assert torch.all(log_u.diff() < 0)
     np.testing.assert_allclose(log_u.numpy(), norm.logsf([9, 10, 20, 100]), rtol=1e-9)
-
-
-def test_the_index_is_uncertainty_times_probability(model, points):
-    q, u = points
-    log_p = torch.linspace(-3, 0, len(q), dtype=torch.float64)
-    value = acquisition(model, Candidates(q, u, log_p), column=1, tolerance=0.02)
-    sigma = deviations(model, q, u)[:, 1].numpy()
-    expected = (1 - norm.cdf(0.02 / sigma)) * np.exp(log_p.numpy())
-    np.testing.assert_allclose(value.exp().numpy(), expected, rtol=1e-6)
-
-
-def test_acquisition_by_variance_looks_at_the_deviation_alone(model, points):
-    q, u = points
-    by_variance = replace(model.definition, design=replace(model.definition.design, acquisition="variance"))
-    log_p = torch.linspace(-9, 0, len(q), dtype=torch.float64)
-    value = acquisition(replace(model, definition=by_variance), Candidates(q, u, log_p), 2, 0.1)
-    torch.testing.assert_close(value, deviations(model, q, u)[:, 2].log())
 
 
 def test_leave_one_out_error_is_of_models_that_never_saw_the_point(definition, few, unseen):

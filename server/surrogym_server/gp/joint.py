@@ -1,0 +1,57 @@
+"""Joint latent posterior of a process at fixed points, and what observing some of them would do to it.
+
+Observing x_i shrinks every covariance by a product of rank one and needs no value of y:
+
+    k'(x_a, x_b) = k(x_a, x_b) - r_a r_b,  r_a = k(x_a, x_i) / sqrt(k(x_i, x_i) + sigma_n^2),
+
+k the posterior covariance; r is the next row of L^-1 k(X, x). One more observation costs O(n m): nothing is refitted.
+Reference: Rasmussen and Williams (2006), section 2.2; Krause, Singh, Guestrin (JMLR 2008), algorithm 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from surrogym_server.gp.kernel import Hyperparameters, covariance, variance
+from surrogym_server.gp.posterior import Posterior
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A process at m points, standardised like its posterior."""
+
+    hyper: Hyperparameters
+    x: Tensor  # (m, d)
+    whitened: Tensor  # (n, m) L^-1 k(X, x)
+    observed: Tensor  # (p, m) the rows r of p points assumed observed
+    variance: Tensor  # (m,) latent
+    noise: float
+
+    @classmethod
+    def of(cls, posterior: Posterior, x: Tensor) -> Joint:
+        """The posterior at x (m, d)."""
+        k = covariance(posterior.hyper, posterior.x, x)
+        whitened = torch.linalg.solve_triangular(posterior.factor, k, upper=False)
+        latent = (variance(posterior.hyper, x) - whitened.square().sum(0)).clamp_min(0)
+        noise = posterior.hyper.noise_variance + posterior.jitter
+        return cls(posterior.hyper, x, whitened, x.new_zeros(0, len(x)), latent, noise)
+
+    def between(self, a: slice, b: slice) -> Tensor:
+        """Posterior covariance of the points a and the points b, (|a|, |b|)."""
+        prior = covariance(self.hyper, self.x[a], self.x[b])
+        known = self.whitened[:, a].T @ self.whitened[:, b] + self.observed[:, a].T @ self.observed[:, b]
+        return prior - known
+
+    def row(self, index: int) -> Tensor:
+        """r of the point ``index``, (m,)."""
+        shared = self.between(slice(index, index + 1), slice(None))[0]
+        return shared / (self.variance[index] + self.noise).sqrt()
+
+    def observe(self, index: int) -> Joint:
+        """The posterior as if the point ``index`` were observed as well."""
+        row = self.row(index)
+        shrunk = (self.variance - row.square()).clamp_min(0)
+        return replace(self, observed=torch.cat([self.observed, row[None]]), variance=shrunk)

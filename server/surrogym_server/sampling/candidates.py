@@ -1,0 +1,77 @@
+"""Points to choose queries from: the declared ranges, and the states that policies visited."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surrogym_server.sampling.latin_hypercube import random_points
+from surrogym_server.sampling.occupancy import log_occupancy
+from surrogym_server.sampling.outlook import Points
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.surrogate.samples import Samples
+
+MAX_CANDIDATES = 4_096  # of each kind; covariances with the reference are held for all of them
+REFERENCE = 256  # points of each kind
+OCCUPIED = 0.5  # share of the visited states in the reference; the rest is the whole sampling range
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Points to choose from, how likely they are, and the points that an answer should be good for."""
+
+    points: Points  # m
+    log_p: Tensor  # (m,) log P_i
+    reference: Points  # r; read by ``integrated_variance``
+    weights: Tensor  # (r,) add up to 1
+
+
+def candidates_of(model: SurrogateModel, points: Points, states: Tensor | None, rng: np.random.Generator) -> Candidates:
+    """Candidates from the Monte Carlo set ``points`` (m) and, as many again, visited states (v, C) under random
+    actions: few points of a set spread over the whole range lie where a policy goes.
+
+    The reference is the Monte Carlo set, mixed with the visited states where there are any.
+    """
+    points = points[:MAX_CANDIDATES]
+    reference, weights = points[:REFERENCE], points.q.new_ones(min(len(points), REFERENCE))
+    if states is not None and len(states) and model.definition.design.preset == "default":
+        visited = _visited(model.definition, states, len(points), rng)
+        also = _visited(model.definition, states, REFERENCE, rng)
+        weights = torch.cat(
+            [weights * (1 - OCCUPIED) / len(weights), weights.new_full((REFERENCE,), OCCUPIED / REFERENCE)]
+        )
+        points, reference = Points.joined([points, visited]), Points.joined([reference, also])
+    return Candidates(points, input_probability(model, points, states), reference, weights / weights.sum())
+
+
+def input_probability(model: SurrogateModel, points: Points, states: Tensor | None) -> Tensor:
+    """log P_i (eq. 11) at m points from visited states (v, C): (m,).
+
+    Without any, preset ``paper`` takes the density of the predicted next states at each point's own, and the default
+    calls every state equally likely.
+    """
+    definition = model.definition
+    if states is not None and len(states):
+        return log_occupancy(definition, states, points.q)
+    if definition.design.preset == "paper":
+        arrived = model.transition(points.q, points.u).q_next
+        return log_occupancy(definition, arrived, arrived, floor=1e-12)
+    return points.q.new_zeros(len(points))
+
+
+def ending(model: SurrogateModel, samples: Samples, points: Points) -> Tensor | None:
+    """Which of m points are predicted to end an episode, (m,) bool, as long as no sample has: what ending pays must be
+    seen once. None where there is nothing to see."""
+    if bool(samples.terminated.any()):
+        return None
+    ends = model.terminated(model.transition(points.q, points.u).q_next) & ~model.terminated(points.q)
+    return ends if bool(ends.any()) else None
+
+
+def _visited(definition: EnvironmentDefinition, states: Tensor, count: int, rng: np.random.Generator) -> Points:
+    chosen = torch.from_numpy(rng.integers(len(states), size=count))
+    return Points(states[chosen], random_points(definition, count, rng)[1])

@@ -1,0 +1,80 @@
+"""Candidates: where they come from, where their probability comes from, and what a query should be good for."""
+
+import numpy as np
+import pytest
+import torch
+
+from support.real_steps import random_steps
+from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.sampling import candidates as candidates_room
+from surrogym_server.sampling.candidates import OCCUPIED, candidates_of, ending, input_probability
+from surrogym_server.sampling.occupancy import log_occupancy
+from surrogym_server.sampling.outlook import Points
+from surrogym_server.surrogate.learn import learn
+from surrogym_server.surrogate.samples import Samples
+from surrogym_shared.spec import Design
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def test_without_visited_states_every_state_is_as_likely(model, points):
+    assert (input_probability(model, Points(*points), None) == 0).all()
+    assert (input_probability(model, Points(*points), torch.zeros(0, 2).double()) == 0).all()
+
+
+def test_visited_states_are_what_is_weighed_by(model, points, unseen):
+    said = input_probability(model, Points(*points), unseen.q)
+    torch.testing.assert_close(said, log_occupancy(model.definition, unseen.q, points[0]))
+
+
+def test_the_paper_takes_the_density_of_predicted_next_states(points):
+    spec = pendulum().model_copy(update={"design": Design(preset="paper")})
+    model = learn(definition_from_spec(spec), random_steps(spec, 12, seed=0)).model
+    arrived = model.transition(*points).q_next
+    expected = log_occupancy(model.definition, arrived, arrived, floor=1e-12)
+    torch.testing.assert_close(input_probability(model, Points(*points), None), expected)
+    assert float(expected.std()) > 0.05
+
+
+def test_without_visited_states_a_query_should_be_good_anywhere(model, points, rng):
+    made = candidates_of(model, Points(*points), None, rng)
+    assert torch.equal(made.points.q, points[0])
+    assert torch.equal(made.reference.q, points[0])
+    torch.testing.assert_close(made.weights, torch.full((60,), 1 / 60, dtype=torch.float64))
+
+
+def test_visited_states_are_candidates_and_have_their_share_of_the_reference(model, points, unseen, rng):
+    visited = unseen.q[:7]
+    made = candidates_of(model, Points(*points), visited, rng)
+    assert torch.equal(made.points.q[:60], points[0])
+    assert all(bool((q == visited).all(1).any()) for q in made.points.q[60:])
+    of_policies = torch.stack([(q == visited).all(1).any() for q in made.reference.q])
+    assert float(made.weights.sum()) == pytest.approx(1)
+    assert float(made.weights[of_policies].sum()) == pytest.approx(OCCUPIED)
+
+
+def test_a_large_monte_carlo_set_is_not_compared_pair_by_pair(model, points, rng, monkeypatch):
+    monkeypatch.setattr(candidates_room, "MAX_CANDIDATES", 20)
+    monkeypatch.setattr(candidates_room, "REFERENCE", 10)
+    made = candidates_of(model, Points(*points), None, rng)
+    assert (len(made.points), len(made.log_p), len(made.reference), len(made.weights)) == (20, 20, 10, 10)
+
+
+def test_the_end_of_an_episode_is_reserved_until_one_was_seen():
+    spec = cartpole()
+    steps = random_steps(spec, 60, seed=0)
+    going = Samples(*(getattr(steps, n)[~steps.terminated] for n in steps.__dataclass_fields__))
+    model = learn(definition_from_spec(spec), going).model
+    points = Points(steps.q, steps.u)
+    reserved = ending(model, going, points)
+    assert bool(model.terminated(model.transition(*steps_of(points, reserved)).q_next).all())
+    assert ending(model, steps, points) is None
+    assert ending(model, going, Points(0 * steps.q, steps.u)) is None
+
+
+def steps_of(points: Points, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    return points.q[chosen], points.u[chosen]

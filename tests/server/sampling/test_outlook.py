@@ -1,0 +1,94 @@
+"""What a query would do to the deviations is what it does, and is known before its answer."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from support.real_steps import random_steps
+from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.sampling.confidence import deviations
+from surrogym_server.sampling.latin_hypercube import random_points
+from surrogym_server.sampling.outlook import Outlook, Points
+from surrogym_server.surrogate.features import encode
+from surrogym_server.surrogate.learn import learn
+from surrogym_server.surrogate.model import OutputModel, SurrogateModel
+from surrogym_shared.spec import Reward
+
+NOTHING = slice(0)
+
+
+@pytest.fixture
+def candidates(points) -> Points:
+    return Points(*points)
+
+
+@pytest.fixture
+def reference(definition) -> Points:
+    return Points(*random_points(definition, 25, np.random.default_rng(5)))
+
+
+def answered(model: SurrogateModel, query: Points) -> SurrogateModel:
+    """The model as if one query had been answered as predicted: every process has one more point."""
+    lead = model.transition(query.q, query.u).q_next[:, 1:]
+
+    def extended(output: OutputModel) -> OutputModel:
+        x = encode(model.definition, output.feature_map, query.q, query.u, lead)
+        return replace(output, posterior=output.posterior.extend(x[0], output.posterior.mean(x)[0]))
+
+    return replace(model, transitions=tuple(map(extended, model.transitions)), reward=extended(model.reward))
+
+
+def test_it_begins_with_the_deviations_of_the_model(model, candidates):
+    outlook = Outlook.of(model, candidates, candidates[NOTHING], candidates[NOTHING])
+    said = torch.stack([output.deviation for output in outlook.outputs], -1)
+    torch.testing.assert_close(said, deviations(model, candidates.q, candidates.u), rtol=1e-6, atol=1e-9)
+
+
+def test_the_reduction_is_what_the_answer_brings(model, candidates, reference):
+    weights = torch.arange(1.0, 26.0, dtype=torch.float64) / 325
+    outlook = Outlook.of(model, candidates, reference, candidates[NOTHING])
+    before = deviations(model, reference.q, reference.u).square()
+    for index in range(3):
+        after = deviations(answered(model, candidates[index : index + 1]), reference.q, reference.u).square()
+        brought = weights @ (before - after)
+        said = torch.stack([output.reduction(weights)[index] for output in outlook.outputs])
+        torch.testing.assert_close(said, brought, rtol=1e-4, atol=1e-10)
+
+
+def test_queries_assumed_and_candidates_observed_do_the_same(model, candidates, reference):
+    weights = torch.full((25,), 1 / 25, dtype=torch.float64)
+    observed = Outlook.of(model, candidates, reference, candidates[NOTHING]).observe(4).observe(9)
+    assumed = Outlook.of(model, candidates, reference, candidates[[4, 9]])
+    for one, other in zip(observed.outputs, assumed.outputs, strict=True):
+        torch.testing.assert_close(one.deviation, other.deviation, rtol=1e-6, atol=1e-9)
+        torch.testing.assert_close(one.reduction(weights), other.reduction(weights), rtol=1e-5, atol=1e-12)
+
+
+def test_an_answer_at_a_bound_teaches_the_dynamics_nothing(model):
+    """It is left out of the processes, so asking for it would not lower their deviations."""
+    q = torch.tensor([[1.5, 7.9], [1.5, 0.0]], dtype=torch.float64)
+    points = Points(q, torch.full((2, 1), 2.0, dtype=torch.float64))
+    theta, speed, reward = Outlook.of(model, points, points[NOTHING], points[NOTHING]).outputs
+    assert speed.counts.tolist() == [False, True]
+    assert reward.counts.tolist() == [True, True]
+    torch.testing.assert_close(speed.observe(0).deviation, speed.deviation)
+    assert speed.observe(1).deviation[1] < speed.deviation[1]
+    assert theta.counts.tolist() == [model.transitions[0].feature_map.lead, True]
+
+
+def test_an_output_that_never_varied_has_no_outlook():
+    steps = random_steps(cartpole(), 12, seed=0)
+    model = learn(definition_from_spec(cartpole()), steps).model
+    points = Points(steps.q, steps.u)
+    assert Outlook.of(model, points, points, points).observe(0).outputs[-1] is None
+
+
+def test_a_reward_after_the_step_is_known_where_the_step_leads(candidates):
+    spec = pendulum().model_copy(update={"reward": Reward(timing="after")})
+    model = learn(definition_from_spec(spec), random_steps(spec, 12, seed=0)).model
+    outlook = Outlook.of(model, candidates, candidates[NOTHING], candidates[NOTHING])
+    expected = deviations(model, candidates.q, candidates.u)[:, -1]
+    torch.testing.assert_close(outlook.outputs[-1].deviation, expected, rtol=1e-6, atol=1e-9)
