@@ -92,7 +92,7 @@ class EnvironmentDefinition:
     action: ActionDefinition
     termination_groups: tuple[tuple[Inequality, ...], ...]
     time_limit: int | None
-    reward_timing: Literal["before", "after"]
+    reward_timing: Literal["before", "after", "auto"]
     penalty: float
     tolerances: tuple[tuple[str, float], ...]
     design: DesignDefinition

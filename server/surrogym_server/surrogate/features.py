@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby, product
 from typing import Literal, NamedTuple
 
@@ -28,14 +28,17 @@ class FeatureMap:
     ``state``: angles as cos and sin, as the wrapped angle, or both; or the observation, as the paper has it.
     ``action``: discrete actions as evenly spaced values, or one-hot. ``lead``: the predicted, clipped next value of
     saturating coordinates is an input as well, so that what follows from it (an angle from its speed) sees no kink.
+    ``after``: the state that the step led to is shown, not the one it began in; only for the reward.
     """
 
     state: State = "cos_sin"
     action: Encoding = "value"
     lead: bool = False
+    after: bool = False
 
     def __str__(self) -> str:
-        return ", ".join([self.state, f"action {self.action}", *(["lead"] if self.lead else [])])
+        extras = [name for name, on in (("lead", self.lead), ("after", self.after)) if on]
+        return ", ".join([self.state, f"action {self.action}", *extras])
 
 
 def leading(definition: EnvironmentDefinition) -> tuple[int, ...]:
@@ -45,6 +48,12 @@ def leading(definition: EnvironmentDefinition) -> tuple[int, ...]:
         for i in definition.moving
         if (c := definition.coordinates[i]).stops is None and math.isfinite(c.low) and math.isfinite(c.high)
     )
+
+
+def reward_candidates(definition: EnvironmentDefinition) -> tuple[FeatureMap, ...]:
+    """Maps worth comparing for the reward: of the state before the step, after it, or both, as its timing says."""
+    timings = {"before": (False,), "after": (True,), "auto": (False, True)}[definition.reward_timing]
+    return tuple(replace(m, after=after) for after in timings for m in candidates(definition, follows=False))
 
 
 def candidates(definition: EnvironmentDefinition, follows: bool) -> tuple[FeatureMap, ...]:
