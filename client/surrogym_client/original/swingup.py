@@ -34,6 +34,7 @@ START = 0.1  # half the width of the start distribution, in each coordinate
 STEP_SECONDS = 0.1
 SUBSTEPS = 10
 GRAVITY = 9.82
+LENGTH = 0.6
 
 # How far from its target the pole's tip may be (m) before the reward falls to exp(-1/2). Hanging, it is 1.2 away:
 # that pays 0.14 under the smooth reward and 1e-5 under PILCO's.
@@ -43,7 +44,8 @@ State = tuple[float, float, float, float]
 
 
 class CartPoleSwingUp(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """State: position, velocity, angle (0 hangs, counter-clockwise), angular velocity. Action: force / N.
+    """State: position, velocity, angle (0 hangs, counter-clockwise), angular velocity. Action: force / N. The observation
+    has the angle's cosine and sine, and the horizontal position of the pole's tip.
 
     Reward of the state after the step: exp(-d^2 / (2 width^2)), d from the pole's tip to where it is when the pole
     stands above the origin. No state ends an episode.
@@ -54,10 +56,10 @@ class CartPoleSwingUp(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def __init__(self, reward: Literal["smooth", "narrow"] = "smooth") -> None:
         if reward not in WIDTH:
             raise ValueError(f"reward: expected one of {', '.join(WIDTH)}, got {reward!r}")
-        self.masscart, self.masspole, self.length, self.friction = 0.5, 0.5, 0.6, 0.1
+        self.masscart, self.masspole, self.length, self.friction = 0.5, 0.5, LENGTH, 0.1
         self.width = WIDTH[reward]
         self.state: NDArray[np.float64] = np.zeros(4)
-        ends = np.array([np.inf, np.inf, 1, 1, np.inf], dtype=np.float32)
+        ends = np.array([np.inf, np.inf, 1, 1, np.inf, np.inf], dtype=np.float32)
         self.observation_space = spaces.Box(-ends, ends, dtype=np.float32)
         self.action_space = spaces.Box(-MAX_FORCE, MAX_FORCE, (1,), dtype=np.float32)
 
@@ -99,12 +101,17 @@ class CartPoleSwingUp(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def _reward(self) -> float:
         x, _, angle, _ = self.state
-        across, below = x + self.length * math.sin(angle), self.length * (1 + math.cos(angle))
+        across, below = self._tip(x, angle), self.length * (1 + math.cos(angle))
         return math.exp(-(across**2 + below**2) / (2 * self.width**2))
 
     def _observation(self) -> NDArray[np.float32]:
         x, velocity, angle, omega = self.state
-        return np.array([x, velocity, math.cos(angle), math.sin(angle), omega], dtype=np.float32)
+        shown = [x, velocity, math.cos(angle), math.sin(angle), omega, self._tip(x, angle)]
+        return np.array(shown, dtype=np.float32)
+
+    def _tip(self, x: float, angle: float) -> float:
+        """Horizontal position of the pole's tip."""
+        return x + self.length * math.sin(angle)
 
 
 def _ahead(state: State, slope: State, h: float) -> State:
@@ -131,6 +138,7 @@ def _specification(environment: str) -> EnvironmentSpec:
         "cos": Term.cos(angle=1),
         "sin": Term.sin(angle=1),
         "omega": linear["omega"],
+        "tip": linear["x"] + LENGTH * Term.sin(angle=1),
     }
     on_circle = ("cos", "sin")
     return EnvironmentSpec(
