@@ -44,8 +44,8 @@ State = tuple[float, float, float, float]
 
 
 class CartPoleSwingUp(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """State: position, velocity, angle (0 hangs, counter-clockwise), angular velocity. Action: force / N. The observation
-    has the angle's cosine and sine, and the horizontal position of the pole's tip.
+    """State: position, velocity, angle (0 hangs, counter-clockwise), angular velocity. Action: force / N. Observed
+    are the angle's cosine and sine, and the horizontal position of the pole's tip as well.
 
     Reward of the state after the step: exp(-d^2 / (2 width^2)), d from the pole's tip to where it is when the pole
     stands above the origin. No state ends an episode.

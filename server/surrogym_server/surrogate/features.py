@@ -25,8 +25,8 @@ Encoding = Literal["value", "one_hot"]  # of discrete actions
 class FeatureMap:
     """How (q, u) is shown to one output's process.
 
-    ``state``: angles as cos and sin, as the wrapped angle, or both; or the observation, as the paper has it (there as it
-    is, elsewhere standardised).
+    ``state``: angles as cos and sin, as the wrapped angle, or both; or the observation: as it is in the paper,
+    standardised elsewhere.
     ``action``: discrete actions as evenly spaced values, or one-hot. ``lead``: the predicted, clipped next value of
     saturating coordinates is an input as well, so that what follows from it (an angle from its speed) sees no kink.
     ``after``: the state that the step led to is shown, not the one it began in; only for the reward.
