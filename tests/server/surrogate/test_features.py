@@ -30,9 +30,14 @@ def test_angles_speeds_and_torque_of_the_pendulum(pendulum_definition):
         ("cos_sin", [math.cos(2), math.sin(2), speed, torque]),
         ("wrapped", [angle, speed, torque]),
         ("both", [math.cos(2), math.sin(2), angle, speed, torque]),
-        ("observation", [math.cos(2), math.sin(2), 4.0, torque]),
     ):
         assert_features(encode(pendulum_definition, FeatureMap(state), q, u), *expected)
+
+
+def test_the_papers_observation_is_shown_as_it_is():
+    paper = definition_from_spec(pendulum().model_copy(update={"design": Design(preset="paper")}))
+    made = encode(paper, FeatureMap("observation"), row(2.0, 4.0), row(1.0))
+    assert_features(made, math.cos(2), math.sin(2), 4.0, math.sqrt(12) / 4)
 
 
 def test_the_lead_is_one_more_input(pendulum_definition):
