@@ -11,7 +11,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint
 PINS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: demo test format-check lint types imports unit bench format postgresql clean help
+.PHONY: demo test format-check lint types imports unit chaos bench format postgresql clean help
 
 demo: .venv/all  ## Solve Pendulum with server, sampler and trainer on this machine (ARGS="--seed 1")
 	@exec $(BIN)/surrogym demo pendulum $(ARGS)
@@ -32,6 +32,9 @@ imports: .venv/dev  ## Check which room imports which
 
 unit: .venv/dev postgresql  ## The tests alone (ARGS="-k pendulum")
 	$(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
+
+chaos: .venv/dev postgresql  ## Faults in full length; make test has a short form (ARGS="-k killed")
+	CHAOS=full $(BIN)/pytest --durations 0 tests/chaos $(ARGS)
 
 bench: .venv/dev  ## What a step costs on this machine, beside bare echoes (ARGS="--lanes 1 16")
 	$(BIN)/python tests/benchmarks/bench_step.py $(ARGS)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from support.server import ServerProcess, start_server
+from support.server import RestartingServer
 from support.teaching import teach
 from surrogym_client.api import Api
 from surrogym_client.env import LOST
@@ -22,43 +21,31 @@ LANES = 3
 PATIENT = Retries(seconds=120)
 
 
-class Restarting:
-    """A server that can be stopped and started at the same address."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.server: ServerProcess = start_server(folder)
-        self.url = self.server.url
-
-    def start(self) -> None:
-        self.server = start_server(self.folder, "--port", self.url.rpartition(":")[2])
-
-
 @pytest.fixture(scope="module")
-def restarting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Restarting]:
-    restarting = Restarting(tmp_path_factory.mktemp("restarting"))
+def restarting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RestartingServer]:
+    restarting = RestartingServer(tmp_path_factory.mktemp("restarting"))
     try:
         with Api(restarting.url) as api:
             teach(api, "pendulum", pendulum(), queries=12)
         yield restarting
     finally:
-        restarting.server.stop()
+        restarting.stop()
 
 
 def actions(steps: int) -> np.ndarray:
     return np.random.default_rng(0).uniform(-2, 2, (steps, LANES, 1)).astype(np.float32)
 
 
-def vec_env(restarting: Restarting) -> SurrogateVecEnv:
+def vec_env(restarting: RestartingServer) -> SurrogateVecEnv:
     return SurrogateVecEnv(restarting.url, "pendulum", LANES, seed=0, time_limit=6, retries=PATIENT)
 
 
-def test_a_clean_restart_goes_unnoticed(restarting: Restarting):
+def test_a_clean_restart_goes_unnoticed(restarting: RestartingServer):
     touched, undisturbed = vec_env(restarting), vec_env(restarting)
     expected = [undisturbed.reset(), *(undisturbed.step(action) for action in actions(10))]
     undisturbed.close()
     seen = [touched.reset(), *(touched.step(action) for action in actions(10)[:4])]
-    restarting.server.stop()
+    restarting.stop()
     restarting.start()
     seen += [touched.step(action) for action in actions(10)[4:]]
     np.testing.assert_array_equal(seen[0], expected[0])
@@ -69,11 +56,11 @@ def test_a_clean_restart_goes_unnoticed(restarting: Restarting):
     touched.close()
 
 
-def test_a_crash_truncates_the_episodes_and_training_goes_on(restarting: Restarting):
+def test_a_crash_truncates_the_episodes_and_training_goes_on(restarting: RestartingServer):
     envs = vec_env(restarting)
     envs.reset()
     last, *_ = envs.step(actions(1)[0])
-    restarting.server.stop(signal.SIGKILL)
+    restarting.stop(signal.SIGKILL)
     with ThreadPoolExecutor(1) as pool:
         step = pool.submit(envs.step, actions(1)[0])
         restarting.start()

@@ -68,3 +68,27 @@ def running_server(folder: Path, *options: str, **environment: str) -> Iterator[
     finally:
         if server.process.poll() is None:
             server.stop()
+
+
+class RestartingServer:
+    """A server that can be stopped and started at the same address, on the same database."""
+
+    def __init__(self, folder: Path, *options: str) -> None:
+        self._folder = folder
+        self._options = options
+        self._server = start_server(folder, *options)
+        self.url = self._server.url
+
+    @property
+    def process(self) -> subprocess.Popen[bytes]:
+        return self._server.process
+
+    @property
+    def log(self) -> str:
+        return self._server.log
+
+    def start(self) -> None:
+        self._server = start_server(self._folder, *self._options, "--port", self.url.rpartition(":")[2])
+
+    def stop(self, sig: int = signal.SIGTERM) -> int:
+        return self._server.stop(sig)
