@@ -330,7 +330,9 @@ class Design(Frozen):
     """The adaptive design of queries: what is chosen before the first one.
 
     ``preset``: ``default`` or ``paper`` (the method as printed, repaired only where it cannot work). Every None takes
-    the preset's value. ``budget`` counts every real step of the design, initial ones included.
+    the preset's value. ``budget`` counts every real step of the design, initial ones included. ``tolerance`` is what
+    eq. 9 divides by the deviation where none is declared: ``relative``, 5 % of the output's deviation over the initial
+    design, or ``raw``, 1 in the output's own unit, as printed.
     """
 
     preset: Literal["default", "paper"] = "default"
@@ -338,6 +340,7 @@ class Design(Frozen):
     initial: Annotated[int, Field(ge=2, le=100_000, strict=True)] | None = None
     target: Annotated[float, Field(gt=0.5, lt=1, strict=True)] = 0.999
     acquisition: Literal["uncertainty_index", "variance", "integrated_variance", "latin_hypercube"] | None = None
+    tolerance: Literal["relative", "raw"] | None = None
     monte_carlo: Annotated[int, Field(ge=16, le=100_000, strict=True)] | None = None
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
 

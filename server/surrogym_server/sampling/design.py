@@ -105,11 +105,9 @@ def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
 
 def default_tolerances(definition: EnvironmentDefinition, samples: Samples) -> tuple[float, ...]:
     """Tolerance of each output: the declared one, else 5 % of the output's deviation over the samples at hand
-    (of its size, if it never varied).
-
-    Preset ``paper`` has 1 in raw units for all.
+    (of its size, if it never varied). As printed it is 1 in raw units for all.
     """
-    if definition.design.preset == "paper":
+    if definition.design.tolerance == "raw":
         return (1.0,) * len(definition.outputs)
     targets = torch.cat([increments(definition, samples), samples.reward[:, None]], -1)
     spread, mean = targets.std(0, correction=0), targets.mean(0).abs()

@@ -77,6 +77,7 @@ class DesignDefinition:
     preset: Preset
     initial: int
     acquisition: Literal["uncertainty_index", "variance", "integrated_variance", "latin_hypercube"]
+    tolerance: Literal["relative", "raw"]
     monte_carlo: int
     seed: int
 

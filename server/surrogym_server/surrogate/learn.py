@@ -89,18 +89,17 @@ class _Learner:
 
 def _transitions(learner: _Learner, samples: Samples) -> tuple[OutputModel, ...]:
     definition = learner.definition
-    everything = torch.ones(len(samples), dtype=torch.bool)
+    everything, change = torch.ones(len(samples), dtype=torch.bool), increments(definition, samples)
     if definition.design.preset == "paper":
         (feature_map,) = candidates(definition, follows=False)
         inputs = {feature_map: encode(definition, feature_map, samples.q, samples.u)}
-        change = definition.observe(samples.q_next) - definition.observe(samples.q)
         return tuple(
             learner.output(name, change[:, i], inputs, everything, everything)
             for i, name in enumerate(definition.observation_names)
         )
     keep = ~saturated(definition, samples.q_next)
     keep = keep if int(keep.sum()) >= MIN_POINTS else everything
-    change, lead = increments(definition, samples), leading(definition)
+    lead = leading(definition)
     outputs = []
     for column, index in enumerate(definition.moving):
         maps = candidates(definition, follows=index not in lead)

@@ -34,7 +34,10 @@ class Samples:
 
 
 def increments(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
-    """Targets of the moving coordinates, q' - q, angles wrapped: (n, M)."""
+    """Targets of the transition outputs, (n, M): q' - q of the moving coordinates, angles wrapped; preset ``paper``:
+    o' - o of the observation."""
+    if definition.design.preset == "paper":
+        return definition.observe(samples.q_next) - definition.observe(samples.q)
     change = samples.q_next - samples.q
     columns = [
         wrap(change[:, i]) if definition.coordinates[i].kind == "angle" else change[:, i] for i in definition.moving

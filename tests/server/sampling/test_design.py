@@ -204,6 +204,16 @@ def test_the_paper_starts_with_ten_points_a_dimension_and_tolerance_one():
     assert [c.confidence_index for c in made.confidences] == [c.confidence_index_paper for c in made.confidences]
 
 
+def test_the_papers_tolerance_can_be_relative_to_what_its_outputs_do():
+    definition = definition_from_spec(designed(preset="paper", tolerance="relative"))
+    samples = random_steps(pendulum(), 40, seed=0)
+    change = definition.observe(samples.q_next) - definition.observe(samples.q)
+    spread = torch.cat([change, samples.reward[:, None]], -1).std(0, correction=0)
+    assert default_tolerances(definition, samples) == pytest.approx((0.05 * spread).tolist())
+    default = definition_from_spec(designed(tolerance="raw"))
+    assert default_tolerances(default, samples) == (1.0,) * 3
+
+
 def test_a_latin_hypercube_design_asks_for_its_whole_budget_at_once():
     definition = definition_from_spec(designed(acquisition="latin_hypercube"))
     assert len(initial_design(definition, 17)[0]) == 17
