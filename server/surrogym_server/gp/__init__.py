@@ -18,6 +18,7 @@ from surrogym_server.gp.blocks import in_blocks
 from surrogym_server.gp.fit import FitOptions, Fitted, fit
 from surrogym_server.gp.joint import Joint
 from surrogym_server.gp.kernel import Hyperparameters
+from surrogym_server.gp.pathwise import Pathwise
 from surrogym_server.gp.posterior import Posterior, condition
 from surrogym_server.gp.serving import Output, Serving
 
@@ -27,6 +28,7 @@ __all__ = [
     "Hyperparameters",
     "Joint",
     "Output",
+    "Pathwise",
     "Posterior",
     "Serving",
     "condition",
