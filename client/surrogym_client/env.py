@@ -22,7 +22,8 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
 
     ``reset(seed=s)`` starts episode 0 of the seed, ``reset()`` goes on to the next episode. The time
     limit is the server's; it shows as ``truncated``. ``info`` carries ``model_version`` and, after a
-    step, ``reward_mean`` (the reward before the penalty) and ``deviation`` (O,) when asked for. When the
+    step, ``reward_mean`` (the reward before the penalty) and ``deviation`` (O,) when asked for. In a
+    session with a trust region, ``untrusted`` says whether leaving it truncated the episode. When the
     server has lost the session, the episode ends as truncated with the reason in
     ``info["surrogym_session_lost"]``, and the next reset begins in a new session.
 
@@ -79,6 +80,8 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
         }
         if result.deviation is not None:
             info["deviation"] = result.deviation[0]
+        if result.untrusted is not None:
+            info["untrusted"] = bool(result.untrusted[0])
         if step.lost is not None:
             info[LOST] = step.lost
         terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])

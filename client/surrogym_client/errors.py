@@ -62,8 +62,7 @@ class ProblemError(SurrogymClientError):
         self.problem = problem
 
     def __str__(self) -> str:
-        request = self.problem.request
-        return self.problem.detail if request is None else f"{self.problem.detail} [request {request}]"
+        return self.problem.detail
 
 
 class InvalidInput(ProblemError):

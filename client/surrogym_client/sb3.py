@@ -21,7 +21,8 @@ class SurrogateVecEnv(VecEnv):
     """Many lanes of a learned virtual environment, for any Stable-Baselines3 algorithm.
 
     Infos have ``TimeLimit.truncated``, at the end of an episode ``terminal_observation``, and
-    ``model_version`` and ``reward_mean``. An episode that ends because the server lost the session is
+    ``model_version`` and ``reward_mean``; in a session with a trust region ``untrusted`` as well, which says
+    whether leaving it truncated the episode. An episode that ends because the server lost the session is
     truncated, with the reason in ``surrogym_session_lost``.
 
     Args:
@@ -156,6 +157,9 @@ def _infos(step: LaneStep) -> list[dict[str, Any]]:
     ]
     for lane, observation in zip(result.final_lanes.tolist(), result.final_observation, strict=True):
         infos[lane]["terminal_observation"] = observation
+    if result.untrusted is not None:
+        for info, untrusted in zip(infos, result.untrusted.tolist(), strict=True):
+            info["untrusted"] = untrusted
     for lane in np.flatnonzero(step.cut).tolist():
         infos[lane][LOST] = step.lost
     return infos

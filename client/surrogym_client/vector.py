@@ -135,6 +135,8 @@ def _step_infos(step: LaneStep, lanes: Bools) -> dict[str, Any]:
     infos = _entry("reward_mean", step.result.reward_mean, lanes)
     if step.result.deviation is not None:
         infos |= _entry("deviation", step.result.deviation, lanes)
+    if step.result.untrusted is not None:
+        infos |= _entry("untrusted", step.result.untrusted, lanes)
     if step.lost is not None and (step.cut & lanes).any():
         infos |= _reason(step.lost, step.cut & lanes)
     return infos

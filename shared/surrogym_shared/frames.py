@@ -7,7 +7,7 @@ session. The same frames are HTTP bodies of type ``MEDIA_TYPE`` and messages of 
 field                                     shape        dtype
 ========================================  ===========  ==============================
 action, actions                           (N, F)       float64; actions (T, N, F)
-mask, terminated, truncated               (N,)         bool: one byte, 0 or 1
+mask, terminated, truncated, untrusted    (N,)         bool: one byte, 0 or 1
 seed (of each lane)                       (N,)         int64
 observation                               (N, D)       float32
 reward, reward_mean                       (N,)         float64
@@ -108,6 +108,7 @@ class Step(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
     final_lanes: memoryview | None = None
     final_observation: memoryview | None = None
     deviation: memoryview | None = None
+    untrusted: memoryview | None = None
 
 
 class ResetReply(Frame, frozen=True, tag="reset"):
@@ -250,6 +251,7 @@ def step_result(step: Step, shape: Shape) -> StepResult:
         model_version=_array("model_version", step.model_version, INT64, (lanes,)).copy(),
         reward_mean=_array("reward_mean", step.reward_mean, FLOAT64, (lanes,)).copy(),
         deviation=deviation,
+        untrusted=None if step.untrusted is None else _flags("untrusted", step.untrusted, lanes).copy(),
     )
 
 
@@ -265,6 +267,7 @@ def _step(result: StepResult) -> Step:
         _flat(result.final_lanes, INT64) if ended else None,
         _flat(result.final_observation, FLOAT32) if ended else None,
         None if result.deviation is None else _flat(result.deviation, FLOAT64),
+        None if result.untrusted is None else _flat(result.untrusted, BOOL),
     )
 
 

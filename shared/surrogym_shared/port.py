@@ -38,6 +38,7 @@ class StepResult:
     model_version: Ints  # (N,)
     reward_mean: Floats  # (N,), before the penalty
     deviation: Floats | None  # (N, O) when asked for
+    untrusted: Bools | None = None  # (N,) lanes truncated for leaving the trusted range; None in a session without one
 
 
 @runtime_checkable

@@ -141,12 +141,34 @@ def test_one_number_a_lane_may_come_without_its_own_brackets(port: SurrogatePort
     assert_same(port.step(first, action), port.step(second, action[:, 0]))
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_an_episode_ends_as_truncated_where_the_model_is_not_trusted(port: SurrogatePort, opened: Opened, mode: str):
+    session = opened(trust=1e-9, autoreset_mode=mode)
+    port.reset(session)
+    result = port.step(session, actions(1)[0])
+    assert result.untrusted.all()
+    assert result.truncated.all()
+    assert not result.terminated.any()
+    assert result.deviation is None
+    assert len(result.final_lanes) == (N if mode == "same_step" else 0)
+
+
+def test_a_wide_trusted_range_ends_nothing_and_none_says_nothing(port: SurrogatePort, opened: Opened):
+    wide, none = opened(trust=1_000.0), opened()
+    assert_same(port.reset(wide), port.reset(none))
+    ours, theirs = port.step(wide, actions(1)[0]), port.step(none, actions(1)[0])
+    assert ours.untrusted.dtype == np.bool_
+    assert not ours.untrusted.any()
+    assert theirs.untrusted is None
+    np.testing.assert_array_equal(ours.observation, theirs.observation)
+
+
 # Seeds
 
 
-@pytest.mark.parametrize("variant", ["deterministic", "probabilistic"])
+@pytest.mark.parametrize("variant", ["deterministic", "probabilistic", "pathwise"])
 def test_the_same_requests_give_the_same_replies(port: SurrogatePort, opened: Opened, variant: str):
-    options = {"variant": variant, "particles": 20, "time_limit": 4}
+    options = {"variant": variant, "particles": 20, "time_limit": 4, "process_noise": True}
     first, second = opened(**options), opened(**options)
     for seed in (0, None):
         assert_same(port.reset(first, seed=seed), port.reset(second, seed=seed))

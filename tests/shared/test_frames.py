@@ -41,6 +41,7 @@ def step_results(draw: st.DrawFn, shape: Shape) -> StepResult:
         model_version=draw(arrays.arrays(np.int64, lanes)),
         reward_mean=draw(floats((lanes,))),
         deviation=draw(st.none() | floats((lanes, shape.outputs))),
+        untrusted=draw(st.none() | arrays.arrays(bool, lanes)),
     )
 
 
@@ -129,6 +130,7 @@ def example() -> StepResult:
         model_version=np.array([1, 2]),
         reward_mean=np.ones(2),
         deviation=np.ones((2, 2)),
+        untrusted=np.array([False, True]),
     )
 
 

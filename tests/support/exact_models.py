@@ -25,7 +25,12 @@ class ExactModel:
     deviation: float = 0.0
     reward_deviation: Callable[[Tensor], Tensor] = lambda q: torch.zeros(len(q), dtype=torch.float64)
     terminal_reward: float = 0.0
+    process_deviation: float = 0.0
     reward: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(scale=1.0))
+
+    @property
+    def scales(self) -> Tensor:
+        return torch.ones(len(self.definition.moving) + 1, dtype=torch.float64)
 
     @property
     def transitions(self) -> tuple[int, ...]:
@@ -40,10 +45,15 @@ class ExactModel:
         u: Tensor,
         *,
         noise: Tensor | None = None,
+        process: Tensor | None = None,
+        paths: Tensor | None = None,
         deviations: bool = False,
         reward_deviation: bool = False,
     ) -> Transition:
+        assert paths is None, "an exact model is no posterior to draw functions from"
         q_next, moving = self.move(q, u), list(self.definition.moving)
+        if process is not None:
+            q_next[..., moving] += self.process_deviation * process
         if noise is not None:
             q_next[..., moving] += self.deviation * noise
         deviation = torch.full((len(q), len(moving)), self.deviation, dtype=q.dtype)

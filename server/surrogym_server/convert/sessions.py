@@ -27,6 +27,8 @@ def opening(request: replies.OpenSession) -> Opening:
         time_limit=request.time_limit,
         penalty=request.penalty or 0.0,
         start_box=request.start_box,
+        process_noise=request.process_noise,
+        trust=request.trust,
         particles=request.particles,
         propagation=request.propagation,
         weighting=request.weighting,

@@ -17,7 +17,7 @@ from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.virtual import LaneState, VirtualSettings
 from surrogym_shared.port import ResetResult, StepResult
 
-FORMAT = 1
+FORMAT, WITHOUT_PATHS = 2, 1  # the one that is written, and an older one that is read as well
 RAGGED = ("final_lanes", "final_observation")  # of another length in each step
 
 Arrays = dict[str, NDArray[Any]]
@@ -56,7 +56,9 @@ def session_from_bytes(definition: EnvironmentDefinition, data: bytes) -> Sessio
     with np.load(io.BytesIO(data), allow_pickle=False) as file:
         arrays: Arrays = {name: file[name] for name in file.files}
     header = json.loads(arrays["header"].tobytes())
-    if header["format"] != FORMAT:
+    if header["format"] == WITHOUT_PATHS:
+        arrays["lanes/path"] = np.zeros((len(arrays["versions"]), 0))
+    elif header["format"] != FORMAT:
         raise InvalidInput(f"expected a session saved in format {FORMAT}, got {header['format']}")
     opened_by = header["opened_by"]
     return Session(
@@ -102,7 +104,7 @@ def _steps(arrays: Arrays) -> tuple[StepResult, ...]:
     ends = np.cumsum(arrays.pop("final_counts"))[:-1]
     ragged = {name: np.split(arrays.pop(name), ends) for name in RAGGED}
     count = len(arrays["reward"])
-    columns: dict[str, Any] = {"deviation": [None] * count, **arrays, **ragged}
+    columns: dict[str, Any] = {"deviation": [None] * count, "untrusted": [None] * count, **arrays, **ragged}
     return tuple(StepResult(**{name: column[t] for name, column in columns.items()}) for t in range(count))
 
 

@@ -171,6 +171,7 @@ def _join(parts: Sequence[tuple[NDArray[np.intp], Transition]]) -> Transition:
     final_lanes = np.concatenate([index[t.final_lanes] for index, t in parts])
     final_order = np.argsort(final_lanes)
     deviation = [t.deviation for t in transitions if t.deviation is not None]
+    untrusted = [t.untrusted for t in transitions if t.untrusted is not None]
     return Transition(
         observation=lanewise([t.observation for t in transitions]),
         reward=lanewise([t.reward for t in transitions]),
@@ -181,6 +182,7 @@ def _join(parts: Sequence[tuple[NDArray[np.intp], Transition]]) -> Transition:
         reset_lanes=lanewise([t.reset_lanes for t in transitions]),
         reward_mean=lanewise([t.reward_mean for t in transitions]),
         deviation=lanewise(deviation) if deviation else None,
+        untrusted=lanewise(untrusted) if untrusted else None,
     )
 
 
@@ -195,6 +197,7 @@ def _result(transition: Transition, versions: Versions) -> StepResult:
         model_version=versions,
         reward_mean=transition.reward_mean,
         deviation=transition.deviation,
+        untrusted=transition.untrusted,
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import secrets
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,9 +23,8 @@ from surrogym_server.engine.session import (
     reset_session,
     step_session,
 )
-from surrogym_server.engine.sessions import LiveSessions, Work
+from surrogym_server.engine.sessions import LiveSessions
 from surrogym_server.errors import InvalidInput, NotReset, SurrogymError, TooLarge
-from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import SavedSession
@@ -39,6 +37,7 @@ Array = NDArray[np.float64]
 
 SESSION_ID_BYTES = 16
 MAX_PARTICLES = 4_000_000  # of all lanes of a session
+MAX_PATHWISE_LANES = 4_096  # the function of each is some thousand numbers
 MAX_ROLLOUT_STEPS = 1_000_000  # of all lanes in one request
 
 
@@ -62,14 +61,12 @@ class SessionService:
         models: ModelCache,
         live: LiveSessions,
         max_lanes: int,
-        counts: Counts,
     ) -> None:
         self._storage = storage
         self._definitions = definitions
         self._models = models
         self._live = live
         self._max_lanes = max_lanes
-        self._counts = counts
         self._opening = asyncio.Lock()
 
     @property
@@ -126,7 +123,7 @@ class SessionService:
             return stepped, (result,)
 
         digest = digest_of("step", _columns(action, 2), mask, deviations)
-        return await self._counted(id, seq, digest, work, steps=1)
+        return await self._live.advance(id, seq, digest, work)
 
     async def rollout(self, id: str, seq: int | None, actions: Array) -> Answer:
         """T steps with a policy's actions (T, N, F) or (T, N), all or none. Raises as ``step``."""
@@ -142,7 +139,7 @@ class SessionService:
             return session, tuple(results)
 
         digest = digest_of("rollout", _columns(actions, 3))
-        return await self._counted(id, seq, digest, work, steps=len(actions))
+        return await self._live.advance(id, seq, digest, work, steps=len(actions))
 
     async def submit_occupancy(self, id: str, checkpoint: str) -> int:
         """Store the states that a session visited under a name; returns how many.
@@ -159,10 +156,6 @@ class SessionService:
             raise NotReset("this session has visited no state yet: reset and step it first")
         await asyncio.to_thread(self._storage.occupancy.put, session.surrogate, checkpoint, states)
         return len(states)
-
-    def alive(self) -> tuple[int, int]:
-        """How many sessions are open, and how many lanes they have."""
-        return len(self._live), sum(session.settings.num_envs for session in self._live)
 
     def save(self) -> int:
         """Hand all live sessions to storage; returns how many."""
@@ -182,19 +175,14 @@ class SessionService:
             restored += 1
         return restored
 
-    async def _counted(self, id: str, seq: int | None, digest: str, work: Work, steps: int) -> Answer:
-        started = time.perf_counter()
-        answer = await self._live.advance(id, seq, digest, work, steps=steps)
-        self._counts.steps.observe(time.perf_counter() - started)
-        self._counts.lane_steps += steps * self._live.get(id).settings.num_envs
-        return answer
-
     def _check_size(self, settings: VirtualSettings) -> None:
         if settings.num_envs > self._max_lanes:
             raise TooLarge(f"expected at most {self._max_lanes} lanes, got {settings.num_envs}")
         particles = settings.num_envs * settings.particles
         if settings.variant == "probabilistic" and particles > MAX_PARTICLES:
             raise TooLarge(f"expected at most {MAX_PARTICLES} particles in all lanes, got {particles}")
+        if settings.variant == "pathwise" and settings.num_envs > MAX_PATHWISE_LANES:
+            raise TooLarge(f"expected at most {MAX_PATHWISE_LANES} lanes of variant pathwise, got {settings.num_envs}")
 
     def _open(self, surrogate: str, opening: Opening, digest: str) -> Session:
         definition = self._definitions.get(surrogate)

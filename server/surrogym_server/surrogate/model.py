@@ -14,10 +14,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from surrogym_server.gp import Output, Posterior, Serving, in_blocks
+from surrogym_server.gp import Output, Posterior, in_blocks
 from surrogym_server.surrogate.definition import EnvironmentDefinition, wrap
 from surrogym_server.surrogate.features import Encoder, FeatureMap, leading
 from surrogym_server.surrogate.recover import ObservationInverse
+from surrogym_server.surrogate.stage import Stage
 
 
 @dataclass(frozen=True)
@@ -82,18 +83,21 @@ class SurrogateModel:
         u: Tensor,
         *,
         noise: Tensor | None = None,
+        process: Tensor | None = None,
+        paths: Tensor | None = None,
         deviations: bool = False,
         reward_deviation: bool = False,
     ) -> Transition:
         """The step from q (m, C) under u (m, F), in blocks of rows; variances only of what is asked for.
 
         With ``noise`` (m, M), standard normal, each transition output is a draw, mean + deviation * noise, instead of
-        its mean.
+        its mean. With ``process`` (m, M), standard normal, it is moved by its learned noise as well (w of eq. 2). With
+        ``paths`` (m, W), see ``draw``, every output follows a function of its own in each row.
         """
         wanted = self._columns if deviations or noise is not None else ()
         wanted += (self._reward_column,) if reward_deviation else ()
         rows = min(stage.serving.rows for stage in self._stages if stage)
-        q_next, mean, spread = in_blocks(rows, partial(self._step, wanted), q, u, noise)
+        q_next, mean, spread = in_blocks(rows, partial(self._step, wanted), q, u, noise, process, paths)
         return Transition(
             q_next,
             mean[:, -1],
@@ -101,33 +105,56 @@ class SurrogateModel:
             spread[:, -1] if reward_deviation else None,
         )
 
+    def draw(self, noise: Tensor) -> Tensor:
+        """Functions drawn from the posteriors of all outputs, one a row of standard normal ``noise`` (N, W): (N, W)."""
+        drawn = [one for stage in self._stages if stage for one in stage.drawn]
+        return torch.cat([noise[:, :0], *(one.pathwise.draw(noise[:, one.span]) for one in drawn)], 1)
+
+    @cached_property
+    def path_size(self) -> int:
+        """How many numbers a draw is, W."""
+        return sum(one.pathwise.size for stage in self._stages if stage for one in stage.drawn)
+
+    @cached_property
+    def scales(self) -> Tensor:
+        """Deviation of each output's targets over the samples, (O,), in its own unit."""
+        return torch.tensor([o.scale for o in (*self.transitions, self.reward)], dtype=torch.float64)
+
     def terminated(self, q: Tensor) -> Tensor:
         """Whether an episode ends on arriving at q (..., C), shape (...)."""
         return self.definition.terminated(q)
 
     def means(self, q: Tensor, u: Tensor) -> Tensor:
         """Posterior mean of every output, increments and then the reward, at q (m, C) and u (m, F): (m, O)."""
-        q_next, mean, _ = self._step((), q, u, None)
+        q_next, mean, _ = self._step((), q, u, None, None, None)
         reward = paid(self.terminal_reward, mean[:, -1], self.terminated(q_next))
         return torch.cat([mean[:, list(self._columns)], reward[:, None]], -1)
 
     def _step(
-        self, wanted: tuple[int, ...], q: Tensor, u: Tensor, noise: Tensor | None
+        self,
+        wanted: tuple[int, ...],
+        q: Tensor,
+        u: Tensor,
+        noise: Tensor | None,
+        process: Tensor | None,
+        paths: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Next coordinates, changes and reward (m, columns), and the deviations of the columns ``wanted``.
 
         Each stage fills its own columns and leaves the others 0, so that they add up.
         """
         first, second, after = self._stages
-        kick = None if noise is None else self._in_columns(noise)
+        kick, shake = self._in_columns(noise), self._in_columns(process)
         x = first.encoder(q, u)
-        mean, spread = first.predict(x, wanted, kick)
+        mean, spread = first.predict(x, wanted, kick, shake, paths)
         if second is not None:
             lead = clip(self.definition, q + mean[:, :-1])[:, leading(self.definition)]
-            mean, spread = _sum((mean, spread), second.predict(first.encoder.with_lead(x, lead), wanted, kick))
+            following = second.predict(first.encoder.with_lead(x, lead), wanted, kick, shake, paths)
+            mean, spread = _sum((mean, spread), following)
         q_next = self._moved(q, mean[:, :-1])
         if after is not None:
-            mean, spread = _sum((mean, spread), after.predict(after.encoder(q_next, u), wanted, None))
+            reward = after.predict(after.encoder(q_next, u), wanted, None, None, paths)
+            mean, spread = _sum((mean, spread), reward)
         return q_next, mean, spread
 
     def _moved(self, q: Tensor, change: Tensor) -> Tensor:
@@ -135,7 +162,9 @@ class SurrogateModel:
             return settle(self.definition, self._inverse(self.definition.observe(q) + change, q))
         return settle(self.definition, q + change)
 
-    def _in_columns(self, noise: Tensor) -> Tensor:
+    def _in_columns(self, noise: Tensor | None) -> Tensor | None:
+        if noise is None:
+            return None
         placed = noise.new_zeros(len(noise), self._reward_column + 1)
         placed[:, list(self._columns)] = noise
         return placed
@@ -154,43 +183,27 @@ class SurrogateModel:
     @cached_property
     def _stages(self) -> tuple[Stage, Stage | None, Stage | None]:
         """What reads (q, u), what reads the lead as well, and a reward that reads the next state."""
-        after = self.reward.feature_map.after
+        after = self.definition.reward_timing == "after"
         outputs = list(zip(self._columns, self.transitions, strict=True))
         reward = [(self._reward_column, self.reward)]
         outputs += [] if after else reward
         leads = [o for o in outputs if o[1].feature_map.lead]
         encoder = Encoder.of(self.definition, [o.feature_map for _, o in outputs])
-        width = self._reward_column + 1
-        return (
-            Stage.of(encoder, [o for o in outputs if not o[1].feature_map.lead], width),
-            Stage.of(encoder, leads, width) if leads else None,
-            Stage.of(Encoder.of(self.definition, [self.reward.feature_map]), reward, width) if after else None,
-        )
+        first = self._stage(encoder, [o for o in outputs if not o[1].feature_map.lead], 0)
+        second = self._stage(encoder, leads, first.end) if leads else None
+        third = None
+        if after:
+            third = self._stage(Encoder.of(self.definition, [self.reward.feature_map]), reward, (second or first).end)
+        return first, second, third
+
+    def _stage(self, encoder: Encoder, outputs: Sequence[tuple[int, OutputModel]], begin: int) -> Stage:
+        served = [Output(c, o.posterior, encoder.inputs(o.feature_map), o.centre, o.scale) for c, o in outputs]
+        lead = any(o.feature_map.lead for _, o in outputs)
+        return Stage.of(encoder, served, self._reward_column + 1, lead=lead, begin=begin)
 
     @cached_property
     def _inverse(self) -> ObservationInverse:
         return ObservationInverse.of(self.definition)
-
-
-@dataclass(frozen=True)
-class Stage:
-    """Outputs predicted at once, from one set of features."""
-
-    encoder: Encoder
-    serving: Serving
-
-    @classmethod
-    def of(cls, encoder: Encoder, outputs: Sequence[tuple[int, OutputModel]], columns: int) -> Stage:
-        served = [Output(c, o.posterior, encoder.inputs(o.feature_map), o.centre, o.scale) for c, o in outputs]
-        lead = any(o.feature_map.lead for _, o in outputs)
-        return cls(encoder, Serving.of(served, columns, encoder.width(lead)))
-
-    def predict(self, x: Tensor, wanted: tuple[int, ...], kick: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Means at features x (m, d), moved by kick (m, O) deviations, and the deviations of the columns wanted."""
-        if not wanted:
-            return self.serving.mean(x), x.new_zeros(len(x), 0)
-        mean, spread = self.serving.mean_and_deviation(x, wanted)
-        return mean if kick is None else torch.addcmul(mean, spread, kick), spread
 
 
 def paid(terminal_reward: float, reward: Tensor, terminated: Tensor) -> Tensor:

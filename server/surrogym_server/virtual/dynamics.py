@@ -11,6 +11,7 @@ from torch import Tensor
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.model import SurrogateModel, paid
 
+Weighting = Literal["inverse_variance", "uniform"]
 WEIGHT_FLOOR = 1e-12  # of the reward's variance, so that a certain particle's weight stays finite
 
 
@@ -26,9 +27,21 @@ class Moved:
     deviation: Tensor | None  # (N, O)
 
 
-def move_mean(model: SurrogateModel, q: Tensor, u: Tensor, penalty: float, deviations: bool) -> Moved:
-    """AUR-D: q (N, C) under u (N, F) goes to the mean of the next state."""
-    transition = model.transition(q, u, deviations=deviations, reward_deviation=deviations or penalty > 0)
+def move_mean(
+    model: SurrogateModel,
+    q: Tensor,
+    u: Tensor,
+    penalty: float,
+    deviations: bool,
+    *,
+    process: Tensor | None = None,
+    paths: Tensor | None = None,
+) -> Moved:
+    """AUR-D: q (N, C) under u (N, F) goes to the mean of the next state, or along each lane's own function, ``paths``
+    (N, W); ``process`` (N, M), standard normal, adds the learned noise."""
+    transition = model.transition(
+        q, u, process=process, paths=paths, deviations=deviations, reward_deviation=deviations or penalty > 0
+    )
     over, spread = model.terminated(transition.q_next), transition.reward_deviation
     mean = paid(model.terminal_reward, transition.reward, over)
     reward = mean if spread is None else mean - penalty * spread
@@ -44,17 +57,22 @@ def move_particles(
     u: Tensor,
     penalty: float,
     noise: Tensor | None,
-    weighting: Literal["inverse_variance", "uniform"],
+    weighting: Weighting,
+    *,
+    process: Tensor | None = None,
 ) -> Moved:
     """AUR-P: particles (N, P, C) under one action a lane, u (N, F).
 
-    With ``noise`` (N, P, M) each particle moves by a draw, without by the mean. The output state is the particles'
+    With ``noise`` (N, P, M) each particle moves by a draw, without by the mean, and with ``process`` (N, P, M) by the
+    learned noise as well, both standard normal. The output state is the particles'
     mean; the reward is the mean of their penalised rewards, weighted by 1/U with U the variance of eq. 7.
     """
     lanes, count, size = particles.shape
     q, action = particles.flatten(0, 1), u.repeat_interleave(count, 0)
-    flat_noise = None if noise is None else noise.flatten(0, 1)
-    transition = model.transition(q, action, noise=flat_noise, deviations=True, reward_deviation=True)
+    flat_noise, flat_process = (None if n is None else n.flatten(0, 1) for n in (noise, process))
+    transition = model.transition(
+        q, action, noise=flat_noise, process=flat_process, deviations=True, reward_deviation=True
+    )
     spread = transition.reward_deviation
     assert transition.deviation is not None
     assert spread is not None
@@ -84,7 +102,7 @@ def mean_state(definition: EnvironmentDefinition, particles: Tensor) -> Tensor:
     return mean
 
 
-def _weights(spread: Tensor, scale: float, weighting: Literal["inverse_variance", "uniform"]) -> Tensor:
+def _weights(spread: Tensor, scale: float, weighting: Weighting) -> Tensor:
     """Normalised weights (N, P) of particles whose rewards deviate by spread (N, P)."""
     if weighting == "uniform":
         return torch.full_like(spread, 1 / spread.shape[1])

@@ -14,9 +14,10 @@ from torch import Tensor
 from surrogym_server.errors import InvalidInput, NotReset
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.model import SurrogateModel
-from surrogym_server.virtual.dynamics import Moved, move_mean, move_particles
+from surrogym_server.virtual.dynamics import Moved, Weighting, move_mean, move_particles
 from surrogym_server.virtual.lanes import ENDED, EVERY, NEW, RUNNING, Chosen, LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
+from surrogym_server.virtual.paths import with_paths
 from surrogym_server.virtual.start import start_coordinates, start_particles
 
 Floats = NDArray[np.floating[Any]]
@@ -29,15 +30,17 @@ class VirtualSettings:
     """What a session chose when it was opened."""
 
     num_envs: int
-    variant: Literal["deterministic", "probabilistic"] = "deterministic"
+    variant: Literal["deterministic", "probabilistic", "pathwise"] = "deterministic"
     autoreset_mode: Literal["next_step", "same_step", "disabled"] = "next_step"
     time_limit: int | None = None
     penalty: float = 0.0  # k of eq. 14
     start_box: float = 0.0  # share of episodes that start anywhere in the sampling range
     particles: int = 1_000
     propagation: Literal["mean", "sample"] = "sample"
-    weighting: Literal["inverse_variance", "uniform"] = "inverse_variance"
+    weighting: Weighting = "inverse_variance"
     spread: float = 0.01  # first deviation of particles, as a share of each coordinate's range
+    process_noise: bool = False  # the learned noise moves the state, w of eq. 2
+    trust: float | None = None  # an episode ends where an output deviates by more, in its deviations over the samples
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,7 @@ class Transition:
     reset_lanes: Bools  # (N,) lanes that a new episode began in
     reward_mean: Floats  # (N,)
     deviation: Floats | None  # (N, O)
+    untrusted: Bools | None  # (N,) truncated for leaving the trusted range; None without one
 
 
 def create(definition: EnvironmentDefinition, settings: VirtualSettings, seed: int) -> LaneState:
@@ -68,6 +72,7 @@ def create(definition: EnvironmentDefinition, settings: VirtualSettings, seed: i
         phase=torch.full((count,), NEW, dtype=torch.int8),
         q=torch.zeros(count, size, dtype=torch.float64),
         particles=torch.zeros(count, particles, size, dtype=torch.float64),
+        path=torch.zeros(count, 0, dtype=torch.float64),
     )
 
 
@@ -109,8 +114,13 @@ def step(
     """
     definition = model.definition
     moving, beginning = _divided(settings, lanes, _mask(mask, len(lanes)))
-    moved = _move(model, settings, lanes.take(moving), torch.from_numpy(u)[moving], deviations)
-    after, cut = _advanced(settings, lanes, moving, moved)
+    active = lanes.take(moving)
+    if settings.variant == "pathwise":
+        active = with_paths(model, active)
+    moved = _move(model, settings, active, torch.from_numpy(u)[moving], deviations)
+    untrusted = _untrusted(model, settings, moved)
+    active, cut = _advanced(settings, active, moved, untrusted)
+    after = lanes.put(moving, active)
     terminated, truncated = _scatter(moving, moved.terminated), _scatter(moving, cut)
     final_lanes = torch.zeros(0, dtype=torch.int64)
     final_observation = np.zeros((0, len(definition.observation_names)), dtype=np.float32)
@@ -130,6 +140,7 @@ def step(
         reset_lanes=beginning.numpy(),
         reward_mean=_scatter(moving, moved.reward_mean).numpy(),
         deviation=None if moved.deviation is None or not deviations else _scatter(moving, moved.deviation).numpy(),
+        untrusted=None if untrusted is None else _scatter(moving, untrusted).numpy(),
     )
 
 
@@ -152,22 +163,41 @@ def _divided(settings: VirtualSettings, lanes: LaneState, chosen: Chosen) -> tup
 
 
 def _move(model: SurrogateModel, settings: VirtualSettings, lanes: LaneState, u: Tensor, deviations: bool) -> Moved:
-    if settings.variant == "deterministic":
-        return move_mean(model, lanes.q, u, settings.penalty, deviations)
-    noise = None
-    if settings.propagation == "sample":
-        noise = normal_noise(lanes, Purpose.TRANSITION, settings.particles, len(model.transitions))
-    return move_particles(model, lanes.particles, u, settings.penalty, noise, settings.weighting)
+    outputs, particles = len(model.transitions), lanes.particles.shape[1]
+    process = normal_noise(lanes, Purpose.PROCESS, max(particles, 1), outputs) if settings.process_noise else None
+    if settings.variant == "probabilistic":
+        noise = None
+        if settings.propagation == "sample":
+            noise = normal_noise(lanes, Purpose.TRANSITION, particles, outputs)
+        return move_particles(model, lanes.particles, u, settings.penalty, noise, settings.weighting, process=process)
+    return move_mean(
+        model,
+        lanes.q,
+        u,
+        settings.penalty,
+        deviations or settings.trust is not None,
+        process=None if process is None else process[:, 0],
+        paths=lanes.path if settings.variant == "pathwise" else None,
+    )
 
 
-def _advanced(settings: VirtualSettings, lanes: LaneState, moving: Chosen, moved: Moved) -> tuple[LaneState, Tensor]:
-    """Lanes after their move, and which of those moved were truncated. As in Gymnasium, a step may end both ways."""
-    before = lanes.take(moving)
+def _untrusted(model: SurrogateModel, settings: VirtualSettings, moved: Moved) -> Tensor | None:
+    """Which lanes (N,) left the trusted range: some output deviates by more than ``trust`` of its own deviations."""
+    if settings.trust is None:
+        return None
+    assert moved.deviation is not None
+    return (moved.deviation > settings.trust * model.scales).any(1)
+
+
+def _advanced(
+    settings: VirtualSettings, before: LaneState, moved: Moved, untrusted: Tensor | None
+) -> tuple[LaneState, Tensor]:
+    """Lanes after their move, and which of them were truncated. As in Gymnasium, a step may end both ways."""
     elapsed = before.elapsed + 1
     cut = torch.zeros_like(moved.terminated) if settings.time_limit is None else elapsed >= settings.time_limit
+    cut = cut if untrusted is None else cut | untrusted
     phase = torch.where(moved.terminated | cut, ENDED, RUNNING).to(torch.int8)
-    after = replace(before, elapsed=elapsed, phase=phase, q=moved.q, particles=moved.particles)
-    return lanes.put(moving, after), cut
+    return replace(before, elapsed=elapsed, phase=phase, q=moved.q, particles=moved.particles), cut
 
 
 def _begin(definition: EnvironmentDefinition, settings: VirtualSettings, lanes: LaneState, chosen: Chosen) -> LaneState:

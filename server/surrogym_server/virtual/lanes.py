@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import pad
 
 NEW, RUNNING, ENDED = 0, 1, 2  # phase of a lane
 EVERY = slice(None)  # in place of a mask of all lanes: nothing is copied
@@ -17,7 +18,11 @@ Chosen = Tensor | slice  # a mask (N,), or EVERY
 
 @dataclass(frozen=True)
 class LaneState:
-    """State of N lanes. P is 0 in the deterministic variant."""
+    """State of N lanes. P is 0 but in the probabilistic variant, W but in the pathwise one.
+
+    Functions of models of several sizes lie side by side: rows are filled up with zeros to the longest, and a model
+    reads as many of W as it has.
+    """
 
     seed: Tensor  # (N,) int64, key of the noise
     lane: Tensor  # (N,) int64, key of the noise
@@ -26,6 +31,7 @@ class LaneState:
     phase: Tensor  # (N,) int8: NEW, RUNNING, or ENDED and waiting for a reset
     q: Tensor  # (N, C) output state: what observation and termination are read from
     particles: Tensor  # (N, P, C)
+    path: Tensor  # (N, W) weights of the function the episode follows; drawn in its first step
 
     def __len__(self) -> int:
         return len(self.seed)
@@ -44,8 +50,13 @@ class LaneState:
         at = torch.as_tensor(index)
         replaced = []
         for f in fields(self):
-            tensor = getattr(self, f.name).clone()
-            tensor[at] = getattr(other, f.name)
+            values = getattr(other, f.name)
+            tensor = getattr(self, f.name)
+            if f.name == "path":
+                width = max(tensor.shape[1], values.shape[1])
+                tensor, values = _widened(tensor, width), _widened(values, width)
+            tensor = tensor.clone()
+            tensor[at] = values
             replaced.append(tensor)
         return LaneState(*replaced)
 
@@ -55,3 +66,8 @@ class LaneState:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> LaneState:
         return cls(*(torch.from_numpy(arrays[f.name].copy()) for f in fields(cls)))
+
+
+def _widened(path: Tensor, width: int) -> Tensor:
+    """Weights (n, W), filled up with zeros to ``width``."""
+    return path if path.shape[1] == width else pad(path, (0, width - path.shape[1]))

@@ -20,6 +20,8 @@ class Purpose(IntEnum):
     BOX_START = 1
     SPREAD = 2
     TRANSITION = 3
+    PATH = 4
+    PROCESS = 5
 
 
 def uniform_noise(lanes: LaneState, purpose: Purpose, size: int) -> Tensor:

@@ -35,9 +35,21 @@ class OpenSession(Request):
     start_box: Annotated[float, Field(ge=0, le=1)] = Field(
         default=0.0, description="share of episodes that start anywhere in the sampling range"
     )
-    particles: Annotated[int, Field(ge=1, le=MAX_PARTICLES)] = 1_000
-    propagation: Literal["mean", "sample"] = "sample"
-    weighting: Literal["inverse_variance", "uniform"] = "inverse_variance"
+    process_noise: bool = Field(default=False, description="the learned noise moves the state")
+    trust: Annotated[float, Field(gt=0, le=1_000)] | None = Field(
+        default=None,
+        description="an episode ends, truncated, where an output's standard deviation exceeds so many times the "
+        "deviation that output has over the samples; None: nowhere",
+    )
+    particles: Annotated[int, Field(ge=1, le=MAX_PARTICLES)] = Field(
+        default=1_000, description="of a lane; this and the next three are the probabilistic variant's"
+    )
+    propagation: Literal["mean", "sample"] = Field(
+        default="sample", description="a particle moves by the mean, or by a draw of its own"
+    )
+    weighting: Literal["inverse_variance", "uniform"] = Field(
+        default="inverse_variance", description="of the particles' rewards"
+    )
     spread: Annotated[float, Field(ge=0, le=1)] = Field(
         default=0.01, description="initial deviation of particles, as a share of each coordinate's sampling range"
     )
@@ -124,6 +136,9 @@ class StepReply(Reply):
     model_version: list[int]
     reward_mean: list[float] = Field(description="(N,) before the penalty")
     deviation: list[list[float]] | None = Field(default=None, description="(N, O), when asked for")
+    untrusted: list[bool] | None = Field(
+        default=None, description="(N,) lanes truncated for leaving the trusted range, in a session that has one"
+    )
 
 
 class RolloutSession(Request):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import json
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -19,6 +21,7 @@ Open = Callable[..., Session]
 Fitted = Callable[[int], SurrogateModel]
 VERSIONS = {1: 6, 2: 9}  # samples of each version's model
 ARRAYS = ("observation", "reward", "terminated", "truncated", "final_lanes", "final_observation", "deviation")
+ARRAYS += ("untrusted",)
 
 
 def stepped(fitted: Fitted, session: Session, action: float = 0.5, latest: int = 2) -> tuple[Session, StepResult]:
@@ -70,11 +73,13 @@ def test_only_stepped_lanes_count_as_visits(opened: Open, fitted: Fitted):
     np.testing.assert_array_equal(session.visited.states[4], session.lanes.q[0])
 
 
-@pytest.mark.parametrize("variant", ["deterministic", "probabilistic"])
+@pytest.mark.parametrize("variant", ["deterministic", "probabilistic", "pathwise"])
 def test_what_was_saved_goes_on_bit_for_bit(
     opened: Open, fitted: Fitted, definition: EnvironmentDefinition, variant: str
 ):
-    session, _ = reset_session(opened(variant=variant, particles=8, occupancy=True), 11, None, 1)
+    session, _ = reset_session(
+        opened(variant=variant, particles=8, occupancy=True, trust=2.0, process_noise=True), 11, None, 1
+    )
     results = []
     for _ in range(2):
         session, result = stepped(fitted, session)
@@ -90,6 +95,36 @@ def test_what_was_saved_goes_on_bit_for_bit(
         for name in ARRAYS:
             np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), strict=True)
     np.testing.assert_array_equal(back.visited.states, session.visited.states)
+
+
+def test_a_session_saved_before_there_were_functions_comes_back(
+    opened: Open, fitted: Fitted, definition: EnvironmentDefinition
+):
+    session, _ = reset_session(opened(), 11, None, 1)
+    with np.load(io.BytesIO(session_to_bytes(session))) as file:
+        arrays = {name: file[name] for name in file.files if name != "lanes/path"}
+    header = json.loads(arrays["header"].tobytes())
+    settings = {key: value for key, value in header["settings"].items() if key not in ("trust", "process_noise")}
+    older = json.dumps({**header, "format": 1, "settings": settings}).encode()
+    buffer = io.BytesIO()
+    np.savez(buffer, **{**arrays, "header": np.frombuffer(older, dtype=np.uint8)})
+    back = session_from_bytes(definition, buffer.getvalue())
+    assert back.settings == session.settings
+    ours, theirs = stepped(fitted, session)[1], stepped(fitted, back)[1]
+    np.testing.assert_array_equal(ours.observation, theirs.observation)
+
+
+def test_pathwise_lanes_of_two_versions_step_side_by_side(opened: Open, fitted: Fitted):
+    session, _ = reset_session(opened(variant="pathwise"), 11, None, 1)
+    mixed = replace(session, versions=np.array([2, 1, 1, 2]))
+    for _ in range(2):
+        mixed, result = stepped(fitted, mixed)
+    one = [replace(session, versions=np.full(4, version)) for version in (1, 2)]
+    for lane, version in enumerate([2, 1, 1, 2]):
+        alone = one[version - 1]
+        for _ in range(2):
+            alone, expected = stepped(fitted, alone)
+        np.testing.assert_allclose(result.observation[lane], expected.observation[lane], rtol=1e-6)
 
 
 def test_the_answer_of_a_reset_is_saved_too(opened: Open, definition: EnvironmentDefinition):

@@ -1,1 +1,0 @@
-"""Evidence: what the documentation claims, made again from real runs."""

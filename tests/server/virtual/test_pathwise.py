@@ -1,0 +1,119 @@
+"""Variant pathwise: a lane follows one function through an episode, drawn anew for the next, by its key alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from support.real_steps import random_steps
+from surrogym_client.original.classic import pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.surrogate.learn import learn
+from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.surrogate.samples import Samples
+from surrogym_server.virtual import LaneState, step
+
+ARRAYS = ("observation", "reward", "terminated", "truncated")
+
+
+@pytest.fixture(scope="module")
+def samples() -> Samples:
+    """So few that the model is unsure."""
+    return random_steps(pendulum(), 7, seed=3)
+
+
+@pytest.fixture(scope="module")
+def model(samples: Samples) -> SurrogateModel:
+    return learn(definition_from_spec(pendulum()), samples).model
+
+
+@pytest.fixture(scope="module")
+def better() -> SurrogateModel:
+    return learn(definition_from_spec(pendulum()), random_steps(pendulum(), 12, seed=3)).model
+
+
+def at(lanes: LaneState, *q: float) -> LaneState:
+    return replace(lanes, q=torch.tensor(q, dtype=torch.float64).expand(len(lanes), -1).clone())
+
+
+def moved(model, settings, lanes, *q: float, action: float = 0.5) -> tuple[LaneState, np.ndarray]:
+    """The lanes after a step from one point, and where they went."""
+    after, _ = step(model, settings, at(lanes, *q), np.full((len(lanes), 1), action))
+    return after, after.q.numpy()
+
+
+def test_a_place_answers_alike_throughout_an_episode(model, started):
+    settings, lanes = started(model, 3, variant="pathwise")
+    lanes, first = moved(model, settings, lanes, 2.0, -6.0)
+    lanes, elsewhere = moved(model, settings, lanes, -1.0, 5.0)
+    lanes, again = moved(model, settings, lanes, 2.0, -6.0)
+    np.testing.assert_array_equal(first, again)
+    assert len(np.unique(first[:, 1])) == 3, "each lane has a function of its own"
+    assert not np.allclose(elsewhere, first)
+
+
+def test_the_next_episode_follows_another_function(model, started):
+    settings, lanes = started(model, 2, variant="pathwise", time_limit=1, autoreset_mode="same_step")
+    lanes, _ = moved(model, settings, lanes, 2.0, -6.0)
+    assert (lanes.elapsed == 0).all()
+    before = lanes.path
+    lanes, _ = moved(model, settings, lanes, 2.0, -6.0)
+    assert not np.isclose(before, lanes.path).any(1).all()
+
+
+def test_functions_scatter_as_the_posterior_does(model, started):
+    """Mean and deviation of 2,000 lanes' steps; the deviation's tolerance has the 256 frequencies' share in it."""
+    count, point = 2_000, (0.5, 3.0)
+    settings, lanes = started(model, count, variant="pathwise")
+    _, q = moved(model, settings, lanes, *point)
+    one = torch.tensor([point], dtype=torch.float64)
+    expected = model.transition(one, torch.full((1, 1), 0.5, dtype=torch.float64), deviations=True)
+    mean, deviation = expected.q_next[0].numpy(), expected.deviation[0].numpy()
+    assert (np.abs(q.mean(0) - mean) < 5 * deviation / np.sqrt(count)).all()
+    np.testing.assert_allclose(q.std(0), deviation, rtol=0.25)
+
+
+def test_functions_pass_through_the_samples(model, samples, started):
+    settings, lanes = started(model, 4, variant="pathwise")
+    for q, u, q_next in zip(samples.q, samples.u, samples.q_next, strict=True):
+        if float(q_next[1].abs()) < 8:  # one that ended at the bound is left out of the dynamics
+            lanes, reached = moved(model, settings, lanes, *q.tolist(), action=float(u))
+            np.testing.assert_allclose(reached, q_next.expand(4, -1), atol=1e-2)
+
+
+def test_the_same_seed_gives_the_same_episodes(model, started):
+    runs = []
+    for _ in range(2):
+        settings, lanes = started(model, 5, variant="pathwise", time_limit=3)
+        made = []
+        for action in np.random.default_rng(0).uniform(-2, 2, (9, 5, 1)):
+            lanes, transition = step(model, settings, lanes, action)
+            made.append(transition)
+        runs.append(made)
+    for ours, theirs in zip(*runs, strict=True):
+        for name in ARRAYS:
+            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+
+
+def test_a_function_does_not_depend_on_how_many_lanes_there_are(model, started):
+    few, many = (moved(model, *started(model, n, variant="pathwise"), 2.0, -6.0)[1] for n in (2, 9))
+    np.testing.assert_allclose(few, many[:2], rtol=1e-9)
+
+
+def test_lanes_under_models_of_two_sizes_keep_their_functions(model, better, started):
+    """A newer model has more points: its lanes' functions are longer, the others' still the same."""
+    settings, lanes = started(model, 4, variant="pathwise")
+    old, reached = moved(model, settings, lanes, 2.0, -6.0)
+    newer, _ = moved(better, settings, lanes.take(np.array([1, 3])), 2.0, -6.0)
+    assert newer.path.shape[1] > old.path.shape[1]
+    both = old.put(np.array([1, 3]), newer)
+    _, again = moved(model, settings, both.take(np.array([0, 2])), 2.0, -6.0)
+    np.testing.assert_allclose(again, reached[[0, 2]], rtol=1e-9)
+
+
+def test_the_reward_follows_a_function_as_well(model, started):
+    settings, lanes = started(model, 50, variant="pathwise")
+    _, transition = step(model, settings, at(lanes, 2.0, -6.0), np.full((50, 1), 0.5))
+    assert transition.reward.std() > 0
+    np.testing.assert_array_equal(transition.reward, transition.reward_mean)
