@@ -62,7 +62,8 @@ class ProblemError(SurrogymClientError):
         self.problem = problem
 
     def __str__(self) -> str:
-        return self.problem.detail
+        request = self.problem.request
+        return self.problem.detail if request is None else f"{self.problem.detail} [request {request}]"
 
 
 class InvalidInput(ProblemError):

@@ -1,17 +1,28 @@
-"""What makes ``gymnasium.make("surrogym/Remote-v0", url=..., surrogate=...)`` work."""
+"""What makes ``gymnasium.make("surrogym/Remote-v0", url=..., surrogate=...)`` work, and the ids of the swing-up."""
 
 from __future__ import annotations
 
 import gymnasium
 
 ENVIRONMENT_ID = "surrogym/Remote-v0"
+SWING_UP = "surrogym/CartPoleSwingUp-v0"
+SWING_UP_NARROW = "surrogym/CartPoleSwingUpNarrow-v0"
+SWING_UP_STEPS = 40  # of 0.1 s
 
 
 def register() -> None:
-    """Enter the remote environment into Gymnasium's registry; doing it twice is harmless."""
+    """Enter this package's environments into Gymnasium's registry; doing it twice is harmless."""
     if ENVIRONMENT_ID not in gymnasium.registry:
         gymnasium.register(
             ENVIRONMENT_ID,
             entry_point="surrogym_client.remote:make_env",
             vector_entry_point="surrogym_client.remote:make_vector_env",
         )
+    for environment_id, reward in ((SWING_UP, "smooth"), (SWING_UP_NARROW, "narrow")):
+        if environment_id not in gymnasium.registry:
+            gymnasium.register(
+                environment_id,
+                entry_point="surrogym_client.original.swingup:CartPoleSwingUp",
+                max_episode_steps=SWING_UP_STEPS,
+                kwargs={"reward": reward},
+            )

@@ -17,15 +17,28 @@ from fastapi import FastAPI
 from fastapi.responses import Response
 
 from surrogym_server import dashboard
-from surrogym_server.api import events, models, problems, queries, samples, service, sessions, steps, surrogates
+from surrogym_server.api import (
+    events,
+    metrics,
+    models,
+    problems,
+    queries,
+    samples,
+    service,
+    sessions,
+    steps,
+    surrogates,
+)
 from surrogym_server.api.auth import Gate
 from surrogym_server.api.guards import BodyLimit, KnownHosts
+from surrogym_server.api.observe import Observed
 from surrogym_server.api.state import Services
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
 from surrogym_server.engine.fits import Fits
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import LiveSessions
+from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import Designer
 from surrogym_server.services.events import EventService
@@ -92,12 +105,14 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     )
     app.state.gate = Gate(settings.tokens)
     app.state.notices = None
+    app.state.counts = Counts()
     problems.install(app)
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes)
     if settings.loopback and not settings.tokens:
         app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", settings.host}))
+    app.add_middleware(Observed, counts=app.state.counts)
     app.router.routes.extend(steps.router.routes)  # tried first, and directly: an included router is another search
-    for room in (sessions, service, surrogates, queries, samples, models, events):
+    for room in (sessions, service, metrics, surrogates, queries, samples, models, events):
         app.include_router(room.router)
     _add_dashboard(app)
     return app
@@ -114,7 +129,7 @@ async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: 
     torch.set_num_threads(settings.threads)
     engine = _build_engine(settings, design)
     app.state.notices = engine.notices
-    services, sweeper = _build_services(settings, design, storage, engine)
+    services, sweeper = _build_services(settings, design, storage, engine, app.state.counts)
     engine.fits.start()
     restored = services.sessions.restore()
     if restored:
@@ -140,7 +155,7 @@ def _build_engine(settings: Settings, design: DesignPort) -> _Engine:
 
 
 def _build_services(
-    settings: Settings, design: DesignPort, storage: Storage, engine: _Engine
+    settings: Settings, design: DesignPort, storage: Storage, engine: _Engine, counts: Counts
 ) -> tuple[Services, Sweeper]:
     definitions = Definitions(storage, _define)
     cache = ModelCache(
@@ -153,6 +168,7 @@ def _build_services(
         engine.fits,
         cache,
         engine.notices,
+        counts,
         owner=uuid4().hex,
         threads=settings.threads,
         look_seconds=settings.sweep_seconds,
@@ -162,12 +178,12 @@ def _build_services(
         queries=QueryService(storage, definitions, engine.notices),
         samples=SampleService(storage, definitions, engine.notices),
         models=ModelService(storage, definitions, cache, engine.notices),
-        sessions=SessionService(storage, definitions, cache, engine.live, settings.max_lanes),
+        sessions=SessionService(storage, definitions, cache, engine.live, settings.max_lanes, counts),
         designer=designer,
         events=EventService(storage, engine.notices),
         storage=storage,
     )
-    return services, Sweeper(storage, engine.live, settings.sweep_seconds)
+    return services, Sweeper(storage, engine.live, settings.sweep_seconds, counts)
 
 
 def _define(spec: dict[str, Any]) -> EnvironmentDefinition:

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from surrogym_server.errors import InvalidInput
+from surrogym_server.logs import LogFormat
 from surrogym_shared.wire import MAX_LANES, Role
 
 PREFIX = "SURROGYM_"
@@ -38,6 +39,7 @@ class Settings(BaseModel):
     max_lanes: Annotated[int, Field(ge=1, le=MAX_LANES, description="of one session")] = MAX_LANES
     sweep_seconds: Annotated[float, Field(gt=0, description="between looks at leases and sessions")] = 1.0
     log_level: LogLevel = "info"
+    log_format: Annotated[LogFormat, Field(description="a line of text for each record, or a JSON object")] = "text"
 
     @model_validator(mode="after")
     def _closed_by_default(self) -> Self:

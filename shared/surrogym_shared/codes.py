@@ -74,4 +74,5 @@ class Problem(BaseModel):
     status: int
     code: Code
     detail: str = Field(description="What was expected and what came.")
+    request: str | None = Field(default=None, description="Id of the request; the server's log names it too.")
     expected_seq: int | None = Field(default=None, description="With seq_conflict: the seq the session waits for.")

@@ -303,11 +303,12 @@ Action = Annotated[BoxAction | DiscreteAction | MultiDiscreteAction, Field(discr
 class Reward(Frozen):
     """How the reward is learned.
 
-    ``timing``: ``before`` reads (q, u), as Gymnasium's Pendulum does; ``after`` reads (q', u), as the paper says.
+    ``timing``: ``before`` reads (q, u), as Gymnasium's Pendulum does; ``after`` reads (q', u), as the paper says;
+    ``auto`` takes, at each fit, the one that the evidence favours.
     ``penalty``: k of eq. 14, reward = mean - k * deviation; None takes the preset's (default 0, paper 3).
     """
 
-    timing: Literal["before", "after"] = "before"
+    timing: Literal["before", "after", "auto"] = "before"
     penalty: Annotated[float, Field(ge=0, le=100, strict=True)] | None = None
 
 

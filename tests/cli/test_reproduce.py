@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from surrogym_client.reproduce import Cell, bootstrap_interval, cells, markdown, run_cell, summaries
+from surrogym_client.reproduce.efficiency import Cell, bootstrap_interval, cells, markdown, run_cell, summaries
 
 ROW = {
     "task": "pendulum",

@@ -15,9 +15,16 @@ def command_line() -> Any:
     return typer.main.get_command(build())
 
 
-def options(name: str) -> set[str]:
-    """All spellings of a command's options. Raises KeyError for no such command."""
-    return {spelling for parameter in command_line().commands[name].params for spelling in parameter.opts}
+def options(*names: str) -> set[str]:
+    """All spellings of a command's options; ``options("reproduce", "paper")`` for one within a group.
+
+    Raises:
+        KeyError: no such command.
+    """
+    command = command_line()
+    for name in names:
+        command = command.commands[name]
+    return {spelling for parameter in command.params for spelling in parameter.opts}
 
 
 def parse(arguments: list[str]) -> dict[str, Any]:
@@ -27,7 +34,9 @@ def parse(arguments: list[str]) -> dict[str, Any]:
         KeyError: no such command.
         Exception: the usage error that a person would see.
     """
-    name, *rest = arguments
-    command = command_line().commands[name]
+    command, name, rest = command_line(), "surrogym", arguments
+    while hasattr(command, "commands"):
+        name, *rest = rest
+        command = command.commands[name]
     values: dict[str, Any] = command.make_context(name, rest).params
     return values

@@ -1,4 +1,5 @@
-"""Gymnasium's classic control tasks: their specifications, and how their state is written and read.
+"""Gymnasium's classic control tasks and the swing-up of this package: specifications, and how their state is written
+and read.
 
 Source of every number: the task's own Gymnasium class. Angles are in radians.
 """
@@ -13,6 +14,8 @@ from typing import Literal
 import numpy as np
 
 from surrogym_client.original.protocol import Array, Native
+from surrogym_client.original.swingup import swing_up, swing_up_narrow
+from surrogym_client.registration import SWING_UP, SWING_UP_NARROW
 from surrogym_shared.spec import (
     Bounds,
     BoxAction,
@@ -230,6 +233,7 @@ def _read_state(env: Native) -> Array:
 
 _PENDULUM_PHYSICS = ("g", "m", "l", "max_torque", "max_speed")
 _CARTPOLE_PHYSICS = ("masscart", "masspole", "length", "force_mag")
+_SWING_UP_PHYSICS = ("masscart", "masspole", "length", "friction")
 _ACROBOT_PHYSICS = ("LINK_LENGTH_1", "LINK_MASS_1", "LINK_MASS_2", "LINK_MOI")
 
 TASKS: dict[str, Task] = {
@@ -238,6 +242,8 @@ TASKS: dict[str, Task] = {
     "MountainCarContinuous-v0": Task(mountain_car_continuous, _write_state, _read_state, ("power", "max_speed")),
     "MountainCar-v0": Task(mountain_car, _write_state, _read_state, ("force", "gravity", "max_speed")),
     "Acrobot-v1": Task(acrobot, _write_state, _read_state, _ACROBOT_PHYSICS),
+    SWING_UP: Task(swing_up, _write_state, _read_state, _SWING_UP_PHYSICS),
+    SWING_UP_NARROW: Task(swing_up_narrow, _write_state, _read_state, _SWING_UP_PHYSICS),
 }
 
 # Tasks that the paper states otherwise than Gymnasium does.

@@ -11,6 +11,7 @@ from fastapi.responses import Response
 from starlette.exceptions import HTTPException
 
 from surrogym_server import errors
+from surrogym_server.logs import REQUEST_ID
 from surrogym_shared.codes import PROBLEM_MEDIA_TYPE, STATUS, Code, Problem
 from surrogym_shared.frames import FrameError
 
@@ -49,6 +50,7 @@ HTTP_CODES = {
 }
 
 NO_FIELDS = ("body", "query", "path", "header", "float", "int", "str", "bool")
+REQUEST_HEADER = "x-request-id"
 RETRY_AFTER_SECONDS = "1"
 SHOWN_CHARACTERS = 120
 
@@ -148,7 +150,8 @@ def _is_field(part: int | str) -> bool:
 
 def _problem(code: Code, detail: str, *, status: int | None = None, **members: Any) -> Problem:
     title = code.value.replace("_", " ")
-    return Problem(title=title, status=status or STATUS[code], code=code, detail=detail, **members)
+    request = REQUEST_ID.get()
+    return Problem(title=title, status=status or STATUS[code], code=code, detail=detail, request=request, **members)
 
 
 def _invalid(found: Sequence[Any]) -> Response:
@@ -187,4 +190,5 @@ async def _http_error(request: Request, error: Exception) -> Response:
 async def _unexpected(_: Request, error: Exception) -> Response:
     """Starlette logs the error itself."""
     assert not isinstance(error, errors.SurrogymError)
-    return response_of(problem_of(error))
+    problem = problem_of(error)
+    return response_of(problem, {REQUEST_HEADER: problem.request or ""})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
 import socket
@@ -15,6 +14,7 @@ from types import FrameType
 import uvicorn
 from fastapi import FastAPI
 
+from surrogym_server import logs
 from surrogym_server.app import create_app, say_goodbye
 from surrogym_server.errors import InvalidInput
 from surrogym_server.settings import Settings
@@ -31,7 +31,7 @@ class Runner(uvicorn.Server):
         config = uvicorn.Config(
             app,
             log_config=None,
-            access_log=settings.log_level == "debug",
+            access_log=False,  # ours names the request
             server_header=False,
             timeout_graceful_shutdown=GRACE_SECONDS,
             ws_max_size=settings.max_body_bytes,
@@ -66,9 +66,7 @@ def run(settings: Settings, ready_file: Path | None, exit_with_parent: bool) -> 
         InvalidInput: the address can't be listened on.
         Unavailable: the database is taken or does not answer.
     """
-    logging.basicConfig(level=settings.log_level.upper(), format="%(levelname)s %(name)s: %(message)s")
-    for quiet in ("uvicorn.error", "alembic"):
-        logging.getLogger(quiet).setLevel(max(logging.WARNING, logging.getLogger().level))
+    logs.configure(settings.log_level, settings.log_format)
     with _listen(settings.host, settings.port) as listener:
         runner = Runner(create_app(settings), settings, _url(listener, settings.host), ready_file)
         if exit_with_parent:

@@ -37,6 +37,7 @@ def serve(
     log_level: Annotated[
         str | None, typer.Option(help="critical, error, warning, info or debug. [default: info]")
     ] = None,
+    log_format: Annotated[str | None, typer.Option(help="text, or json: one object a line. [default: text]")] = None,
     ready_file: Annotated[
         Path | None, typer.Option(help="File to write the URL to, once the server accepts requests.")
     ] = None,
@@ -64,6 +65,7 @@ def serve(
             threads=threads,
             session_idle_seconds=session_idle_seconds,
             log_level=log_level,
+            log_format=log_format,
         )
         from surrogym_server.cli import runner  # imports torch, which neither --help nor a refusal should wait for
 

@@ -104,7 +104,7 @@ class OutputOutlook:
 
 def _inputs(model: SurrogateModel, output: OutputModel, points: Points, q_next: Tensor) -> Tensor:
     """What one output's process reads at points whose predicted next coordinates are q_next (m, C): (m, d)."""
-    after = output is model.reward and model.definition.reward_timing == "after"
+    after = output.feature_map.after
     lead = q_next[:, leading(model.definition)]
     return encode(model.definition, output.feature_map, q_next if after else points.q, points.u, lead)
 

@@ -12,6 +12,7 @@ import numpy as np
 from surrogym_server.engine.design_job import DesignJob, DesignResult
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.errors import InvalidInput, SurrogymError, Unavailable, UnknownSurrogate
+from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
@@ -44,6 +45,7 @@ class Designer:
         fits: FitRunner,
         models: ModelCache,
         notices: Notices,
+        counts: Counts,
         *,
         owner: str,
         threads: int,
@@ -56,6 +58,7 @@ class Designer:
             fits: where jobs are done.
             models: told of each new version.
             notices: wake this designer, and are posted after each fit.
+            counts: of this process.
             owner: name of this server in the right to fit.
             threads: of torch in a fit.
             look_seconds: how often to look for what no notice told.
@@ -65,6 +68,7 @@ class Designer:
         self._fits = fits
         self._models = models
         self._notices = notices
+        self._counts = counts
         self._owner = owner
         self._threads = threads
         self._look_seconds = look_seconds
@@ -112,10 +116,12 @@ class Designer:
         try:
             result = await self._fits.run(await asyncio.to_thread(self._job, lease))
             await asyncio.to_thread(self._commit, lease, result)
+            self._counts.fits.observe(result.seconds)
         except asyncio.CancelledError:
             self._abort(lease, None)
             raise
         except Exception as error:
+            self._counts.failed_fits += 1
             logger.warning("the fit of %s failed", name, exc_info=not isinstance(error, SurrogymError))
             await asyncio.to_thread(self._abort, lease, f"the fit failed: {error}")
         finally:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import secrets
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,8 +24,9 @@ from surrogym_server.engine.session import (
     reset_session,
     step_session,
 )
-from surrogym_server.engine.sessions import LiveSessions
+from surrogym_server.engine.sessions import LiveSessions, Work
 from surrogym_server.errors import InvalidInput, NotReset, SurrogymError, TooLarge
+from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import SavedSession
@@ -61,12 +63,14 @@ class SessionService:
         models: ModelCache,
         live: LiveSessions,
         max_lanes: int,
+        counts: Counts,
     ) -> None:
         self._storage = storage
         self._definitions = definitions
         self._models = models
         self._live = live
         self._max_lanes = max_lanes
+        self._counts = counts
         self._opening = asyncio.Lock()
 
     @property
@@ -123,7 +127,7 @@ class SessionService:
             return stepped, (result,)
 
         digest = digest_of("step", _columns(action, 2), mask, deviations)
-        return await self._live.advance(id, seq, digest, work)
+        return await self._counted(id, seq, digest, work, steps=1)
 
     async def rollout(self, id: str, seq: int | None, actions: Array) -> Answer:
         """T steps with a policy's actions (T, N, F) or (T, N), all or none. Raises as ``step``."""
@@ -139,7 +143,7 @@ class SessionService:
             return session, tuple(results)
 
         digest = digest_of("rollout", _columns(actions, 3))
-        return await self._live.advance(id, seq, digest, work, steps=len(actions))
+        return await self._counted(id, seq, digest, work, steps=len(actions))
 
     async def submit_occupancy(self, id: str, checkpoint: str) -> int:
         """Store the states that a session visited under a name; returns how many.
@@ -156,6 +160,10 @@ class SessionService:
             raise NotReset("this session has visited no state yet: reset and step it first")
         await asyncio.to_thread(self._storage.occupancy.put, session.surrogate, checkpoint, states)
         return len(states)
+
+    def alive(self) -> tuple[int, int]:
+        """How many sessions are open, and how many lanes they have."""
+        return len(self._live), sum(session.settings.num_envs for session in self._live)
 
     def save(self) -> int:
         """Hand all live sessions to storage; returns how many."""
@@ -174,6 +182,13 @@ class SessionService:
                 continue
             restored += 1
         return restored
+
+    async def _counted(self, id: str, seq: int | None, digest: str, work: Work, steps: int) -> Answer:
+        started = time.perf_counter()
+        answer = await self._live.advance(id, seq, digest, work, steps=steps)
+        self._counts.steps.observe(time.perf_counter() - started)
+        self._counts.lane_steps += steps * self._live.get(id).settings.num_envs
+        return answer
 
     def _check_size(self, settings: VirtualSettings) -> None:
         if settings.num_envs > self._max_lanes:

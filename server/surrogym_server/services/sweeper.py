@@ -7,16 +7,18 @@ import logging
 
 from surrogym_server.engine.sessions import LiveSessions
 from surrogym_server.errors import SurrogymError
+from surrogym_server.services.counts import Counts
 from surrogym_server.storage.port import Storage
 
 logger = logging.getLogger(__name__)
 
 
 class Sweeper:
-    def __init__(self, storage: Storage, live: LiveSessions, seconds: float) -> None:
+    def __init__(self, storage: Storage, live: LiveSessions, seconds: float, counts: Counts) -> None:
         self._storage = storage
         self._live = live
         self._seconds = seconds
+        self._counts = counts
 
     async def run(self) -> None:
         """Sweep every so many seconds, for ever; ends by cancellation."""
@@ -27,8 +29,9 @@ class Sweeper:
     async def sweep(self) -> None:
         """Sweep once. A lease that ends here leaves its query to the next sampler, or sets it aside."""
         for id in self._live.sweep():
+            self._counts.expired_sessions += 1
             logger.info("session %s was idle and has expired", id)
         try:
-            await asyncio.to_thread(self._storage.queries.sweep_expired)
+            self._counts.expired_leases += await asyncio.to_thread(self._storage.queries.sweep_expired)
         except SurrogymError as error:
             logger.warning("leases were not swept: %s", error)

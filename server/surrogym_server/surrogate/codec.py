@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, get_args
 
 import torch
@@ -18,12 +18,13 @@ from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.features import Encoding, FeatureMap, State, encode
 from surrogym_server.surrogate.model import OutputModel, SurrogateModel
 
-FORMAT = 1
+FORMAT = 2
+READABLE = (1, 2)  # 1: a reward's timing was the definition's alone
 KNOWN_MAPS = frozenset(
-    FeatureMap(state, action, lead)
+    FeatureMap(state, action, lead, after)
     for state in get_args(State)
     for action in get_args(Encoding)
-    for lead in (False, True)
+    for lead, after in ((False, False), (True, False), (False, True))
 )
 
 
@@ -56,22 +57,32 @@ def from_bytes(definition: EnvironmentDefinition, data: bytes) -> SurrogateModel
         length = int.from_bytes(data[:8], "little")
         header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["surrogym"])
         tensors = load(data)
-        outputs = tuple(_output(entry, tensors, str(i)) for i, entry in enumerate(header["outputs"]))
         stored, terminal_reward = header["format"], float(header["terminal_reward"])
+        outputs = tuple(_output(entry, tensors, str(i)) for i, entry in enumerate(header["outputs"]))
+        if stored == 1 and definition.reward_timing == "after":
+            outputs = (*outputs[:-1], _read_after(outputs[-1]))
         samples, digest = int(header["samples"]), str(header["digest"])
     except (SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise InvalidInput(f"expected a Surrogym model in safetensors form, got {len(data)} bytes: {error}") from error
     names = tuple(output.name for output in outputs)
-    if stored != FORMAT or names != definition.outputs:
+    if stored not in READABLE or names != definition.outputs:
         raise InvalidInput(
             f"expected a model of format {FORMAT} with outputs {definition.outputs}, got format {stored} with {names}"
         )
     if not math.isfinite(terminal_reward) or samples < 1:
         raise InvalidInput(f"expected a finite terminal reward and samples, got {terminal_reward} and {samples}")
+    if any(output.feature_map.after for output in outputs[:-1]):
+        raise InvalidInput(
+            "expected transition outputs that read the state before the step, got one that reads its own"
+        )
     for output in outputs:
         _require_shapes(definition, output)
         _require_numbers(output)
     return SurrogateModel(definition, outputs[:-1], outputs[-1], terminal_reward, samples, digest)
+
+
+def _read_after(reward: OutputModel) -> OutputModel:
+    return replace(reward, feature_map=replace(reward.feature_map, after=True))
 
 
 def _header(output: OutputModel) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from surrogym_server.surrogate.terms import Term, TermSet, compile_terms
 
 REWARD = "reward"
 REACH = 1e6
+SCALING_POINTS = 4_096
 Array = NDArray[np.float64]
 Preset = Literal["default", "paper"]
 Kind = Literal["linear", "angle", "constant"]
@@ -93,7 +94,7 @@ class EnvironmentDefinition:
     action: ActionDefinition
     termination_groups: tuple[tuple[Inequality, ...], ...]
     time_limit: int | None
-    reward_timing: Literal["before", "after"]
+    reward_timing: Literal["before", "after", "auto"]
     penalty: float
     tolerances: tuple[tuple[str, float], ...]
     design: DesignDefinition
@@ -118,6 +119,22 @@ class EnvironmentDefinition:
     def observe(self) -> TermSet:
         """Observation of coordinates: q (..., C) -> o (..., D)."""
         return compile_terms(self.observation_terms, len(self.coordinates))
+
+    @cached_property
+    def observation_combines(self) -> bool:
+        """Whether an observation entry says more than one coordinate, its cosine or its sine does."""
+        terms = self.observation_terms
+        return any(len(t.parts) > 1 or any(np.count_nonzero(p.weights) > 1 for p in t.parts) for t in terms)
+
+    @cached_property
+    def observation_scaling(self) -> tuple[Tensor, Tensor]:
+        """Mean and deviation of the observation over the sampling range, (D,) each; an entry that never varies has
+        deviation 1."""
+        p = torch.from_numpy(np.random.default_rng(0).uniform(size=(SCALING_POINTS, len(self.coordinates))))
+        q = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(self.coordinates)], -1)
+        shown = self.observe(q)
+        deviation = shown.std(0, correction=0)
+        return shown.mean(0), torch.where(deviation > 1e-9, deviation, 1.0)
 
     @cached_property
     def bounds(self) -> tuple[Tensor, Tensor]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby, product
 from typing import Literal, NamedTuple
 
@@ -25,17 +25,21 @@ Encoding = Literal["value", "one_hot"]  # of discrete actions
 class FeatureMap:
     """How (q, u) is shown to one output's process.
 
-    ``state``: angles as cos and sin, as the wrapped angle, or both; or the observation, as the paper has it.
+    ``state``: angles as cos and sin, as the wrapped angle, or both; or the observation: as it is in the paper,
+    standardised elsewhere.
     ``action``: discrete actions as evenly spaced values, or one-hot. ``lead``: the predicted, clipped next value of
     saturating coordinates is an input as well, so that what follows from it (an angle from its speed) sees no kink.
+    ``after``: the state that the step led to is shown, not the one it began in; only for the reward.
     """
 
     state: State = "cos_sin"
     action: Encoding = "value"
     lead: bool = False
+    after: bool = False
 
     def __str__(self) -> str:
-        return ", ".join([self.state, f"action {self.action}", *(["lead"] if self.lead else [])])
+        extras = [name for name, on in (("lead", self.lead), ("after", self.after)) if on]
+        return ", ".join([self.state, f"action {self.action}", *extras])
 
 
 def leading(definition: EnvironmentDefinition) -> tuple[int, ...]:
@@ -45,6 +49,18 @@ def leading(definition: EnvironmentDefinition) -> tuple[int, ...]:
         for i in definition.moving
         if (c := definition.coordinates[i]).stops is None and math.isfinite(c.low) and math.isfinite(c.high)
     )
+
+
+def reward_candidates(definition: EnvironmentDefinition) -> tuple[FeatureMap, ...]:
+    """Maps worth comparing for the reward: of the state before the step, after it, or both, as its timing says.
+
+    Rewards are often told by what the observation combines, such as the way from a tip to its target.
+    """
+    timings = {"before": (False,), "after": (True,), "auto": (False, True)}[definition.reward_timing]
+    maps = candidates(definition, follows=False)
+    if definition.observation_combines and definition.design.preset == "default":
+        maps += tuple(FeatureMap("observation", action) for action in dict.fromkeys(m.action for m in maps))
+    return tuple(replace(m, after=after) for after in timings for m in maps)
 
 
 def candidates(definition: EnvironmentDefinition, follows: bool) -> tuple[FeatureMap, ...]:
@@ -74,7 +90,7 @@ def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tupl
     """The features of a map, in their order."""
     made: list[Feature] = []
     if feature_map.state == "observation":
-        made += [Feature("observed", entry) for entry in range(len(definition.observation_names))]
+        made += _of_observation(definition)
     else:
         for index in range(len(definition.coordinates)):
             made += _of_coordinate(definition, feature_map, index)
@@ -136,7 +152,8 @@ class Encoder:
     def _values(self, function: str, entries: slice | Tensor, centre: Tensor, scale: Tensor, raw: Tensor) -> Tensor:
         match function:
             case "observed":
-                return self.definition.observe(raw[..., : len(self.definition.coordinates)])[..., entries]
+                shown = self.definition.observe(raw[..., : len(self.definition.coordinates)])[..., entries]
+                return (shown - centre) / scale
             case "cos":
                 return raw[..., entries].cos()
             case "sin":
@@ -147,6 +164,13 @@ class Encoder:
                 return (raw[..., entries] == centre).to(raw.dtype)
             case _:
                 return (raw[..., entries] - centre) / scale
+
+
+def _of_observation(definition: EnvironmentDefinition) -> list[Feature]:
+    if definition.design.preset == "paper":
+        return [Feature("observed", entry) for entry in range(len(definition.observation_names))]
+    centres, scales = (values.tolist() for values in definition.observation_scaling)
+    return [Feature("observed", entry, *scaling) for entry, scaling in enumerate(zip(centres, scales, strict=True))]
 
 
 def _of_coordinate(definition: EnvironmentDefinition, feature_map: FeatureMap, index: int) -> list[Feature]:

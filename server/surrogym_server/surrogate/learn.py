@@ -14,7 +14,7 @@ from torch import Tensor
 from surrogym_server.errors import InvalidInput
 from surrogym_server.gp import FitOptions, Fitted, fit
 from surrogym_server.surrogate.definition import REWARD, EnvironmentDefinition
-from surrogym_server.surrogate.features import FeatureMap, candidates, encode, leading
+from surrogym_server.surrogate.features import FeatureMap, candidates, encode, leading, reward_candidates
 from surrogym_server.surrogate.model import OutputModel, SurrogateModel
 from surrogym_server.surrogate.samples import Samples, increments, saturated
 
@@ -130,9 +130,10 @@ def _saturates(definition: EnvironmentDefinition, index: int, q_next: Tensor) ->
 def _reward(learner: _Learner, samples: Samples) -> tuple[OutputModel, float]:
     """The reward process of steps that go on, and what a step that ends the episode pays beyond it."""
     definition = learner.definition
-    state = samples.q if definition.reward_timing == "before" else samples.q_next
-    maps = candidates(definition, follows=False)
-    inputs = {m: encode(definition, m, state, samples.u) for m in maps}
+    inputs = {
+        m: encode(definition, m, samples.q_next if m.after else samples.q, samples.u)
+        for m in reward_candidates(definition)
+    }
     going = (
         ~samples.terminated if int((~samples.terminated).sum()) >= MIN_POINTS else torch.ones_like(samples.terminated)
     )

@@ -183,7 +183,7 @@ class SurrogateModel:
     @cached_property
     def _stages(self) -> tuple[Stage, Stage | None, Stage | None]:
         """What reads (q, u), what reads the lead as well, and a reward that reads the next state."""
-        after = self.definition.reward_timing == "after"
+        after = self.reward.feature_map.after
         outputs = list(zip(self._columns, self.transitions, strict=True))
         reward = [(self._reward_column, self.reward)]
         outputs += [] if after else reward

@@ -13,6 +13,7 @@ from support import pendulum
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.errors import InvalidInput, NumericalFailure
+from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import Designer, phase_after
 from surrogym_server.services.models import load_model
@@ -62,7 +63,9 @@ def designer(storage: Storage, definitions: Definitions, cache: ModelCache, runn
     """Makes a designer of the running event loop."""
 
     def make() -> Designer:
-        return Designer(storage, definitions, runner, cache, Notices(), owner="here", threads=1, look_seconds=0.05)
+        return Designer(
+            storage, definitions, runner, cache, Notices(), Counts(), owner="here", threads=1, look_seconds=0.05
+        )
 
     return make
 

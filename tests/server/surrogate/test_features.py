@@ -3,13 +3,15 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from surrogym_client.original.classic import acrobot, mountain_car_continuous, pendulum
+from surrogym_client.original.mujoco_tasks import reacher
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.surrogate.definition import ActionDefinition
-from surrogym_server.surrogate.features import Encoder, FeatureMap, candidates, encode, leading
+from surrogym_server.surrogate.features import Encoder, FeatureMap, candidates, encode, leading, reward_candidates
 from surrogym_shared.spec import Design
 
 
@@ -28,9 +30,14 @@ def test_angles_speeds_and_torque_of_the_pendulum(pendulum_definition):
         ("cos_sin", [math.cos(2), math.sin(2), speed, torque]),
         ("wrapped", [angle, speed, torque]),
         ("both", [math.cos(2), math.sin(2), angle, speed, torque]),
-        ("observation", [math.cos(2), math.sin(2), 4.0, torque]),
     ):
         assert_features(encode(pendulum_definition, FeatureMap(state), q, u), *expected)
+
+
+def test_the_papers_observation_is_shown_as_it_is():
+    paper = definition_from_spec(pendulum().model_copy(update={"design": Design(preset="paper")}))
+    made = encode(paper, FeatureMap("observation"), row(2.0, 4.0), row(1.0))
+    assert_features(made, math.cos(2), math.sin(2), 4.0, math.sqrt(12) / 4)
 
 
 def test_the_lead_is_one_more_input(pendulum_definition):
@@ -91,3 +98,20 @@ def test_features_of_several_maps_at_once_are_those_of_each(task):
     for feature_map in maps:
         columns = list(encoder.inputs(feature_map))
         assert torch.equal(every[:, columns], encode(definition, feature_map, q, u, lead))
+
+
+def test_a_reward_may_read_an_observation_that_combines_coordinates():
+    """The way from a fingertip to its target says in two inputs what joints and target say in six."""
+    combines, plain = definition_from_spec(reacher()), definition_from_spec(pendulum())
+    assert FeatureMap("observation", after=True) in reward_candidates(combines)
+    assert all(m.state != "observation" for m in reward_candidates(plain))
+    assert all(m.state != "observation" for m in candidates(combines, follows=False))
+
+
+def test_an_observation_is_standardised_over_the_sampling_range():
+    definition = definition_from_spec(reacher())
+    p = torch.from_numpy(np.random.default_rng(1).uniform(size=(2_000, 6)))
+    q = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(definition.coordinates)], -1)
+    made = encode(definition, FeatureMap("observation"), q, torch.zeros(2_000, 2, dtype=torch.float64))[:, :10]
+    torch.testing.assert_close(made.mean(0), torch.zeros(10, dtype=torch.float64), atol=0.1, rtol=0)
+    torch.testing.assert_close(made.std(0), torch.ones(10, dtype=torch.float64), atol=0.1, rtol=0)

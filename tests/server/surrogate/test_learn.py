@@ -42,6 +42,19 @@ def test_a_reward_of_the_cosine_is_given_cos_and_sin(pendulum_definition):
     assert reward.feature_map.state == "cos_sin"
 
 
+@pytest.mark.parametrize("after", [False, True])
+@pytest.mark.parametrize("seed", range(2))
+def test_the_rewards_timing_is_found_by_evidence(pendulum_definition, after, seed):
+    steps = random_steps(pendulum(), 24, seed=seed)
+    state = steps.q_next if after else steps.q
+    paying = replace(steps, reward=-state[:, 0].square() - 0.1 * state[:, 1].square())
+    reward = learn(replace(pendulum_definition, reward_timing="auto"), paying).model.reward
+    assert reward.feature_map.after == after
+    scores = dict(reward.scores)
+    assert {", after" in name for name in scores} == {False, True}
+    assert max(scores, key=scores.get) == str(reward.feature_map)
+
+
 def test_cut_increments_are_left_out_of_the_dynamics_and_kept_for_the_reward(pendulum_definition, half_saturated):
     cut = int((half_saturated.q_next[:, 1].abs() >= 8).sum())
     assert cut >= 5

@@ -63,7 +63,8 @@ def test_a_draw_is_the_mean_plus_deviations(pendulum_model):
 
 @pytest.mark.parametrize("timing", ["before", "after"])
 def test_a_step_in_blocks_of_rows_is_a_step_of_each(pendulum_model, monkeypatch, timing):
-    model = replace(pendulum_model, definition=replace(pendulum_model.definition, reward_timing=timing))
+    feature_map = replace(pendulum_model.reward.feature_map, after=timing == "after")
+    model = replace(pendulum_model, reward=replace(pendulum_model.reward, feature_map=feature_map))
     points = random_steps(pendulum(), 20, seed=3)
     noise = torch.randn(20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     asked = {"deviations": True, "reward_deviation": True}
@@ -114,7 +115,8 @@ def test_an_angle_that_reads_the_lead_follows_the_drawn_speed(pendulum_model):
 
 @pytest.mark.parametrize("timing", ["before", "after"])
 def test_the_reward_reads_the_state_that_its_timing_names(pendulum_model, timing):
-    model = replace(pendulum_model, definition=replace(pendulum_model.definition, reward_timing=timing))
+    feature_map = replace(pendulum_model.reward.feature_map, after=timing == "after")
+    model = replace(pendulum_model, reward=replace(pendulum_model.reward, feature_map=feature_map))
     q, u = torch.tensor([[0.0, 6.0]], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
     predicted = model.transition(q, u, reward_deviation=True)
     angle, speed = (q if timing == "before" else predicted.q_next)[0].tolist()

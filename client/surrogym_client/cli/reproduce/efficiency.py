@@ -1,25 +1,22 @@
-"""``surrogym reproduce``: the figures in the documentation, made again."""
+"""``surrogym reproduce efficiency``: real steps against real return, over tasks, arms and seeds."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
 from surrogym_client.cli.options import AsJson, Quiet
 
-Study = Literal["efficiency"]
-
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("reproduce")(command)
+    app.command("efficiency")(command)
 
 
 def command(
-    study: Annotated[Study, typer.Argument(help="efficiency: real steps against real return.")],
     tasks: Annotated[str, typer.Option(help="Tasks of the demo, with commas between.")] = "pendulum,cartpole",
     arms: Annotated[str, typer.Option(help="default, paper, with commas between.")] = "default",
     seeds: Annotated[int, typer.Option(min=1, help="How many seeds, from 0 on.")] = 3,
@@ -38,9 +35,8 @@ def command(
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.cli.output import columns, give, progress
     from surrogym_client.demo.run import TASKS
-    from surrogym_client.reproduce import ARMS, Cell, cells, run_cells, summaries
+    from surrogym_client.reproduce.efficiency import ARMS, Cell, cells, run_cells, summaries
 
-    del study  # there is one
     for what, given, known in (("task", tasks, TASKS), ("arm", arms, ARMS)):
         if unknown := [name for name in given.split(",") if name not in known]:
             raise CommandError(f"unknown {what} {unknown[0]!r}: expected some of {', '.join(known)}")

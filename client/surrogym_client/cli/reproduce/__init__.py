@@ -1,0 +1,21 @@
+"""``surrogym reproduce``: the figures in the documentation, made again; one study a file."""
+
+from __future__ import annotations
+
+import typer
+
+from surrogym_client.cli.reproduce import efficiency
+
+STUDIES = (efficiency,)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command and its studies."""
+    studies = typer.Typer(
+        help="Make the figures in the documentation again.\n\nExample: surrogym reproduce efficiency --seeds 3",
+        no_args_is_help=True,
+        rich_markup_mode=None,
+    )
+    for study in STUDIES:
+        study.register(studies)
+    app.add_typer(studies, name="reproduce")

@@ -1,0 +1,1 @@
+"""Evidence: what the documentation claims, made again from real runs."""

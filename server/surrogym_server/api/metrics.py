@@ -1,0 +1,109 @@
+"""``GET /metrics``: what the server does, in the text format of Prometheus, read at the moment it is asked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from fastapi import APIRouter, Request
+from fastapi.responses import Response
+from prometheus_client import CollectorRegistry
+from prometheus_client.core import (
+    CounterMetricFamily,
+    GaugeMetricFamily,
+    HistogramMetricFamily,
+    InfoMetricFamily,
+    Metric,
+)
+from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
+
+from surrogym_server.api.auth import READ
+from surrogym_server.api.problems import documented
+from surrogym_server.api.state import Services, Use
+from surrogym_server.services.counts import Counts, Durations
+from surrogym_server.services.surrogates import SurrogateStatus
+from surrogym_shared.codes import Code
+
+router = APIRouter(tags=["service"])
+
+BY_SURROGATE = ("surrogate",)
+
+
+@router.get(
+    "/metrics",
+    summary="Counters for Prometheus",
+    dependencies=[READ],
+    response_class=Response,
+    responses={200: {"content": {"text/plain": {}}}, **documented(Code.UNAVAILABLE)},
+)
+def metrics(request: Request, use: Use) -> Response:
+    """Requests, steps, fits and expiries since the start of this process; samples, queries and fidelity as stored."""
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(_Reading(request.app.version, use, request.app.state.counts))
+    return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
+
+
+class _Reading:
+    """A collector that is asked once."""
+
+    def __init__(self, version: str, use: Services, counts: Counts) -> None:
+        self._version = version
+        self._use = use
+        self._counts = counts
+
+    def collect(self) -> Iterator[Metric]:
+        yield InfoMetricFamily("surrogym_build", "Version of the server.", {"version": self._version})
+        yield from self._process()
+        yield from _of_surrogates(self._use.surrogates.list())
+
+    def _process(self) -> Iterator[Metric]:
+        counts = self._counts
+        yield _requests(counts)
+        yield _durations("surrogym_step_seconds", "Of a request that steps a session, waiting included.", counts.steps)
+        yield _durations("surrogym_fit_seconds", "Of a fit with the choice of the next queries.", counts.fits)
+        yield CounterMetricFamily("surrogym_lane_steps", "Virtual environment steps.", counts.lane_steps)
+        yield CounterMetricFamily("surrogym_failed_fits", "Fits that failed.", counts.failed_fits)
+        yield CounterMetricFamily("surrogym_expired_leases", "Leases that ended unanswered.", counts.expired_leases)
+        yield CounterMetricFamily("surrogym_expired_sessions", "Sessions idle for too long.", counts.expired_sessions)
+        sessions, lanes = self._use.sessions.alive()
+        yield GaugeMetricFamily("surrogym_sessions", "Open sessions.", sessions)
+        yield GaugeMetricFamily("surrogym_lanes", "Lanes of all open sessions.", lanes)
+
+
+def _requests(counts: Counts) -> Metric:
+    family = HistogramMetricFamily(
+        "surrogym_request_seconds", "Of a request over HTTP.", labels=("method", "route", "status")
+    )
+    for (method, route, status), durations in sorted(counts.requests.items()):
+        family.add_metric([method, route, str(status)], list(durations.cumulative()), durations.sum)
+    return family
+
+
+def _durations(name: str, text: str, durations: Durations) -> Metric:
+    return HistogramMetricFamily(name, text, buckets=list(durations.cumulative()), sum_value=durations.sum)
+
+
+def _of_surrogates(statuses: Iterable[SurrogateStatus]) -> list[Metric]:
+    samples = CounterMetricFamily(
+        "surrogym_real_steps", "Acknowledged real steps by purpose.", labels=("surrogate", "purpose")
+    )
+    unresolved = GaugeMetricFamily(
+        "surrogym_unresolved_attempts", "Leases that began and never answered.", labels=BY_SURROGATE
+    )
+    queries = GaugeMetricFamily("surrogym_queries", "Queries by status.", labels=("surrogate", "status"))
+    phase = GaugeMetricFamily("surrogym_phase", "1 for the phase of a surrogate.", labels=("surrogate", "phase"))
+    confidence = GaugeMetricFamily(
+        "surrogym_confidence_index", "Of the latest model: the smallest over outputs.", labels=BY_SURROGATE
+    )
+    version = GaugeMetricFamily("surrogym_model_version", "The latest one.", labels=BY_SURROGATE)
+    for status in statuses:
+        name, ledger = status.record.name, status.ledger
+        for purpose in ("initial", "adaptive", "manual", "evaluation"):
+            samples.add_metric([name, purpose], getattr(ledger, purpose))
+        unresolved.add_metric([name], ledger.unresolved)
+        for kind in ("pending", "leased", "answered", "set_aside"):
+            queries.add_metric([name, kind], getattr(status.queries, kind))
+        phase.add_metric([name, status.record.phase], 1)
+        if status.model is not None:
+            confidence.add_metric([name], status.model.fidelity["confidence_index"])
+            version.add_metric([name], status.model.version)
+    return [samples, unresolved, queries, phase, confidence, version]

@@ -1,0 +1,71 @@
+"""Every request gets an id, which its reply, its problem body and its log lines carry, and is timed by route."""
+
+from __future__ import annotations
+
+import logging
+import re
+import secrets
+import time
+
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from surrogym_server.api.problems import REQUEST_HEADER
+from surrogym_server.logs import REQUEST_ID
+from surrogym_server.services.counts import Counts, Durations
+
+logger = logging.getLogger("surrogym_server.requests")
+
+UNKNOWN_ROUTE = "unknown"
+METHODS = frozenset({"GET", "POST", "PUT", "PATCH", "DELETE", "HEAD", "OPTIONS"})
+FAILED = 500  # a request that ended before its reply began
+
+_GIVEN = re.compile(r"[A-Za-z0-9._-]{1,64}")
+
+
+class Observed:
+    """The outermost middleware: what it sees is what the caller sees."""
+
+    def __init__(self, app: ASGIApp, counts: Counts) -> None:
+        self._app = app
+        self._counts = counts
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        id = _id_of(scope)
+        REQUEST_ID.set(id)  # for good: the task is this request's own, and the handler of the unexpected is outside
+        started, status = time.perf_counter(), FAILED
+        header = (REQUEST_HEADER.encode(), id.encode())
+
+        async def identified(message: Message) -> None:
+            nonlocal status
+            if "headers" in message or message["type"] == "http.response.start":
+                status = message.get("status", status)
+                message["headers"] = [*message.get("headers", ()), header]
+            await send(message)
+
+        try:
+            await self._app(scope, receive, identified)
+        finally:
+            if scope["type"] == "http":
+                self._note(scope, status, time.perf_counter() - started)
+
+    def _note(self, scope: Scope, status: int, seconds: float) -> None:
+        method = scope["method"] if scope["method"] in METHODS else "other"
+        route = getattr(scope.get("route"), "path", UNKNOWN_ROUTE)
+        key = (method, route, status)
+        durations = self._counts.requests.get(key)
+        if durations is None:
+            durations = self._counts.requests[key] = Durations()
+        durations.observe(seconds)
+        level = logging.WARNING if status >= FAILED else logging.INFO if status >= 400 else logging.DEBUG
+        if logger.isEnabledFor(level):
+            logger.log(level, "%s %s -> %d in %.1f ms", method, scope["path"], status, 1e3 * seconds)
+
+
+def _id_of(scope: Scope) -> str:
+    """The caller's own id of a request where it is usable, else a new one."""
+    given = Headers(scope=scope).get(REQUEST_HEADER)
+    return given if given is not None and _GIVEN.fullmatch(given) else secrets.token_hex(6)
