@@ -24,12 +24,18 @@ LONGEST_EPISODE = 1_000  # where the specification has no time limit
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """``wide`` starts anywhere in the sampling range; ``perturb`` is the deviation of physical attributes."""
+    """``wide`` starts anywhere in the sampling range, ``start_scale`` spreads the declared starts so many times as far
+    about their middle; ``perturb`` is the deviation of physical attributes."""
 
     episodes: int = 100
     first_seed: int = FIRST_SEED
     wide: bool = False
+    start_scale: float = 1.0
     perturb: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.wide and self.start_scale != 1:
+            raise ValueError("expected starts over the whole range or scaled ones, got both")
 
 
 @dataclass(frozen=True)
@@ -179,8 +185,8 @@ def _start(episode: Episode, settings: EvaluationSettings, index: int) -> Moment
     rng = np.random.default_rng(seed)
     if settings.perturb > 0:
         episode.perturb(rng, settings.perturb)
-    if settings.wide:
-        return episode.place(draw(episode.spec, rng, wide=True))
+    if settings.wide or settings.start_scale != 1:
+        return episode.place(draw(episode.spec, rng, wide=settings.wide, scale=settings.start_scale))
     return episode.reset(seed)
 
 

@@ -1,9 +1,12 @@
-"""Versions of what a result depends on."""
+"""Versions of what a result depends on, and where it was made."""
 
 from __future__ import annotations
 
+import os
 import platform
+import subprocess
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 PACKAGES = ("surrogym", "gymnasium", "numpy", "torch", "stable-baselines3")
 
@@ -17,3 +20,33 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
+
+
+def commit() -> str:
+    """The commit of the checkout this code runs from, ``-dirty`` with changes; else the version of the package."""
+    here = Path(__file__)
+    git = ["git", "-C", str(here.parent)]
+    try:
+        subprocess.run([*git, "ls-files", "--error-unmatch", here.name], check=True, capture_output=True)
+        said = subprocess.run(
+            [*git, "describe", "--always", "--dirty", "--abbrev=10", "--exclude=*"],
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return version("surrogym")
+    return said.stdout.strip()
+
+
+def machine() -> str:
+    """Processor, cores and system, in words."""
+    return f"{_processor()}, {os.cpu_count()} cores, {platform.system()} {platform.machine()}"
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or "unknown processor"
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "processor")

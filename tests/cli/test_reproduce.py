@@ -1,73 +1,47 @@
-"""Evidence can be made again: cells resume, every seed counts, and the statistics are those they say they are."""
+"""Evidence by command: what is not known is refused, rows merge, and a page takes the table."""
 
-import json
-
-import numpy as np
 import pytest
 
-from surrogym_client.reproduce.efficiency import Cell, bootstrap_interval, cells, markdown, run_cell, summaries
+from surrogym_client.demo.settings import DemoSettings
+from surrogym_client.reproduce.cells import Cell
+from surrogym_client.reproduce.rows import Row, read_rows, write_rows
 
-ROW = {
-    "task": "pendulum",
-    "arm": "default",
-    "seed": 0,
-    "initial": 4,
-    "adaptive": 5,
-    "real_steps": 9,
-    "confidence_index": 1.0,
-    "phase": "ready",
-    "virtual_steps": 100,
-    "mean": -150.0,
-    "iqm": -140.0,
-    "min": -400.0,
-    "mean_length": 200.0,
-    "success_rate": 1.0,
-    "seconds": 50.0,
-}
-
-
-def test_every_combination_is_a_cell():
-    found = list(cells(["pendulum", "acrobot"], ["default", "paper"], 3, ["--steps", "8"]))
-    assert len({cell.name for cell in found}) == 12
-    assert found[-1].arguments == ("acrobot", "--seed", "2", "--preset", "paper", "--steps", "8")
-    assert found[0].configuration == found[1].configuration != found[3].configuration
-
-
-def test_a_cell_that_is_done_is_read_not_run(tmp_path):
-    cell = Cell("pendulum", "default", 0)
-    row = {**ROW, "configuration": cell.configuration}
-    (tmp_path / f"{cell.name}.json").write_text(json.dumps(row))
-    assert run_cell(cell, tmp_path) == row
-    assert sorted(path.name for path in tmp_path.iterdir()) == [f"{cell.name}.json"]
-
-
-def test_no_seed_is_left_out_of_a_summary():
-    rows = [
-        {**ROW, "seed": i, "mean": m, "real_steps": 9 + i, "success_rate": s}
-        for i, (m, s) in enumerate([(-150.0, 1.0), (-160.0, 0.9), (-1000.0, 0.2), (-155.0, 1.0)])
-    ]
-    (summary,) = summaries(rows)
-    assert summary.seeds == 4
-    assert summary.worst_seed == -1000.0
-    assert summary.success == "20 %"
-    assert summary.real_steps == "10.5 (9 to 12)"
-    assert summary.real_return.startswith("-157.5 (")
-    assert markdown([summary]).count("\n") == 3
-
-
-def test_the_interval_covers_the_truth_about_as_often_as_it_says():
-    rng = np.random.default_rng(0)
-    inside = 0
-    for _ in range(60):
-        low, high = bootstrap_interval(rng.normal(5.0, 2.0, 12))
-        inside += low <= 5.0 <= high
-    assert 48 <= inside <= 60
+ROW = Row("pendulum", "default", 0, 14, 4, 5, 9, mean=-150.0, min=-400.0, reached=True, seconds=1.0)
 
 
 @pytest.mark.parametrize(
-    ("option", "words"), [("--tasks=nothing", "unknown task 'nothing'"), ("--arms=x", "unknown arm 'x'")]
+    ("option", "words"),
+    [
+        ("--tasks=nothing", "unknown task 'nothing': expected all, or some of pendulum, "),
+        ("--arms=default,x", "unknown arm 'x': expected all, or some of default, "),
+        ("--shares=half", "expected numbers with commas between, got 'half'"),
+        ("--shares=0", "expected numbers above 0"),
+    ],
 )
 def test_what_is_not_known_is_refused(surrogym, option, words):
     said = surrogym("reproduce", "efficiency", option)
     assert said.code == 1
     assert words in said.err
+
+
+def test_what_is_done_is_not_run_again(surrogym, tmp_path):
+    row = Row(**{**vars(ROW), "specification": Cell(DemoSettings("pendulum")).specification})
+    write_rows(tmp_path / "out" / "rows.csv", [row])
+    said = surrogym("reproduce", "efficiency", "--tasks=pendulum", "--seeds=1", "--out=out", "--json")
+    assert said.code == 0
+    assert "1 runs, 1 of them done already" in said.err
+    assert [found["mean"] for found in said.json["rows"]] == [-150.0]
+
+
+def test_rows_of_several_sittings_become_one_table(surrogym, tmp_path):
+    write_rows(tmp_path / "night.csv", [ROW])
+    oracle = Row("pendulum", "oracle", 0, 14, 0, 0, 300_000, mean=-170.0, min=-300.0, seconds=9.0)
+    write_rows(tmp_path / "day.csv", [oracle])
+    page = tmp_path / "page.md"
+    page.write_text("# Results\n\n<!-- efficiency: begin -->\n<!-- efficiency: end -->\n")
+    said = surrogym("reproduce", "table", "--rows=night.csv", "--rows=day.csv", "--out=both", "--page=page.md")
+    assert said.code == 0
+    assert len(read_rows(tmp_path / "both" / "rows.csv")) == 2
+    assert (tmp_path / "both" / "efficiency.md").read_text() in page.read_text()
+    assert "| pendulum | oracle | 1 | 300000 | -170.0 (-170.0 to -170.0) |" in said.out
+    assert surrogym("reproduce", "table", "--rows=nowhere.csv").err == "error: nowhere.csv: no such file\n"

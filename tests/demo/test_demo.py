@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from surrogym_client.reproduce.rows import row_of
+
 pytestmark = [pytest.mark.e2e, pytest.mark.slow]
 
 MARK = "DEMO_TEST_MARK"
@@ -85,10 +87,13 @@ def test_a_small_demo_from_start_to_run_folder(demo, tmp_path):
     assert 0 < metrics["confidence_index"] <= 1
     assert metrics["fidelity"]["confidence_index"] == metrics["confidence_index"]
     assert 0 < metrics["virtual_steps"] <= 8000
-    assert set(metrics["seconds"]) == {"design", "train", "evaluate", "total"}
+    assert set(metrics["seconds"]) == {"start", "design", "train", "evaluate", "report", "total"}
     assert metrics["seconds"]["total"] >= metrics["seconds"]["train"]
     assert metrics["real_return"]["episodes"] == len(metrics["returns"]) == 3
-    assert metrics["evaluation_steps"] == 600
+    assert metrics["evaluation_steps"] == 2 * 600  # from Gymnasium's starts, and from the whole box
+    assert not metrics["reached"]
+    assert row_of(metrics).key == ("pendulum", "default", 8, 1)
+    assert len(metrics["configuration"]) == len(metrics["specification"]) == 12
     assert 0 <= metrics["success_rate"] <= 1
 
     folder = small.folder
@@ -97,7 +102,15 @@ def test_a_small_demo_from_start_to_run_folder(demo, tmp_path):
     pictures = ("samples.png", "learning.png", "returns.png", "rollout.png")
     assert all((folder / name).stat().st_size > 0 for name in (*names, *pictures))
     assert "live server: http://127.0.0.1:" in err
-    for shown in ("task ", "real queries", "confidence index", "virtual steps", "real return, 3 starts", str(folder)):
+    for shown in (
+        "task ",
+        "real queries",
+        "confidence index",
+        "virtual steps",
+        "real return, 3 starts",
+        "the whole box",
+        str(folder),
+    ):
         assert shown in out
     assert "real queries" not in err
 

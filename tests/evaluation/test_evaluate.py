@@ -169,3 +169,16 @@ def test_every_given_criterion_must_hold():
         cartpole_policy, partial(open_episode, "CartPole-v1", strict, lambda: None), EvaluationSettings(episodes=2)
     )
     assert not result.success.any()
+
+
+def test_scaled_starts_are_declared_ones_spread_about_their_middle():
+    starts = []
+
+    def policy(observation):
+        starts.append(observation.copy())
+        return np.zeros(len(observation), int)
+
+    evaluate(policy, opener("CartPole-v1"), EvaluationSettings(episodes=60, start_scale=2.0))
+    assert 0.09 < np.abs(starts[0]).max() <= 0.1
+    with pytest.raises(ValueError, match="got both"):
+        EvaluationSettings(wide=True, start_scale=2.0)

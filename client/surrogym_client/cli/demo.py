@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from surrogym_client.cli.options import Preset, Quiet
+from surrogym_client.cli.options import ExitWithParent, Quiet
+from surrogym_client.demo.arms import ARMS
+from surrogym_client.demo.tasks import TASKS
 
-Task = Literal["pendulum", "cartpole", "mountaincar", "acrobot", "invertedpendulum", "reacher"]
+if TYPE_CHECKING:
+    Task = str
+    ArmName = str
+else:
+    Task, ArmName = Literal[tuple(TASKS)], Literal[tuple(ARMS)]
 
 
 def register(app: typer.Typer) -> None:
@@ -26,11 +32,13 @@ def command(
         typer.Option("--json", help="Write the metrics to this file too; - prints them instead of the table."),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Run folder. [default: runs/TASK-seedSEED-TIME]")] = None,
-    budget: Annotated[int | None, typer.Option(min=2, help="Real steps of the design. [default: the task's]")] = None,
-    preset: Annotated[Preset | None, typer.Option(help="default, or paper: the method as printed.")] = None,
+    arm: Annotated[ArmName, typer.Option(help="How to spend the real steps; see docs/results.md.")] = "default",
+    budget: Annotated[int | None, typer.Option(min=2, help="Real steps, at most. [default: the task's]")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Virtual steps of the training.")] = None,
     episodes: Annotated[int, typer.Option(min=1, help="Real episodes of the evaluation.")] = 100,
+    pictures: Annotated[bool, typer.Option(help="Draw the run.")] = True,
     keep: Annotated[bool, typer.Option("--keep", help="Leave the server running until Ctrl-C.")] = False,
+    exit_with_parent: ExitWithParent = False,
     quiet: Quiet = False,
 ) -> None:
     """Start a server, a sampler and a trainer, solve a task from a few real steps, and show what came of it.
@@ -40,12 +48,24 @@ def command(
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.cli.output import give
     from surrogym_client.demo.report import table
-    from surrogym_client.demo.run import DemoSettings, run_demo
+    from surrogym_client.demo.run import run_demo
+    from surrogym_client.demo.settings import DemoSettings
+    from surrogym_client.lifetime import exit_with_parent as watch_parent
+
+    if exit_with_parent:
+        watch_parent()
 
     if json_file is not None and not json_file.resolve().parent.is_dir():
         raise CommandError(f"expected an existing folder for --json, got {json_file.parent}")
     settings = DemoSettings(
-        task=task, seed=seed, budget=budget, preset=preset, steps=steps, episodes=episodes, keep=keep
+        task=task,
+        seed=seed,
+        arm=arm,
+        budget=budget,
+        steps=steps,
+        episodes=episodes,
+        pictures=pictures,
+        keep=keep,
     )
     as_json = json_file == Path("-")
 

@@ -32,6 +32,9 @@ def command(
     episodes: Annotated[int, typer.Option(min=1, help="How many real episodes.")] = 100,
     first_seed: Annotated[int, typer.Option(min=0, help="Reset seed of the first episode; the next follow.")] = 10_000,
     wide: Annotated[bool, typer.Option("--wide", help="Start anywhere in the sampling range.")] = False,
+    start_scale: Annotated[
+        float, typer.Option(min=0, help="Spread the declared starts so many times as far about their middle.")
+    ] = 1.0,
     perturb: Annotated[
         float, typer.Option(min=0, help="Deviation of random factors on masses, lengths and limits.")
     ] = 0.0,
@@ -50,12 +53,15 @@ def command(
 
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 100
     """
+    from surrogym_client.cli.errors import CommandError
     from surrogym_client.cli.output import give, progress
     from surrogym_client.evaluate import EvaluationSettings, evaluate
     from surrogym_client.policy_file import load_policy, read_card
 
     card = read_card(policy)
-    settings = EvaluationSettings(episodes=episodes, first_seed=first_seed, wide=wide, perturb=perturb)
+    if wide and start_scale != 1:
+        raise CommandError("expected --wide or --start-scale, got both")
+    settings = EvaluationSettings(episodes, first_seed, wide, start_scale, perturb)
     opener = _opener(env, read_spec(spec), card)
     predict = load_policy(policy, algorithm or card.algorithm)
     with progress("evaluate", quiet=quiet) as update:
@@ -123,7 +129,8 @@ def _enter(
 
 
 def _settings(settings: EvaluationSettings) -> dict[str, Any]:
-    return {"first_seed": settings.first_seed, "wide": settings.wide, "perturb": settings.perturb}
+    names = ("first_seed", "wide", "start_scale", "perturb")
+    return {name: getattr(settings, name) for name in names}
 
 
 def _words(result: Evaluation) -> str:

@@ -18,7 +18,7 @@ from surrogym_client.original.mujoco import Joints, is_known, open_mujoco
 from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
 from surrogym_client.original.protocol import Array, Factory, OriginalEnvironment
 from surrogym_client.original.terms import observe
-from surrogym_shared.spec import EnvironmentSpec, Fixed, Normal, Uniform
+from surrogym_shared.spec import EnvironmentSpec, Fixed, Normal, Uniform, limits
 
 SMALLEST_FACTOR = 0.05  # a mass or a length stays positive, however large the perturbation
 
@@ -171,10 +171,21 @@ def open_episode(name: str, spec: EnvironmentSpec | None, factory: Factory) -> E
     return SteppedEpisode(factory())
 
 
-def draw(spec: EnvironmentSpec, rng: np.random.Generator, *, wide: bool) -> Array:
-    """Start coordinates (C,): from the start distribution, or from the whole sampling range."""
+def draw(spec: EnvironmentSpec, rng: np.random.Generator, *, wide: bool, scale: float = 1.0) -> Array:
+    """Start coordinates (C,): from the start distribution, or from the whole sampling range.
+
+    Args:
+        spec: of the environment.
+        rng: draws them.
+        wide: from the sampling range.
+        scale: how many times as far from the middle of each start distribution; bounds are kept.
+    """
     chosen = [c.sampling if wide else spec.start[c.name] for c in spec.coordinates]
-    return np.array([_draw_one(distribution, rng) for distribution in chosen])
+    drawn = np.array([_draw_one(distribution, rng) for distribution in chosen])
+    if scale == 1:
+        return drawn
+    middle = np.array([sum(limits(distribution)) / 2 for distribution in chosen])
+    return wrapped(spec, middle + scale * (drawn - middle))
 
 
 def _draw_one(distribution: Uniform | Normal | Fixed, rng: np.random.Generator) -> float:

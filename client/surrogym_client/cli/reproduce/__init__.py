@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import typer
 
-from surrogym_client.cli.reproduce import efficiency
+from surrogym_client.cli.reproduce import efficiency, table
 
-STUDIES = (efficiency,)
+STUDIES = (efficiency, table)
 
 
 def register(app: typer.Typer) -> None:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from surrogym_client.cli.options import AsJson, Quiet
+
+if TYPE_CHECKING:
+    from surrogym_client.reproduce.cells import Progress
+    from surrogym_client.reproduce.rows import Row
 
 
 def register(app: typer.Typer) -> None:
@@ -17,39 +21,91 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
-    tasks: Annotated[str, typer.Option(help="Tasks of the demo, with commas between.")] = "pendulum,cartpole",
-    arms: Annotated[str, typer.Option(help="default, paper, with commas between.")] = "default",
-    seeds: Annotated[int, typer.Option(min=1, help="How many seeds, from 0 on.")] = 3,
-    out: Annotated[Path, typer.Option(help="Folder of the cells and the table; a run goes on where it ended.")] = Path(
+    tasks: Annotated[str, typer.Option(help="Tasks of the demo with commas between, or all.")] = "all",
+    arms: Annotated[str, typer.Option(help="Arms with commas between, or all.")] = "default",
+    seeds: Annotated[int, typer.Option(min=1, help="How many seeds.")] = 3,
+    first_seed: Annotated[int, typer.Option(min=0, help="The first of them.")] = 0,
+    jobs: Annotated[int, typer.Option(min=1, help="Runs at once; each takes about one core.")] = 1,
+    out: Annotated[Path, typer.Option(help="Folder of rows, tables, pictures, logs and runs.")] = Path(
         "runs/efficiency"
     ),
+    shares: Annotated[str, typer.Option(help="Shares of each task's budget, with commas between.")] = "1",
+    again: Annotated[bool, typer.Option("--again", help="Run also what has a row already.")] = False,
     steps: Annotated[int | None, typer.Option(min=1, help="Virtual steps of each training.")] = None,
     episodes: Annotated[int, typer.Option(min=1, help="Real episodes of each evaluation.")] = 100,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Run the demo over tasks, arms and seeds, and put results.csv and results.md into a folder.
+    """Run the demo over tasks, arms and seeds; rows.csv, efficiency.md and a picture of each task go into a folder.
 
-    Example: surrogym reproduce efficiency --tasks pendulum,cartpole --seeds 3 --out runs/efficiency
+    A run that has its row in rows.csv is not repeated, so that the same command goes on after Ctrl-C. Arms: default,
+    no_loop, variance, latin_hypercube, paper, paper_hypercube, oracle; docs/results.md says what each is.
+
+    Example: surrogym reproduce efficiency --seeds 10 --jobs 2 --out runs/efficiency
+
+    Example: surrogym reproduce efficiency --tasks pendulum,acrobot --arms default,latin_hypercube --seeds 5
     """
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.cli.output import columns, give, progress
-    from surrogym_client.demo.run import TASKS
-    from surrogym_client.reproduce.efficiency import ARMS, Cell, cells, run_cells, summaries
+    from surrogym_client.cli.output import progress, say
+    from surrogym_client.cli.reproduce.table import present
+    from surrogym_client.demo.arms import ARMS
+    from surrogym_client.demo.tasks import TASKS
+    from surrogym_client.reproduce.cells import cells, done_already, run_cells
+    from surrogym_client.reproduce.rows import read_rows
 
-    for what, given, known in (("task", tasks, TASKS), ("arm", arms, ARMS)):
-        if unknown := [name for name in given.split(",") if name not in known]:
-            raise CommandError(f"unknown {what} {unknown[0]!r}: expected some of {', '.join(known)}")
-    options = ["--episodes", str(episodes), *([] if steps is None else ["--steps", str(steps)])]
-    todo = list(cells(tasks.split(","), arms.split(","), seeds, options))
-    with progress("reproduce", quiet=quiet) as update:
+    chosen = _chosen("task", tasks, TASKS), _chosen("arm", arms, ARMS), range(first_seed, first_seed + seeds)
+    wanted = list(cells(*chosen, shares=_shares(shares), steps=steps, episodes=episodes))
+    rows = read_rows(out / "rows.csv")
+    todo = wanted if again else [cell for cell in wanted if not done_already(cell, rows)]
+    say(f"{len(wanted)} runs, {len(wanted) - len(todo)} of them done already", quiet=quiet)
+    try:
+        with progress("reproduce", quiet=quiet) as update:
 
-        def report(number: int, cell: Cell) -> None:
-            update(number / len(todo), f"cell {number + 1} of {len(todo)}: {cell.name}")
+            def tell(now: Progress) -> None:
+                update(now.done / now.of, _words(now))
+                if now.last is not None:
+                    say(_outcome(now.last), quiet=quiet)
 
-        table = summaries(run_cells(todo, out, report))
-        update(1.0, f"{len(todo)} cells")
-    rows = [list(asdict(summary).values()) for summary in table]
-    heading = list(asdict(table[0]))
-    result = {"out": str(out), "rows": [asdict(summary) for summary in table]}
-    give(result, lambda: columns([heading, *rows]), as_json=as_json, quiet=quiet)
+            rows = run_cells(todo, rows, out, jobs, tell) if todo else rows
+    except KeyboardInterrupt:
+        say(f"interrupted; what is done stays in {out / 'rows.csv'}, and the same command goes on from there")
+        raise
+    present(rows, out, as_json=as_json, quiet=quiet)
+    if bad := [row for row in rows if row.error and row.key in {cell.key for cell in wanted}]:
+        raise CommandError(f"{len(bad)} runs ended badly, the first with {bad[0].error}; logs: {out / 'logs'}")
+
+
+def _chosen(what: str, given: str, known: Iterable[str]) -> list[str]:
+    from surrogym_client.cli.errors import CommandError
+
+    if given == "all":
+        return list(known)
+    names = list(dict.fromkeys(given.split(",")))
+    if unknown := [name for name in names if name not in known]:
+        raise CommandError(f"unknown {what} {unknown[0]!r}: expected all, or some of {', '.join(known)}")
+    return names
+
+
+def _shares(given: str) -> list[float]:
+    from surrogym_client.cli.errors import CommandError
+
+    try:
+        shares = [float(share) for share in given.split(",")]
+    except ValueError as error:
+        raise CommandError(f"--shares: expected numbers with commas between, got {given!r}") from error
+    if not all(0 < share <= 10 for share in shares):
+        raise CommandError(f"--shares: expected numbers above 0 and up to 10, got {given!r}")
+    return shares
+
+
+def _words(now: Progress) -> str:
+    left = "" if now.left_seconds is None else f", about {now.left_seconds / 60:.0f} min left"
+    return f"{now.done} of {now.of} runs{left}; running: {', '.join(now.running) or '-'}"
+
+
+def _outcome(row: Row) -> str:
+    name = f"{row.task} {row.arm} seed {row.seed}"
+    if row.error or row.mean is None or row.seconds is None:
+        return f"{name}: ended badly, {row.error}"
+    reached = "reached" if row.reached else "not reached"
+    return f"{name}: {row.real_steps} real steps, mean return {row.mean:.1f}, target {reached}, {row.seconds:.0f} s"

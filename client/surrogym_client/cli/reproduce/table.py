@@ -1,0 +1,61 @@
+"""``surrogym reproduce table``: rows of several sittings and machines, merged into one table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from surrogym_client.cli.options import AsJson, Quiet
+
+if TYPE_CHECKING:
+    from surrogym_client.reproduce.rows import Row
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("table")(command)
+
+
+def command(
+    rows: Annotated[list[Path], typer.Option(help="File of rows; may be given again, later ones win.")],
+    out: Annotated[Path, typer.Option(help="Folder of the merged rows, the table and the pictures.")] = Path(
+        "runs/table"
+    ),
+    page: Annotated[
+        Path | None, typer.Option(help="Put the table into this page too, between the marks efficiency.")
+    ] = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Merge files of rows, and write the merged rows.csv, efficiency.md and a picture of each task.
+
+    Example: surrogym reproduce table --rows night/rows.csv --rows day/rows.csv --out runs/table
+    """
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.reproduce.page import insert
+    from surrogym_client.reproduce.rows import merge, read_rows, write_rows
+    from surrogym_client.reproduce.table import report
+
+    if missing := [path for path in rows if not path.exists()]:
+        raise CommandError(f"{missing[0]}: no such file")
+    merged = merge(*map(read_rows, rows))
+    write_rows(out / "rows.csv", merged)
+    if page is not None:
+        insert(page, "efficiency", report(merged))
+    present(merged, out, as_json=as_json, quiet=quiet)
+
+
+def present(rows: Sequence[Row], out: Path, *, as_json: bool, quiet: bool) -> None:
+    """Write table and pictures of rows, and show the table."""
+    from surrogym_client.cli.output import give
+    from surrogym_client.reproduce.pictures import draw_tasks
+    from surrogym_client.reproduce.table import report
+
+    text = report(rows)
+    (out / "efficiency.md").write_text(text, encoding="utf-8")
+    pictures = draw_tasks(out, rows)
+    result = {"out": str(out), "rows": [vars(row) for row in rows], "pictures": [str(path) for path in pictures]}
+    give(result, lambda: text, as_json=as_json, quiet=quiet)

@@ -1,0 +1,59 @@
+"""The arms of a comparison: how the same budget of real steps is spent, and on which model.
+
+The default may stop before its budget is spent. Every other arm that learns a surrogate spends exactly that budget, so
+that a comparison can only be in its favour. Imports nothing but the standard library.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+Acquisition = Literal["variance", "latin_hypercube"]
+PAPERS_SHARE = 3  # the paper's initial designs were 40 of 125 and 50 of 120 steps, about a third
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One way to spend a budget.
+
+    ``closed_loop``: queries where policies have been, between trainings; without it the whole budget is the design's,
+    before training. ``original``: no surrogate at all, the policy search runs in the original environment.
+    """
+
+    words: str
+    preset: Literal["default", "paper"] = "default"
+    acquisition: Acquisition | None = None
+    closed_loop: bool = False
+    original: bool = False
+
+    def design(self, budget: int, dimensions: int) -> dict[str, Any]:
+        """Fields of the specification's design.
+
+        Args:
+            budget: real steps of the whole run.
+            dimensions: D + F, entries of observation and action.
+        """
+        chosen: dict[str, Any] = {"preset": self.preset, "budget": budget}
+        if self.acquisition is not None:
+            chosen["acquisition"] = self.acquisition
+        if self.preset == "paper":  # 10 (D + F), section 3.1, would leave nothing to adapt
+            chosen["initial"] = max(2, min(10 * dimensions, budget // PAPERS_SHARE))
+        return chosen
+
+    def fields(self) -> dict[str, Any]:
+        """What distinguishes the arm, JSON-able."""
+        return {name: value for name, value in asdict(self).items() if name != "words"}
+
+
+ARMS = {
+    "default": Arm("as surrogym demo runs it; it may stop early", closed_loop=True),
+    "no_loop": Arm("the whole budget by the design, before training"),
+    "variance": Arm("no_loop, each query where the deviation is largest", acquisition="variance"),
+    "latin_hypercube": Arm("no_loop, all queries from one Latin hypercube", acquisition="latin_hypercube"),
+    "paper": Arm("the paper's representation, index, reward penalty and initial share", preset="paper"),
+    "paper_hypercube": Arm(
+        "paper, all queries from one Latin hypercube", preset="paper", acquisition="latin_hypercube"
+    ),
+    "oracle": Arm("the same PPO in the original environment, each training step a real one", original=True),
+}

@@ -1,0 +1,56 @@
+"""The oracle: the policy search that serves the surrogate, with the original environment in its place."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+from surrogym_client.cli.output import progress
+from surrogym_client.cli.train import words_of
+from surrogym_client.demo.judging import Judgement, episodes_of
+from surrogym_client.demo.learning import Learned
+from surrogym_client.demo.settings import DemoSettings
+from surrogym_client.original.port import OriginalPort
+from surrogym_client.policy_file import PolicyCard, write_card
+from surrogym_client.train import TrainProgress, TrainSettings, train
+
+STEPS = 300_000  # real ones
+
+
+class OriginalRun:
+    """PPO in the original environment; each of its training steps is a real one."""
+
+    def __init__(self, settings: DemoSettings, folder: Path, *, quiet: bool) -> None:
+        self._settings = settings
+        self._policy = folder / "policy.zip"
+        self._quiet = quiet
+
+    def learn(self) -> Learned:
+        """Train, and count the steps of the original environment."""
+        chosen = TrainSettings(total_steps=self._settings.virtual_steps or STEPS, seed=self._settings.seed)
+        port = OriginalPort(self._settings.judged_by(), episodes_of(self._settings))
+        with progress("train", quiet=self._quiet) as update:
+
+            def look(now: TrainProgress) -> None:
+                update(now.steps / now.total_steps, words_of(asdict(now)))
+
+            result = train(port, self._policy, chosen, look)
+        write_card(
+            self._policy,
+            PolicyCard(
+                algorithm=result.algorithm,
+                spec=port.spec(),
+                seed=chosen.seed,
+                virtual_steps=0,
+                imagined_return=None,
+                settings=result.settings,
+            ),
+        )
+        steps = {"initial": 0, "adaptive": 0, "total": port.steps, "unresolved": 0}
+        return Learned(self._policy, steps, {"train": result.seconds})
+
+    def keep(self, judgement: Judgement) -> None:
+        """There is no ledger, and nothing was designed."""
+
+    def linger(self) -> None:
+        """Nothing runs."""

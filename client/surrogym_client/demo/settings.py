@@ -1,0 +1,68 @@
+"""What one run is asked to do, and the specification that follows from it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from surrogym_client.demo.arms import ARMS, Arm
+from surrogym_client.demo.tasks import TASKS, DemoTask, design_budget
+from surrogym_client.original import make
+from surrogym_client.original.loading import with_choices
+from surrogym_shared.spec import EnvironmentSpec
+
+
+@dataclass(frozen=True)
+class DemoSettings:
+    """None takes the task's own."""
+
+    task: str = "pendulum"
+    seed: int = 0
+    arm: str = "default"
+    budget: int | None = None  # real steps
+    steps: int | None = None  # virtual steps of the last training
+    episodes: int = 100
+    pictures: bool = True
+    keep: bool = False
+
+    @property
+    def demo_task(self) -> DemoTask:
+        return TASKS[self.task]
+
+    @property
+    def way(self) -> Arm:
+        return ARMS[self.arm]
+
+    @property
+    def real_steps(self) -> int:
+        """The budget."""
+        return self.budget or self.demo_task.budget
+
+    @property
+    def virtual_steps(self) -> int | None:
+        return self.steps or self.demo_task.steps
+
+    def spec(self) -> EnvironmentSpec:
+        """The environment's specification with the design of this arm."""
+        plain = make(self.demo_task.environment, preset=self.way.preset, seed=self.seed).spec()
+        budget = design_budget(self.real_steps) if self.way.closed_loop else self.real_steps
+        design = self.way.design(budget, len(plain.observation) + plain.action.size)
+        return with_choices(plain, design, None)
+
+    def judged_by(self) -> EnvironmentSpec:
+        """The original environment as every arm is judged by it, also one that learns another form of it."""
+        return make(self.demo_task.environment).spec()
+
+    def asked(self) -> dict[str, Any]:
+        """All that a result depends on and that is known before the run, but the seed; JSON-able."""
+        spec = self.spec().model_dump(mode="json")
+        spec["design"].pop("seed")
+        names = ("task", "real_steps", "virtual_steps", "episodes")
+        return {"spec": spec, "arm": self.way.fields(), **{name: getattr(self, name) for name in names}}
+
+
+def fingerprint(content: Any) -> str:
+    """Twelve hexadecimal digits for JSON-able content."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:12]

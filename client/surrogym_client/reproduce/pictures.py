@@ -1,0 +1,55 @@
+"""Pictures of an efficiency study: real steps against real return, one picture a task."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+from matplotlib.figure import Figure
+
+from surrogym_client.demo.arms import ARMS
+from surrogym_client.evaluate import interquartile_mean
+from surrogym_client.reproduce.rows import Row
+from surrogym_client.reproduce.statistics import bootstrap_interval
+from surrogym_client.reproduce.table import Group, column, grouped
+
+COLOURS = dict(zip(ARMS, ("#dd8452", "#4c72b0", "#55a868", "#8172b3", "#937860", "#c9a66b", "#555555"), strict=True))
+SIZE = (6.0, 3.6)  # inches
+BESIDE = 0.05  # dots of single seeds stand so far from their arm, as a share of its real steps
+
+
+def draw_tasks(folder: Path, rows: Sequence[Row]) -> list[Path]:
+    """Write ``efficiency-TASK.png`` for each task that has a result."""
+    groups = grouped(rows)
+    written = []
+    for task in dict.fromkeys(task for task, _, _ in groups):
+        own = {group: of for group, of in groups.items() if group[0] == task and len(column(of, "mean"))}
+        if own:
+            written.append(folder / f"efficiency-{task}.png")
+            draw_task(task, own).savefig(written[-1], dpi=120)
+    return written
+
+
+def draw_task(task: str, groups: dict[Group, list[Row]]) -> Figure:
+    """Each arm where its median of real steps is: interquartile mean with interval, and beside it every seed."""
+    figure = Figure(figsize=SIZE, layout="constrained")
+    axes = figure.add_subplot()
+    named: set[str] = set()
+    for (_, arm, _), rows in groups.items():
+        known = [row for row in rows if row.mean is not None]
+        means, steps = column(known, "mean"), column(known, "real_steps")
+        middle, at = interquartile_mean(means), float(sorted(steps)[len(steps) // 2])
+        low, high = bootstrap_interval(means)
+        label = None if arm in named else arm
+        named.add(arm)
+        axes.errorbar(
+            [at], [middle], [[middle - low], [high - middle]], color=COLOURS[arm], marker="o", capsize=4, label=label
+        )
+        axes.scatter((1 + BESIDE) * steps, means, s=9, color=COLOURS[arm], alpha=0.5, linewidths=0)
+    axes.set(xscale="log", xlabel="real steps", ylabel="real return of an episode", title=task)
+    figure.legend(loc="outside right upper", frameon=False)
+    return figure

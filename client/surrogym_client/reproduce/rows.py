@@ -1,0 +1,157 @@
+"""Rows: what one run gave, one line of a CSV file. Rows of several sittings and machines merge."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+from surrogym_client.errors import SurrogymClientError
+
+Key = tuple[str, str, int, int]
+
+
+class UnusableRows(SurrogymClientError):
+    """A file of rows can't be read; says which line and why."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One run. Returns are over its real episodes; ``also_*`` are from the task's other starts, where it has any.
+
+    ``specification`` is a hash of what was asked (specification, arm, budget, virtual steps, episodes, without the
+    seed), ``configuration`` of that and the settings of the training. ``error`` is why a run ended badly: it counts as
+    a seed, and as one that did not reach its target.
+    """
+
+    task: str
+    arm: str
+    seed: int
+    budget: int
+    initial: int | None = None
+    adaptive: int | None = None
+    real_steps: int | None = None
+    mean: float | None = None
+    iqm: float | None = None
+    min: float | None = None
+    max: float | None = None
+    episodes: int | None = None
+    success: float | None = None  # share of the episodes
+    failures: int | None = None  # episodes without success
+    also_mean: float | None = None
+    also_min: float | None = None
+    also_success: float | None = None
+    reached: bool = False  # the task's target
+    imagined: float | None = None
+    virtual_steps: int | None = None
+    phase: str = ""
+    confidence_index: float | None = None
+    seconds: float | None = None
+    commit: str = ""
+    specification: str = ""
+    configuration: str = ""
+    machine: str = ""
+    error: str = ""
+
+    @property
+    def key(self) -> Key:
+        """Task, arm, budget, seed: rows of the same key are of the same cell."""
+        return self.task, self.arm, self.budget, self.seed
+
+
+COLUMNS = tuple(field.name for field in fields(Row))
+
+
+def row_of(metrics: dict[str, Any]) -> Row:
+    """The row of a run, from the metrics of its demo."""
+    real, returns, also = metrics["real_queries"], metrics["real_return"], metrics["also"]
+    success = metrics["success_rate"]
+    return Row(
+        **{name: metrics[name] for name in ("task", "arm", "seed", "budget", "reached", "virtual_steps")},
+        **{name: metrics[name] for name in ("confidence_index", "commit", "specification", "configuration", "machine")},
+        **{name: returns[name] for name in ("mean", "iqm", "min", "max", "episodes")},
+        initial=real["initial"],
+        adaptive=real["adaptive"],
+        real_steps=real["total"],
+        success=success,
+        failures=None if success is None else round((1 - success) * returns["episodes"]),
+        also_mean=also and also["mean"],
+        also_min=also and also["min"],
+        also_success=also and also["success_rate"],
+        imagined=metrics["imagined_return"],
+        phase=metrics["phase"] or "",
+        seconds=metrics["seconds"]["total"],
+    )
+
+
+def read_rows(path: Path) -> list[Row]:
+    """The rows of a CSV file; none where there is no file.
+
+    Raises:
+        UnusableRows: other columns than expected, or a value that is none.
+    """
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        if tuple(reader.fieldnames or ()) != COLUMNS:
+            raise UnusableRows(f"{path}: expected the columns {', '.join(COLUMNS)}, got {reader.fieldnames}")
+        rows = []
+        for number, line in enumerate(reader, start=2):
+            try:
+                rows.append(Row(**{name: _read(kind, line[name]) for name, kind in _kinds().items()}))
+            except (ValueError, TypeError) as error:
+                raise UnusableRows(f"{path}, line {number}: {error}") from error
+        return rows
+
+
+def write_rows(path: Path, rows: Iterable[Row]) -> None:
+    """Write rows as CSV, in place of what was there at once: a reader never sees half of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    with partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        writer.writerows([_write(value) for value in asdict(row).values()] for row in rows)
+    os.replace(partial, path)
+
+
+def merge(*sources: Iterable[Row]) -> list[Row]:
+    """All rows, sorted; of the same cell the last one, but never an error over a result."""
+    merged: dict[Key, Row] = {}
+    for row in (row for source in sources for row in source):
+        if row.key not in merged or not row.error or merged[row.key].error:
+            merged[row.key] = row
+    return sorted(merged.values(), key=lambda row: row.key)
+
+
+def _kinds() -> dict[str, Any]:
+    return get_type_hints(Row)
+
+
+def _read(kind: Any, text: str) -> Any:
+    options = get_args(kind) or (kind,)
+    if text == "" and type(None) in options:
+        return None
+    if kind is bool:
+        return {"yes": True, "no": False}[text] if text in ("yes", "no") else _refuse(text)
+    return options[0](text)
+
+
+def _refuse(text: str) -> bool:
+    raise ValueError(f"expected yes or no, got {text!r}")
+
+
+def _write(value: Any) -> str:
+    match value:
+        case None:
+            return ""
+        case bool():
+            return "yes" if value else "no"
+        case float():
+            return f"{value:.6g}"
+        case _:
+            return str(value)

@@ -1,0 +1,141 @@
+"""Tables of an efficiency study, as Markdown: every cell that was run counts, also one that ended badly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.demo.arms import ARMS
+from surrogym_client.demo.tasks import TASKS
+from surrogym_client.evaluate import interquartile_mean
+from surrogym_client.reproduce.rows import Row
+from surrogym_client.reproduce.statistics import bootstrap_interval, difference_interval
+
+Group = tuple[str, str, int]
+HEADING = (
+    *("task", "arm", "seeds", "real steps", "real return", "worst seed", "worst episode"),
+    *("success", "other starts", "imagined", "target reached", "seconds"),
+)
+NOTES = """\
+Real steps: median (smallest to largest). Real return: interquartile mean over seeds of the mean over episodes, with its
+95 % bootstrap interval. Worst seed: its mean. Success and other starts: share of the episodes, worst seed. Imagined:
+what the surrogate promised. Target reached: by how many seeds of all. Seconds: median (largest).
+"""
+
+
+def report(rows: Sequence[Row]) -> str:
+    """Targets, the main table, differences to the default, and where the rows come from."""
+    groups = grouped(rows)
+    parts = [_targets(groups), _markdown([HEADING, *(_line(group, of) for group, of in groups.items())]), NOTES]
+    if differences := _differences(groups):
+        parts += ["Default minus another arm, interquartile means, with a 95 % bootstrap interval:\n", differences]
+    return "\n".join([*parts, _origin(rows)])
+
+
+def grouped(rows: Sequence[Row]) -> dict[Group, list[Row]]:
+    """Rows by task, arm and budget; tasks and arms in their order here, seeds ascending."""
+    tasks, arms = list(TASKS), list(ARMS)
+
+    def place(row: Row) -> tuple[int, int, int, int]:
+        return tasks.index(row.task), row.budget, arms.index(row.arm), row.seed
+
+    ordered = sorted((row for row in rows if row.task in TASKS and row.arm in ARMS), key=place)
+    return {key: list(of) for key, of in groupby(ordered, key=lambda row: (row.task, row.arm, row.budget))}
+
+
+def column(rows: Sequence[Row], name: str) -> NDArray[np.float64]:
+    """The known values of a column."""
+    return np.array([value for row in rows if (value := getattr(row, name)) is not None], dtype=np.float64)
+
+
+def _targets(groups: dict[Group, list[Row]]) -> str:
+    lines = [("task", "budget", "target for each seed", "reached", "worst seed")]
+    for (task, arm, budget), rows in groups.items():
+        if arm == "default" and budget == TASKS[task].budget:
+            means = column(rows, "mean")
+            worst = _number(means.min()) if len(means) else "-"
+            lines.append((task, str(budget), TASKS[task].target.words, _reached(rows), worst))
+    return _markdown(lines) if len(lines) > 1 else ""
+
+
+def _line(group: Group, rows: Sequence[Row]) -> Sequence[str]:
+    task, arm, budget = group
+    name = arm if budget == TASKS[task].budget else f"{arm}, budget {budget}"
+    crashed = sum(bool(row.error) for row in rows)
+    seeds = f"{len(rows)}, {crashed} ended badly" if crashed else str(len(rows))
+    means = column(rows, "mean")
+    if not len(means):
+        return task, name, seeds, *["-"] * (len(HEADING) - 3)
+    low, high = bootstrap_interval(means)
+    imagined = column(rows, "imagined")
+    return (
+        task,
+        name,
+        seeds,
+        _spread(column(rows, "real_steps")),
+        f"{_number(interquartile_mean(means))} ({_number(low)} to {_number(high)})",
+        _number(means.min()),
+        _number(column(rows, "min").min()),
+        _share(column(rows, "success")),
+        _share(column(rows, "also_success")),
+        _number(interquartile_mean(imagined)) if len(imagined) else "-",
+        _reached(rows),
+        _median(column(rows, "seconds")),
+    )
+
+
+def _differences(groups: dict[Group, list[Row]]) -> str:
+    lines = [("task", "arm", "seeds", "difference", "interval", "better")]
+    for (task, arm, budget), rows in groups.items():
+        default = column(groups.get((task, "default", budget), []), "mean")
+        other = column(rows, "mean")
+        if arm != "default" and len(default) > 1 and len(other) > 1:
+            low, high = difference_interval(default, other)
+            better = "default" if low > 0 else arm if high < 0 else "undecided"
+            difference = _number(interquartile_mean(default) - interquartile_mean(other))
+            seeds = f"{len(default)}, {len(other)}"
+            lines.append((task, arm, seeds, difference, f"{_number(low)} to {_number(high)}", better))
+    return _markdown(lines) if len(lines) > 1 else ""
+
+
+def _origin(rows: Sequence[Row]) -> str:
+    """Commits and machines; and a warning where rows that are compared were not made alike."""
+    lines = [f"Commits: {_listed(rows, 'commit')}. Machines: {_listed(rows, 'machine')}."]
+    for (task, arm, budget), of in grouped(rows).items():
+        made = {row.configuration for row in of if row.configuration}
+        if len(made) > 1:
+            lines.append(f"{task}, {arm}, budget {budget}: rows of {len(made)} configurations.")
+    return "\n".join(lines) + "\n"
+
+
+def _listed(rows: Sequence[Row], name: str) -> str:
+    return "; ".join(sorted({getattr(row, name) for row in rows if getattr(row, name)})) or "unknown"
+
+
+def _reached(rows: Sequence[Row]) -> str:
+    return f"{sum(row.reached for row in rows)} of {len(rows)}"
+
+
+def _spread(values: NDArray[np.float64]) -> str:
+    low, high = values.min(), values.max()
+    return f"{low:.0f}" if low == high else f"{np.median(values):g} ({low:.0f} to {high:.0f})"
+
+
+def _median(values: NDArray[np.float64]) -> str:
+    return f"{np.median(values):.0f} ({values.max():.0f})"
+
+
+def _share(values: NDArray[np.float64]) -> str:
+    return f"{100 * values.min():.0f} %" if len(values) else "-"
+
+
+def _number(value: float) -> str:
+    return f"{value:.1f}" if abs(value) >= 10 else f"{value:.3g}"
+
+
+def _markdown(lines: Sequence[Sequence[str]]) -> str:
+    rows = [lines[0], ["---"] * len(lines[0]), *lines[1:]]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)

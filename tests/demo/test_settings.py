@@ -1,0 +1,51 @@
+"""What an arm may spend, and that it spends it: budgets are equal, and the default can only spend less."""
+
+import pytest
+
+from surrogym_client.demo.arms import ARMS
+from surrogym_client.demo.settings import DemoSettings
+from surrogym_client.demo.tasks import ROUNDS, TASKS, Outcome, Target, design_budget, queries_a_round
+from surrogym_client.original.loading import is_known
+
+KNOWN = [name for name, task in TASKS.items() if is_known(task.environment)]
+
+
+@pytest.mark.parametrize("budget", [2, 8, 14, 20, 21, 60, 100, 200])
+def test_the_closed_loop_stays_within_the_budget(budget):
+    spent = design_budget(budget) + ROUNDS * queries_a_round(budget)
+    assert budget - ROUNDS < spent <= budget
+
+
+@pytest.mark.parametrize("task", KNOWN)
+def test_arms_have_the_same_budget(task):
+    for name, arm in ARMS.items():
+        settings = DemoSettings(task, seed=3, arm=name)
+        design = settings.spec().design
+        expected = design_budget(TASKS[task].budget) if arm.closed_loop else TASKS[task].budget
+        assert (design.budget, design.seed) == (expected, 3)
+        assert settings.judged_by().design.preset == "default"
+
+
+def test_arms_differ_in_what_they_say():
+    designs = {name: DemoSettings("acrobot", arm=name).spec().design for name in ARMS}
+    assert designs["variance"].acquisition == "variance"
+    assert designs["latin_hypercube"].acquisition == designs["paper_hypercube"].acquisition == "latin_hypercube"
+    assert (designs["paper"].preset, designs["paper"].initial) == ("paper", 33)
+    assert designs["no_loop"].acquisition is designs["default"].acquisition is None
+
+
+def test_the_paper_learns_its_own_cart_pole_and_is_judged_by_gymnasiums():
+    settings = DemoSettings("cartpole", arm="paper")
+    assert settings.spec().time_limit == 200
+    assert settings.judged_by().time_limit == 500
+
+
+def test_a_target_is_reached_only_when_all_of_it_is():
+    target = Target("all", mean=-160, lowest=-400, success=1.0, also_success=0.98)
+    good = Outcome(-150.0, -399.0, 1.0)
+    assert target.reached(good, Outcome(-500.0, -900.0, 0.98))
+    assert not target.reached(good, Outcome(-500.0, -900.0, 0.97))
+    assert not target.reached(good)
+    for other in (Outcome(-161.0, -399.0, 1.0), Outcome(-150.0, -401.0, 1.0), Outcome(-150.0, -399.0, 0.99)):
+        assert not target.reached(other, Outcome(0.0, 0.0, 1.0))
+    assert Target("mean", mean=93).reached(Outcome(93.0, 0.0, None))

@@ -1,0 +1,48 @@
+"""Rows survive the file, and merge without losing a seed or hiding an error."""
+
+from dataclasses import replace
+
+import pytest
+
+from support.metrics import METRICS
+from surrogym_client.reproduce.rows import Row, UnusableRows, merge, read_rows, row_of, write_rows
+
+ROW = Row("pendulum", "default", 0, 14, 4, 5, 9, mean=-150.123, success=0.97, reached=True, phase="ready")
+
+
+def test_a_row_says_what_the_run_gave():
+    row = row_of(METRICS)
+    assert row.key == ("pendulum", "default", 14, 3)
+    assert (row.real_steps, row.failures, row.also_success, row.seconds) == (9, 7, 0.9, 50.0)
+    assert row_of({**METRICS, "also": None, "success_rate": None}).failures is None
+
+
+def test_rows_survive_the_file(tmp_path):
+    rows = [ROW, Row("cartpole", "paper", 1, 8, error="exit code 1: no, nothing")]
+    write_rows(tmp_path / "rows.csv", rows)
+    assert read_rows(tmp_path / "rows.csv") == rows
+    assert read_rows(tmp_path / "none.csv") == []
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("seed", "sead"), "expected the columns task, arm, seed"),
+        (("pendulum,default,0", "pendulum,default,zero"), "line 2: invalid literal"),
+        ((",yes,", ",maybe,"), "line 2: expected yes or no, got 'maybe'"),
+    ],
+)
+def test_a_file_that_is_none_of_ours_is_refused(tmp_path, change, words):
+    path = tmp_path / "rows.csv"
+    write_rows(path, [ROW])
+    path.write_text(path.read_text().replace(*change, 1))
+    with pytest.raises(UnusableRows, match=words):
+        read_rows(path)
+
+
+def test_later_rows_win_but_no_error_hides_a_result():
+    better, bad, other = replace(ROW, mean=-140.0), replace(ROW, mean=None, error="died"), replace(ROW, seed=1)
+    assert merge([ROW], [better, other]) == [better, other]
+    assert merge([ROW], [bad]) == [ROW]
+    assert merge([bad], [ROW]) == [ROW]
+    assert merge([replace(ROW, budget=7)], [ROW]) == [replace(ROW, budget=7), ROW]

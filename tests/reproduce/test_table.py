@@ -1,0 +1,87 @@
+"""The table leaves no seed out, and says where rows that are compared were not made alike."""
+
+from dataclasses import replace
+
+import pytest
+
+from surrogym_client.reproduce.page import NoSuchPlace, insert, inserted
+from surrogym_client.reproduce.pictures import draw_tasks
+from surrogym_client.reproduce.rows import Row
+from surrogym_client.reproduce.table import report
+
+ROW = Row(
+    *("pendulum", "default", 0, 14, 4, 5, 9),
+    mean=-150.0,
+    min=-400.0,
+    success=1.0,
+    also_success=0.99,
+    reached=True,
+    imagined=-140.0,
+    seconds=50.0,
+    commit="abc",
+    configuration="c",
+)
+DEFAULT = [
+    replace(ROW, seed=i, mean=m, success=s, reached=r, real_steps=9 + i)
+    for i, (m, s, r) in enumerate(
+        [(-150.0, 1.0, True), (-160.0, 0.9, False), (-1000.0, 0.2, False), (-155.0, 1.0, True)]
+    )
+]
+HYPERCUBE = [replace(ROW, arm="latin_hypercube", seed=i, mean=-400.0 - i, reached=False) for i in range(4)]
+
+
+def line(text: str, *cells: str) -> str:
+    (found,) = [one for one in text.splitlines() if one.startswith(f"| {' | '.join(cells)} |")]
+    return found
+
+
+def test_no_seed_is_left_out():
+    text = report(DEFAULT)
+    assert line(text, "pendulum", "default") == (
+        "| pendulum | default | 4 | 10.5 (9 to 12) | -157.5 (-1000.0 to -150.0) | -1000.0 | -400.0 | 20 % | 99 % |"
+        " -140.0 | 2 of 4 | 50 (50) |"
+    )
+    assert line(text, "pendulum", "14").endswith("| 2 of 4 | -1000.0 |")
+
+
+def test_a_run_that_ended_badly_counts_as_one_that_missed_the_target():
+    bad = Row("pendulum", "default", 4, 14, error="exit code 1: no")
+    text = report([*DEFAULT, bad])
+    assert "| 5, 1 ended badly |" in line(text, "pendulum", "default")
+    assert "| 2 of 5 |" in line(text, "pendulum", "default")
+    assert "| 1, 1 ended badly | - |" in report([bad])
+
+
+def test_arms_are_compared_with_an_interval():
+    text = report([*HYPERCUBE, *DEFAULT[:2], replace(ROW, seed=3)])
+    assert line(text, "pendulum", "latin_hypercube", "3, 4").endswith("| default |")
+    assert text.index("| pendulum | default |") < text.index("| pendulum | latin_hypercube |")
+    assert "undecided" in report([*HYPERCUBE, *DEFAULT[:1], replace(DEFAULT[0], seed=1, mean=-1000.0)])
+
+
+def test_rows_that_were_not_made_alike_are_told():
+    assert "configurations" not in report(DEFAULT)
+    assert "pendulum, default, budget 14: rows of 2 configurations" in report(
+        [*DEFAULT, replace(ROW, seed=9, configuration="d")]
+    )
+
+
+def test_other_budgets_stand_beside():
+    text = report([*DEFAULT, replace(ROW, budget=7, mean=-900.0)])
+    assert line(text, "pendulum", "default, budget 7", "1")
+
+
+def test_each_task_gets_a_picture(tmp_path):
+    written = draw_tasks(tmp_path, [*DEFAULT, *HYPERCUBE, Row("cartpole", "default", 0, 8, error="no")])
+    assert [path.name for path in written] == ["efficiency-pendulum.png"]
+    assert written[0].stat().st_size > 5_000
+
+
+def test_a_table_goes_between_its_marks(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- efficiency: begin -->\nold\n<!-- efficiency: end -->\nafter\n")
+    insert(page, "efficiency", "new\n")
+    assert inserted(page, "efficiency") == "new\n"
+    assert page.read_text() == "before\n<!-- efficiency: begin -->\nnew\n<!-- efficiency: end -->\nafter\n"
+    with pytest.raises(NoSuchPlace, match="<!-- paper: begin -->"):
+        insert(page, "paper", "new\n")
