@@ -359,7 +359,8 @@ class EnvironmentSpec(Frozen):
     time_limit: Annotated[int, Field(ge=1, le=10_000_000, strict=True)] | None = None
     reward: Reward = Reward()
     tolerances: dict[Name, Positive] = Field(
-        default_factory=dict, description="by moving coordinate, or 'reward', in the output's own unit"
+        default_factory=dict,
+        description="by moving coordinate (preset paper: by observation entry), or 'reward', in the output's own unit",
     )
     success: Success | None = None
     design: Design = Design()
@@ -384,7 +385,8 @@ class EnvironmentSpec(Frozen):
         require(not missing, f"start distribution lacks {missing}: expected every coordinate of {list(names)}")
         moving = [c.name for c in self.coordinates if c.kind != "constant"]
         require(bool(moving), "expected at least one coordinate that moves (linear or angle)")
-        require_known("tolerances", self.tolerances, (*moving, REWARD))
+        learned = moving if self.design.preset == "default" else self.observation_names
+        require_known("tolerances", self.tolerances, (*learned, REWARD))
         for c in self.coordinates:
             if c.bounds is not None:
                 if c.bounds.stops is not None:

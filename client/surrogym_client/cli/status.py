@@ -11,7 +11,12 @@ from surrogym_client.cli.options import AsJson, Server, Token, connect
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from surrogym_shared.wire import SurrogateSummary, SurrogateView
+    from surrogym_shared.wire import OutputFidelity, SurrogateSummary, SurrogateView
+
+FIDELITY = (
+    *("output", "confidence", "as in the paper", "tolerance", "coverage"),
+    *("leave-one-out error", "within 1 deviation", "within 2"),
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -77,14 +82,13 @@ def _detail(view: SurrogateView) -> str:
         lines += [
             f"model {view.model_version}: confidence index {view.fidelity.confidence_index:.4f}, "
             f"target {view.target:g}; as the paper counts it {view.fidelity.confidence_index_paper:.4f}",
-            columns(
-                [
-                    ("output", "confidence", "tolerance", "coverage", "leave-one-out error"),
-                    *(
-                        (o.name, o.confidence_index, o.tolerance, o.coverage, o.leave_one_out_error)
-                        for o in view.fidelity.outputs
-                    ),
-                ]
-            ),
+            columns([FIDELITY, *(_judged(output) for output in view.fidelity.outputs)]),
         ]
     return "\n".join(lines)
+
+
+def _judged(output: OutputFidelity) -> tuple[str | float | None, ...]:
+    return (
+        *(output.name, output.confidence_index, output.confidence_index_paper, output.tolerance, output.coverage),
+        *(output.leave_one_out_error, output.leave_one_out_within_one, output.leave_one_out_within_two),
+    )

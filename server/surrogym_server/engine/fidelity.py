@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from surrogym_server.sampling.confidence import OutputConfidence, confidence, deviations
-from surrogym_server.sampling.design import TOLERANCE, monte_carlo
+from surrogym_server.sampling.design import monte_carlo, resolved_tolerances
 from surrogym_server.surrogate.model import OutputModel, SurrogateModel
 
 
@@ -38,9 +38,7 @@ def fidelity_of(model: SurrogateModel, tolerances: Sequence[float], target: floa
         target: confidence index the design aims at.
     """
     outputs = _outputs(model)
-    if not tolerances:
-        declared = dict(model.definition.tolerances)
-        tolerances = [declared.get(output.name, TOLERANCE * output.scale) for output in outputs]
+    tolerances = tolerances or resolved_tolerances(model.definition, [output.scale for output in outputs])
     deviation = deviations(model, *monte_carlo(model.definition))
     confidences = [confidence(o, deviation[:, i], t) for i, (o, t) in enumerate(zip(outputs, tolerances, strict=True))]
     return fidelity_fields(model, confidences, tolerances, target)

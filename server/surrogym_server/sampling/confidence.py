@@ -20,6 +20,8 @@ class OutputConfidence:
     confidence_index_paper: float
     coverage: float  # share of the set whose deviation is below the tolerance
     leave_one_out_error: float  # root mean square, in the output's unit
+    leave_one_out_within_one: float  # share of the samples within one predictive deviation: 0.68 if it tells the truth
+    leave_one_out_within_two: float  # 0.95
 
 
 def deviations(model: SurrogateModel, q: Tensor, u: Tensor) -> Tensor:
@@ -48,13 +50,16 @@ def confidence(output: OutputModel, deviation: Tensor, tolerance: float) -> Outp
         float(certainty(deviation, tolerance).mean()),
         float(certainty(deviation, 1.0).mean()),
         float((deviation <= tolerance).double().mean()),
-        leave_one_out_error(output),
+        *leave_one_out(output),
     )
 
 
-def leave_one_out_error(output: OutputModel) -> float:
-    """Root mean square of the leave-one-out errors, in the output's unit; 0 for an output that never varied."""
+def leave_one_out(output: OutputModel) -> tuple[float, float, float]:
+    """Root mean square of the leave-one-out errors, in the output's unit, and which share of them lies within one and
+    within two of the deviations predicted for them. An output that never varied makes no error."""
     if output.posterior is None:
-        return 0.0
-    mean, _ = output.posterior.leave_one_out()
-    return float(output.scale * (mean - output.posterior.y).square().mean().sqrt())
+        return 0.0, 1.0, 1.0
+    mean, variance = output.posterior.leave_one_out()
+    error, deviation = (mean - output.posterior.y).abs(), variance.sqrt()
+    within = ((error <= width * deviation).double().mean() for width in (1, 2))
+    return float(output.scale * error.square().mean().sqrt()), *map(float, within)

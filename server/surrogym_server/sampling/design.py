@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -104,16 +105,18 @@ def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
 
 
 def default_tolerances(definition: EnvironmentDefinition, samples: Samples) -> tuple[float, ...]:
-    """Tolerance of each output: the declared one, else 5 % of the output's deviation over the samples at hand
-    (of its size, if it never varied). As printed it is 1 in raw units for all.
-    """
-    if definition.design.tolerance == "raw":
-        return (1.0,) * len(definition.outputs)
+    """Tolerance of each output, whose size is its deviation over the samples at hand: that of its mean, if it never
+    varied."""
     targets = torch.cat([increments(definition, samples), samples.reward[:, None]], -1)
     spread, mean = targets.std(0, correction=0), targets.mean(0).abs()
-    size = torch.where(spread > 0, spread, torch.where(mean > 0, mean, 1.0))
-    declared = dict(definition.tolerances)
-    return tuple(declared.get(name, TOLERANCE * float(size[i])) for i, name in enumerate(definition.outputs))
+    return resolved_tolerances(definition, torch.where(spread > 0, spread, torch.where(mean > 0, mean, 1.0)).tolist())
+
+
+def resolved_tolerances(definition: EnvironmentDefinition, sizes: Sequence[float]) -> tuple[float, ...]:
+    """Tolerance of each output, of sizes (O,): the declared one, else 5 % of its size, or as printed 1 in its unit."""
+    raw = definition.design.tolerance == "raw"
+    usual = {name: 1.0 if raw else TOLERANCE * size for name, size in zip(definition.outputs, sizes, strict=True)}
+    return tuple((usual | dict(definition.tolerances)).values())
 
 
 def judge(

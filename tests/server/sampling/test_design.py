@@ -250,8 +250,39 @@ def test_declared_tolerances_hold(few):
     assert default_tolerances(definition_from_spec(spec), still)[2] == pytest.approx(0.05)
 
 
-SURE = OutputConfidence(0.9995, 0.9995, 1.0, leave_one_out_error=0.5)
-UNSURE = OutputConfidence(0.9985, 0.9985, 1.0, leave_one_out_error=0.5)
+def test_a_tolerance_is_declared_for_what_the_preset_learns():
+    """Preset ``paper`` moves the observation: it has no error in an angle to compare with a tolerance."""
+    design = Design(preset="paper", initial=10)
+    spec = EnvironmentSpec.model_validate(pendulum().model_dump() | {"tolerances": {"cos": 0.02}, "design": design})
+    definition = definition_from_spec(spec)
+    assert default_tolerances(definition, random_steps(spec, 10, seed=0)) == (0.02, 1.0, 1.0, 1.0)
+    with pytest.raises(ValueError, match=r"'theta'.*\['cos', 'sin', 'speed', 'reward'\]"):
+        EnvironmentSpec.model_validate(pendulum().model_dump() | {"tolerances": {"theta": 0.02}, "design": design})
+
+
+@pytest.mark.parametrize("outputs", ["all of it", "its reward"])
+def test_what_never_changes_is_known(outputs):
+    """An output that never varied has no deviation to choose queries by; the design is ready all the same."""
+    spec = designed(initial=4, monte_carlo=64)
+    definition = definition_from_spec(spec)
+    state, samples = DesignState(), still(answer(spec, *initial_design(definition, 20)), outputs)
+    for _ in range(20):
+        made = advance(definition, samples, state, request())
+        if made.verdict != "continue":
+            break
+        samples, state = join(samples, still(answer(spec, made.q, made.u), outputs)), made.state
+    assert made.verdict == "ready"
+    assert 6 <= len(samples) < 20
+    assert made.confidences[2].confidence_index == 1
+
+
+def still(steps: Samples, outputs: str) -> Samples:
+    q_next = steps.q if outputs == "all of it" else steps.q_next
+    return replace(steps, q_next=q_next, reward=torch.ones_like(steps.reward))
+
+
+SURE = OutputConfidence(0.9995, 0.9995, 1.0, 0.5, 0.68, 0.95)
+UNSURE = replace(SURE, confidence_index=0.9985)
 SURPRISED = replace(SURE, leave_one_out_error=1.5)
 
 
