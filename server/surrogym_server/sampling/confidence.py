@@ -61,5 +61,5 @@ def leave_one_out(output: OutputModel) -> tuple[float, float, float]:
         return 0.0, 1.0, 1.0
     mean, variance = output.posterior.leave_one_out()
     error, deviation = (mean - output.posterior.y).abs(), variance.sqrt()
-    within = ((error <= width * deviation).double().mean() for width in (1, 2))
-    return float(output.scale * error.square().mean().sqrt()), *map(float, within)
+    one, two = (float((error <= width * deviation).double().mean()) for width in (1, 2))
+    return float(output.scale * error.square().mean().sqrt()), one, two
