@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import typer
 
-from surrogym_client.cli.reproduce import efficiency, table
+from surrogym_client.cli.reproduce import efficiency, paper, table
 
-STUDIES = (efficiency, table)
+STUDIES = (efficiency, paper, table)
 
 
 def register(app: typer.Typer) -> None:

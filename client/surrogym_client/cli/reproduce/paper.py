@@ -1,0 +1,54 @@
+"""``surrogym reproduce paper``: section 5 of the paper, its figures 5 to 15 and its numbers beside ours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from surrogym_client.cli.options import AsJson, Quiet
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("paper")(command)
+
+
+def command(
+    out: Annotated[
+        Path, typer.Option(help="Folder of stages, table and pictures; a run goes on where it ended.")
+    ] = Path("runs/paper"),
+    tasks: Annotated[str, typer.Option(help="pendulum, cartpole, with commas between.")] = "pendulum,cartpole",
+    seeds: Annotated[int, typer.Option(min=1, help="How many seeds, from 0 on.")] = 5,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Virtual steps of each training. [default: from the specification]")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Hardly any of everything, to see that it works.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Run section 5 of the paper; results.md, rows.json and figure05.png to figure15.png go into a folder.
+
+    Example: surrogym reproduce paper --out runs/paper
+
+    Example: surrogym reproduce paper --quick --tasks cartpole --seeds 1
+    """
+    from dataclasses import replace
+
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.cli.output import columns, give, progress
+    from surrogym_client.reproduce.paper import run_cells, write_results
+    from surrogym_client.reproduce.paper_cases import QUICK, TASKS, WHOLE, cells
+
+    chosen = tasks.split(",")
+    if unknown := [name for name in chosen if name not in TASKS]:
+        raise CommandError(f"unknown task {unknown[0]!r}: expected some of {', '.join(TASKS)}")
+    scale = QUICK if quick else WHOLE
+    scale = scale if steps is None else replace(scale, steps=steps)
+    with progress("reproduce", quiet=quiet) as update:
+        rows = run_cells(list(cells(chosen, seeds, scale)), out, update)
+        tables = write_results(rows, chosen, out)
+        update(1.0, f"{len(rows)} cells")
+    result = {"out": str(out), "tables": tables}
+    give(result, lambda: "\n\n".join(columns(lines) for lines in tables.values()), as_json=as_json, quiet=quiet)

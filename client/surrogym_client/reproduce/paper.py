@@ -1,0 +1,168 @@
+"""The paper's section 5, made again: designs, policies and real episodes as stages that can be resumed.
+
+A cell is one design with one seed. Its stages lie in a folder of their own, and a stage that is there is not run again;
+the server's database keeps the real steps of a design that was interrupted.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from surrogym_client.api import Api
+from surrogym_client.connection import Retries
+from surrogym_client.demo.processes import Children, await_file
+from surrogym_client.original import make
+from surrogym_client.policy_file import load_policy
+from surrogym_client.reproduce.paper_cases import Cell
+from surrogym_client.reproduce.paper_measures import Unseen, confidences, run_variation, some
+from surrogym_client.reproduce.paper_table import markdown, table
+from surrogym_client.sampler import Outcome, Sampler, SamplerSettings
+from surrogym_client.train import TrainProgress, TrainSettings, train
+from surrogym_client.transport import HttpSurrogate
+from surrogym_client.waiting import wait_for_design
+from surrogym_shared.wire import Query
+
+PATIENCE_SECONDS = 3_600.0
+
+Say = Callable[[float, str], None]  # share of the whole, a few words
+Row = dict[str, Any]
+
+
+def run_cells(todo: Sequence[Cell], folder: Path, say: Say) -> list[Row]:
+    """What every cell gave, one after the other; stages that are there are read.
+
+    Raises:
+        CommandError: the server did not start.
+        SurrogymClientError: it refused, or a design failed.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if all(_is_done(cell, folder) for cell in todo):
+        return [_row(cell, folder) for cell in todo]
+    with _server(folder) as api:
+        for number, cell in enumerate(todo):
+
+            def tell(share: float, words: str, number: int = number, cell: Cell = cell) -> None:
+                where = f"{number + 1} of {len(todo)}, {cell.task} {cell.arm} seed {cell.seed}"
+                say((number + share) / len(todo), f"{where}: {words}")
+
+            _run(cell, folder, api, tell)
+    return [_row(cell, folder) for cell in todo]
+
+
+def write_results(rows: Sequence[Row], tasks: Sequence[str], folder: Path) -> dict[str, list[tuple[str, ...]]]:
+    """Put rows, tables and figures into the folder; gives back the tables by task."""
+    from surrogym_client.reproduce.paper_pictures import draw_all
+
+    tables = {task: table(rows, task) for task in tasks}
+    (folder / "rows.json").write_text(json.dumps(rows) + "\n", encoding="utf-8")
+    text = "\n".join(f"{task}\n\n{markdown(lines)}" for task, lines in tables.items())
+    (folder / "results.md").write_text(text, encoding="utf-8")
+    draw_all(rows, folder)
+    return tables
+
+
+def _run(cell: Cell, folder: Path, api: Api, tell: Say) -> None:
+    place = folder / "cells" / cell.name
+    place.mkdir(parents=True, exist_ok=True)
+    _stage(place / "design.json", lambda: _design(cell, api, tell))
+    if not cell.trained:
+        return
+    _stage(place / "training.json", lambda: _train(cell, api, place, tell))
+    _stage(place / "episodes.json", lambda: _episodes(cell, api, place, tell))
+
+
+def _stage(done: Path, run: Callable[[], Row]) -> None:
+    """Run a stage unless its result is there; the result appears whole or not at all."""
+    if done.exists():
+        return
+    result, draft = run(), done.with_suffix(".part")
+    draft.write_text(json.dumps(result) + "\n", encoding="utf-8")
+    draft.replace(done)
+
+
+def _design(cell: Cell, api: Api, tell: Say) -> Row:
+    """Answer the queries of the design, then hold some of its models against unseen real steps."""
+    spec = cell.spec
+    view = api.create_surrogate(cell.name, spec)
+    environment = make(spec.environment, spec=spec)
+    try:
+        answered = count(1)
+
+        def look(query: Query, outcome: Outcome, error: str) -> None:
+            del query  # its number counts those of all designs
+            number = next(answered)
+            tell(min(0.3, 0.3 * number / view.budget), f"real step {number} {outcome}{': ' if error else ''}{error}")
+
+        Sampler(api, cell.name, environment, SamplerSettings(until_done=True), look).run()
+    finally:
+        environment.close()
+    view = wait_for_design(api, cell.name, PATIENCE_SECONDS)
+    models = api.models(cell.name)
+    tell(0.3, "errors of its models")
+    unseen = Unseen(spec, cell.scale.unseen)
+    errors = [unseen.errors(api, cell.name, model) for model in some(models, cell.scale.versions)]
+    api.report_steps(cell.name, cell.scale.unseen, note="unseen single steps", idempotency_key=f"{cell.name}-unseen")
+    return {
+        "initial": view.ledger.initial,
+        "adaptive": view.ledger.adaptive,
+        "phase": view.phase,
+        "confidence": confidences(models),
+        "errors": [{k: e[k] for k in ("samples", "reward", "state")} for e in errors],
+        "response": {"real": unseen.reward.tolist(), "low": errors[0], "high": errors[-1]},
+        "samples": [{"purpose": s.purpose, "coordinates": s.coordinates} for s in api.samples(cell.name)],
+    }
+
+
+def _train(cell: Cell, api: Api, place: Path, tell: Say) -> Row:
+    def look(now: TrainProgress) -> None:
+        tell(0.3 + 0.6 * now.steps / now.total_steps, f"{now.steps} of {now.total_steps} virtual steps")
+
+    settings = TrainSettings(total_steps=cell.scale.steps, seed=cell.seed)
+    with HttpSurrogate(api.url, cell.name, "") as port:
+        result = train(port, place / "policy.zip", settings, look)
+    return {
+        "virtual_steps": result.virtual_steps,
+        "seconds": result.seconds,
+        "imagined_return": result.imagined_return,
+    }
+
+
+def _episodes(cell: Cell, api: Api, place: Path, tell: Say) -> Row:
+    predict, spec, results = load_policy(place / "policy.zip"), cell.paper_task.evaluated, {}
+    for variation in cell.variations:
+        tell(0.9, f"{variation.episodes} real episodes, {variation.name}")
+        results[variation.name] = run_variation(predict, spec, variation)
+    steps = sum(result["steps"] for result in results.values())
+    api.report_steps(cell.name, steps, note="section 5", idempotency_key=f"{cell.name}-episodes")
+    return results
+
+
+@contextmanager
+def _server(folder: Path) -> Iterator[Api]:
+    """A server of its own on the folder's database; it ends with the context."""
+    ready = folder / "server.url"
+    ready.unlink(missing_ok=True)
+    options = ["--port", "0", "--database", str(folder / "surrogym.db"), "--ready-file", str(ready)]
+    with Children(folder) as children:
+        child = children.start("server", "surrogym_server", ["serve", *options, "--log-level", "warning"])
+        with Api(await_file(child, ready), token="", retries=Retries(seconds=10.0)) as api:
+            yield api
+
+
+def _is_done(cell: Cell, folder: Path) -> bool:
+    last = "episodes.json" if cell.trained else "design.json"
+    return (folder / "cells" / cell.name / last).exists()
+
+
+def _row(cell: Cell, folder: Path) -> Row:
+    place = folder / "cells" / cell.name
+    stages = ("design", "training", "episodes") if cell.trained else ("design",)
+    row: Row = {"task": cell.task, "arm": cell.arm, "seed": cell.seed}
+    for stage in stages:
+        row[stage] = json.loads((place / f"{stage}.json").read_text(encoding="utf-8"))
+    return row
