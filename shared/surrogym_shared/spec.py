@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from surrogym_shared.checks import (
     Count,
@@ -241,6 +241,18 @@ class Inequality(Frozen):
 AllOf = Annotated[tuple[Inequality, ...], Field(min_length=1, max_length=MAX_INEQUALITIES)]
 
 
+def _termination_kind(value: object) -> str:
+    return "learned" if isinstance(value, str) else "declared"
+
+
+Termination = Annotated[
+    Annotated[Literal["learned"], Tag("learned")]
+    | Annotated[tuple[AllOf, ...], Field(max_length=MAX_INEQUALITIES), Tag("declared")],
+    Discriminator(_termination_kind),
+    Field(description="ends when any of these all-of groups holds at q'; or 'learned' from samples that ended"),
+]
+
+
 # Actions
 
 
@@ -353,9 +365,7 @@ class EnvironmentSpec(Frozen):
     observation: tuple[ObservationEntry, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
     action: Action
     start: dict[Name, StartDistribution]
-    termination: tuple[AllOf, ...] = Field(
-        default=(), max_length=MAX_INEQUALITIES, description="ends when any of these all-of groups holds at q'"
-    )
+    termination: Termination = ()
     time_limit: Annotated[int, Field(ge=1, le=10_000_000, strict=True)] | None = None
     reward: Reward = Reward()
     tolerances: dict[Name, Positive] = Field(
@@ -368,6 +378,11 @@ class EnvironmentSpec(Frozen):
     @property
     def coordinate_names(self) -> tuple[str, ...]:
         return tuple(c.name for c in self.coordinates)
+
+    @property
+    def termination_groups(self) -> tuple[AllOf, ...]:
+        """Declared terminations; none where termination is learned."""
+        return () if self.termination == "learned" else self.termination
 
     @property
     def observation_names(self) -> tuple[str, ...]:
@@ -423,7 +438,7 @@ class EnvironmentSpec(Frozen):
     def _terms(self) -> Iterable[tuple[str, Term]]:
         for entry in self.observation:
             yield f"observation {entry.name!r}", entry.term
-        for group in self.termination:
+        for group in self.termination_groups:
             for inequality in group:
                 yield "termination", inequality.term
         if self.success is not None:

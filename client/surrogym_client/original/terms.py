@@ -33,7 +33,7 @@ def holds(spec: EnvironmentSpec, inequality: Inequality, coordinates: Array) -> 
 def terminates(spec: EnvironmentSpec, coordinates: Array) -> Bools:
     """Whether (n,) any of the declared terminations holds at coordinates (n, C)."""
     ended = np.zeros(len(coordinates), dtype=np.bool_)
-    for group in spec.termination:
+    for group in spec.termination_groups:
         ended |= np.all([holds(spec, inequality, coordinates) for inequality in group], axis=0)
     return ended
 

@@ -28,12 +28,13 @@ def definition_from_spec(spec: wire.EnvironmentSpec) -> core.EnvironmentDefiniti
         observation_low=tuple(_or(o.low, -math.inf) for o in spec.observation),
         observation_high=tuple(_or(o.high, math.inf) for o in spec.observation),
         action=_action(spec.action),
-        termination_groups=tuple(tuple(_inequality(i, names) for i in g) for g in spec.termination),
+        termination_groups=tuple(tuple(_inequality(i, names) for i in g) for g in spec.termination_groups),
         time_limit=spec.time_limit,
         reward_timing=spec.reward.timing,
         penalty=_or(spec.reward.penalty, PENALTY[spec.design.preset]),
         tolerances=tuple(spec.tolerances.items()),
         design=_design(spec),
+        learns_termination=spec.termination == "learned",
     )
     if definition.design.preset == "paper":
         ObservationInverse.of(definition)

@@ -51,7 +51,7 @@ def choose(
         if not bool(allowed.any()):
             break
         value = distance if output is None else acquisition(definition, output, candidates, tolerances[column])
-        if reserved is not None and not picks:
+        if reserved is not None and not picks and bool((allowed & reserved).any()):
             allowed &= reserved
         elif output is not None:
             allowed &= output.counts

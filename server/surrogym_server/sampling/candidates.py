@@ -13,7 +13,6 @@ from surrogym_server.sampling.occupancy import log_occupancy
 from surrogym_server.sampling.outlook import Points
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.model import SurrogateModel
-from surrogym_server.surrogate.samples import Samples
 
 MAX_CANDIDATES = 4_096  # of each kind; covariances with the reference are held for all of them
 REFERENCE = 256  # points of each kind
@@ -61,15 +60,6 @@ def input_probability(model: SurrogateModel, points: Points, states: Tensor | No
         arrived = model.transition(points.q, points.u).q_next
         return log_occupancy(definition, arrived, arrived, floor=1e-12)
     return points.q.new_zeros(len(points))
-
-
-def ending(model: SurrogateModel, samples: Samples, points: Points) -> Tensor | None:
-    """Which of m points are predicted to end an episode, (m,) bool, as long as no sample has: what ending pays must be
-    seen once. None where there is nothing to see."""
-    if bool(samples.terminated.any()):
-        return None
-    ends = model.terminated(model.transition(points.q, points.u).q_next) & ~model.terminated(points.q)
-    return ends if bool(ends.any()) else None
 
 
 def _visited(definition: EnvironmentDefinition, states: Tensor, count: int, rng: np.random.Generator) -> Points:

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from surrogym_server.sampling.acquisition import choose
-from surrogym_server.sampling.candidates import Candidates, candidates_of, ending
+from surrogym_server.sampling.candidates import Candidates, candidates_of
 from surrogym_server.sampling.confidence import OutputConfidence, confidence, deviations
+from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import latin_hypercube, random_points
 from surrogym_server.sampling.outlook import Points
 from surrogym_server.surrogate.definition import EnvironmentDefinition
@@ -89,10 +90,12 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     deviation = deviations(learned.model, points.q, points.u)
     outputs = (*learned.model.transitions, learned.model.reward)
     confidences = tuple(confidence(o, deviation[:, i], tolerances[i]) for i, o in enumerate(outputs))
-    verdict = judge(definition, confidences, tolerances, len(samples), request)
     rng = _rng(definition, f"visited {state.round}")
     candidates = candidates_of(learned.model, points, request.states, rng)
-    chosen = _choose(learned.model, samples, candidates, confidences, tolerances, verdict, request)
+    reserved = ending(learned.model, samples, candidates.points)
+    settled = reserved is None or not definition.learns_termination
+    verdict = judge(definition, confidences, tolerances, len(samples), request, settled)
+    chosen = _choose(learned.model, samples, candidates, confidences, tolerances, verdict, request, reserved)
     if verdict == "continue" and not len(chosen):
         verdict = "over_budget"  # the rest of the budget is pending, or nothing distinct is left to ask
     new_state = DesignState(state.round + 1, tolerances, learned.thetas)
@@ -125,13 +128,15 @@ def judge(
     tolerances: tuple[float, ...],
     samples: int,
     request: Request,
+    settled: bool = True,
 ) -> Verdict:
-    """Whether to go on. The default trusts a confidence only when leave-one-out errors agree and adaptive queries,
-    half as many as the initial design had, have tried to disprove it; the paper trusts the index alone."""
+    """Whether to go on. The default trusts a confidence only when leave-one-out errors agree, it is settled where
+    episodes end, and adaptive queries, half as many as the initial design had, have tried to disprove it; the paper
+    trusts the index alone."""
     sure = all(c.confidence_index >= request.target for c in confidences)
     if definition.design.preset == "default":
         sure = sure and all(c.leave_one_out_error <= t for c, t in zip(confidences, tolerances, strict=True))
-        sure = sure and samples >= math.ceil(1.5 * definition.design.initial)
+        sure = sure and settled and samples >= math.ceil(1.5 * definition.design.initial)
     if sure:
         return "ready"
     return "continue" if samples < request.budget else "over_budget"
@@ -145,8 +150,9 @@ def _choose(
     tolerances: tuple[float, ...],
     verdict: Verdict,
     request: Request,
+    reserved: Tensor | None,
 ) -> Points:
-    """One query for each output below its target, least confident first."""
+    """One query for each output below its target, least confident first; the first one of those reserved."""
     order = sorted(range(len(confidences)), key=lambda i: confidences[i].confidence_index)
     below = [i for i in order if confidences[i].confidence_index < request.target] or order[:1]
     if verdict == "continue":
@@ -154,7 +160,6 @@ def _choose(
     else:
         wanted = [below[i % len(below)] for i in range(request.extra)]
     taken = Points.joined([Points(samples.q, samples.u), request.pending])
-    reserved = ending(model, samples, candidates.points)
     return candidates.points[choose(model, candidates, taken, request.pending, wanted, tolerances, reserved)]
 
 

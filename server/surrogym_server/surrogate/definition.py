@@ -98,6 +98,7 @@ class EnvironmentDefinition:
     penalty: float
     tolerances: tuple[tuple[str, float], ...]
     design: DesignDefinition
+    learns_termination: bool = False  # from samples; no groups are declared then
 
     @cached_property
     def coordinate_names(self) -> tuple[str, ...]:
@@ -156,7 +157,7 @@ class EnvironmentDefinition:
         return tuple(i for i, c in enumerate(self.coordinates) if c.kind == "angle")
 
     def terminated(self, q: Tensor) -> Tensor:
-        """Whether an episode ends at q (..., C), shape (...): any group all of whose inequalities hold."""
+        """Whether an episode ends at q (..., C) as declared, shape (...): any group all of whose inequalities hold."""
         if not self.termination_groups:
             return torch.zeros(q.shape[:-1], dtype=torch.bool, device=q.device)
         terms, sign, threshold, membership = self._termination

@@ -18,6 +18,7 @@ from surrogym_server.gp import Output, Posterior, in_blocks
 from surrogym_server.surrogate.definition import EnvironmentDefinition, wrap
 from surrogym_server.surrogate.features import Encoder, FeatureMap, leading
 from surrogym_server.surrogate.recover import ObservationInverse
+from surrogym_server.surrogate.regions import Region
 from surrogym_server.surrogate.stage import Stage
 
 
@@ -70,12 +71,14 @@ class SurrogateModel:
     terminal_reward: float  # what a step that ends the episode pays beyond the reward process
     samples: int
     digest: str
+    ending: Region | None = None  # where episodes end, if that is learned
 
     @property
     def description(self) -> dict[str, Any]:
         """Structure and hyperparameters of every output, for people."""
         outputs = [_describe(o) for o in (*self.transitions, self.reward)]
-        return {"outputs": outputs, "terminal_reward": self.terminal_reward, "samples": self.samples}
+        ending = {} if self.ending is None else {"termination": self.ending.description}
+        return {"outputs": outputs, "terminal_reward": self.terminal_reward, "samples": self.samples, **ending}
 
     def transition(
         self,
@@ -121,8 +124,12 @@ class SurrogateModel:
         return torch.tensor([o.scale for o in (*self.transitions, self.reward)], dtype=torch.float64)
 
     def terminated(self, q: Tensor) -> Tensor:
-        """Whether an episode ends on arriving at q (..., C), shape (...)."""
-        return self.definition.terminated(q)
+        """Whether an episode ends on arriving at q (m, C), (m,)."""
+        return self.definition.terminated(q) if self.ending is None else self.ending.probability(q) > 0.5
+
+    def termination_probability(self, q: Tensor) -> Tensor:
+        """How likely an episode ends on arriving at q (m, C), (m,): 0 or 1 where termination is declared."""
+        return self.definition.terminated(q).to(q.dtype) if self.ending is None else self.ending.probability(q)
 
     def means(self, q: Tensor, u: Tensor) -> Tensor:
         """Posterior mean of every output, increments and then the reward, at q (m, C) and u (m, F): (m, O)."""

@@ -1,0 +1,40 @@
+"""Queries reserved for the end of an episode: what it pays, and where it is if that is learned, must be seen."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from surrogym_server.sampling.outlook import Points
+from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.surrogate.regions import unexplored
+from surrogym_server.surrogate.samples import Samples
+
+FRONTIER = 0.1  # of what was seen of the coordinates: a shorter way beyond it is not worth a query
+DOUBT = 0.005  # chance of a wrong ending, averaged over the candidates, that is good enough
+
+
+def ending(model: SurrogateModel, samples: Samples, points: Points) -> Tensor | None:
+    """Which of m points to take a query from for the sake of the episodes' end, (m,) bool; None if none is needed.
+
+    Declared: those predicted to end one, as long as no sample has. Learned: those most in doubt, until little doubt is
+    left; then those that go farthest beyond where episodes are known to go on, for there may be another end.
+    """
+    if not model.definition.learns_termination:
+        return None if bool(samples.terminated.any()) else _predicted(model, points)
+    q_next = model.transition(points.q, points.u).q_next
+    doubt = in_doubt(model, q_next)
+    if float(doubt.mean()) > DOUBT:
+        return doubt >= 0.5 * doubt.max()
+    beyond = unexplored(model.definition, samples.q_next[~samples.terminated], q_next) * ~model.terminated(q_next)
+    return beyond >= 0.9 * beyond.max() if float(beyond.max()) > FRONTIER else None
+
+
+def in_doubt(model: SurrogateModel, q_next: Tensor) -> Tensor:
+    """Chance that the model errs about an ending at q_next (m, C), (m,); 0 where termination is declared."""
+    probability = model.termination_probability(q_next)
+    return probability.minimum(1 - probability)
+
+
+def _predicted(model: SurrogateModel, points: Points) -> Tensor | None:
+    ends = model.terminated(model.transition(points.q, points.u).q_next) & ~model.terminated(points.q)
+    return ends if bool(ends.any()) else None

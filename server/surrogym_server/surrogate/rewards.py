@@ -1,0 +1,29 @@
+"""Learning the reward: the process of steps that go on, and what a step that ends the episode pays beyond it."""
+
+from __future__ import annotations
+
+import torch
+
+from surrogym_server.surrogate.definition import REWARD
+from surrogym_server.surrogate.features import encode, reward_candidates
+from surrogym_server.surrogate.learner import Learner
+from surrogym_server.surrogate.model import OutputModel
+from surrogym_server.surrogate.samples import Samples
+
+FEW = 2  # steps that go on: fewer tell nothing without those that end
+
+
+def reward(learner: Learner, samples: Samples) -> tuple[OutputModel, float]:
+    """The reward process of steps that go on, and what a step that ends the episode pays beyond it."""
+    definition = learner.definition
+    inputs = {
+        m: encode(definition, m, samples.q_next if m.after else samples.q, samples.u)
+        for m in reward_candidates(definition)
+    }
+    going = ~samples.terminated if int((~samples.terminated).sum()) >= FEW else torch.ones_like(samples.terminated)
+    output = learner.output(REWARD, samples.reward, inputs, going, going)
+    ended = ~going
+    if not bool(ended.any()):
+        return output, 0.0
+    bonus = samples.reward[ended] - output.mean(inputs[output.feature_map][ended])
+    return output, float(bonus.mean())
