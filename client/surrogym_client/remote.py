@@ -9,25 +9,40 @@ from __future__ import annotations
 from typing import Any
 
 from surrogym_client.env import RemoteEnv
+from surrogym_client.registration import ENVIRONMENT_ID
 from surrogym_client.transport import HttpSurrogate, Transport
 from surrogym_client.vector import RemoteVectorEnv
 
 
 def make_env(
-    *, surrogate: str, url: str | None = None, token: str | None = None, transport: Transport = "auto", **options: Any
+    *,
+    surrogate: str | None = None,
+    url: str | None = None,
+    token: str | None = None,
+    transport: Transport = "auto",
+    **options: Any,
 ) -> RemoteEnv:
-    """One lane of a surrogate; options are those of ``RemoteEnv``."""
-    return RemoteEnv(HttpSurrogate(url, surrogate, token, transport=transport), **options)
+    """One lane of a surrogate; options are those of ``RemoteEnv``. Raises ``ValueError`` without a surrogate."""
+    return RemoteEnv(HttpSurrogate(url, _named(surrogate), token, transport=transport), **options)
 
 
 def make_vector_env(
     *,
     num_envs: int,
-    surrogate: str,
+    surrogate: str | None = None,
     url: str | None = None,
     token: str | None = None,
     transport: Transport = "auto",
     **options: Any,
 ) -> RemoteVectorEnv:
-    """Many lanes of a surrogate; options are those of ``RemoteVectorEnv``."""
-    return RemoteVectorEnv(HttpSurrogate(url, surrogate, token, transport=transport), num_envs, **options)
+    """Many lanes; options are those of ``RemoteVectorEnv``. Raises ``ValueError`` without a surrogate."""
+    return RemoteVectorEnv(HttpSurrogate(url, _named(surrogate), token, transport=transport), num_envs, **options)
+
+
+def _named(surrogate: str | None) -> str:
+    if surrogate is None:
+        raise ValueError(
+            f'which surrogate? expected gymnasium.make("{ENVIRONMENT_ID}", surrogate="its name"); '
+            "surrogym status lists those of a server"
+        )
+    return surrogate

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from functools import partial
 
 import gymnasium
 import pytest
@@ -28,6 +29,14 @@ def test_the_id_may_name_the_package_to_import():
         "except Exception as error: print(type(error).__name__, error)"
     )
     assert run(code).startswith("ServerUnreachable expected a server address")
+
+
+def test_without_a_surrogate_the_error_says_what_is_missing():
+    for make in (gymnasium.make, partial(gymnasium.make_vec, num_envs=2)):
+        with pytest.raises(
+            ValueError, match=r'which surrogate\? expected gymnasium.make\("surrogym/Remote-v0", surrogate='
+        ):
+            make(ENVIRONMENT_ID, url="http://127.0.0.1:8000")
 
 
 def test_registering_twice_is_harmless():

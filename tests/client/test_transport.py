@@ -6,7 +6,7 @@ import pickle
 import numpy as np
 import pytest
 
-from support.scripted_server import Answer, ScriptedServer, lost_reply, problem, reply, scripted_server
+from support.scripted_server import Answer, ScriptedServer, lost_reply, problem, reply, scripted_server, session_view
 from surrogym_client import errors
 from surrogym_client.transport import HttpSurrogate, Retries
 from surrogym_shared import wire
@@ -14,28 +14,6 @@ from surrogym_shared.codes import Code
 from surrogym_shared.port import SurrogatePort
 
 QUICK = Retries(seconds=2.0, first_delay=0.01, longest_delay=0.05)
-
-
-def view(seq: int = 0, protocol: int = wire.PROTOCOL) -> Answer:
-    session = wire.SessionView(
-        protocol=protocol,
-        id="abc",
-        surrogate="pendulum",
-        num_envs=2,
-        variant="deterministic",
-        seed=1,
-        autoreset_mode="same_step",
-        model="latest",
-        model_version=[1, 1],
-        seq=seq,
-        time_limit=200,
-        penalty=0.0,
-        observation_space=wire.BoxSpace(low=[None, None], high=[None, None]),
-        action_space=wire.BoxSpace(low=[-2.0], high=[2.0]),
-        outputs=["angle", "reward"],
-        idle_seconds=60.0,
-    )
-    return reply(session.model_dump_json())
 
 
 def step_reply(seq: int) -> wire.StepReply:
@@ -72,7 +50,7 @@ def test_it_is_a_surrogate_port():
 
 
 def test_a_lost_reply_is_asked_for_again_under_the_same_seq():
-    with scripted_server(view(), lost_reply, step(1), step(2)) as server, surrogate(server) as port:
+    with scripted_server(session_view(), lost_reply, step(1), step(2)) as server, surrogate(server) as port:
         session = port.open(wire.OpenSession(num_envs=2)).id
         port.step(session, ACTION)
         port.step(session, ACTION)
@@ -81,7 +59,7 @@ def test_a_lost_reply_is_asked_for_again_under_the_same_seq():
 
 
 def test_a_refused_step_leaves_the_seq_as_it_was():
-    with scripted_server(view(), problem(Code.NOT_RESET), step(1)) as server, surrogate(server) as port:
+    with scripted_server(session_view(), problem(Code.NOT_RESET), step(1)) as server, surrogate(server) as port:
         session = port.open(wire.OpenSession(num_envs=2)).id
         with pytest.raises(errors.NotReset):
             port.step(session, ACTION)
@@ -92,7 +70,7 @@ def test_a_refused_step_leaves_the_seq_as_it_was():
 def test_what_it_sends_is_what_the_wire_accepts():
     reset = reply(wire.ResetReply(seq=1, observation=[[0, 0]] * 2, model_version=[1, 1]).model_dump_json())
     rollout = reply(wire.RolloutReply(seq=3, steps=[step_reply(3)] * 2).model_dump_json())
-    with scripted_server(view(), reset, step(2), rollout) as server, surrogate(server) as port:
+    with scripted_server(session_view(), reset, step(2), rollout) as server, surrogate(server) as port:
         port.open(wire.OpenSession(num_envs=2, seed=0))
         port.reset("abc", seed=[np.int64(3), 4], mask=np.array([True, False]))
         port.step("abc", ACTION, mask=np.array([True, False]), deviations=True)
@@ -109,7 +87,7 @@ def test_what_it_sends_is_what_the_wire_accepts():
 
 
 def test_a_reply_becomes_arrays():
-    with scripted_server(view(), step(1)) as server, surrogate(server) as port:
+    with scripted_server(session_view(), step(1)) as server, surrogate(server) as port:
         port.open(wire.OpenSession(num_envs=2))
         result = port.step("abc", ACTION)
     np.testing.assert_array_equal(result.observation, np.float32([[0.1, 0.2], [0.3, 0.4]]))
@@ -131,7 +109,7 @@ def test_a_reply_becomes_arrays():
     ],
 )
 def test_what_json_cannot_carry_is_refused_before_it_is_sent(action: np.ndarray, message: str):
-    with scripted_server(view()) as server, surrogate(server) as port:
+    with scripted_server(session_view()) as server, surrogate(server) as port:
         port.open(wire.OpenSession(num_envs=2))
         with pytest.raises(errors.InvalidInput, match=message):
             port.step("abc", action)
@@ -139,7 +117,7 @@ def test_what_json_cannot_carry_is_refused_before_it_is_sent(action: np.ndarray,
 
 
 def test_another_client_goes_on_with_a_session_it_did_not_open():
-    with scripted_server(view(seq=41), step(42)) as server, surrogate(server) as port:
+    with scripted_server(session_view(seq=41), step(42)) as server, surrogate(server) as port:
         port.step("abc", ACTION)
         assert bodies_of_posts(server)[0]["seq"] == 42
 
@@ -149,7 +127,7 @@ def bodies_of_posts(server: ScriptedServer) -> list[dict[str, object]]:
 
 
 def test_a_pickled_client_goes_on_with_the_session():
-    with scripted_server(view(), step(1), step(2)) as server, surrogate(server) as port:
+    with scripted_server(session_view(), step(1), step(2)) as server, surrogate(server) as port:
         port.open(wire.OpenSession(num_envs=2))
         port.step("abc", ACTION)
         with pickle.loads(pickle.dumps(port)) as again:
@@ -159,7 +137,7 @@ def test_a_pickled_client_goes_on_with_the_session():
 
 def test_an_older_or_newer_server_is_refused():
     with (
-        scripted_server(view(protocol=wire.PROTOCOL + 1)) as server,
+        scripted_server(session_view(protocol=wire.PROTOCOL + 1)) as server,
         surrogate(server) as port,
         pytest.raises(errors.ProtocolMismatch, match=r"expected protocol 1 .* got 2"),
     ):
@@ -168,14 +146,14 @@ def test_an_older_or_newer_server_is_refused():
 
 @pytest.mark.parametrize("body", ['{"seq": 1}', "not json", step_reply(1).model_dump_json()[:-1] + ',"more":1}'])
 def test_an_answer_that_is_no_step_is_refused(body: str):
-    with scripted_server(view(), reply(body)) as server, surrogate(server) as port:
+    with scripted_server(session_view(), reply(body)) as server, surrogate(server) as port:
         port.open(wire.OpenSession(num_envs=2))
         with pytest.raises(errors.ProtocolMismatch, match="unexpected answer of /v1/sessions/abc/step"):
             port.step("abc", ACTION)
 
 
 def test_the_last_session_takes_its_sockets_with_it():
-    with scripted_server(view(), step(1), reply(""), view(seq=4), step(5)) as server:
+    with scripted_server(session_view(), step(1), reply(""), session_view(seq=4), step(5)) as server:
         port = surrogate(server)
         port.open(wire.OpenSession(num_envs=2))
         port.step("abc", ACTION)
@@ -186,7 +164,7 @@ def test_the_last_session_takes_its_sockets_with_it():
 
 
 def test_a_lost_session_keeps_no_socket_open():
-    with scripted_server(view(), problem(Code.SESSION_EXPIRED), reply("")) as server:
+    with scripted_server(session_view(), problem(Code.SESSION_EXPIRED), reply("")) as server:
         port = surrogate(server)
         port.open(wire.OpenSession(num_envs=2))
         with pytest.raises(errors.SessionExpired):

@@ -10,7 +10,7 @@ from http.server import BaseHTTPRequestHandler
 import numpy as np
 import pytest
 
-from support.scripted_server import Answer, ScriptedServer, problem, reply, scripted_server
+from support.scripted_server import Answer, ScriptedServer, problem, reply, scripted_server, session_view
 from surrogym_client import errors
 from surrogym_client.connection import Connection, Retries
 from surrogym_client.transport import HttpSurrogate
@@ -21,27 +21,6 @@ from surrogym_shared.port import StepResult
 QUICK = Retries(seconds=2.0, first_delay=0.01, longest_delay=0.05)
 ACTION = np.array([[0.5], [-0.5]])
 WEBSOCKET_KEY = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"  # RFC 6455, 1.3
-
-
-def view(seq: int = 0) -> Answer:
-    session = wire.SessionView(
-        id="abc",
-        surrogate="pendulum",
-        num_envs=2,
-        variant="deterministic",
-        seed=1,
-        autoreset_mode="same_step",
-        model="latest",
-        model_version=[1, 1],
-        seq=seq,
-        time_limit=200,
-        penalty=0.0,
-        observation_space=wire.BoxSpace(low=[None, None], high=[None, None]),
-        action_space=wire.BoxSpace(low=[-2.0], high=[2.0]),
-        outputs=["angle", "reward"],
-        idle_seconds=60.0,
-    )
-    return reply(session.model_dump_json())
 
 
 def step(seq: int) -> Answer:
@@ -97,7 +76,7 @@ REFUSALS = [reply("<html>", 426, "text/html"), problem(Code.NOT_FOUND), reply("<
 @pytest.mark.parametrize("refusal", REFUSALS)
 def test_where_the_upgrade_is_refused_frames_go_by_http(refusal: Answer):
     with (
-        scripted_server(view(), refusal, step(1), step(2)) as server,
+        scripted_server(session_view(), refusal, step(1), step(2)) as server,
         HttpSurrogate(server.url, "pendulum", retries=QUICK) as port,
     ):
         port.open(wire.OpenSession(num_envs=2))
@@ -108,7 +87,7 @@ def test_where_the_upgrade_is_refused_frames_go_by_http(refusal: Answer):
 
 
 def test_a_step_lost_with_its_stream_is_repeated_by_http_under_its_seq():
-    script = [view(), upgrade_and_cut, step(1), upgrade_and_cut, step(2)]
+    script = [session_view(), upgrade_and_cut, step(1), upgrade_and_cut, step(2)]
     with scripted_server(*script) as server, HttpSurrogate(server.url, "pendulum", retries=QUICK) as port:
         port.open(wire.OpenSession(num_envs=2))
         assert [port.step("abc", ACTION).reward[0] for _ in range(2)] == [1.0, 2.0]
@@ -118,7 +97,7 @@ def test_a_step_lost_with_its_stream_is_repeated_by_http_under_its_seq():
 
 def test_the_stream_alone_is_tried_again_and_given_up():
     with (
-        scripted_server(view(), reply("<html>", 426, "text/html")) as server,
+        scripted_server(session_view(), reply("<html>", 426, "text/html")) as server,
         HttpSurrogate(server.url, "pendulum", retries=Retries(seconds=0.2), transport="stream") as port,
     ):
         port.open(wire.OpenSession(num_envs=2))
@@ -140,7 +119,7 @@ def test_the_stream_alone_is_tried_again_and_given_up():
 )
 def test_an_answer_that_is_no_step_is_refused(content: bytes, message: str):
     with (
-        scripted_server(view(), binary(content)) as server,
+        scripted_server(session_view(), binary(content)) as server,
         HttpSurrogate(server.url, "pendulum", transport="binary") as port,
     ):
         port.open(wire.OpenSession(num_envs=2))
@@ -150,7 +129,7 @@ def test_an_answer_that_is_no_step_is_refused(content: bytes, message: str):
 
 def test_an_answer_to_another_request_is_refused():
     with (
-        scripted_server(view(), step(7)) as server,
+        scripted_server(session_view(), step(7)) as server,
         HttpSurrogate(server.url, "pendulum", transport="binary") as port,
     ):
         port.open(wire.OpenSession(num_envs=2))
@@ -168,7 +147,7 @@ def test_an_answer_to_another_request_is_refused():
     ],
 )
 def test_what_a_frame_would_hide_is_refused_before_it_is_sent(action, mask, message: str):
-    with scripted_server(view()) as server, HttpSurrogate(server.url, "pendulum", transport="binary") as port:
+    with scripted_server(session_view()) as server, HttpSurrogate(server.url, "pendulum", transport="binary") as port:
         port.open(wire.OpenSession(num_envs=2))
         with pytest.raises(errors.InvalidInput, match=message):
             port.step("abc", action, mask=mask)

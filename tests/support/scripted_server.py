@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
+from surrogym_shared import wire
 from surrogym_shared.codes import STATUS, Code, Problem
 
 
@@ -48,6 +49,29 @@ def reply(body: str, status: int = 200, content_type: str = "application/json", 
 def problem(code: Code, detail: str = "why") -> Answer:
     body = Problem(title=code.value, status=STATUS[code], code=code, detail=detail)
     return reply(body.model_dump_json(), STATUS[code], "application/problem+json")
+
+
+def session_view(seq: int = 0, protocol: int = wire.PROTOCOL) -> Answer:
+    """What opening or reading session ``abc`` of surrogate ``pendulum`` gives: two lanes, two observation entries."""
+    session = wire.SessionView(
+        protocol=protocol,
+        id="abc",
+        surrogate="pendulum",
+        num_envs=2,
+        variant="deterministic",
+        seed=1,
+        autoreset_mode="same_step",
+        model="latest",
+        model_version=[1, 1],
+        seq=seq,
+        time_limit=200,
+        penalty=0.0,
+        observation_space=wire.BoxSpace(low=[None, None], high=[None, None]),
+        action_space=wire.BoxSpace(low=[-2.0], high=[2.0]),
+        outputs=["angle", "reward"],
+        idle_seconds=60.0,
+    )
+    return reply(session.model_dump_json())
 
 
 def lost_reply(handler: BaseHTTPRequestHandler) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from typing import Any
 
 import sqlalchemy as sa
@@ -22,6 +23,10 @@ COLUMNS = [
         *("extra_queries", "checkpoint", "created_at"),
     )
 ]
+
+
+ABSENT = object()
+SHOWN = 120  # characters of a value in an error
 
 
 class SqlSurrogates(port.Surrogates):
@@ -119,9 +124,29 @@ def _insert(connection: Connection, new: NewSurrogate) -> bool:
 
 
 def _same(present: SurrogateRecord, new: NewSurrogate) -> SurrogateRecord:
-    if present.spec != json.loads(json.dumps(new.spec)):
-        raise SpecConflict(f"expected the spec that {new.name!r} was created with, got another")
+    given = json.loads(json.dumps(new.spec))
+    if present.spec != given:
+        where, had, got = _difference(present.spec, given)
+        raise SpecConflict(
+            f"{new.name!r} exists with another spec: {where} was created as {_short(had)}, got {_short(got)}"
+        )
     return present
+
+
+def _difference(had: Any, got: Any, where: str = "") -> tuple[str, Any, Any]:
+    """The first place where two JSON values differ, as ``coordinates.0.name``, and what stands there."""
+    if isinstance(had, dict) and isinstance(got, dict):
+        pairs = [(key, had.get(key, ABSENT), got.get(key, ABSENT)) for key in {**had, **got}]
+    elif isinstance(had, list) and isinstance(got, list) and len(had) == len(got):
+        pairs = [(str(i), *pair) for i, pair in enumerate(zip(had, got, strict=True))]
+    else:
+        return where, had, got
+    key, old, new = next(pair for pair in pairs if pair[1] != pair[2])
+    return _difference(old, new, f"{where}.{key}" if where else key)
+
+
+def _short(value: Any) -> str:
+    return "nothing" if value is ABSENT else textwrap.shorten(json.dumps(value), SHOWN, placeholder=" ...")
 
 
 def _apply(connection: Connection, held: Row[Any], changes: dict[str, Any]) -> None:
