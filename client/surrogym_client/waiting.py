@@ -11,6 +11,11 @@ from surrogym_shared.wire import Phase, SurrogateView
 
 FINISHED: tuple[Phase, ...] = ("ready", "over_budget")
 LOOK_SECONDS = 0.25
+IN_WORDS: dict[Phase, str] = {  # of the phases in which a sampler stops
+    "ready": "the design is ready",
+    "over_budget": "the budget is spent, and the design is not sure of its model",
+    "failed": "the design has failed",
+}
 
 
 class DesignUnfinished(SurrogymClientError):

@@ -49,3 +49,11 @@ def test_a_target_is_reached_only_when_all_of_it_is():
     for other in (Outcome(-161.0, -399.0, 1.0), Outcome(-150.0, -401.0, 1.0), Outcome(-150.0, -399.0, 0.99)):
         assert not target.reached(other, Outcome(0.0, 0.0, 1.0))
     assert Target("mean", mean=93).reached(Outcome(93.0, 0.0, None))
+
+
+def test_a_task_is_solved_by_whole_episodes():
+    success = {task: DemoSettings(task).judged_by().success for task in KNOWN}
+    assert success["cartpole"].min_steps == 500
+    assert success["invertedpendulum"].min_steps == 1_000
+    for task in ("pendulum", "swingup", "swingup-narrow"):
+        assert (success[task].hold_steps, abs(success[task].hold[0].value)) == (20, 0.95)

@@ -82,7 +82,7 @@ def command(
             sampler = Sampler(api, surrogate, environment, settings, None if quiet else _tell)
             signal.signal(signal.SIGTERM, lambda *_: sampler.stop())
             report = sampler.run()
-    give(asdict(report), lambda: _words(report), as_json=as_json, quiet=quiet)
+    give(asdict(report), lambda: _words(surrogate, report), as_json=as_json, quiet=quiet)
     if report.phase == "failed":
         raise typer.Exit(1)
 
@@ -108,7 +108,11 @@ def _tell(query: Query, outcome: Outcome, error: str) -> None:
     say(f"query {query.id} ({query.purpose}) {outcome}{': ' if error else ''}{error}")
 
 
-def _words(report: SamplerReport) -> str:
+def _words(surrogate: str, report: SamplerReport) -> str:
+    from surrogym_client.waiting import FINISHED, IN_WORDS
+
     failed = f", {report.failed} failed" if report.failed else ""
-    phase = "" if report.phase is None else f"; the design is {report.phase}"
-    return f"{report.answered} queries answered{failed} in {report.seconds:.1f} s{phase}"
+    said = f"{report.answered} queries answered{failed} in {report.seconds:.1f} s"
+    if report.phase in IN_WORDS:
+        said += f"; {IN_WORDS[report.phase]}"
+    return f"{said}; next: surrogym train {surrogate}" if report.phase in FINISHED else said

@@ -12,6 +12,7 @@ from surrogym_client.demo.settings import DemoSettings, fingerprint
 from surrogym_client.evaluate import Evaluation
 from surrogym_client.policy_file import PolicyCard, read_card
 from surrogym_client.versions import commit, machine, versions
+from surrogym_client.waiting import IN_WORDS
 
 BY_RUN = ("seed", "start_from", "tensorboard")  # training settings that differ from run to run
 
@@ -56,12 +57,16 @@ def metrics_of(
 def table(metrics: dict[str, Any], folder: Path) -> str:
     """The result for a person, two columns."""
     real, returns, index = metrics["real_queries"], metrics["real_return"], metrics["confidence_index"]
+    design = IN_WORDS.get(metrics["phase"], metrics["phase"])
     arm = "" if metrics["arm"] == "default" else f", arm {metrics['arm']}"
     rows = [
         ("task", f"{metrics['task']} ({metrics['environment']}), seed {metrics['seed']}{arm}"),
         ("real queries", f"{real['total']}: {real['initial']} initial, {real['adaptive']} adaptive"),
         ("real steps of evaluation", str(metrics["evaluation_steps"])),
-        ("confidence index", "-" if index is None else f"{index:.4f}, design {metrics['phase']}"),
+        (
+            "confidence index",
+            "-" if index is None else f"{index:.4f}, {design}",
+        ),
         ("virtual steps", str(metrics["virtual_steps"])),
         ("seconds", _seconds(metrics["seconds"])),
         (

@@ -84,7 +84,7 @@ def cartpole() -> EnvironmentSpec:
             (_inequality("pole", "<", -math.radians(12)),),
         ),
         time_limit=500,
-        min_steps=475,
+        min_steps=500,
     )
 
 

@@ -36,7 +36,7 @@ def inverted_pendulum() -> EnvironmentSpec:
         termination=(*_outside("hinge", 0.2), *_outside("slider", 0.95)),
         time_limit=1000,
         reward=Reward(timing="after"),
-        success=Success(min_steps=950),
+        success=Success(min_steps=1000),
     )
 
 
@@ -73,7 +73,7 @@ def inverted_double_pendulum() -> EnvironmentSpec:
         ),
         time_limit=1000,
         reward=Reward(timing="after"),
-        success=Success(min_return=9100),
+        success=Success(min_return=9000),
     )
 
 
