@@ -37,11 +37,17 @@ def test_rows_of_several_sittings_become_one_table(surrogym, tmp_path):
     write_rows(tmp_path / "night.csv", [ROW])
     oracle = Row("pendulum", "oracle", 0, 14, 0, 0, 300_000, mean=-170.0, min=-300.0, seconds=9.0)
     write_rows(tmp_path / "day.csv", [oracle])
-    page = tmp_path / "page.md"
-    page.write_text("# Results\n\n<!-- efficiency: begin -->\n<!-- efficiency: end -->\n")
-    said = surrogym("reproduce", "table", "--rows=night.csv", "--rows=day.csv", "--out=both", "--page=page.md")
+    said = surrogym("reproduce", "table", "--rows=night.csv", "--rows=day.csv", "--out=both")
     assert said.code == 0
-    assert len(read_rows(tmp_path / "both" / "rows.csv")) == 2
-    assert (tmp_path / "both" / "efficiency.md").read_text() in page.read_text()
+    assert read_rows(tmp_path / "both" / "efficiency.csv") == [ROW, oracle]
+    assert (tmp_path / "both" / "efficiency.md").read_text() in said.out
     assert "| pendulum | oracle | 1 | 300000 | -170.0 (-170.0 to -170.0) |" in said.out
     assert surrogym("reproduce", "table", "--rows=nowhere.csv").err == "error: nowhere.csv: no such file\n"
+
+
+def test_a_page_takes_the_table(surrogym, tmp_path):
+    write_rows(tmp_path / "rows.csv", [ROW])
+    (tmp_path / "page.md").write_text("<!-- efficiency: begin -->\n<!-- efficiency: end -->\n")
+    assert surrogym("reproduce", "table", "--rows=rows.csv", "--out=.", "--page=page.md").code == 0
+    assert "| pendulum | 14 |" in (tmp_path / "page.md").read_text()
+    assert not (tmp_path / "efficiency.md").exists()

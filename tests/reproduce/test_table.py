@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from surrogym_client.reproduce.page import NoSuchPlace, insert, inserted
+from surrogym_client.reproduce.page import NoSuchPlace, present_section, section, update
 from surrogym_client.reproduce.pictures import draw_tasks
 from surrogym_client.reproduce.rows import Row
 from surrogym_client.reproduce.table import report
@@ -52,11 +52,16 @@ def test_a_run_that_ended_badly_counts_as_one_that_missed_the_target():
     assert "| 1, 1 ended badly | - |" in report([bad])
 
 
-def test_arms_are_compared_with_an_interval():
-    text = report([*HYPERCUBE, *DEFAULT[:2], replace(ROW, seed=3)])
-    assert line(text, "pendulum", "latin_hypercube", "3, 4").endswith("| default |")
-    assert text.index("| pendulum | default |") < text.index("| pendulum | latin_hypercube |")
-    assert "undecided" in report([*HYPERCUBE, *DEFAULT[:1], replace(DEFAULT[0], seed=1, mean=-1000.0)])
+def test_pairs_of_arms_answer_questions_with_an_interval():
+    adaptive = [replace(row, arm="no_loop") for row in DEFAULT]
+    text = report([*HYPERCUBE, *[row for row in adaptive if row.seed != 2]])
+    told = line(text, "pendulum", "adaptive queries", "no_loop, latin_hypercube", "3, 4")
+    assert told.endswith("| no_loop |")
+    assert "undecided" in line(
+        report([*HYPERCUBE, *adaptive]), "pendulum", "adaptive queries", "no_loop, latin_hypercube"
+    )
+    assert "closed loop" not in text
+    assert text.index("| pendulum | no_loop |") < text.index("| pendulum | latin_hypercube |")
 
 
 def test_rows_that_were_not_made_alike_are_told():
@@ -77,11 +82,15 @@ def test_each_task_gets_a_picture(tmp_path):
     assert written[0].stat().st_size > 5_000
 
 
-def test_a_table_goes_between_its_marks(tmp_path):
-    page = tmp_path / "page.md"
+def test_tables_and_pictures_go_between_the_marks_of_a_page(tmp_path):
+    page = tmp_path / "docs" / "page.md"
+    page.parent.mkdir()
     page.write_text("before\n<!-- efficiency: begin -->\nold\n<!-- efficiency: end -->\nafter\n")
-    insert(page, "efficiency", "new\n")
-    assert inserted(page, "efficiency") == "new\n"
-    assert page.read_text() == "before\n<!-- efficiency: begin -->\nnew\n<!-- efficiency: end -->\nafter\n"
-    with pytest.raises(NoSuchPlace, match="<!-- paper: begin -->"):
-        insert(page, "paper", "new\n")
+    update(page, DEFAULT, page.parent / "results")
+    assert present_section(page) == section(DEFAULT, "results")
+    assert page.read_text().startswith("before\n<!-- efficiency: begin -->\n\n| task | budget |")
+    assert page.read_text().endswith("![pendulum](results/efficiency-pendulum.png)\n<!-- efficiency: end -->\nafter\n")
+    assert (page.parent / "results" / "efficiency-pendulum.png").exists()
+    page.write_text("no marks")
+    with pytest.raises(NoSuchPlace, match="<!-- efficiency: begin -->"):
+        update(page, DEFAULT, tmp_path)

@@ -15,7 +15,7 @@ from surrogym_client.demo.arms import ARMS
 from surrogym_client.evaluate import interquartile_mean
 from surrogym_client.reproduce.rows import Row
 from surrogym_client.reproduce.statistics import bootstrap_interval
-from surrogym_client.reproduce.table import Group, column, grouped
+from surrogym_client.reproduce.table import Group, column, grouped, tasks_with_results
 
 COLOURS = dict(zip(ARMS, ("#dd8452", "#4c72b0", "#55a868", "#8172b3", "#937860", "#c9a66b", "#555555"), strict=True))
 SIZE = (6.0, 3.6)  # inches
@@ -24,13 +24,12 @@ BESIDE = 0.05  # dots of single seeds stand so far from their arm, as a share of
 
 def draw_tasks(folder: Path, rows: Sequence[Row]) -> list[Path]:
     """Write ``efficiency-TASK.png`` for each task that has a result."""
-    groups = grouped(rows)
+    folder.mkdir(parents=True, exist_ok=True)
     written = []
-    for task in dict.fromkeys(task for task, _, _ in groups):
-        own = {group: of for group, of in groups.items() if group[0] == task and len(column(of, "mean"))}
-        if own:
-            written.append(folder / f"efficiency-{task}.png")
-            draw_task(task, own).savefig(written[-1], dpi=120)
+    for task in tasks_with_results(rows):
+        groups = {group: of for group, of in grouped(rows).items() if group[0] == task and len(column(of, "mean"))}
+        written.append(folder / f"efficiency-{task}.png")
+        draw_task(task, groups).savefig(written[-1], dpi=120, metadata={"Software": None})
     return written
 
 

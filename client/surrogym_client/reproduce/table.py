@@ -19,6 +19,15 @@ HEADING = (
     *("task", "arm", "seeds", "real steps", "real return", "worst seed", "worst episode"),
     *("success", "other starts", "imagined", "target reached", "seconds"),
 )
+CONTRASTS = (  # what a pair of arms tells, at the same budget
+    ("adaptive queries", "no_loop", "latin_hypercube"),
+    ("adaptive queries, in the paper's representation", "paper", "paper_hypercube"),
+    ("representation, on a hypercube", "latin_hypercube", "paper_hypercube"),
+    ("acquisition", "no_loop", "variance"),
+    ("closed loop", "default", "no_loop"),
+    ("the whole of it", "default", "paper"),
+    ("surrogate or original", "default", "oracle"),
+)
 NOTES = """\
 Real steps: median (smallest to largest). Real return: interquartile mean over seeds of the mean over episodes, with its
 95 % bootstrap interval. Worst seed: its mean. Success and other starts: share of the episodes, worst seed. Imagined:
@@ -27,11 +36,14 @@ what the surrogate promised. Target reached: by how many seeds of all. Seconds: 
 
 
 def report(rows: Sequence[Row]) -> str:
-    """Targets, the main table, differences to the default, and where the rows come from."""
+    """Targets, the main table, the questions that pairs of arms answer, and where the rows come from."""
     groups = grouped(rows)
     parts = [_targets(groups), _markdown([HEADING, *(_line(group, of) for group, of in groups.items())]), NOTES]
-    if differences := _differences(groups):
-        parts += ["Default minus another arm, interquartile means, with a 95 % bootstrap interval:\n", differences]
+    if contrasts := _contrasts(groups):
+        parts += [
+            "Difference of interquartile means, first arm minus second, with a 95 % bootstrap interval:\n",
+            contrasts,
+        ]
     return "\n".join([*parts, _origin(rows)])
 
 
@@ -44,6 +56,11 @@ def grouped(rows: Sequence[Row]) -> dict[Group, list[Row]]:
 
     ordered = sorted((row for row in rows if row.task in TASKS and row.arm in ARMS), key=place)
     return {key: list(of) for key, of in groupby(ordered, key=lambda row: (row.task, row.arm, row.budget))}
+
+
+def tasks_with_results(rows: Sequence[Row]) -> list[str]:
+    """Tasks of which at least one run has a return, in their order."""
+    return [task for task in TASKS if any(row.task == task and row.mean is not None for row in rows)]
 
 
 def column(rows: Sequence[Row], name: str) -> NDArray[np.float64]:
@@ -87,17 +104,25 @@ def _line(group: Group, rows: Sequence[Row]) -> Sequence[str]:
     )
 
 
-def _differences(groups: dict[Group, list[Row]]) -> str:
-    lines = [("task", "arm", "seeds", "difference", "interval", "better")]
-    for (task, arm, budget), rows in groups.items():
-        default = column(groups.get((task, "default", budget), []), "mean")
-        other = column(rows, "mean")
-        if arm != "default" and len(default) > 1 and len(other) > 1:
-            low, high = difference_interval(default, other)
-            better = "default" if low > 0 else arm if high < 0 else "undecided"
-            difference = _number(interquartile_mean(default) - interquartile_mean(other))
-            seeds = f"{len(default)}, {len(other)}"
-            lines.append((task, arm, seeds, difference, f"{_number(low)} to {_number(high)}", better))
+def _contrasts(groups: dict[Group, list[Row]]) -> str:
+    lines = [("task", "question", "arms", "seeds", "difference", "interval", "better")]
+    for task, budget in dict.fromkeys((task, budget) for task, _, budget in groups):
+        for question, first, second in CONTRASTS:
+            pair = [column(groups.get((task, arm, budget), []), "mean") for arm in (first, second)]
+            if min(map(len, pair)) > 1:
+                low, high = difference_interval(*pair)
+                difference = interquartile_mean(pair[0]) - interquartile_mean(pair[1])
+                lines.append(
+                    (
+                        task if budget == TASKS[task].budget else f"{task}, budget {budget}",
+                        question,
+                        f"{first}, {second}",
+                        f"{len(pair[0])}, {len(pair[1])}",
+                        _number(difference),
+                        f"{_number(low)} to {_number(high)}",
+                        first if low > 0 else second if high < 0 else "undecided",
+                    )
+                )
     return _markdown(lines) if len(lines) > 1 else ""
 
 

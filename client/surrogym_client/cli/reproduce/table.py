@@ -21,31 +21,31 @@ def register(app: typer.Typer) -> None:
 
 def command(
     rows: Annotated[list[Path], typer.Option(help="File of rows; may be given again, later ones win.")],
-    out: Annotated[Path, typer.Option(help="Folder of the merged rows, the table and the pictures.")] = Path(
+    out: Annotated[Path, typer.Option(help="Folder of the merged efficiency.csv, the table and the pictures.")] = Path(
         "runs/table"
     ),
     page: Annotated[
-        Path | None, typer.Option(help="Put the table into this page too, between the marks efficiency.")
+        Path | None, typer.Option(help="Put table and pictures into this page instead, between the marks efficiency.")
     ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Merge files of rows, and write the merged rows.csv, efficiency.md and a picture of each task.
+    """Merge files of rows; efficiency.csv, efficiency.md and a picture of each task go into a folder.
 
     Example: surrogym reproduce table --rows night/rows.csv --rows day/rows.csv --out runs/table
     """
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.reproduce.page import insert
+    from surrogym_client.reproduce.page import update
     from surrogym_client.reproduce.rows import merge, read_rows, write_rows
-    from surrogym_client.reproduce.table import report
 
     if missing := [path for path in rows if not path.exists()]:
         raise CommandError(f"{missing[0]}: no such file")
     merged = merge(*map(read_rows, rows))
-    write_rows(out / "rows.csv", merged)
-    if page is not None:
-        insert(page, "efficiency", report(merged))
-    present(merged, out, as_json=as_json, quiet=quiet)
+    write_rows(out / "efficiency.csv", merged)
+    if page is None:
+        present(merged, out, as_json=as_json, quiet=quiet)
+    else:
+        update(page, merged, out)
 
 
 def present(rows: Sequence[Row], out: Path, *, as_json: bool, quiet: bool) -> None:
