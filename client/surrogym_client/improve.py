@@ -21,7 +21,7 @@ from surrogym_client.train import (
 from surrogym_client.waiting import wait_for_design
 from surrogym_shared.port import SurrogatePort
 
-ROUND_SHARE = 0.4  # of a whole training, in each round before the last
+ROUND_SHARE = 0.25  # of a whole training, in each round before the last
 VISIT_LANES = 32
 VISIT_STEPS = 1_000  # where the specification has no time limit
 
@@ -62,26 +62,33 @@ def train_and_improve(
         DesignUnfinished: the queries of a round were not answered in time.
         ValueError, SurrogymClientError: as ``train``.
     """
-    whole = planned_steps(settings)
-    part = max(1, int(ROUND_SHARE * whole))
-    whole = min(whole, MAX_STEPS - improve.rounds * part)
-    done, seconds, policy = 0, 0.0, settings.start_from
-    for number in range(improve.rounds):
+    whole, part = shares(settings, improve.rounds)
+    trained, visited, seconds, policy = 0, 0, 0.0, settings.start_from
+    for _ in range(improve.rounds):
         view = api.surrogate(name)
         if view.phase == "ready":
             break
-        left = done + (improve.rounds - number) * part + whole
-        result = train(
-            port, out, replace(settings, total_steps=part, start_from=policy), _shifted(progress, done, left)
-        )
-        done, seconds, policy = done + result.virtual_steps, seconds + result.seconds, out
+        now = replace(settings, total_steps=part, start_from=policy)
+        result = train(port, out, now, _shifted(progress, trained + visited, whole))
+        trained, seconds, policy = trained + result.virtual_steps, seconds + result.seconds, out
         checkpoint = f"seed {settings.seed}, round {view.round}"
-        done += visit(port, out, settings, checkpoint)
+        visited += visit(port, out, settings, checkpoint)
         api.improve(name, improve.queries, checkpoint=checkpoint)
         wait_for_design(api, name, improve.patience_seconds, after_round=view.round)
-    last = replace(settings, total_steps=whole, start_from=policy)
-    result = train(port, out, last, _shifted(progress, done, done + whole))
-    return replace(result, virtual_steps=done + result.virtual_steps, seconds=seconds + result.seconds)
+    left = whole - trained if settings.total_steps else min(planned_steps(settings), whole - trained)
+    last = replace(settings, total_steps=max(left, 1), start_from=policy)
+    result = train(port, out, last, _shifted(progress, trained + visited, trained + visited + left))
+    return replace(result, virtual_steps=trained + visited + result.virtual_steps, seconds=seconds + result.seconds)
+
+
+def shares(settings: TrainSettings, rounds: int) -> tuple[int, int]:
+    """Virtual steps of the whole training, all rounds included, and of each round; visits come on top.
+
+    What was asked for bounds the whole; what is suggested is added to, up to the cap.
+    """
+    planned = planned_steps(settings)
+    part = max(1, int(min(ROUND_SHARE, 1 / (rounds + 1)) * planned))
+    return planned if settings.total_steps is not None else min(planned + rounds * part, MAX_STEPS), part
 
 
 def visit(port: SurrogatePort, policy: Path, settings: TrainSettings, checkpoint: str) -> int:

@@ -20,15 +20,18 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from surrogym_client.policies import PaperPolicy, Standardise
+from surrogym_client.imagined import imagined_returns
+from surrogym_client.policies import WIDER, PaperPolicy, Standardise
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import EnvironmentSpec
 
 MAX_STEPS = 1_000_000  # virtual steps of one training, the paper's cap
-ON_POLICY_STEPS = 300_000
+ON_POLICY_STEPS = 600_000
 OFF_POLICY_STEPS = 50_000  # these learn from every step, and take far longer for each
 STATISTICS_LANES = 1_024
+CHECKS = 12  # of the imagined return in one training; the best policy is kept
+CHECK_EPISODES = 64
 LEARNING_RATE = 3e-3
 LAST_RATE = 0.02  # share of the learning rate that is left at the end
 
@@ -38,8 +41,8 @@ def _decaying(remaining: float) -> float:
 
 
 PPO_DEFAULTS: dict[str, Any] = {
-    "n_steps": 64,
-    "batch_size": 256,
+    "n_steps": 32,
+    "batch_size": 1_024,  # most of a training is the update, and its cost goes by the batch
     "n_epochs": 10,
     "learning_rate": _decaying,
     "gae_lambda": 0.9,
@@ -70,7 +73,7 @@ class TrainSettings:
 class TrainProgress:
     steps: int
     total_steps: int
-    imagined_return: float | None  # mean over the last 100 virtual episodes, penalty included
+    imagined_return: float | None  # at the last check: mean over virtual episodes from the declared starts
     penalty_share: float  # of the reward's size, since the last report
 
 
@@ -80,7 +83,7 @@ class TrainResult:
     algorithm: str
     virtual_steps: int
     seconds: float
-    imagined_return: float | None
+    imagined_return: float | None  # of the policy that was kept
     lost_episodes: int  # cut because the server lost the session
     settings: dict[str, Any]
 
@@ -116,10 +119,11 @@ def train(
     started = time.perf_counter()
     try:
         statistics = observation_statistics(port, settings.seed)
-        learner = _learner(algorithm, wrapped, settings, statistics, gamma)
+        learner = _learner(algorithm, wrapped, settings, spec, statistics, gamma)
         total = _whole_rollouts(learner, total)
-        report = _Report(total, progress)
+        report = _Report(total, progress, lambda: imagined_return(port, learner, settings))
         learner.learn(total, callback=report, reset_num_timesteps=True)
+        report.restore_best()
         out.parent.mkdir(parents=True, exist_ok=True)
         learner.save(out)
     finally:
@@ -129,7 +133,7 @@ def train(
         algorithm=settings.algorithm,
         virtual_steps=learner.num_timesteps,
         seconds=time.perf_counter() - started,
-        imagined_return=report.imagined_return,
+        imagined_return=report.best,
         lost_episodes=report.lost,
         settings={**asdict(settings), "num_envs": num_envs, "total_steps": total, "gamma": gamma},
     )
@@ -148,13 +152,22 @@ def algorithm_by_name(name: str) -> type[BaseAlgorithm]:
 
 
 def suggested_gamma(spec: EnvironmentSpec) -> float:
-    """A discount whose horizon, 1 / (1 - gamma), is a sixth of the time limit: 0.97 for 200 steps, 0.988 for 500."""
-    return float(np.clip(1 - 6 / (spec.time_limit or 1_000), 0.9, 0.999))
+    """A discount whose horizon, 1 / (1 - gamma), is a third of the time limit: 0.985 for 200 steps, 0.994 for 500."""
+    return float(np.clip(1 - 3 / (spec.time_limit or 1_000), 0.9, 0.999))
 
 
 def suggested_lanes(algorithm: type[BaseAlgorithm]) -> int:
     """On-policy algorithms want many lanes, the others learn once for each step of all of them."""
-    return 64 if issubclass(algorithm, OnPolicyAlgorithm) else 4
+    return 256 if issubclass(algorithm, OnPolicyAlgorithm) else 4
+
+
+def imagined_return(port: SurrogatePort, learner: BaseAlgorithm, settings: TrainSettings) -> float:
+    """Mean imagined return of the policy as it is now, without exploration, on the same starts at every check."""
+
+    def predict(observation: Any) -> Any:
+        return learner.predict(observation, deterministic=True)[0]
+
+    return float(imagined_returns(port, predict, CHECK_EPISODES, settings.seed, **settings.session).mean())
 
 
 def observation_statistics(port: SurrogatePort, seed: int) -> tuple[list[float], list[float]]:
@@ -172,6 +185,7 @@ def _learner(
     algorithm: type[BaseAlgorithm],
     env: VecNormalize,
     settings: TrainSettings,
+    spec: EnvironmentSpec,
     statistics: tuple[Sequence[float], Sequence[float]],
     gamma: float,
 ) -> BaseAlgorithm:
@@ -179,10 +193,12 @@ def _learner(
         return algorithm.load(settings.start_from, env=env, device="cpu", seed=settings.seed)
     extractor = {"mean": statistics[0], "deviation": statistics[1]}
     defaults: dict[str, Any] = {"gamma": gamma}
-    policy_kwargs = {"features_extractor_class": Standardise, "features_extractor_kwargs": extractor}
+    policy_kwargs: dict[str, Any] = {"features_extractor_class": Standardise, "features_extractor_kwargs": extractor}
     if algorithm is stable_baselines3.PPO:
         defaults |= PPO_DEFAULTS
     own = issubclass(algorithm, OnPolicyAlgorithm)
+    if own and spec.design.preset == "default":
+        policy_kwargs["net_arch"] = WIDER
     try:
         return algorithm(
             PaperPolicy if own else "MlpPolicy",
@@ -214,19 +230,25 @@ def _whole_rollouts(learner: BaseAlgorithm, total: int) -> int:
 
 
 class _Report(BaseCallback):
-    """Reports progress, and logs what the penalty took of the reward."""
+    """Remembers the policy with the best imagined return; reports progress, and what the penalty took of the reward."""
 
-    def __init__(self, total: int, progress: Callable[[TrainProgress], None] | None) -> None:
+    def __init__(
+        self, total: int, progress: Callable[[TrainProgress], None] | None, imagine: Callable[[], float]
+    ) -> None:
         super().__init__()
         self._total = total
         self._progress = progress
+        self._imagine = imagine
         self._penalty = self._size = 0.0
+        self._checked = 0  # checks made
+        self._latest: float | None = None
+        self._kept: dict[str, Any] = {}
+        self.best: float | None = None
         self.lost = 0
 
-    @property
-    def imagined_return(self) -> float | None:
-        episodes = self.model.ep_info_buffer
-        return float(np.mean([e["r"] for e in episodes])) if episodes else None
+    def restore_best(self) -> None:
+        """Give the learner the policy with the best imagined return of all checks."""
+        self.model.policy.load_state_dict(self._kept)
 
     def _on_step(self) -> bool:
         infos, env = self.locals["infos"], self.training_env
@@ -242,9 +264,22 @@ class _Report(BaseCallback):
         share = self._penalty / self._size if self._size else 0.0
         self._penalty = self._size = 0.0
         self.logger.record("surrogym/penalty_share", share)
+        if self.num_timesteps * CHECKS >= (self._checked + 1) * self._total:
+            self._check()
         if self._progress is not None:
             steps = min(self.num_timesteps, self._total)
-            self._progress(TrainProgress(steps, self._total, self.imagined_return, share))
+            self._progress(TrainProgress(steps, self._total, self._latest, share))
+
+    def _on_training_end(self) -> None:
+        self._check()
+
+    def _check(self) -> None:
+        self._checked = int(self.num_timesteps * CHECKS / self._total)
+        self._latest = self._imagine()
+        self.logger.record("surrogym/imagined_return", self._latest)
+        if self.best is None or self._latest >= self.best:
+            self.best = self._latest
+            self._kept = {name: tensor.clone() for name, tensor in self.model.policy.state_dict().items()}
 
 
 __all__ = ["TrainProgress", "TrainResult", "TrainSettings", "algorithm_by_name", "train"]

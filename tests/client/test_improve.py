@@ -13,16 +13,16 @@ import pytest
 from support.server import ServerProcess, running_server
 from support.teaching import answer
 from surrogym_client.api import Api
-from surrogym_client.improve import ImproveSettings, train_and_improve
+from surrogym_client.improve import ImproveSettings, shares, train_and_improve
 from surrogym_client.original.classic import pendulum
 from surrogym_client.original.gymnasium import GymnasiumEnvironment
-from surrogym_client.train import TrainProgress, TrainSettings
+from surrogym_client.train import MAX_STEPS, TrainProgress, TrainSettings
 from surrogym_client.transport import HttpSurrogate
 from surrogym_client.waiting import wait_for_design
 from surrogym_shared.spec import Design, EnvironmentSpec
 
 SETTINGS = TrainSettings(total_steps=400, num_envs=8, hyperparameters={"n_steps": 10, "batch_size": 40, "n_epochs": 1})
-ROUND_STEPS = 160 + 32 * 200  # two fifths of 400, and the visit: 32 lanes for a time limit of 200
+VISIT = 32 * 200  # 32 lanes for a time limit of 200
 
 
 @pytest.fixture(scope="module")
@@ -75,8 +75,15 @@ def test_rounds_go_on_until_the_design_is_ready(
         view = api.surrogate(name)
     assert view.ledger.total == real_steps
     assert view.ledger.initial == initial
-    assert result.virtual_steps == rounds * ROUND_STEPS + 400
+    assert result.virtual_steps == 400 + rounds * VISIT, "the steps asked for are those of all trainings"
     assert result.path.exists()
     steps = [now.steps for now in seen]
     assert steps == sorted(steps)
     assert all(isinstance(now, TrainProgress) and now.steps <= now.total_steps for now in seen)
+
+
+def test_rounds_share_the_steps_that_were_asked_for() -> None:
+    assert shares(TrainSettings(total_steps=1_000), rounds=3) == (1_000, 250)
+    assert shares(TrainSettings(total_steps=1_000), rounds=9) == (1_000, 100)
+    whole, part = shares(TrainSettings(), rounds=3)
+    assert part * 3 < whole <= MAX_STEPS

@@ -8,14 +8,17 @@ import pytest
 from stable_baselines3 import PPO, SAC
 
 from support.real_steps import random_steps
+from surrogym_client.imagined import imagined_returns
 from surrogym_client.original.classic import cartpole, pendulum
-from surrogym_client.policies import PaperPolicy
+from surrogym_client.original.loading import make
+from surrogym_client.policies import WIDER, PaperPolicy
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.train import (
     MAX_STEPS,
     TrainProgress,
     TrainSettings,
     algorithm_by_name,
+    imagined_return,
     observation_statistics,
     suggested_gamma,
     suggested_lanes,
@@ -52,7 +55,7 @@ def test_a_policy_and_what_it_was_trained_with_are_written(surrogate, tmp_path: 
     assert result.lost_episodes == 0
     written = json.loads(out.with_suffix(".json").read_text())
     assert written["virtual_steps"] == 256
-    assert written["settings"]["gamma"] == 0.97
+    assert written["settings"]["gamma"] == 0.985
     assert [p.steps for p in seen] == [128, 256]
     assert all(isinstance(p, TrainProgress) and p.total_steps == 256 for p in seen)
 
@@ -76,13 +79,14 @@ def test_the_same_seed_gives_the_same_policy(surrogate, tmp_path: Path):
 
 def test_training_goes_on_from_a_saved_policy(surrogate, tmp_path: Path):
     first, second = tmp_path / "first.zip", tmp_path / "second.zip"
-    train(surrogate, first, small(total_steps=128))
-    train(surrogate, second, small(total_steps=128, start_from=first))
+    before = train(surrogate, first, small(total_steps=128))
+    after = train(surrogate, second, small(total_steps=128, start_from=first))
+    assert after.imagined_return >= before.imagined_return, "the policy it started from is one of those compared"
     env = SurrogateVecEnv.from_port(surrogate, 2)
-    fresh = PPO(PaperPolicy, env, device="cpu").policy
+    fresh = PPO(PaperPolicy, env, device="cpu", policy_kwargs={"net_arch": WIDER}).policy
     env.close()
     one, two = (PPO.load(path, device="cpu").policy for path in (first, second))
-    assert 0 < distance(one, two) < 0.3 * distance(one, fresh)
+    assert distance(one, two) < 0.3 * distance(one, fresh)
 
 
 def distance(a: PaperPolicy, b: PaperPolicy) -> float:
@@ -101,6 +105,35 @@ def test_a_penalty_is_reported(surrogate, tmp_path: Path):
         )
     assert shares[0] == pytest.approx(0, abs=1e-6)
     assert shares[1] > 1e-3
+
+
+def test_the_policy_with_the_best_imagined_return_is_kept(surrogate, tmp_path: Path):
+    seen: list[float] = []
+    ruinous = {"learning_rate": 0.3}  # every update throws away what was learned
+    settings = small(total_steps=512, hyperparameters=SMALL | ruinous)
+    result = train(surrogate, tmp_path / "policy.zip", settings, lambda p: seen.append(p.imagined_return))
+    kept = PPO.load(result.path, device="cpu")
+    assert result.imagined_return >= max(seen)
+    assert imagined_return(surrogate, kept, settings) == pytest.approx(result.imagined_return)
+
+
+def test_imagined_returns_are_whole_episodes_from_the_declared_starts(surrogate):
+    def nothing(observation: np.ndarray) -> np.ndarray:
+        return np.zeros((len(observation), 1), np.float32)
+
+    returns = imagined_returns(surrogate, nothing, 8, seed=3)
+    assert returns.shape == (8,)
+    assert ((returns > -2_000) & (returns < -400)).all(), "a free pendulum earns that in 200 steps"
+    np.testing.assert_array_equal(returns, imagined_returns(surrogate, nothing, 8, seed=3, start_box=1.0))
+    assert not surrogate._sessions
+
+
+@pytest.mark.parametrize(("preset", "hidden"), [("default", [64, 64]), ("paper", [32])])
+def test_the_papers_network_belongs_to_its_preset(tmp_path: Path, preset, hidden):
+    spec = make("Pendulum-v1", preset=preset).spec()
+    result = train(local(spec), tmp_path / "policy.zip", small(total_steps=128))
+    network = PPO.load(result.path, device="cpu").policy.mlp_extractor.policy_net
+    assert [layer.out_features for layer in network if hasattr(layer, "out_features")] == hidden
 
 
 def test_a_discrete_task_trains(tmp_path: Path):
@@ -139,10 +172,10 @@ def test_what_can_not_be_trained_is_refused(surrogate, tmp_path: Path, settings,
 
 
 def test_settings_follow_from_the_specification(surrogate):
-    assert suggested_gamma(pendulum()) == pytest.approx(0.97)
-    assert suggested_gamma(cartpole()) == pytest.approx(0.988)
+    assert suggested_gamma(pendulum()) == pytest.approx(0.985)
+    assert suggested_gamma(cartpole()) == pytest.approx(0.994)
     assert suggested_gamma(pendulum().model_copy(update={"time_limit": 20})) == 0.9
-    assert suggested_gamma(pendulum().model_copy(update={"time_limit": None})) == pytest.approx(0.994)
+    assert suggested_gamma(pendulum().model_copy(update={"time_limit": None})) == pytest.approx(0.997)
     assert suggested_lanes(PPO) > suggested_lanes(SAC)
 
 

@@ -34,7 +34,8 @@ def command(
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write the policy to.")] = Path("policy.zip"),
     algorithm: Annotated[str, typer.Option(help="Algorithm of Stable-Baselines3.")] = "PPO",
     steps: Annotated[
-        int | None, typer.Option(min=1, help="Virtual steps of the last training. [default: from the specification]")
+        int | None,
+        typer.Option(min=1, help="Virtual steps, all rounds of --improve included. [default: from the algorithm]"),
     ] = None,
     num_envs: Annotated[
         int | None, typer.Option(min=1, help="Lanes of the session. [default: from the specification]")
@@ -61,6 +62,8 @@ def command(
     quiet: Quiet = False,
 ) -> None:
     """Train a policy in the virtual environment; no real step is taken, unless --improve asks a sampler for more.
+
+    The imagined return that is shown is what the policy earns in the surrogate, not in the original environment.
 
     Example: surrogym train pendulum --out policy.zip --seed 0
     """
@@ -187,4 +190,4 @@ def words_of(now: dict[str, Any]) -> str:
 
 
 def _imagined(value: float | None) -> str:
-    return "" if value is None else f", imagined return {value:.1f}"
+    return "" if value is None else f", imagined return {value:.1f} (in the surrogate)"
