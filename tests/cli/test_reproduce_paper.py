@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from surrogym_client.original import make
-from surrogym_client.reproduce.paper_cases import QUICK, TASKS, Cell, Variation, cells
+from surrogym_client.reproduce.paper_cases import QUICK, TASKS, WHOLE, Cell, Variation, cells
 from surrogym_client.reproduce.paper_measures import BiasedEpisode, Unseen, run_variation, some
 from surrogym_client.reproduce.paper_table import markdown, settling_time, table
 from surrogym_shared.spec import Fixed
@@ -28,7 +28,9 @@ def test_designs_have_the_papers_numbers_of_real_steps():
 
 def test_a_cell_is_named_after_all_that_it_depends_on():
     one = Cell("pendulum", "paper", 0)
-    assert one.name == Cell("pendulum", "paper", 0).name
+    longer = replace(one, scale=replace(WHOLE, steps=1_000))
+    assert one.name == Cell("pendulum", "paper", 0).name == longer.name
+    assert one.policy_name != longer.policy_name  # the same design serves both
     assert len({one.name, replace(one, seed=1).name, replace(one, scale=QUICK).name}) == 3
 
 

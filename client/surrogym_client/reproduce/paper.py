@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from surrogym_client.reproduce.paper_table import markdown, table
 from surrogym_client.sampler import Outcome, Sampler, SamplerSettings
 from surrogym_client.train import TrainProgress, TrainSettings, train
 from surrogym_client.transport import HttpSurrogate
+from surrogym_client.versions import commit
 from surrogym_client.waiting import wait_for_design
 from surrogym_shared.wire import Query
 
@@ -34,46 +35,54 @@ Row = dict[str, Any]
 
 
 def run_cells(todo: Sequence[Cell], folder: Path, say: Say) -> list[Row]:
-    """What every cell gave, one after the other; stages that are there are read.
+    """What every cell gave, one after the other; stages that are there are read. Tables and figures of all seeds that
+    are complete are written after each.
 
     Raises:
         CommandError: the server did not start.
         SurrogymClientError: it refused, or a design failed.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    if all(_is_done(cell, folder) for cell in todo):
-        return [_row(cell, folder) for cell in todo]
-    with _server(folder) as api:
+    rows: list[Row] = []
+    with ExitStack() as stack:
+        if not all(_is_done(cell, folder) for cell in todo):
+            api = stack.enter_context(_server(folder))
         for number, cell in enumerate(todo):
 
             def tell(share: float, words: str, number: int = number, cell: Cell = cell) -> None:
                 where = f"{number + 1} of {len(todo)}, {cell.task} {cell.arm} seed {cell.seed}"
                 say((number + share) / len(todo), f"{where}: {words}")
 
-            _run(cell, folder, api, tell)
-    return [_row(cell, folder) for cell in todo]
+            if not _is_done(cell, folder):
+                _run(cell, folder, api, tell)
+            rows.append(_row(cell, folder))
+            if [cell.seed] != [following.seed for following in todo[number + 1 : number + 2]]:
+                _write_results(rows, folder)
+    return rows
 
 
-def write_results(rows: Sequence[Row], tasks: Sequence[str], folder: Path) -> dict[str, list[tuple[str, ...]]]:
-    """Put rows, tables and figures into the folder; gives back the tables by task."""
+def tables(rows: Sequence[Row]) -> dict[str, list[tuple[str, ...]]]:
+    """The paper's numbers beside ours, by task."""
+    return {task: table(rows, task) for task in dict.fromkeys(row["task"] for row in rows)}
+
+
+def _write_results(rows: Sequence[Row], folder: Path) -> None:
+    """Put rows, tables and figures into the folder."""
     from surrogym_client.reproduce.paper_pictures import draw_all
 
-    tables = {task: table(rows, task) for task in tasks}
     (folder / "rows.json").write_text(json.dumps(rows) + "\n", encoding="utf-8")
-    text = "\n".join(f"{task}\n\n{markdown(lines)}" for task, lines in tables.items())
+    text = "\n".join(f"{task}\n\n{markdown(lines)}" for task, lines in tables(rows).items())
     (folder / "results.md").write_text(text, encoding="utf-8")
     draw_all(rows, folder)
-    return tables
 
 
 def _run(cell: Cell, folder: Path, api: Api, tell: Say) -> None:
-    place = folder / "cells" / cell.name
-    place.mkdir(parents=True, exist_ok=True)
-    _stage(place / "design.json", lambda: _design(cell, api, tell))
-    if not cell.trained:
-        return
-    _stage(place / "training.json", lambda: _train(cell, api, place, tell))
-    _stage(place / "episodes.json", lambda: _episodes(cell, api, place, tell))
+    design, policy = _places(cell, folder)
+    policy.mkdir(parents=True, exist_ok=True)
+    _stage(design / "design.json", lambda: _design(cell, api, tell))
+    if cell.trained:
+        _stage(policy / "training.json", lambda: _train(cell, api, policy, tell))
+        _stage(policy / "episodes.json", lambda: _episodes(cell, api, policy, tell))
 
 
 def _stage(done: Path, run: Callable[[], Row]) -> None:
@@ -108,6 +117,7 @@ def _design(cell: Cell, api: Api, tell: Say) -> Row:
     errors = [unseen.errors(api, cell.name, model) for model in some(models, cell.scale.versions)]
     api.report_steps(cell.name, cell.scale.unseen, note="unseen single steps", idempotency_key=f"{cell.name}-unseen")
     return {
+        "commit": commit(),
         "initial": view.ledger.initial,
         "adaptive": view.ledger.adaptive,
         "phase": view.phase,
@@ -138,7 +148,7 @@ def _episodes(cell: Cell, api: Api, place: Path, tell: Say) -> Row:
         tell(0.9, f"{variation.episodes} real episodes, {variation.name}")
         results[variation.name] = run_variation(predict, spec, variation)
     steps = sum(result["steps"] for result in results.values())
-    api.report_steps(cell.name, steps, note="section 5", idempotency_key=f"{cell.name}-episodes")
+    api.report_steps(cell.name, steps, note="section 5", idempotency_key=f"{cell.name}-{cell.policy_name}")
     return results
 
 
@@ -154,15 +164,19 @@ def _server(folder: Path) -> Iterator[Api]:
             yield api
 
 
+def _places(cell: Cell, folder: Path) -> tuple[Path, Path]:
+    """Where a cell's design lies, and what its policy gave."""
+    design = folder / "cells" / cell.name
+    return design, design / cell.policy_name
+
+
 def _is_done(cell: Cell, folder: Path) -> bool:
-    last = "episodes.json" if cell.trained else "design.json"
-    return (folder / "cells" / cell.name / last).exists()
+    design, policy = _places(cell, folder)
+    return (policy / "episodes.json" if cell.trained else design / "design.json").exists()
 
 
 def _row(cell: Cell, folder: Path) -> Row:
-    place = folder / "cells" / cell.name
-    stages = ("design", "training", "episodes") if cell.trained else ("design",)
-    row: Row = {"task": cell.task, "arm": cell.arm, "seed": cell.seed}
-    for stage in stages:
-        row[stage] = json.loads((place / f"{stage}.json").read_text(encoding="utf-8"))
-    return row
+    design, policy = _places(cell, folder)
+    stages = [design / "design.json", *([policy / "training.json", policy / "episodes.json"] if cell.trained else [])]
+    read = {stage.stem: json.loads(stage.read_text(encoding="utf-8")) for stage in stages}
+    return {"task": cell.task, "arm": cell.arm, "seed": cell.seed, **read}

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from surrogym_client.original import make
@@ -132,10 +132,14 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Task, arm, seed, and a hash of everything else that the result depends on."""
-        depends = [self.spec.model_dump(mode="json"), asdict(self.scale), _plain(self.variations), versions()]
-        digest = hashlib.sha256(json.dumps(depends).encode()).hexdigest()[:8]
-        return f"{self.task}-{self.arm}-seed{self.seed}-{digest}"
+        """Task, arm, seed, and a hash of everything else that the design depends on."""
+        scale = [self.scale.unseen, self.scale.versions]
+        return f"{self.task}-{self.arm}-seed{self.seed}-{_hash(self.spec.model_dump(mode='json'), scale)}"
+
+    @property
+    def policy_name(self) -> str:
+        """The same for its policy and what that has to stand."""
+        return f"policy-{_hash(self.scale.steps, [_plain(v) for v in self.variations])}"
 
     @property
     def paper_task(self) -> PaperTask:
@@ -173,14 +177,16 @@ def cells(tasks: Sequence[str], seeds: int, scale: Scale = WHOLE) -> Iterator[Ce
 def _fewer(variation: Variation, shrink: int) -> Variation:
     if shrink == 1:
         return variation
-    return Variation(**{**variation.__dict__, "episodes": max(1, variation.episodes // (10 * shrink))})
+    return replace(variation, episodes=max(1, variation.episodes // (10 * shrink)))
 
 
-def _plain(variations: Sequence[Variation]) -> list[dict[str, Any]]:
-    plain = []
-    for v in variations:
-        start: Any = v.start
-        if isinstance(start, dict):
-            start = {name: distribution.model_dump() for name, distribution in start.items()}
-        plain.append({**v.__dict__, "start": start})
-    return plain
+def _plain(variation: Variation) -> dict[str, Any]:
+    """A variation as JSON."""
+    start: Any = variation.start
+    if isinstance(start, dict):
+        start = {name: distribution.model_dump() for name, distribution in start.items()}
+    return {**variation.__dict__, "start": start}
+
+
+def _hash(*depends: Any) -> str:
+    return hashlib.sha256(json.dumps([*depends, versions()]).encode()).hexdigest()[:8]

@@ -38,7 +38,7 @@ def command(
 
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.cli.output import columns, give, progress
-    from surrogym_client.reproduce.paper import run_cells, write_results
+    from surrogym_client.reproduce.paper import run_cells, tables
     from surrogym_client.reproduce.paper_cases import QUICK, TASKS, WHOLE, cells
 
     chosen = tasks.split(",")
@@ -48,7 +48,7 @@ def command(
     scale = scale if steps is None else replace(scale, steps=steps)
     with progress("reproduce", quiet=quiet) as update:
         rows = run_cells(list(cells(chosen, seeds, scale)), out, update)
-        tables = write_results(rows, chosen, out)
         update(1.0, f"{len(rows)} cells")
-    result = {"out": str(out), "tables": tables}
-    give(result, lambda: "\n\n".join(columns(lines) for lines in tables.values()), as_json=as_json, quiet=quiet)
+    shown = tables(rows)
+    result = {"out": str(out), "tables": shown}
+    give(result, lambda: "\n\n".join(columns(lines) for lines in shown.values()), as_json=as_json, quiet=quiet)
