@@ -65,7 +65,7 @@ def _design(spec: wire.EnvironmentSpec) -> core.DesignDefinition:
     return core.DesignDefinition(
         preset=design.preset,
         initial=initial,
-        acquisition=design.acquisition or "uncertainty_index",
+        acquisition=design.acquisition or ("uncertainty_index" if paper else "integrated_variance"),
         tolerance=design.tolerance or ("raw" if paper else "relative"),
         monte_carlo=design.monte_carlo or MONTE_CARLO,
         seed=design.seed,

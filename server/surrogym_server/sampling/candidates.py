@@ -16,7 +16,7 @@ from surrogym_server.surrogate.model import SurrogateModel
 
 MAX_CANDIDATES = 4_096  # of each kind; covariances with the reference are held for all of them
 REFERENCE = 256  # points of each kind
-OCCUPIED = 0.5  # share of the visited states in the reference; the rest is the whole sampling range
+OCCUPIED = 0.75  # share of the visited states in the reference; the rest is the whole sampling range
 
 
 @dataclass(frozen=True)
