@@ -5,6 +5,7 @@ Settings follow from properties of the specification alone (kind of action, time
 
 from __future__ import annotations
 
+import inspect
 import json
 import time
 from collections.abc import Callable, Sequence
@@ -135,7 +136,7 @@ def train(
         seconds=time.perf_counter() - started,
         imagined_return=report.best,
         lost_episodes=report.lost,
-        settings={**asdict(settings), "num_envs": num_envs, "total_steps": total, "gamma": gamma},
+        settings={**asdict(settings), "num_envs": num_envs, "total_steps": total, **effective(learner)},
     )
     out.with_suffix(".json").write_text(json.dumps(asdict(result), indent=2, default=str) + "\n")
     return result
@@ -149,6 +150,14 @@ def algorithm_by_name(name: str) -> type[BaseAlgorithm]:
         raise ValueError(f"unknown algorithm {name!r}: expected one of {', '.join(sorted(known))}")
     found: type[BaseAlgorithm] = known[name]
     return found
+
+
+def effective(learner: BaseAlgorithm) -> dict[str, Any]:
+    """What the algorithm was made with, defaults included, as far as it is numbers and words; and the network."""
+    names = inspect.signature(type(learner).__init__).parameters
+    given = {name: getattr(learner, name, None) for name in names if name not in ("self", "seed", "verbose")}
+    plain = {name: value for name, value in given.items() if isinstance(value, bool | int | float | str)}
+    return {**plain, "net_arch": learner.policy_kwargs.get("net_arch")}
 
 
 def suggested_gamma(spec: EnvironmentSpec) -> float:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from surrogym_client import original
-from surrogym_client.original.episodes import open_episode
+from surrogym_client.original.episodes import GymnasiumEpisode, open_episode
 from surrogym_client.original.port import OriginalPort
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.train import TrainSettings, train
@@ -66,13 +66,23 @@ def test_the_same_seed_gives_the_same_starts_and_the_box_is_wide():
     assert np.abs(starts[0][:, 2]).max() > 6
 
 
-def test_a_trainer_takes_it_for_a_surrogate_and_the_count_is_its_steps(tmp_path):
-    port = port_of("Pendulum-v1")
-    settings = TrainSettings(
-        total_steps=256, num_envs=4, hyperparameters={"n_steps": 16, "batch_size": 32, "n_epochs": 1}
-    )
-    result = train(port, tmp_path / "policy.zip", settings)
-    assert port.steps == result.virtual_steps == 256
+def test_a_trainer_takes_it_for_a_surrogate_and_every_step_counts(tmp_path):
+    name = "Pendulum-v1"
+    spec = original.make(name).spec().model_copy(update={"time_limit": 5})
+    taken = []
+
+    class Counted(GymnasiumEpisode):
+        def step(self, action):
+            taken.append(action)
+            return super().step(action)
+
+    port = OriginalPort(spec, lambda: Counted(spec))
+    quick = {"n_steps": 16, "batch_size": 32, "n_epochs": 1}
+    result = train(port, tmp_path / "policy.zip", TrainSettings(total_steps=256, num_envs=4, hyperparameters=quick))
+    assert result.virtual_steps == 256
+    assert port.steps == len(taken) > 256, "the checks of the policy are real steps too"
+    assert (result.settings["n_steps"], result.settings["gae_lambda"]) == (16, 0.9)
+    assert result.settings["net_arch"]
 
 
 def test_another_autoreset_mode_is_refused():

@@ -14,11 +14,9 @@ from surrogym_client.original.port import OriginalPort
 from surrogym_client.policy_file import PolicyCard, write_card
 from surrogym_client.train import TrainProgress, TrainSettings, train
 
-STEPS = 300_000  # real ones
-
 
 class OriginalRun:
-    """PPO in the original environment; each of its training steps is a real one."""
+    """The default training in the original environment: its steps are real ones, those of its checks too."""
 
     def __init__(self, settings: DemoSettings, folder: Path, *, quiet: bool) -> None:
         self._settings = settings
@@ -27,7 +25,7 @@ class OriginalRun:
 
     def learn(self) -> Learned:
         """Train, and count the steps of the original environment."""
-        chosen = TrainSettings(total_steps=self._settings.virtual_steps or STEPS, seed=self._settings.seed)
+        chosen = TrainSettings(total_steps=self._settings.virtual_steps, seed=self._settings.seed)
         port = OriginalPort(self._settings.judged_by(), episodes_of(self._settings))
         with progress("train", quiet=self._quiet) as update:
 

@@ -11,10 +11,10 @@ from surrogym_client.demo.learning import Learned
 from surrogym_client.demo.settings import DemoSettings, fingerprint
 from surrogym_client.evaluate import Evaluation
 from surrogym_client.policy_file import PolicyCard, read_card
-from surrogym_client.versions import commit, machine, versions
+from surrogym_client.versions import machine, versions
 from surrogym_client.waiting import IN_WORDS
 
-BY_RUN = ("seed", "start_from", "tensorboard")  # training settings that differ from run to run
+BY_RUN = ("seed", "start_from", "tensorboard", "tensorboard_log", "total_steps")  # differ between runs of one kind
 
 
 def metrics_of(
@@ -48,7 +48,6 @@ def metrics_of(
         "demo": asdict(settings),
         "specification": fingerprint(settings.asked()),
         "configuration": fingerprint({"asked": settings.asked(), "training": _training(card)}),
-        "commit": commit(),
         "machine": machine(),
         "versions": versions(),
     }

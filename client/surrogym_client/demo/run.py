@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Any, Protocol
 
 from surrogym_client.cli.errors import CommandError
@@ -18,6 +16,8 @@ from surrogym_client.demo.learning import Learned, SurrogateRun
 from surrogym_client.demo.processes import Children
 from surrogym_client.demo.report import metrics_of
 from surrogym_client.demo.settings import DemoSettings
+from surrogym_client.lifetime import terminations_as_interrupts
+from surrogym_client.versions import commit
 
 
 class Run(Protocol):
@@ -49,9 +49,9 @@ def run_demo(
         CommandError: the folder is not empty, or a process ended badly; says which, its last words and its log.
         SurrogymClientError: the server refused, or the design failed.
     """
-    started = time.monotonic()
+    started, code = time.monotonic(), commit()
     folder = _empty_folder(out or _new_folder(settings))
-    with _terminations_as_interrupts(), _told_what_stays(folder), Children(folder) as children:
+    with terminations_as_interrupts(), _told_what_stays(folder), Children(folder) as children:
         run = _run(settings, folder, children, quiet=quiet)
         learned = run.learn()
         judging = time.monotonic()
@@ -61,6 +61,7 @@ def run_demo(
         now = time.monotonic()
         seconds = {"evaluate": keeping - judging, "report": now - keeping, "total": now - started}
         metrics = metrics_of(settings, learned, judgement, learned.seconds | seconds)
+        metrics["commit"] = code if code == commit() else f"{code} to {commit()}"
         (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
         if tell is not None:
             tell(metrics, folder)
@@ -86,22 +87,6 @@ def _empty_folder(folder: Path) -> Path:
     if any(folder.iterdir()):
         raise CommandError(f"expected an empty run folder, got {folder}, where there is something already")
     return folder.resolve()
-
-
-@contextmanager
-def _terminations_as_interrupts() -> Iterator[None]:
-    """A polite kill is taken like Ctrl-C, so that the children are ended on the way out."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        del number, frame
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager

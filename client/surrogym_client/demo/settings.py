@@ -22,7 +22,7 @@ class DemoSettings:
     seed: int = 0
     arm: str = "default"
     budget: int | None = None  # real steps
-    steps: int | None = None  # virtual steps of the last training
+    steps: int | None = None  # virtual steps, all rounds together
     episodes: int = 100
     pictures: bool = True
     keep: bool = False

@@ -54,7 +54,7 @@ class DemoTask:
     budget: int
     target: Target
     also: Starts | None = None
-    steps: int | None = None  # virtual steps of the last training; None derives them from the specification
+    steps: int | None = None  # virtual ones, all rounds together; None derives them from the specification
 
 
 TASKS = {

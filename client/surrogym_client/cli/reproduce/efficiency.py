@@ -50,6 +50,7 @@ def command(
     from surrogym_client.cli.reproduce.table import present
     from surrogym_client.demo.arms import ARMS
     from surrogym_client.demo.tasks import TASKS
+    from surrogym_client.lifetime import terminations_as_interrupts
     from surrogym_client.reproduce.cells import cells, done_already, run_cells
     from surrogym_client.reproduce.rows import read_rows
 
@@ -59,7 +60,7 @@ def command(
     todo = wanted if again else [cell for cell in wanted if not done_already(cell, rows)]
     say(f"{len(wanted)} runs, {len(wanted) - len(todo)} of them done already", quiet=quiet)
     try:
-        with progress("reproduce", quiet=quiet) as update:
+        with terminations_as_interrupts(), progress("reproduce", quiet=quiet) as update:
 
             def tell(now: Progress) -> None:
                 update(now.done / now.of, _words(now))
