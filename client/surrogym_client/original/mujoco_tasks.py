@@ -44,11 +44,11 @@ def inverted_double_pendulum() -> EnvironmentSpec:
     """InvertedDoublePendulum-v5. The constraint force it shows is 0 except at the rail's ends: termination."""
     sampling = {
         "slider": Uniform(low=-0.9, high=0.9),
-        "hinge": Uniform(low=-0.7, high=0.7),
-        "hinge2": Uniform(low=-0.9, high=0.9),
-        "slider_velocity": Normal(mean=0, std=1.5),
-        "hinge_velocity": Normal(mean=0, std=2.5),
-        "hinge2_velocity": Normal(mean=0, std=3),
+        "hinge": Uniform(low=-0.5, high=0.5),
+        "hinge2": Uniform(low=-0.5, high=0.5),
+        "slider_velocity": Normal(mean=0, std=1),
+        "hinge_velocity": Normal(mean=0, std=1.5),
+        "hinge2_velocity": Normal(mean=0, std=2),
     }
     height = 0.6 * Term.cos(hinge=1) + 0.6 * Term.cos(hinge=1, hinge2=1)
     positions, speeds = list(sampling)[:3], list(sampling)[3:]
