@@ -17,9 +17,9 @@ from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.endings import TERMINATION
 from surrogym_server.surrogate.model import OutputModel, SurrogateModel
 
-FORMAT = 2
+FORMAT = 3
 MALFORMED = (SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError)
-READABLE = (1, 2)  # 1: a reward's timing was the definition's alone
+READABLE = (1, 2, 3)  # 1: a reward's timing was the definition's alone; 2: no drift
 
 
 def to_bytes(model: SurrogateModel) -> bytes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, get_args
 
 import torch
@@ -35,6 +35,7 @@ def output_tensors(output: OutputModel, prefix: str) -> dict[str, Tensor]:
 
 def require_output(definition: EnvironmentDefinition, output: OutputModel) -> None:
     """Raises InvalidInput: arrays of other shapes than the environment's, or numbers that no process has."""
+    _require_drift(definition, output)
     _require_shapes(definition, output)
     _require_numbers(output)
 
@@ -78,11 +79,24 @@ def read_output(entry: dict[str, Any], tensors: Mapping[str, Tensor], prefix: st
             hyper, arrays["x"], arrays["y"], arrays["factor"], arrays["weights"], float(stored["jitter"])
         )
     scores = tuple((name, score) for name, score in entry["scores"])
-    feature_map = FeatureMap(**entry["feature_map"])
-    if feature_map not in KNOWN_MAPS:
+    feature_map = _feature_map(entry["feature_map"])
+    if replace(feature_map, drift=()) not in KNOWN_MAPS:
         raise ValueError(f"unknown feature map {feature_map}")
     centre, scale = float(entry["centre"]), float(entry["scale"])
     return OutputModel(str(entry["name"]), feature_map, posterior, centre, scale, int(entry["left_out"]), scores)
+
+
+def _feature_map(entry: dict[str, Any]) -> FeatureMap:
+    drift = tuple(tuple(float(w) for w in row) for row in entry.get("drift", ()))
+    return FeatureMap(**{**entry, "drift": drift})
+
+
+def _require_drift(definition: EnvironmentDefinition, output: OutputModel) -> None:
+    if not (drift := output.feature_map.drift):
+        return
+    shape = (len(definition.angles), len(definition.coordinates))
+    if len(drift) != shape[0] or any(len(row) != shape[1] or not all(map(math.isfinite, row)) for row in drift):
+        raise InvalidInput(f"output {output.name!r}: expected a drift of shape {shape}, finite, got {drift}")
 
 
 def _require_numbers(output: OutputModel) -> None:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from surrogym_server.surrogate.definition import EnvironmentDefinition, wrap
 from surrogym_server.surrogate.distributions import scaling
+from surrogym_server.surrogate.drift import Drift
 
 State = Literal["cos_sin", "wrapped", "both", "observation"]
 Encoding = Literal["value", "one_hot"]  # of discrete actions
@@ -29,16 +30,18 @@ class FeatureMap:
     standardised elsewhere.
     ``action``: discrete actions as evenly spaced values, or one-hot. ``lead``: the predicted, clipped next value of
     saturating coordinates is an input as well, so that what follows from it (an angle from its speed) sees no kink.
-    ``after``: the state that the step led to is shown, not the one it began in; only for the reward.
+    ``after``: the state that the step led to is shown, not the one it began in; only for the reward. ``drift``: weights
+    (C,) of q for each angle; cos and sin of where the angle turns to by them are inputs as well.
     """
 
     state: State = "cos_sin"
     action: Encoding = "value"
     lead: bool = False
     after: bool = False
+    drift: Drift = ()
 
     def __str__(self) -> str:
-        extras = [name for name, on in (("lead", self.lead), ("after", self.after)) if on]
+        extras = [name for name in ("lead", "after", "drift") if getattr(self, name)]
         return ", ".join([self.state, f"action {self.action}", *extras])
 
 
@@ -63,8 +66,8 @@ def reward_candidates(definition: EnvironmentDefinition) -> tuple[FeatureMap, ..
     return tuple(replace(m, after=after) for after in timings for m in maps)
 
 
-def candidates(definition: EnvironmentDefinition, follows: bool) -> tuple[FeatureMap, ...]:
-    """Maps worth comparing for one output; ``follows`` says that it may read the lead."""
+def candidates(definition: EnvironmentDefinition, follows: bool, drift: Drift = ()) -> tuple[FeatureMap, ...]:
+    """Maps worth comparing for one output; ``follows`` says that it may read the lead, ``drift`` how angles turn."""
     if definition.design.preset == "paper":
         return (FeatureMap(state="observation"),)
     states: list[State] = ["cos_sin"]
@@ -74,16 +77,18 @@ def candidates(definition: EnvironmentDefinition, follows: bool) -> tuple[Featur
     if any(n > 2 for n in definition.action.nvec):
         actions.append("one_hot")
     leads = [False, True] if follows and leading(definition) else [False]
-    return tuple(FeatureMap(s, a, lead) for s, a, lead in product(states, actions, leads))
+    maps = tuple(FeatureMap(s, a, lead) for s, a, lead in product(states, actions, leads))
+    return maps + tuple(replace(m, drift=drift) for m in maps if drift and m.state == "cos_sin")
 
 
 class Feature(NamedTuple):
-    """One input: a function of one entry of [q, u], of the lead, or one observation entry."""
+    """One input: a function of one entry of [q, u], of the lead, of weights . q, or one observation entry."""
 
-    function: Literal["affine", "cos", "sin", "wrapped", "equal", "observed", "lead"]
+    function: Literal["affine", "cos", "sin", "turned_cos", "turned_sin", "wrapped", "equal", "observed", "lead"]
     entry: int
     centre: float = 0.0  # "equal": the value it is compared with
     scale: float = 1.0
+    weights: tuple[float, ...] = ()  # (C,), "turned"
 
 
 def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tuple[Feature, ...]:
@@ -94,6 +99,9 @@ def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tupl
     else:
         for index in range(len(definition.coordinates)):
             made += _of_coordinate(definition, feature_map, index)
+    for index, weights in zip(definition.angles, feature_map.drift, strict=False):
+        turned = tuple(w + (i == index) for i, w in enumerate(weights))
+        made += [Feature("turned_cos", index, weights=turned), Feature("turned_sin", index, weights=turned)]
     for entry in range(definition.action.size):
         made += _of_action(definition, feature_map, entry)
     if feature_map.lead:
@@ -121,7 +129,7 @@ class Encoder:
     """The features of several maps, each computed once and all of a function together."""
 
     definition: EnvironmentDefinition
-    groups: tuple[tuple[str, slice | Tensor, Tensor, Tensor], ...]  # function, entries, centres, scales
+    groups: tuple[tuple[str, slice | Tensor, Tensor, Tensor], ...]  # function, entries (weights), centres, scales
     columns: Mapping[Feature, int]
 
     @classmethod
@@ -158,12 +166,20 @@ class Encoder:
                 return raw[..., entries].cos()
             case "sin":
                 return raw[..., entries].sin()
+            case "turned_cos":
+                return self._turned(entries, raw).cos()
+            case "turned_sin":
+                return self._turned(entries, raw).sin()
             case "wrapped":
                 return wrap(raw[..., entries]) * (math.sqrt(3) / math.pi)
             case "equal":
                 return (raw[..., entries] == centre).to(raw.dtype)
             case _:
                 return (raw[..., entries] - centre) / scale
+
+    def _turned(self, weights: slice | Tensor, raw: Tensor) -> Tensor:
+        assert isinstance(weights, Tensor)
+        return raw[..., : len(self.definition.coordinates)] @ weights
 
 
 def _of_observation(definition: EnvironmentDefinition) -> list[Feature]:
@@ -193,9 +209,11 @@ def _of_action(definition: EnvironmentDefinition, feature_map: FeatureMap, entry
 
 
 def _group(same: tuple[Feature, ...]) -> tuple[slice | Tensor, Tensor, Tensor]:
-    """Entries, as a slice where they are neighbours, centres and scales."""
+    """Entries, as a slice where they are neighbours, or weights (C, k); centres and scales."""
+    centre, scale = torch.tensor([(f.centre, f.scale) for f in same], dtype=torch.float64).T
+    if same[0].weights:
+        return torch.tensor([f.weights for f in same], dtype=torch.float64).T, centre, scale
     entries = [feature.entry for feature in same]
     neighbours = entries == list(range(entries[0], entries[0] + len(entries)))
     index = slice(entries[0], entries[-1] + 1) if neighbours else torch.tensor(entries)
-    centre, scale = torch.tensor([f[2:] for f in same], dtype=torch.float64).T
     return index, centre, scale

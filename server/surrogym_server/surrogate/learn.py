@@ -12,6 +12,7 @@ from torch import Tensor
 
 from surrogym_server.errors import InvalidInput
 from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.surrogate.drift import drift_of
 from surrogym_server.surrogate.endings import ending
 from surrogym_server.surrogate.features import FeatureMap, candidates, encode, leading
 from surrogym_server.surrogate.learner import Learner, Thetas
@@ -59,10 +60,10 @@ def _transitions(learner: Learner, samples: Samples) -> tuple[OutputModel, ...]:
         )
     keep = ~saturated(definition, samples.q_next)
     keep = keep if int(keep.sum()) >= MIN_POINTS else everything
-    lead = leading(definition)
+    lead, drift = leading(definition), drift_of(definition, samples)
     outputs = []
     for column, index in enumerate(definition.moving):
-        maps = candidates(definition, follows=index not in lead)
+        maps = candidates(definition, follows=index not in lead, drift=drift)
         inputs = {m: encode(definition, m, samples.q, samples.u, samples.q_next[:, lead]) for m in maps}
         keep_lead = ~_saturates(definition, index, samples.q_next) | ~keep.any()
         name = definition.coordinates[index].name

@@ -1,0 +1,33 @@
+"""Drift: where an angle turns to within a step under the motion it has, learned from samples.
+
+A step of a fast pole takes it far round. What pulls on it underway depends on where it goes, not only on where it is,
+so cosine and sine of angle + drift are better inputs than those of the angle alone; what they are is linear regression.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from surrogym_server.surrogate.definition import EnvironmentDefinition, wrap
+from surrogym_server.surrogate.distributions import scaling
+from surrogym_server.surrogate.samples import Samples
+
+Drift = tuple[tuple[float, ...], ...]  # weights (C,) of q for each angle
+POINTS_A_WEIGHT = 3
+
+
+def drift_of(definition: EnvironmentDefinition, samples: Samples) -> Drift:
+    """For each angle the weights (C,) with which linear coordinates turn it, increment = w . q + constant, by least
+    squares; empty where there is nothing to turn, or too little to learn it from."""
+    moved_by = [i for i in definition.moving if definition.coordinates[i].kind == "linear"]
+    if not definition.angles or not moved_by or len(samples) < POINTS_A_WEIGHT * (len(moved_by) + 1):
+        return ()
+    centre, scale = torch.tensor([scaling(definition.coordinates[i].sampling) for i in moved_by], dtype=torch.float64).T
+    basis = torch.cat([torch.ones(len(samples), 1, dtype=torch.float64), (samples.q[:, moved_by] - centre) / scale], 1)
+    change = wrap((samples.q_next - samples.q)[:, definition.angles])
+    fitted = torch.linalg.lstsq(basis, change, driver="gelsd").solution
+    turns = ((basis @ fitted - change) / (2 * torch.pi)).round()  # more than half a turn was wrapped
+    fitted = torch.linalg.lstsq(basis, change + 2 * torch.pi * turns, driver="gelsd").solution
+    weights = torch.zeros(len(definition.angles), len(definition.coordinates), dtype=torch.float64)
+    weights[:, moved_by] = fitted[1:].T / scale
+    return tuple(tuple(row) for row in weights.tolist())
