@@ -313,15 +313,69 @@ Action = Annotated[BoxAction | DiscreteAction | MultiDiscreteAction, Field(discr
 
 
 class Reward(Frozen):
-    """How the reward is learned.
+    """How the reward is learned, which is the rule.
 
     ``timing``: ``before`` reads (q, u), as Gymnasium's Pendulum does; ``after`` reads (q', u), as the paper says;
     ``auto`` takes, at each fit, the one that the evidence favours.
     ``penalty``: k of eq. 14, reward = mean - k * deviation; None takes the preset's (default 0, paper 3).
     """
 
+    kind: Literal["learned"] = "learned"
     timing: Literal["before", "after", "auto"] = "before"
     penalty: Annotated[float, Field(ge=0, le=100, strict=True)] | None = None
+
+
+class Quantity(Frozen):
+    """What a declared reward measures: x = term(q) + action . u, ``action`` a weight for each entry of u."""
+
+    term: Term | None = None
+    action: tuple[Number, ...] = Field(default=(), max_length=MAX_DIMENSIONS)
+
+    @model_validator(mode="after")
+    def _something(self) -> Self:
+        require(self.term is not None or bool(self.action), "a quantity needs a term or weights of the action")
+        return self
+
+
+class RewardTerm(Frozen):
+    """weight * shape(of), where every inequality in ``when`` holds, else 0.
+
+    ``one``: 1. ``linear``: sum of x. ``absolute``: sum of |x|. ``square``: sum of x^2. ``bump``: exp(-1/2 sum of x^2).
+    """
+
+    weight: Number = 1.0
+    shape: Literal["one", "linear", "absolute", "square", "bump"]
+    of: tuple[Quantity, ...] = Field(default=(), max_length=MAX_TERM_PARTS)
+    when: tuple[Inequality, ...] = Field(default=(), max_length=MAX_INEQUALITIES)
+
+    @model_validator(mode="after")
+    def _measured(self) -> Self:
+        if self.shape == "one":
+            require(not self.of, "a reward term of shape 'one' takes no quantities")
+        else:
+            require(bool(self.of), f"a reward term of shape {self.shape!r} needs quantities to measure")
+        return self
+
+
+class DeclaredReward(Frozen):
+    """A reward that is known: the sum of its terms, so no query is spent on it. Data, never evaluated as code.
+
+    ``timing`` says which state the terms read; ``terminal`` is what a step that ends the episode pays beyond them.
+    """
+
+    kind: Literal["declared"]
+    terms: tuple[RewardTerm, ...] = Field(min_length=1, max_length=MAX_TERM_PARTS)
+    timing: Literal["before", "after"] = "before"
+    terminal: Number = 0.0
+
+
+def _reward_kind(value: object) -> object:
+    return value.get("kind", "learned") if isinstance(value, dict) else getattr(value, "kind", "learned")
+
+
+AnyReward = Annotated[
+    Annotated[Reward, Tag("learned")] | Annotated[DeclaredReward, Tag("declared")], Discriminator(_reward_kind)
+]
 
 
 class Success(Frozen):
@@ -367,7 +421,7 @@ class EnvironmentSpec(Frozen):
     start: dict[Name, StartDistribution]
     termination: Termination = ()
     time_limit: Annotated[int, Field(ge=1, le=10_000_000, strict=True)] | None = None
-    reward: Reward = Reward()
+    reward: AnyReward = Reward()
     tolerances: dict[Name, Positive] = Field(
         default_factory=dict,
         description="by moving coordinate (preset paper: by observation entry), or 'reward', in the output's own unit",
@@ -414,6 +468,7 @@ class EnvironmentSpec(Frozen):
                 require(
                     inside, f"start of {c.name!r}, [{low}, {high}], leaves its bounds [{c.bounds.low}, {c.bounds.high}]"
                 )
+        self._require_reward()
         for where, term in self._terms():
             for part in term.parts:
                 require_known(f"{where}: term", part.weights, names)
@@ -427,6 +482,16 @@ class EnvironmentSpec(Frozen):
                 f"design: initial {self.design.initial} exceeds the budget {self.design.budget}",
             )
         return self
+
+    def _require_reward(self) -> None:
+        if not isinstance(self.reward, DeclaredReward):
+            return
+        lengths = {len(quantity.action) for term in self.reward.terms for quantity in term.of} - {0}
+        require(
+            lengths <= {self.action.size},
+            f"reward: expected {self.action.size} weights of the action, got {sorted(lengths)}",
+        )
+        require(self.design.preset == "default", "preset 'paper' learns its reward: expected one of kind 'learned'")
 
     def _require_stoppable(self, name: str, stopped: str) -> None:
         require(stopped != name, f"coordinate {name!r} stops itself: expected another one")
@@ -444,3 +509,7 @@ class EnvironmentSpec(Frozen):
         if self.success is not None:
             for inequality in self.success.hold:
                 yield "success", inequality.term
+        if isinstance(self.reward, DeclaredReward):
+            for paying in self.reward.terms:
+                yield from (("reward", quantity.term) for quantity in paying.of if quantity.term is not None)
+                yield from (("reward", inequality.term) for inequality in paying.when)

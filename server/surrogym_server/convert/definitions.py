@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from surrogym_server.errors import InvalidSpec
+from surrogym_server.surrogate import conditions, declared, distributions, terms
 from surrogym_server.surrogate import definition as core
-from surrogym_server.surrogate import distributions, terms
 from surrogym_server.surrogate.recover import ObservationInverse
 from surrogym_shared import spec as wire
 
@@ -31,10 +31,11 @@ def definition_from_spec(spec: wire.EnvironmentSpec) -> core.EnvironmentDefiniti
         termination_groups=tuple(tuple(_inequality(i, names) for i in g) for g in spec.termination_groups),
         time_limit=spec.time_limit,
         reward_timing=spec.reward.timing,
-        penalty=_or(spec.reward.penalty, PENALTY[spec.design.preset]),
+        penalty=_penalty(spec),
         tolerances=tuple(spec.tolerances.items()),
         design=_design(spec),
         learns_termination=spec.termination == "learned",
+        declared_reward=_declared_reward(spec),
     )
     if definition.design.preset == "paper":
         ObservationInverse.of(definition)
@@ -104,8 +105,35 @@ def _term(term: wire.Term, names: tuple[str, ...]) -> terms.Term:
     return terms.Term(parts, _or(term.low, -math.inf), _or(term.high, math.inf))
 
 
-def _inequality(inequality: wire.Inequality, names: tuple[str, ...]) -> core.Inequality:
-    return core.Inequality(_term(inequality.term, names), inequality.relation, inequality.value)
+def _penalty(spec: wire.EnvironmentSpec) -> float:
+    if isinstance(spec.reward, wire.DeclaredReward):
+        return 0.0
+    return _or(spec.reward.penalty, PENALTY[spec.design.preset])
+
+
+def _declared_reward(spec: wire.EnvironmentSpec) -> declared.DeclaredReward | None:
+    if not isinstance(spec.reward, wire.DeclaredReward):
+        return None
+    names = spec.coordinate_names
+    reward_terms = tuple(
+        declared.RewardTerm(
+            term.weight,
+            term.shape,
+            tuple(_quantity(quantity, spec) for quantity in term.of),
+            tuple(_inequality(inequality, names) for inequality in term.when),
+        )
+        for term in spec.reward.terms
+    )
+    return declared.DeclaredReward(reward_terms, spec.reward.timing == "after", spec.reward.terminal, len(names))
+
+
+def _quantity(quantity: wire.Quantity, spec: wire.EnvironmentSpec) -> declared.Quantity:
+    term = terms.Term(()) if quantity.term is None else _term(quantity.term, spec.coordinate_names)
+    return declared.Quantity(term, quantity.action or (0.0,) * spec.action.size)
+
+
+def _inequality(inequality: wire.Inequality, names: tuple[str, ...]) -> conditions.Inequality:
+    return conditions.Inequality(_term(inequality.term, names), inequality.relation, inequality.value)
 
 
 def _action(action: wire.BoxAction | wire.DiscreteAction | wire.MultiDiscreteAction) -> core.ActionDefinition:

@@ -71,6 +71,9 @@ def from_bytes(definition: EnvironmentDefinition, data: bytes) -> SurrogateModel
     if (ending is not None) != definition.learns_termination:
         learned, got = ("learned" if x else "declared" for x in (definition.learns_termination, ending))
         raise InvalidInput(f"expected a model of an environment whose termination is {learned}, got {got}")
+    known, reward = definition.declared_reward, outputs[-1]
+    if known is not None and (reward.posterior, reward.centre, reward.feature_map.after) != (None, 0.0, known.after):
+        raise InvalidInput("expected a model without a reward of its own, as the environment's is declared")
     for output in outputs:
         require_output(definition, output)
     if ending is not None:

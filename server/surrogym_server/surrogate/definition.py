@@ -11,6 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from surrogym_server.surrogate.conditions import Conditions, Inequality
+from surrogym_server.surrogate.declared import DeclaredReward
 from surrogym_server.surrogate.distributions import Distribution
 from surrogym_server.surrogate.terms import Term, TermSet, compile_terms
 
@@ -20,7 +22,6 @@ SCALING_POINTS = 4_096
 Array = NDArray[np.float64]
 Preset = Literal["default", "paper"]
 Kind = Literal["linear", "angle", "constant"]
-Relation = Literal["<", "<=", ">", ">="]
 
 
 @dataclass(frozen=True)
@@ -64,13 +65,6 @@ class ActionDefinition:
 
 
 @dataclass(frozen=True)
-class Inequality:
-    term: Term
-    relation: Relation
-    value: float
-
-
-@dataclass(frozen=True)
 class DesignDefinition:
     """Settings of the adaptive design, every default resolved."""
 
@@ -99,6 +93,7 @@ class EnvironmentDefinition:
     tolerances: tuple[tuple[str, float], ...]
     design: DesignDefinition
     learns_termination: bool = False  # from samples; no groups are declared then
+    declared_reward: DeclaredReward | None = None
 
     @cached_property
     def coordinate_names(self) -> tuple[str, ...]:
@@ -160,22 +155,11 @@ class EnvironmentDefinition:
         """Whether an episode ends at q (..., C) as declared, shape (...): any group all of whose inequalities hold."""
         if not self.termination_groups:
             return torch.zeros(q.shape[:-1], dtype=torch.bool, device=q.device)
-        terms, sign, threshold, membership = self._termination
-        holds = sign * terms(q) >= threshold
-        return ((~holds).to(membership.dtype) @ membership == 0).any(-1)
+        return self._termination(q).any(-1)
 
     @cached_property
-    def _termination(self) -> tuple[TermSet, Tensor, Tensor, Tensor]:
-        """Every inequality as sign * term >= threshold, exactly, (K,), and which group it belongs to, (K, G)."""
-        inequalities = [i for group in self.termination_groups for i in group]
-        groups = [g for g, group in enumerate(self.termination_groups) for _ in group]
-        sign = np.array([1.0 if i.relation in (">", ">=") else -1.0 for i in inequalities])
-        bound = sign * np.array([i.value for i in inequalities])
-        strict = np.array([i.relation in ("<", ">") for i in inequalities])
-        threshold = np.where(strict, np.nextafter(bound, np.inf), bound)
-        membership = np.eye(len(self.termination_groups))[groups]
-        terms = compile_terms([i.term for i in inequalities], len(self.coordinates))
-        return terms, torch.from_numpy(sign), torch.from_numpy(threshold), torch.from_numpy(membership)
+    def _termination(self) -> Conditions:
+        return Conditions.of(self.termination_groups, len(self.coordinates))
 
 
 def wrap(angle: Tensor) -> Tensor:

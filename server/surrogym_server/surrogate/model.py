@@ -77,6 +77,8 @@ class SurrogateModel:
     def description(self) -> dict[str, Any]:
         """Structure and hyperparameters of every output, for people."""
         outputs = [_describe(o) for o in (*self.transitions, self.reward)]
+        if self.definition.declared_reward is not None:
+            outputs[-1]["kernel"] = "declared"
         ending = {} if self.ending is None else {"termination": self.ending.description}
         return {"outputs": outputs, "terminal_reward": self.terminal_reward, "samples": self.samples, **ending}
 
@@ -103,7 +105,7 @@ class SurrogateModel:
         q_next, mean, spread = in_blocks(rows, partial(self._step, wanted), q, u, noise, process, paths)
         return Transition(
             q_next,
-            mean[:, -1],
+            self._rewarded(q, u, q_next, mean[:, -1]),
             spread[:, list(self._columns)] if deviations else None,
             spread[:, -1] if reward_deviation else None,
         )
@@ -134,7 +136,8 @@ class SurrogateModel:
     def means(self, q: Tensor, u: Tensor) -> Tensor:
         """Posterior mean of every output, increments and then the reward, at q (m, C) and u (m, F): (m, O)."""
         q_next, mean, _ = self._step((), q, u, None, None, None)
-        reward = paid(self.terminal_reward, mean[:, -1], self.terminated(q_next))
+        reward = self._rewarded(q, u, q_next, mean[:, -1])
+        reward = paid(self.terminal_reward, reward, self.terminated(q_next))
         return torch.cat([mean[:, list(self._columns)], reward[:, None]], -1)
 
     def _step(
@@ -163,6 +166,11 @@ class SurrogateModel:
             reward = after.predict(after.encoder(q_next, u), wanted, None, None, paths)
             mean, spread = _sum((mean, spread), reward)
         return q_next, mean, spread
+
+    def _rewarded(self, q: Tensor, u: Tensor, q_next: Tensor, mean: Tensor) -> Tensor:
+        """Reward (m,) of steps from q (m, C) under u (m, F) to q_next (m, C): the process' mean and what is known."""
+        known = self.definition.declared_reward
+        return mean if known is None else mean + known(q_next if known.after else q, u)
 
     def _moved(self, q: Tensor, change: Tensor) -> Tensor:
         if self.definition.design.preset == "paper":

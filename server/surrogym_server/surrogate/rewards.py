@@ -1,11 +1,12 @@
-"""Learning the reward: the process of steps that go on, and what a step that ends the episode pays beyond it."""
+"""The reward: declared, or a process of the steps that go on and what a step that ends the episode pays beyond it."""
 
 from __future__ import annotations
 
 import torch
 
+from surrogym_server.surrogate.declared import DeclaredReward
 from surrogym_server.surrogate.definition import REWARD
-from surrogym_server.surrogate.features import encode, reward_candidates
+from surrogym_server.surrogate.features import FeatureMap, encode, reward_candidates
 from surrogym_server.surrogate.learner import Learner
 from surrogym_server.surrogate.model import OutputModel
 from surrogym_server.surrogate.samples import Samples
@@ -16,6 +17,8 @@ FEW = 2  # steps that go on: fewer tell nothing without those that end
 def reward(learner: Learner, samples: Samples) -> tuple[OutputModel, float]:
     """The reward process of steps that go on, and what a step that ends the episode pays beyond it."""
     definition = learner.definition
+    if (known := definition.declared_reward) is not None:
+        return _declared(known, samples), known.terminal
     inputs = {
         m: encode(definition, m, samples.q_next if m.after else samples.q, samples.u)
         for m in reward_candidates(definition)
@@ -27,3 +30,11 @@ def reward(learner: Learner, samples: Samples) -> tuple[OutputModel, float]:
         return output, 0.0
     bonus = samples.reward[ended] - output.mean(inputs[output.feature_map][ended])
     return output, float(bonus.mean())
+
+
+def _declared(known: DeclaredReward, samples: Samples) -> OutputModel:
+    """No process; its score is how far a sample's reward was off at most."""
+    paid = known(samples.q_next if known.after else samples.q, samples.u) + known.terminal * samples.terminated
+    off = float((samples.reward - paid).abs().max())
+    scores = (("declared, largest error over the samples", off),)
+    return OutputModel(REWARD, FeatureMap(after=known.after), None, 0.0, 1.0, 0, scores)

@@ -8,7 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from surrogym_server.surrogate.definition import EnvironmentDefinition, Inequality, wrap
+from surrogym_server.surrogate.conditions import Inequality
+from surrogym_server.surrogate.definition import EnvironmentDefinition, wrap
 from surrogym_server.surrogate.terms import Part, Term, compile_terms
 
 COORDINATES = 3
