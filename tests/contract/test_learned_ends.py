@@ -1,0 +1,59 @@
+"""A declared reward and a learned termination, registered over HTTP, are the same on every transport and in process."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from support.teaching import teach
+from surrogym_client.api import Api
+from surrogym_client.original.classic import cartpole
+from surrogym_client.transport import HttpSurrogate
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.local import LocalSurrogate
+from surrogym_server.surrogate.codec import from_bytes
+from surrogym_shared.port import SurrogatePort
+from surrogym_shared.spec import DeclaredReward, Quantity, RewardTerm, Term
+from surrogym_shared.wire import OpenSession
+
+NAME = "learned-ends"
+DISTANCE = RewardTerm(weight=-1.0, shape="absolute", of=(Quantity(term=Term.linear(pole=1)),))
+SPEC = cartpole().model_copy(
+    update={
+        "termination": "learned",
+        "reward": DeclaredReward(kind="declared", timing="after", terms=(DISTANCE,), terminal=-5.0),
+    }
+)
+
+
+@pytest.fixture(scope="module")
+def ports(pendulum_server) -> Iterator[dict[str, SurrogatePort]]:
+    with Api(pendulum_server.url) as api:
+        teach(api, NAME, SPEC, queries=40)
+        stored = api.surrogate(NAME).spec
+        model = from_bytes(definition_from_spec(stored), api.export_model(NAME, 1))
+    assert stored.termination == "learned"
+    assert isinstance(stored.reward, DeclaredReward)
+    with (
+        HttpSurrogate(pendulum_server.url, NAME, transport="json") as json,
+        HttpSurrogate(pendulum_server.url, NAME, transport="binary") as binary,
+        HttpSurrogate(pendulum_server.url, NAME, transport="stream") as stream,
+    ):
+        yield {"local": LocalSurrogate(stored, model), "json": json, "binary": binary, "stream": stream}
+
+
+def test_every_transport_ends_and_pays_alike(ports):
+    told = {}
+    for name, port in ports.items():
+        session = port.open(OpenSession(num_envs=4, seed=3, autoreset_mode="same_step")).id
+        port.reset(session)
+        told[name] = [port.step(session, np.ones(4, dtype=np.int64)) for _ in range(30)]
+        port.close(session)
+    rewards = {name: np.stack([step.reward for step in steps]) for name, steps in told.items()}
+    ends = {name: np.stack([step.terminated for step in steps]) for name, steps in told.items()}
+    assert ends["local"].any(), "a cart that is pushed one way drops its pole"
+    assert (rewards["local"][ends["local"]] < -5).all()
+    assert (np.abs(rewards["local"][~ends["local"]]) < 0.3).all()
+    for name in ("json", "binary", "stream"):
+        np.testing.assert_array_equal(rewards[name], rewards["local"])
+        np.testing.assert_array_equal(ends[name], ends["local"])
