@@ -1,45 +1,60 @@
-"""Imagined return: what a policy earns in the surrogate, from the declared starts and without exploration."""
+"""What a surrogate says of a policy, and of the observations it will see, without training."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_client.sb3 import SurrogateVecEnv
+from surrogym_client.lanes import Lanes, session_request
 from surrogym_shared.port import SurrogatePort
 
 LONGEST_EPISODE = 1_000  # where the specification has no time limit
+STATISTICS_LANES = 1_024
 
 
 def imagined_returns(
     port: SurrogatePort,
     predict: Callable[[NDArray[Any]], NDArray[Any]],
     episodes: int,
-    seed: int,
+    seed: int | Sequence[int],
     **options: Any,
 ) -> NDArray[np.float64]:
     """Undiscounted returns (episodes,) of whole virtual episodes side by side, any penalty included.
+
+    The imagined return of a policy is their mean: from the declared starts, without exploration.
 
     Args:
         port: the surrogate.
         predict: observations (N, D) to actions.
         episodes: how many.
-        seed: of their starts; the same seed compares policies on the same starts.
+        seed: of their starts, or one an episode; the same seed compares policies on the same starts.
         options: further fields of ``OpenSession``.
     """
-    env = SurrogateVecEnv.from_port(port, episodes, seed=seed, **(options | {"start_box": 0.0}))
+    lanes = Lanes(port, session_request(episodes, "same_step", options | {"start_box": 0.0}))
     returns, running = np.zeros(episodes), np.ones(episodes, dtype=bool)
     try:
-        observation: Any = env.reset()
+        observation = lanes.reset(seed).observation
         for _ in range(port.spec().time_limit or LONGEST_EPISODE):
-            observation, reward, done, _ = env.step(predict(observation))
-            returns += np.where(running, reward, 0.0)
-            running &= ~done
+            result = lanes.step(predict(observation)).result
+            observation = result.observation
+            returns += np.where(running, result.reward, 0.0)
+            running &= ~(result.terminated | result.truncated)
             if not running.any():
                 break
     finally:
-        env.close()
+        lanes.close()
     return returns
+
+
+def observation_statistics(port: SurrogatePort, seed: int) -> tuple[list[float], list[float]]:
+    """Mean and deviation, (D,) each, of observations over the sampling range."""
+    lanes = Lanes(port, session_request(STATISTICS_LANES, "same_step", {"start_box": 1.0}))
+    try:
+        observation = np.asarray(lanes.reset(seed).observation, dtype=np.float64)
+    finally:
+        lanes.close()
+    deviation = observation.std(0)
+    return observation.mean(0).tolist(), np.where(deviation > 1e-6, deviation, 1.0).tolist()

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from surrogym_client.api import Api
+from surrogym_client.evaluate import Predict
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.train import (
     MAX_STEPS,
@@ -19,6 +20,7 @@ from surrogym_client.train import (
     train,
 )
 from surrogym_client.waiting import wait_for_design
+from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
 
 ROUND_SHARE = 0.25  # of a whole training, in each round before the last
@@ -94,19 +96,26 @@ def shares(settings: TrainSettings, rounds: int) -> tuple[int, int]:
 def visit(port: SurrogatePort, policy: Path, settings: TrainSettings, checkpoint: str) -> int:
     """Let a policy run from the declared starts and submit where it went; the number of virtual steps that took."""
     spec = port.spec()
-    learner = algorithm_by_name(settings.algorithm).load(policy, device="cpu")
+    act = explorer(policy, settings.algorithm)
     options = {**settings.session, "occupancy": True}
     env = SurrogateVecEnv.from_port(port, VISIT_LANES, seed=settings.seed, **options)
     steps = min(spec.time_limit or VISIT_STEPS, VISIT_STEPS)
     try:
         observation: Any = env.reset()
         for _ in range(steps):
-            action, _ = learner.predict(observation, deterministic=False)
-            observation, _, _, _ = env.step(action)
+            observation, _, _, _ = env.step(act(observation))
         env.submit_occupancy(checkpoint)
     finally:
         env.close()
     return steps * VISIT_LANES
+
+
+def explorer(policy: Path, algorithm: str) -> Predict:
+    """The policy as it explores while it learns; a network of arrays has one action for each observation."""
+    if Network.is_at(policy):
+        return Network.load(policy)
+    learner = algorithm_by_name(algorithm).load(policy, device="cpu")
+    return lambda observation: learner.predict(observation, deterministic=False)[0]
 
 
 def _shifted(

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from surrogym_client.errors import SurrogymClientError
 from surrogym_client.evaluate import Predict
+from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec
 
 DEFAULT_ALGORITHM = "PPO"
@@ -68,18 +69,20 @@ def read_card(policy: Path) -> PolicyCard:
 def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM) -> Predict:
     """The policy as a function of observations, its most probable action each.
 
-    Such a file is unpickled: load only what you trust.
+    A network of arrays is read as such. Any other file is unpickled: load only what you trust.
 
     Args:
-        path: what ``save`` of a Stable-Baselines3 algorithm wrote.
-        algorithm: name of its class.
+        path: what ``save`` of a Stable-Baselines3 algorithm wrote, or ``Network.save``.
+        algorithm: name of its class; a network of arrays needs none.
 
     Raises:
         UnusablePolicy: no such algorithm, or the file is none of its policies.
     """
+    if Network.is_at(path):
+        return _network(path)
     import stable_baselines3
 
-    kind = getattr(stable_baselines3, algorithm, None)
+    kind = getattr(stable_baselines3, algorithm.upper(), None)
     if kind is None or not hasattr(kind, "load"):
         raise UnusablePolicy(f"Stable-Baselines3 has no algorithm {algorithm!r}: expected for instance PPO, SAC or DQN")
     try:
@@ -92,3 +95,10 @@ def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM) -> Predict:
         return actions
 
     return predict
+
+
+def _network(path: Path) -> Predict:
+    try:
+        return Network.load(path)
+    except ValueError as error:
+        raise UnusablePolicy(str(error)) from error

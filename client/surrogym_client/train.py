@@ -9,7 +9,7 @@ import inspect
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +21,17 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from surrogym_client.imagined import imagined_returns
+from surrogym_client.evolution import EVOLUTION, EVOLUTION_STEPS, evolve
+from surrogym_client.imagined import imagined_returns, observation_statistics
 from surrogym_client.policies import WIDER, PaperPolicy, Standardise
 from surrogym_client.sb3 import SurrogateVecEnv
+from surrogym_client.training import CHECK_EPISODES, CHECKS, TrainProgress, TrainResult, TrainSettings
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import EnvironmentSpec
 
 MAX_STEPS = 1_000_000  # virtual steps of one training, the paper's cap
 ON_POLICY_STEPS = 600_000
 OFF_POLICY_STEPS = 50_000  # these learn from every step, and take far longer for each
-STATISTICS_LANES = 1_024
-CHECKS = 12  # of the imagined return in one training; the best policy is kept
-CHECK_EPISODES = 64
 LEARNING_RATE = 3e-3
 LAST_RATE = 0.02  # share of the learning rate that is left at the end
 
@@ -48,45 +47,6 @@ PPO_DEFAULTS: dict[str, Any] = {
     "learning_rate": _decaying,
     "gae_lambda": 0.9,
 }
-
-
-@dataclass(frozen=True)
-class TrainSettings:
-    """What to train. None takes what the specification suggests.
-
-    ``session`` holds further fields of ``OpenSession`` (variant, particles, model, penalty, ...); ``hyperparameters``
-    go to the algorithm's constructor, over the defaults.
-    """
-
-    algorithm: str = "PPO"
-    total_steps: int | None = None
-    num_envs: int | None = None
-    seed: int = 0
-    start_box: float = 0.5
-    start_from: Path | None = None  # go on from a saved policy
-    threads: int = 1
-    tensorboard: Path | None = None
-    session: dict[str, Any] = field(default_factory=dict)
-    hyperparameters: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class TrainProgress:
-    steps: int
-    total_steps: int
-    imagined_return: float | None  # at the last check: mean over virtual episodes from the declared starts
-    penalty_share: float  # of the reward's size, since the last report
-
-
-@dataclass(frozen=True)
-class TrainResult:
-    path: Path
-    algorithm: str
-    virtual_steps: int
-    seconds: float
-    imagined_return: float | None  # of the policy that was kept
-    lost_episodes: int  # cut because the server lost the session
-    settings: dict[str, Any]
 
 
 def train(
@@ -108,6 +68,8 @@ def train(
         SurrogymClientError: the surrogate can't be reached, or has no model yet.
     """
     settings = settings or TrainSettings()
+    if settings.algorithm.upper() == EVOLUTION:
+        return evolve(port, out, settings, planned_steps(settings), progress)
     torch.set_num_threads(settings.threads)
     spec, algorithm = port.spec(), algorithm_by_name(settings.algorithm)
     total = planned_steps(settings)
@@ -131,7 +93,7 @@ def train(
         wrapped.close()
     result = TrainResult(
         path=out,
-        algorithm=settings.algorithm,
+        algorithm=algorithm.__name__,
         virtual_steps=learner.num_timesteps,
         seconds=time.perf_counter() - started,
         imagined_return=report.best,
@@ -143,12 +105,12 @@ def train(
 
 
 def algorithm_by_name(name: str) -> type[BaseAlgorithm]:
-    """A Stable-Baselines3 algorithm. Raises ValueError with the known names."""
+    """A Stable-Baselines3 algorithm, in any case. Raises ValueError with the known names."""
     known = {n: a for n in dir(stable_baselines3) if isinstance(a := getattr(stable_baselines3, n), type)}
     known = {n: a for n, a in known.items() if issubclass(a, BaseAlgorithm)}
-    if name not in known:
-        raise ValueError(f"unknown algorithm {name!r}: expected one of {', '.join(sorted(known))}")
-    found: type[BaseAlgorithm] = known[name]
+    found: type[BaseAlgorithm] | None = known.get(name.upper())
+    if found is None:
+        raise ValueError(f"unknown algorithm {name!r}: expected one of {', '.join(sorted([*known, EVOLUTION]))}")
     return found
 
 
@@ -177,17 +139,6 @@ def imagined_return(port: SurrogatePort, learner: BaseAlgorithm, settings: Train
         return learner.predict(observation, deterministic=True)[0]
 
     return float(imagined_returns(port, predict, CHECK_EPISODES, settings.seed, **settings.session).mean())
-
-
-def observation_statistics(port: SurrogatePort, seed: int) -> tuple[list[float], list[float]]:
-    """Mean and deviation, (D,) each, of observations over the sampling range."""
-    env = SurrogateVecEnv.from_port(port, STATISTICS_LANES, seed=seed, start_box=1.0)
-    try:
-        observation = np.asarray(env.reset(), dtype=np.float64)
-    finally:
-        env.close()
-    deviation = observation.std(0)
-    return observation.mean(0).tolist(), np.where(deviation > 1e-6, deviation, 1.0).tolist()
 
 
 def _learner(
@@ -223,7 +174,12 @@ def _learner(
 
 
 def planned_steps(settings: TrainSettings) -> int:
-    """Virtual steps of a training. Raises ValueError where they exceed the cap, or for an unknown algorithm."""
+    """Virtual steps of a training. Raises ValueError where they exceed the cap, or for an unknown algorithm.
+
+    CMA-ES has no cap: it learns from whole episodes and takes far more steps, each far cheaper.
+    """
+    if settings.algorithm.upper() == EVOLUTION:
+        return settings.total_steps or EVOLUTION_STEPS
     algorithm = algorithm_by_name(settings.algorithm)
     suggested = ON_POLICY_STEPS if issubclass(algorithm, OnPolicyAlgorithm) else OFF_POLICY_STEPS
     total = suggested if settings.total_steps is None else settings.total_steps

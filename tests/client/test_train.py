@@ -144,7 +144,7 @@ def test_a_discrete_task_trains(tmp_path: Path):
     assert set(action.tolist()) <= {0, 1}
 
 
-@pytest.mark.parametrize("algorithm", ["A2C", "SAC", "TD3"])
+@pytest.mark.parametrize("algorithm", ["A2C", "sac", "TD3"])
 def test_other_algorithms_by_name(surrogate, tmp_path: Path, algorithm):
     hyperparameters = {"n_steps": 8} if algorithm == "A2C" else {"learning_starts": 32, "batch_size": 16}
     settings = small(algorithm=algorithm, num_envs=4, total_steps=64, hyperparameters=hyperparameters)

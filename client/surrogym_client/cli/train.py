@@ -32,7 +32,9 @@ def register(app: typer.Typer) -> None:
 def command(
     surrogate: Annotated[str, typer.Argument(help="Name of the surrogate.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write the policy to.")] = Path("policy.zip"),
-    algorithm: Annotated[str, typer.Option(help="Algorithm of Stable-Baselines3.")] = "PPO",
+    algorithm: Annotated[
+        str, typer.Option(help="Algorithm of Stable-Baselines3 (ppo, a2c, sac, td3, ddpg, dqn), or cmaes.")
+    ] = "PPO",
     steps: Annotated[
         int | None,
         typer.Option(min=1, help="Virtual steps, all rounds of --improve included. [default: from the algorithm]"),

@@ -1,0 +1,49 @@
+"""What every policy search is asked, tells while it runs, and gives back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+CHECKS = 12  # of the imagined return in one training; the best policy is kept
+CHECK_EPISODES = 64
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """What to train. None takes what the specification suggests.
+
+    ``session`` holds further fields of ``OpenSession`` (variant, particles, model, penalty, ...); ``hyperparameters``
+    go to the algorithm's constructor, over the defaults.
+    """
+
+    algorithm: str = "PPO"
+    total_steps: int | None = None
+    num_envs: int | None = None
+    seed: int = 0
+    start_box: float = 0.5
+    start_from: Path | None = None  # go on from a saved policy
+    threads: int = 1
+    tensorboard: Path | None = None
+    session: dict[str, Any] = field(default_factory=dict)
+    hyperparameters: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class TrainProgress:
+    steps: int
+    total_steps: int
+    imagined_return: float | None  # at the last check: mean over virtual episodes from the declared starts
+    penalty_share: float  # of the reward's size, since the last report
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    path: Path
+    algorithm: str
+    virtual_steps: int
+    seconds: float
+    imagined_return: float | None  # of the policy that was kept
+    lost_episodes: int  # cut because the server lost the session
+    settings: dict[str, Any]

@@ -1,0 +1,82 @@
+"""CMA-ES over a port: it learns, the same seed finds the same policy, and evaluation reads its file."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.real_steps import random_steps
+from surrogym_client.evolution import evolve
+from surrogym_client.imagined import imagined_returns
+from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
+from surrogym_client.policy_file import load_policy
+from surrogym_client.train import TrainSettings, train
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.local import LocalSurrogate
+from surrogym_server.surrogate.learn import learn
+from surrogym_shared.network import Network
+
+SMALL = {"population": 8, "starts": 2, "units": 4}
+
+
+def local(spec) -> LocalSurrogate:
+    return LocalSurrogate(spec, learn(definition_from_spec(spec), random_steps(spec, 12, seed=0)).model)
+
+
+def short(spec):
+    return spec.model_copy(update={"time_limit": 20})
+
+
+def small(**settings) -> TrainSettings:
+    return TrainSettings(**{"algorithm": "cmaes", "hyperparameters": SMALL} | settings)
+
+
+@pytest.fixture(scope="module")
+def surrogate() -> LocalSurrogate:
+    return local(short(pendulum()))
+
+
+def test_generations_are_as_many_as_the_steps_allow(surrogate, tmp_path: Path):
+    seen = []
+    result = train(surrogate, tmp_path / "policy.zip", small(total_steps=8 * 2 * 20 * 3 + 10), seen.append)
+    assert result.virtual_steps == 8 * 2 * 20 * 3
+    assert [p.steps for p in seen] == [320, 640, 960]
+    assert result.imagined_return == max(p.imagined_return for p in seen)
+    assert not surrogate._sessions
+
+
+def test_the_same_seed_finds_the_same_policy(surrogate, tmp_path: Path):
+    def found(seed: int) -> np.ndarray:
+        return Network.load(evolve(surrogate, tmp_path / "p.zip", small(seed=seed), 1_000).path).vector
+
+    np.testing.assert_array_equal(found(0), found(0))
+    assert not np.array_equal(found(0), found(1))
+
+
+def test_it_learns_to_balance_and_evaluation_reads_the_file(tmp_path: Path):
+    surrogate = local(cartpole().model_copy(update={"time_limit": 60}))
+    result = train(surrogate, tmp_path / "policy.zip", small(total_steps=12 * 8 * 2 * 60))
+    assert result.imagined_return > 55
+    returns = imagined_returns(surrogate, load_policy(result.path), 16, seed=5)
+    assert returns.mean() > 50
+
+
+def test_it_goes_on_from_a_network(surrogate, tmp_path: Path):
+    first = evolve(surrogate, tmp_path / "first.zip", small(), 3_000)
+    second = evolve(surrogate, tmp_path / "second.zip", small(start_from=first.path, seed=1), 320)
+    assert second.path.exists()
+    wider = small(start_from=first.path, hyperparameters=SMALL | {"units": 6})
+    with pytest.raises(ValueError, match="expected a network of 31 parameters, got 21"):
+        evolve(surrogate, tmp_path / "third.zip", wider, 320)
+
+
+def test_unknown_hyperparameters_are_refused(surrogate, tmp_path: Path):
+    with pytest.raises(ValueError, match="CMAES takes population, starts, units, sigma, got gamma"):
+        train(surrogate, tmp_path / "policy.zip", small(hyperparameters={"gamma": 0.9}))
+
+
+def test_a_goal_far_from_the_start_is_found(tmp_path: Path):
+    """Whole policies explore: noise on each action leads nowhere here."""
+    surrogate = local(mountain_car_continuous())
+    settings = TrainSettings(algorithm="cmaes", hyperparameters={"population": 16, "starts": 2, "units": 4})
+    assert evolve(surrogate, tmp_path / "policy.zip", settings, 8 * 16 * 2 * 999).imagined_return > 80

@@ -1,0 +1,75 @@
+"""A network of arrays: its layers, several at once, both kinds of action, and a file that holds no code."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_shared.network import Network
+from surrogym_shared.spec import EnvironmentSpec, MultiDiscreteAction
+
+UNITS = 5
+
+
+def network(spec: EnvironmentSpec, *many: int) -> Network:
+    d = len(spec.observation)
+    vector = np.random.default_rng(0).normal(size=(*many, Network.size(spec, UNITS)))
+    return Network.of(spec, np.arange(d, dtype=float), np.full(d, 2.0), UNITS, vector)
+
+
+def observations(spec: EnvironmentSpec, *shape: int) -> np.ndarray:
+    return np.random.default_rng(1).normal(size=(*shape, len(spec.observation))).astype(np.float32)
+
+
+def test_a_continuous_action_is_a_scaled_tanh():
+    made, seen = network(pendulum()), observations(pendulum(), 7)
+    x = (seen - [0, 1, 2]) / 2
+    hidden = np.tanh(x @ made.hidden + made.hidden_bias)
+    np.testing.assert_allclose(made(seen), 2 * np.tanh(hidden @ made.output + made.output_bias), rtol=1e-5)
+    assert made(seen).shape == (7, 1)
+    assert made(1e6 * seen).dtype == np.float32
+    assert np.abs(made(1e6 * seen)).max() <= 2
+
+
+@pytest.mark.parametrize(("counts", "shape"), [((3, 2), (50, 2)), ((4,), (50,))])
+def test_a_discrete_action_is_the_most_probable_of_each_entry(counts, shape):
+    action = MultiDiscreteAction(nvec=counts)
+    spec = cartpole().model_copy(update={"action": action})
+    made, seen = network(spec), 10 * observations(spec, 50)
+    chosen = made(seen)
+    assert chosen.shape == shape
+    scores = np.tanh((seen - made.mean) / 2 @ made.hidden + made.hidden_bias) @ made.output + made.output_bias
+    expected = [part.argmax(1) for part in np.split(scores, np.cumsum(counts)[:-1], axis=1)]
+    np.testing.assert_array_equal(chosen.reshape(50, -1), np.stack(expected, 1))
+    assert len(np.unique(chosen)) > 1
+
+
+def test_many_networks_at_once_act_as_each_alone():
+    many, seen = network(pendulum(), 3), observations(pendulum(), 3, 4)
+    vector = np.random.default_rng(0).normal(size=(3, Network.size(pendulum(), UNITS)))
+    for i in range(3):
+        one = Network.of(pendulum(), many.mean, many.deviation, UNITS, vector[i])
+        np.testing.assert_allclose(one(seen[i]), many(seen)[i], rtol=1e-6)
+        np.testing.assert_allclose(one.vector, vector[i])
+
+
+def test_what_is_saved_is_read_again(tmp_path: Path):
+    path = tmp_path / "policy.zip"
+    for spec in (pendulum(), cartpole()):
+        network(spec).save(path)
+        assert Network.is_at(path)
+        np.testing.assert_array_equal(Network.load(path)(observations(spec, 9)), network(spec)(observations(spec, 9)))
+
+
+@pytest.mark.parametrize("content", [b"", b"no zip", None])
+def test_another_file_is_refused(tmp_path: Path, content):
+    path = tmp_path / "policy.zip"
+    if content is None:
+        with path.open("wb") as file:
+            np.savez(file, hidden=np.zeros(3))
+    else:
+        path.write_bytes(content)
+    assert not Network.is_at(path)
+    with pytest.raises(ValueError, match="no network of arrays"):
+        Network.load(path)
