@@ -49,6 +49,17 @@ def test_only_the_named_quantities_are_off(upward, least):
     assert min(masses) < 1 or upward
 
 
+def test_a_full_command_stays_the_full_torque():
+    variation = Variation(
+        "any", 1, {"theta": Fixed(value=0.0), "speed": Fixed(value=0.0)}, ("max_torque",), limit="max_torque"
+    )
+    episode = BiasedEpisode(make("Pendulum-v1").spec().model_copy(update={"start": variation.start}), variation)
+    episode.reset(5)
+    episode.step(np.array([-2.0]))
+    assert episode._env.last_u == pytest.approx(-episode._env.max_torque)
+    assert abs(episode._env.last_u + 2.0) > 1e-3
+
+
 def test_what_follows_from_a_mass_follows():
     variation = Variation("any", 1, None, ("masspole",), 0.5)
     episode = BiasedEpisode(make("CartPole-v1").spec(), variation)

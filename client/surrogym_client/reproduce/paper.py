@@ -82,7 +82,7 @@ def _run(cell: Cell, folder: Path, api: Api, tell: Say) -> None:
     _stage(design / "design.json", lambda: _design(cell, api, tell))
     if cell.trained:
         _stage(policy / "training.json", lambda: _train(cell, api, policy, tell))
-        _stage(policy / "episodes.json", lambda: _episodes(cell, api, policy, tell))
+        _stage(policy / f"{cell.episodes_name}.json", lambda: _episodes(cell, api, policy, tell))
 
 
 def _stage(done: Path, run: Callable[[], Row]) -> None:
@@ -148,7 +148,7 @@ def _episodes(cell: Cell, api: Api, place: Path, tell: Say) -> Row:
         tell(0.9, f"{variation.episodes} real episodes, {variation.name}")
         results[variation.name] = run_variation(predict, spec, variation)
     steps = sum(result["steps"] for result in results.values())
-    api.report_steps(cell.name, steps, note="section 5", idempotency_key=f"{cell.name}-{cell.policy_name}")
+    api.report_steps(cell.name, steps, note="section 5", idempotency_key=f"{cell.name}-{cell.episodes_name}")
     return results
 
 
@@ -172,11 +172,13 @@ def _places(cell: Cell, folder: Path) -> tuple[Path, Path]:
 
 def _is_done(cell: Cell, folder: Path) -> bool:
     design, policy = _places(cell, folder)
-    return (policy / "episodes.json" if cell.trained else design / "design.json").exists()
+    return (policy / f"{cell.episodes_name}.json" if cell.trained else design / "design.json").exists()
 
 
 def _row(cell: Cell, folder: Path) -> Row:
     design, policy = _places(cell, folder)
-    stages = [design / "design.json", *([policy / "training.json", policy / "episodes.json"] if cell.trained else [])]
-    read = {stage.stem: json.loads(stage.read_text(encoding="utf-8")) for stage in stages}
+    stages = {"design": design / "design.json"}
+    if cell.trained:
+        stages |= {"training": policy / "training.json", "episodes": policy / f"{cell.episodes_name}.json"}
+    read = {stage: json.loads(path.read_text(encoding="utf-8")) for stage, path in stages.items()}
     return {"task": cell.task, "arm": cell.arm, "seed": cell.seed, **read}

@@ -25,7 +25,8 @@ ANYWHERE: Literal["anywhere"] = "anywhere"
 class Variation:
     """Real episodes of one kind: where they start, and which physical quantities are off by normal factors.
 
-    ``start`` None is the environment's own; ``upward`` makes quantities larger only; ``traced`` keeps every step.
+    ``start`` None is the environment's own; ``upward`` makes quantities larger only; ``traced`` keeps every step. Where
+    ``limit``, one of ``physics``, grows, actions grow with it: a full command stays the system's full effort.
     """
 
     name: str
@@ -34,6 +35,7 @@ class Variation:
     physics: tuple[str, ...] = ()
     sigma: float = BIAS
     upward: bool = False
+    limit: str | None = None
     traced: bool = False
 
 
@@ -71,7 +73,9 @@ TASKS = {
             Variation("any start", 100, ANYWHERE),
             Variation("five starts", 5, ANYWHERE, traced=True),
             Variation("hanging", 1, HANGING, traced=True),
-            Variation("higher limits", 5, HANGING, ("max_torque", "max_speed"), upward=True, traced=True),
+            Variation(
+                "higher limits", 5, HANGING, ("max_torque", "max_speed"), upward=True, limit="max_torque", traced=True
+            ),
             Variation("other bodies", 100, None, ("g", "m", "l")),
         ),
     ),
@@ -138,8 +142,13 @@ class Cell:
 
     @property
     def policy_name(self) -> str:
-        """The same for its policy and what that has to stand."""
-        return f"policy-{_hash(self.scale.steps, [_plain(v) for v in self.variations])}"
+        """The same for its policy."""
+        return f"policy-{_hash(self.scale.steps)}"
+
+    @property
+    def episodes_name(self) -> str:
+        """The same for what the policy has to stand."""
+        return f"episodes-{_hash([_plain(v) for v in self.variations])}"
 
     @property
     def paper_task(self) -> PaperTask:

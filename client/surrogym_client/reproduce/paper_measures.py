@@ -32,17 +32,24 @@ class BiasedEpisode(GymnasiumEpisode):
     def __init__(self, spec: EnvironmentSpec, variation: Variation) -> None:
         super().__init__(spec)
         self._variation = variation
+        self._gain = 1.0
 
     def reset(self, seed: int) -> Moment:
         """Factors and start are drawn from the seed; where the variation names no start, it is the environment's."""
         rng = np.random.default_rng(seed)
         for name in self._variation.physics:
-            setattr(self._env, name, getattr(self._env, name) * _factor(rng, self._variation))
+            factor = _factor(rng, self._variation)
+            setattr(self._env, name, getattr(self._env, name) * factor)
+            if name == self._variation.limit:
+                self._gain = factor
         if self._task.settle is not None:
             self._task.settle(self._env)
         if self._variation.start is None:
             return super().reset(seed)
         return self.place(draw(self.spec, rng, wide=self._variation.start == ANYWHERE))
+
+    def step(self, action: Array) -> Moment:
+        return super().step(action if self._gain == 1.0 else self._gain * action)
 
 
 def _factor(rng: np.random.Generator, variation: Variation) -> float:
