@@ -20,10 +20,11 @@ from surrogym_shared.port import SurrogatePort
 class SurrogateVecEnv(VecEnv):
     """Many lanes of a learned virtual environment, for any Stable-Baselines3 algorithm.
 
-    Infos have ``TimeLimit.truncated``, at the end of an episode ``terminal_observation``, and
-    ``model_version`` and ``reward_mean``; in a session with a trust region ``untrusted`` as well, which says
-    whether leaving it truncated the episode. An episode that ends because the server lost the session is
-    truncated, with the reason in ``surrogym_session_lost``.
+    Infos have ``TimeLimit.truncated``, ``model_version`` and ``reward_mean``, and at the end of an episode
+    ``terminal_observation`` and, in a session with a penalty, ``penalty``: what it took off the episode's
+    return. In a session with a trust region, ``untrusted`` says whether leaving it truncated the episode. An
+    episode that ends because the server lost the session is truncated, with the reason in
+    ``surrogym_session_lost``.
 
     Args:
         url: the server's address; None takes ``SURROGYM_URL``, then http://127.0.0.1:8000.
@@ -72,6 +73,7 @@ class SurrogateVecEnv(VecEnv):
         view = self._lanes.view
         super().__init__(num_envs, space(view.observation_space), space(view.action_space))
         self._actions: NDArray[Any] | None = None
+        self._penalty = np.zeros(num_envs)  # taken off the running episodes' returns
 
     @property
     def session(self) -> str:
@@ -85,6 +87,7 @@ class SurrogateVecEnv(VecEnv):
     def reset(self) -> NDArray[Any]:
         given = any(seed is not None for seed in self._seeds)
         start = self._lanes.reset(self._seeds if given else None)
+        self._penalty = np.zeros(self.num_envs)
         self.reset_infos = [{"model_version": int(version)} for version in start.model_version]
         if start.lost is not None:
             for info in self.reset_infos:
@@ -104,7 +107,13 @@ class SurrogateVecEnv(VecEnv):
         done = result.terminated | result.truncated
         for lane in result.final_lanes:
             self.reset_infos[lane] = {"model_version": int(result.model_version[lane])}
-        return result.observation.copy(), result.reward.astype(np.float32), done, _infos(step)
+        infos = _infos(step)
+        if self._lanes.view.penalty > 0:
+            self._penalty += result.reward_mean - result.reward
+            for lane in np.flatnonzero(done):
+                infos[lane]["penalty"] = float(self._penalty[lane])
+            self._penalty[done] = 0
+        return result.observation.copy(), result.reward.astype(np.float32), done, infos
 
     def close(self) -> None:
         self._lanes.close()

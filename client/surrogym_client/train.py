@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 import json
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -97,6 +98,7 @@ def train(
         virtual_steps=learner.num_timesteps,
         seconds=time.perf_counter() - started,
         imagined_return=report.best,
+        episode_penalty=report.episode_penalty,
         lost_episodes=report.lost,
         settings={**asdict(settings), "num_envs": num_envs, "total_steps": total, **effective(learner)},
     )
@@ -209,11 +211,16 @@ class _Report(BaseCallback):
         self._latest: float | None = None
         self._kept: dict[str, Any] = {}
         self.best: float | None = None
+        self._penalties: deque[float] = deque(maxlen=100)  # of the last episodes
         self.lost = 0
 
     def restore_best(self) -> None:
         """Give the learner the policy with the best imagined return of all checks."""
         self.model.policy.load_state_dict(self._kept)
+
+    @property
+    def episode_penalty(self) -> float | None:
+        return float(np.mean(self._penalties)) if self._penalties else None
 
     def _on_step(self) -> bool:
         infos, env = self.locals["infos"], self.training_env
@@ -222,6 +229,7 @@ class _Report(BaseCallback):
         mean = np.array([info["reward_mean"] for info in infos])
         self._penalty += float(np.abs(mean - reward).sum())
         self._size += float(np.abs(mean).sum())
+        self._penalties.extend(info["penalty"] for info in infos if "penalty" in info)
         self.lost += sum("surrogym_session_lost" in info for info in infos)
         return True
 
@@ -233,7 +241,7 @@ class _Report(BaseCallback):
             self._check()
         if self._progress is not None:
             steps = min(self.num_timesteps, self._total)
-            self._progress(TrainProgress(steps, self._total, self._latest, share))
+            self._progress(TrainProgress(steps, self._total, self._latest, share, self.episode_penalty))
 
     def _on_training_end(self) -> None:
         self._check()

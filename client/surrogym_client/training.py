@@ -36,6 +36,7 @@ class TrainProgress:
     total_steps: int
     imagined_return: float | None  # at the last check: mean over virtual episodes from the declared starts
     penalty_share: float  # of the reward's size, since the last report
+    episode_penalty: float | None = None  # what it takes off a training episode's return; mean of the last 100
 
 
 @dataclass(frozen=True)
@@ -47,3 +48,4 @@ class TrainResult:
     imagined_return: float | None  # of the policy that was kept
     lost_episodes: int  # cut because the server lost the session
     settings: dict[str, Any]
+    episode_penalty: float | None = None  # what it takes off a training episode's return; mean of the last 100

@@ -123,9 +123,13 @@ def test_ones_own_environment_has_to_be_named_by_the_person(on_server, name, tmp
 @pytest.mark.slow
 def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum, tmp_path):
     assert on_server("sample", pendulum, "--until-done", "--time-limit", "120", "--quiet").code == 0
-    trained = on_server("train", pendulum, "--steps", "2000", "--num-envs", "4", "--seed", "3", "--json", "--quiet")
+    session = ("--variant", "pathwise", "--trust", "9", "--process-noise", "--start-box", "0.25")
+    options = ("--steps", "2000", "--num-envs", "4", "--seed", "3", *session)
+    trained = on_server("train", pendulum, *options, "--json", "--quiet")
     assert trained.code == 0, trained.err
     card = json.loads((tmp_path / "policy.json").read_text())
+    assert card["settings"]["session"] == {"variant": "pathwise", "process_noise": True, "trust": 9.0}
+    assert card["settings"]["start_box"] == 0.25
     assert (card["surrogate"], card["seed"]) == (pendulum, 3)
     assert 0 < card["virtual_steps"] == trained.json["virtual_steps"] <= 2000
     evaluated = on_server("evaluate", "policy.zip", "--episodes", "3", "--json", "--quiet")

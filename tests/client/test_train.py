@@ -94,17 +94,33 @@ def distance(a: PaperPolicy, b: PaperPolicy) -> float:
     return sum(float((p - q).detach().square().sum()) for p, q in pairs) ** 0.5
 
 
+def test_an_episodes_penalty_comes_with_its_end(surrogate):
+    env, taken = SurrogateVecEnv.from_port(surrogate, 2, seed=0, penalty=3.0, time_limit=4), np.zeros(2)
+    env.reset()
+    for _ in range(4):
+        _, reward, _, infos = env.step(np.zeros((2, 1)))
+        taken += [info["reward_mean"] for info in infos] - reward
+    env.close()
+    np.testing.assert_allclose([info["penalty"] for info in infos], taken, rtol=1e-5)
+
+
 def test_a_penalty_is_reported(surrogate, tmp_path: Path):
-    shares = []
+    reports = []
     for penalty in (0.0, 3.0):
-        train(
-            surrogate,
-            tmp_path / "policy.zip",
-            small(session={"penalty": penalty}, total_steps=128),
-            lambda p: shares.append(p.penalty_share),
-        )
-    assert shares[0] == pytest.approx(0, abs=1e-6)
-    assert shares[1] > 1e-3
+        session = {"penalty": penalty, "time_limit": 4}
+        result = train(surrogate, tmp_path / "policy.zip", small(session=session, total_steps=128), reports.append)
+    free, penalised = reports[0], reports[-1]
+    assert free.penalty_share == pytest.approx(0, abs=1e-6)
+    assert free.episode_penalty is None
+    assert penalised.penalty_share > 1e-3
+    assert result.episode_penalty == penalised.episode_penalty > 0
+
+
+@pytest.mark.parametrize("session", [{"variant": "pathwise"}, {"trust": 0.1}, {"process_noise": True}])
+def test_every_kind_of_session_trains(surrogate, tmp_path: Path, session):
+    result = train(surrogate, tmp_path / "policy.zip", small(session=session, total_steps=128))
+    assert result.settings["session"] == session
+    assert result.virtual_steps == 128
 
 
 def test_the_policy_with_the_best_imagined_return_is_kept(surrogate, tmp_path: Path):

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
     Record = Callable[[TrainProgress], None]
 
-Variant = Literal["deterministic", "probabilistic"]
+Variant = Literal["deterministic", "probabilistic", "pathwise"]
+Propagation = Literal["mean", "sample"]
+Weighting = Literal["inverse_variance", "uniform"]
 
 
 def register(app: typer.Typer) -> None:
@@ -43,8 +45,28 @@ def command(
         int | None, typer.Option(min=1, help="Lanes of the session. [default: from the specification]")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of policy and virtual environment.")] = 0,
-    variant: Annotated[Variant, typer.Option(help="deterministic or probabilistic.")] = "deterministic",
-    particles: Annotated[int | None, typer.Option(min=1, help="Particles of a probabilistic step.")] = None,
+    variant: Annotated[
+        Variant, typer.Option(help="The state moves by the mean, as particles, or along a drawn function.")
+    ] = "deterministic",
+    particles: Annotated[int | None, typer.Option(min=1, help="Particles of variant probabilistic.")] = None,
+    propagation: Annotated[
+        Propagation | None, typer.Option(help="How a particle moves: by the mean or by a draw. [default: sample]")
+    ] = None,
+    weighting: Annotated[
+        Weighting | None, typer.Option(help="Of the particles' rewards. [default: inverse_variance]")
+    ] = None,
+    process_noise: Annotated[
+        bool, typer.Option("--process-noise", help="Let the learned noise move the state.")
+    ] = False,
+    trust: Annotated[
+        float | None,
+        typer.Option(
+            help="End episodes where an output deviates by so many times its deviation in the samples. [default: none]"
+        ),
+    ] = None,
+    start_box: Annotated[
+        float, typer.Option(min=0, max=1, help="Share of episodes that start anywhere in the sampling range.")
+    ] = 0.5,
     penalty: Annotated[
         float | None, typer.Option(min=0, help="Deviations taken off the reward. [default: the specification's]")
     ] = None,
@@ -80,12 +102,21 @@ def command(
     spec, url = _trainable(surrogate, server, token, wait)
     from surrogym_client.train import TrainSettings  # torch; imported once there is something to train on
 
-    options = {"variant": variant, "particles": particles, "penalty": penalty}
+    options = {
+        "variant": variant,
+        "particles": particles,
+        "propagation": propagation,
+        "weighting": weighting,
+        "process_noise": process_noise or None,
+        "trust": trust,
+        "penalty": penalty,
+    }
     settings = TrainSettings(
         algorithm=algorithm,
         total_steps=steps,
         num_envs=num_envs,
         seed=seed,
+        start_box=start_box,
         start_from=start_from,
         tensorboard=tensorboard,
         session={key: value for key, value in options.items() if value is not None},
@@ -188,7 +219,8 @@ def _words(result: TrainResult) -> str:
 
 def words_of(now: dict[str, Any]) -> str:
     """One look at the training, from the fields of ``TrainProgress``."""
-    return f"{now['steps']} of {now['total_steps']} virtual steps{_imagined(now['imagined_return'])}"
+    penalty = f", penalty {now['episode_penalty']:.1f} an episode" if now["episode_penalty"] else ""
+    return f"{now['steps']} of {now['total_steps']} virtual steps{_imagined(now['imagined_return'])}{penalty}"
 
 
 def _imagined(value: float | None) -> str:
