@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from surrogym_client.lanes import Lanes, session_request
 from surrogym_shared.port import SurrogatePort
 
+WHOLE = {"start_box": 0.0, "trust": None}  # an episode cut short would earn more where rewards are costs
 LONGEST_EPISODE = 1_000  # where the specification has no time limit
 STATISTICS_LANES = 1_024
 
@@ -33,7 +34,7 @@ def imagined_returns(
         seed: of their starts, or one an episode; the same seed compares policies on the same starts.
         options: further fields of ``OpenSession``.
     """
-    lanes = Lanes(port, session_request(episodes, "same_step", options | {"start_box": 0.0}))
+    lanes = Lanes(port, session_request(episodes, "same_step", options | WHOLE))
     returns, running = np.zeros(episodes), np.ones(episodes, dtype=bool)
     try:
         observation = lanes.reset(seed).observation
