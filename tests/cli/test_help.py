@@ -5,12 +5,15 @@ import sys
 
 import pytest
 
+from support.commands import command_line
 from surrogym_client.cli import COMMANDS
 
+STUDIES = [f"reproduce {name}" for name in command_line().commands["reproduce"].commands]
 
-@pytest.mark.parametrize("command", [*COMMANDS, "serve"])
+
+@pytest.mark.parametrize("command", [*COMMANDS, *STUDIES, "serve"])
 def test_help_has_an_example(surrogym, command):
-    said = surrogym(command, "--help")
+    said = surrogym(*command.split(), "--help")
     assert said.code == 0
     assert f"Example: surrogym {command} " in said.out
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -25,7 +26,7 @@ from surrogym_client.waiting import FINISHED, wait_for_design
 from surrogym_shared.wire import SurrogateView
 
 PATIENCE_SECONDS = 3_600.0
-LOOK_SECONDS = 0.2
+LOOK_SECONDS = 1.0  # a look costs the server a little of what the trainer wants
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,8 @@ class SurrogateRun:
                 for line in read_curve(self._curve)[-1:]:
                     real = self._api.surrogate(self._settings.task).ledger.total
                     update(line["steps"] / line["total_steps"], f"{words_of(line)}, {real} real steps")
-                time.sleep(LOOK_SECONDS)
+                with suppress(subprocess.TimeoutExpired):
+                    trainer.process.wait(LOOK_SECONDS)
             trainer.check()
             update(1.0, f"{read_card(self._policy).virtual_steps} virtual steps")
 
