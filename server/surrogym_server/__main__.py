@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import typer
 
-from surrogym_server.cli.serve import register
+from surrogym_server.cli import optimise, serve
 
 
 def main() -> None:
     """Run the commands of the server."""
     app = typer.Typer(name="surrogym-server", no_args_is_help=True, add_completion=False)
     app.callback()(_keep_names)
-    register(app)
+    serve.register(app)
+    optimise.register(app)
     app()
 
 

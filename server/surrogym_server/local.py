@@ -63,6 +63,11 @@ class LocalSurrogate:
     def spec(self) -> EnvironmentSpec:
         return self._spec
 
+    @property
+    def model(self) -> SurrogateModel:
+        """What the steps are computed with."""
+        return self._model
+
     def open(self, request: OpenSession) -> SessionView:
         if request.model not in ("latest", VERSION):
             raise UnknownModel(f"expected model 'latest' or {VERSION}, got {request.model}")

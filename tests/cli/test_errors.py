@@ -61,7 +61,10 @@ def test_an_address_that_is_none(surrogym):
         ),
         (("demo", "pendulum", "--out", "."), "expected an empty run folder, got ., where there is something already"),
         (("demo", "pendulum", "--json", "no/such/m.json"), "expected an existing folder for --json, got no/such"),
-        (("export", "pendulum", "--out", "samples.txt"), "expected a file ending in .csv or .npz, got '.txt'"),
+        (
+            ("export", "pendulum", "--out", "samples.txt"),
+            "expected a file ending in .csv, .npz, .safetensors or .json, got '.txt'",
+        ),
     ],
 )
 def test_what_is_not_there_or_wrong(surrogym, tmp_path, arguments, message):

@@ -1,13 +1,16 @@
-"""``surrogym export``: the real samples as a file."""
+"""``surrogym export``: the real samples, the latest model or the specification as a file."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from surrogym_client.cli.options import AsJson, Quiet, Server, Token, connect
+
+if TYPE_CHECKING:
+    from surrogym_client.api import Api
 
 
 def register(app: typer.Typer) -> None:
@@ -17,33 +20,43 @@ def register(app: typer.Typer) -> None:
 
 def command(
     surrogate: Annotated[str, typer.Argument(help="Name of the surrogate.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="File to write; .csv or .npz says the format.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="File to write; its ending says what: .csv, .npz, .safetensors, .json.")
+    ],
     server: Server = None,
     token: Token = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write every real sample of a surrogate to a file.
+    """Write every real sample of a surrogate (.csv, .npz), its latest model (.safetensors) or its spec (.json).
 
     Example: surrogym export pendulum --out samples.csv
     """
     from surrogym_client.cli.output import give
 
-    file_format = _format(out)
     with connect(server, token) as api:
-        content = api.export_samples(surrogate, file_format)
+        content = _content(api, surrogate, out)
     out.write_bytes(content)
     words = f"{len(content)} bytes written to {out}"
     give({"file": str(out), "bytes": len(content)}, lambda: words, as_json=as_json, quiet=quiet)
 
 
-def _format(out: Path) -> Literal["csv", "npz"]:
+def _content(api: Api, surrogate: str, out: Path) -> bytes:
     from surrogym_client.cli.errors import CommandError
 
     match out.suffix.lower():
         case ".csv":
-            return "csv"
+            return api.export_samples(surrogate, "csv")
         case ".npz":
-            return "npz"
+            return api.export_samples(surrogate, "npz")
+        case ".json":
+            return api.surrogate(surrogate).spec.model_dump_json(indent=2).encode()
+        case ".safetensors":
+            version = api.surrogate(surrogate).model_version
+            if version is None:
+                raise CommandError(f"{surrogate!r} has no model yet")
+            return api.export_model(surrogate, version)
         case other:
-            raise CommandError(f"expected a file ending in .csv or .npz, got {other or 'no ending'!r}")
+            raise CommandError(
+                f"expected a file ending in .csv, .npz, .safetensors or .json, got {other or 'no ending'!r}"
+            )

@@ -1,0 +1,76 @@
+"""``surrogym optimise``: a policy by gradients straight through an exported model, beside the server."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from surrogym_server.errors import SurrogymError
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``optimise`` to an app of commands."""
+    app.command()(optimise)
+
+
+def optimise(
+    spec: Annotated[Path, typer.Option(help="Specification of the surrogate (JSON), as surrogym export writes it.")],
+    model: Annotated[Path, typer.Option(help="Its model (safetensors), as surrogym export writes it.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write the policy to.")] = Path("policy.zip"),
+    seed: Annotated[int, typer.Option(min=0, help="Seed of policy and starts.")] = 0,
+    updates: Annotated[int | None, typer.Option(min=1, help="Steps up the gradient. [default: 200]")] = None,
+    horizon: Annotated[
+        int | None, typer.Option(min=1, help="Steps of an episode to differentiate. [default: from the specification]")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+) -> None:
+    """Optimise a policy by the gradient of its return through a model; continuous actions only, no server is asked.
+
+    The imagined return that is shown is what the policy earns in the model, not in the original environment.
+
+    Example: surrogym optimise --spec spec.json --model model.safetensors --out policy.zip
+    """
+    import torch
+
+    from surrogym_server.gradients import GradientSettings, Update
+    from surrogym_server.gradients import optimise as climb
+    from surrogym_server.local import LocalSurrogate
+
+    torch.set_num_threads(1)  # many small products: threads cost more than they give
+    chosen = GradientSettings(seed=seed, horizon=horizon)
+    settings = chosen if updates is None else GradientSettings(seed=seed, horizon=horizon, updates=updates)
+
+    def tell(now: Update) -> None:
+        imagined = "" if now.imagined_return is None else f", imagined return {now.imagined_return:.1f} (in the model)"
+        typer.echo(f"\r{now.number} of {settings.updates} updates{imagined}   ", nl=False, err=True)
+
+    started = time.perf_counter()
+    try:
+        surrogate = LocalSurrogate.load(spec, model)
+        found = climb(surrogate, settings, None if quiet else tell)
+        found.policy.save(out)
+    except (SurrogymError, OSError, ValueError) as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(1) from None
+    seconds = time.perf_counter() - started
+    card = {
+        "algorithm": "gradient",
+        "spec": surrogate.spec().model_dump(mode="json"),
+        "seed": seed,
+        "virtual_steps": found.virtual_steps,
+        "seconds": seconds,
+        "imagined_return": found.imagined_return,
+        "settings": asdict(settings),
+    }
+    out.with_suffix(".json").write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
+    if not quiet:
+        typer.echo("", err=True)
+        typer.echo(
+            f"{out}: {found.virtual_steps} virtual steps in {seconds:.1f} s, imagined return "
+            f"{found.imagined_return:.1f} (in the model); next: surrogym evaluate {out}"
+        )

@@ -1,0 +1,202 @@
+"""Policy search by gradients straight through the model, for those who run beside the server.
+
+The paper's Autograd remark: the return of an imagined episode is a differentiable function of the policy's
+parameters, mean increments and mean rewards of the processes (AUR-D), one after the other. Episodes are cut after a
+horizon, because gradients through an unstable system grow with its length, and no lane may outweigh the others. Noise
+before the last tanh, fading out, smooths the return: without it Pendulum ended in a local optimum in three of four
+runs. A step that ends an episode ends the sum; when episodes end has no gradient, so a task that is all about when
+(MountainCarContinuous, InvertedPendulum) is none for this search.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surrogym_server.errors import InvalidInput
+from surrogym_server.local import LocalSurrogate
+from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.virtual import LaneState, VirtualSettings, create, reset
+from surrogym_shared.network import Network
+from surrogym_shared.spec import BoxAction
+
+SHORTEST_HORIZON, LONGEST_HORIZON = 50, 100  # between them, a third of the time limit
+LONGEST_EPISODE = 1_000  # where the specification has no time limit
+START_BOX = 0.5  # share of episodes that start anywhere in the sampling range
+CHECKS = 12
+CHECK_LANES = 64
+LARGEST_LANE = 2.0  # of the median lane's gradient, at every step backwards
+NOISE = 1.0  # first deviation of the noise before the last tanh
+FIRST_SPREAD = 0.5  # deviation of the first parameters
+LAST_RATE = 0.05  # share of the learning rate that is left at the end
+
+
+@dataclass(frozen=True)
+class GradientSettings:
+    """``horizon`` None is a third of the time limit, between 50 and 100 steps."""
+
+    updates: int = 200
+    lanes: int = 128
+    horizon: int | None = None
+    units: int = 64
+    learning_rate: float = 0.05
+    largest_norm: float = 1.0
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Update:
+    number: int
+    imagined_return: float | None  # at the last check: whole episodes from the declared starts
+
+
+@dataclass(frozen=True)
+class Optimised:
+    policy: Network
+    imagined_return: float
+    virtual_steps: int
+
+
+def optimise(
+    surrogate: LocalSurrogate,
+    settings: GradientSettings | None = None,
+    progress: Callable[[Update], None] | None = None,
+) -> Optimised:
+    """Climb the gradient of the imagined return; gives the policy whose imagined return was best.
+
+    Args:
+        surrogate: with continuous actions.
+        settings: of the search.
+        progress: called after every update.
+
+    Raises:
+        InvalidInput: the policy's actions are discrete, so that nothing can be differentiated; or the return does not
+            depend on them anywhere, as where every step alive pays the same.
+
+    Example:
+        >>> optimise(LocalSurrogate.load("spec.json", "model.safetensors")).policy.save(Path("policy.zip"))
+    """
+    settings = settings or GradientSettings()
+    search = _Search(surrogate, settings)
+    best, kept, latest = -np.inf, search.policy(), None
+    for number in range(1, settings.updates + 1):
+        search.update()
+        if number * CHECKS // settings.updates > (number - 1) * CHECKS // settings.updates:
+            latest = search.imagined_return()
+            if latest >= best:
+                best, kept = latest, search.policy()
+        if progress is not None:
+            progress(Update(number, latest))
+    return Optimised(kept, float(best), search.virtual_steps)
+
+
+class _Search:
+    """Parameters of a ``Network`` as one vector, Adam, and the lanes whose starts are drawn anew for each update."""
+
+    def __init__(self, surrogate: LocalSurrogate, settings: GradientSettings) -> None:
+        self._spec, self._model, self._settings = surrogate.spec(), surrogate.model, settings
+        action = self._spec.action
+        if not isinstance(action, BoxAction) or action.bins is not None:
+            raise InvalidInput("expected continuous actions to differentiate by, got discrete ones")
+        self._limit = self._spec.time_limit or LONGEST_EPISODE
+        third = min(max(self._limit // 3, SHORTEST_HORIZON), LONGEST_HORIZON)
+        self._horizon = min(settings.horizon or third, self._limit)
+        definition = self._model.definition
+        self._mean, self._deviation = definition.observation_scaling
+        first = np.random.default_rng(settings.seed).normal(size=Network.size(self._spec, settings.units))
+        self._vector = torch.tensor(FIRST_SPREAD * first, requires_grad=True)
+        self._adam = torch.optim.Adam([self._vector], lr=settings.learning_rate)
+        self._rate = torch.optim.lr_scheduler.LinearLR(self._adam, 1.0, LAST_RATE, settings.updates)
+        self._training = VirtualSettings(num_envs=settings.lanes, start_box=START_BOX)
+        self._random = torch.Generator().manual_seed(settings.seed)
+        self._lanes = create(definition, self._training, settings.seed)
+        self._check_lanes = self._checked_starts()
+        self.virtual_steps = 0
+
+    def policy(self) -> Network:
+        """The policy as it is now."""
+        vector = self._vector.detach().numpy().copy()
+        return Network.of(self._spec, self._mean.numpy(), self._deviation.numpy(), self._settings.units, vector)
+
+    def update(self) -> None:
+        """One step up the gradient of the mean return of episodes from new starts."""
+        self._lanes, _ = reset(self._model.definition, self._training, self._lanes)
+        returns = self._returns(self._lanes.q, self._horizon)
+        if not returns.requires_grad:
+            raise InvalidInput("expected a return that depends on the actions, got one that is the same for all")
+        self._adam.zero_grad()
+        (-returns.mean() / self._horizon).backward()  # type: ignore[no-untyped-call]
+        gradient = self._vector.grad
+        assert gradient is not None
+        if not bool(gradient.isfinite().all()):
+            gradient.zero_()  # these starts lead where the model is too steep; others follow
+        torch.nn.utils.clip_grad_norm_([self._vector], self._settings.largest_norm)
+        self._adam.step()
+        self._rate.step()
+
+    @torch.no_grad()
+    def imagined_return(self) -> float:
+        """Mean return of whole episodes from the same declared starts at every check."""
+        return float(self._returns(self._check_lanes.q, self._limit).mean())
+
+    def _returns(self, q: Tensor, steps: int) -> Tensor:
+        """Sum of rewards (N,) of ``steps`` steps from q (N, C)."""
+        returns, alive = q.new_zeros(len(q)), torch.ones(len(q), dtype=torch.bool)
+        for _ in range(steps):
+            self.virtual_steps += len(q)
+            if q.requires_grad:
+                q.register_hook(_evened)  # type: ignore[no-untyped-call]
+            q, reward, over = _step(self._model, q, self._act(q))
+            returns = returns + torch.where(alive, reward, 0.0)
+            alive = alive & ~over
+            if not bool(alive.any()):
+                break
+        return returns
+
+    def _act(self, q: Tensor) -> Tensor:
+        """What ``Network`` does, in torch: q (N, C) to actions (N, F)."""
+        d, units, size = len(self._mean), self._settings.units, self._spec.action.size
+        hidden, bias, output, output_bias = torch.split(self._vector, [d * units, units, units * size, size])
+        x = (self._model.definition.observe(q) - self._mean) / self._deviation
+        y = torch.tanh(x @ hidden.reshape(d, units) / d**0.5 + bias) @ output.reshape(units, size) / units**0.5
+        low, high = self._bounds
+        if torch.is_grad_enabled():
+            y = y + self._noise * torch.randn(y.shape, generator=self._random, dtype=y.dtype)
+        return (low + high) / 2 + (high - low) / 2 * torch.tanh(y + output_bias)
+
+    @property
+    def _noise(self) -> float:
+        """Deviation of what is added before the last tanh: it smooths the return, and fades like the learning rate."""
+        return NOISE * float(self._rate.get_last_lr()[0]) / self._settings.learning_rate
+
+    @property
+    def _bounds(self) -> tuple[Tensor, Tensor]:
+        action = self._spec.action
+        assert isinstance(action, BoxAction)
+        return torch.tensor(action.low, dtype=torch.float64), torch.tensor(action.high, dtype=torch.float64)
+
+    def _checked_starts(self) -> LaneState:
+        declared = VirtualSettings(num_envs=CHECK_LANES)
+        lanes = create(self._model.definition, declared, self._settings.seed)
+        return reset(self._model.definition, declared, lanes)[0]
+
+
+def _evened(gradient: Tensor) -> Tensor:
+    """The gradient (N, C) of what is still to come, where no lane outweighs the others.
+
+    Backwards through an unstable stretch a lane's gradient grows with every step, and would soon be the only one.
+    """
+    size = gradient.norm(dim=1, keepdim=True)
+    evened: Tensor = gradient * (LARGEST_LANE * size.median() / size.clamp_min(1e-300)).clamp_max(1.0)
+    return evened
+
+
+def _step(model: SurrogateModel, q: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean next state (N, C), mean reward (N,) and whether the episode ended (N,)."""
+    moved = model.transition(q, u)
+    over = model.terminated(moved.q_next)
+    return moved.q_next, moved.reward + model.terminal_reward * over, over

@@ -1,0 +1,50 @@
+"""``surrogym optimise``: from files to a policy and its card; what can't be optimised is one sentence."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from support.real_steps import random_steps
+from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_client.policy_file import read_card
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.surrogate.codec import to_bytes
+from surrogym_server.surrogate.learn import learn
+from surrogym_shared.network import Network
+
+
+def optimise(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "surrogym_server", "optimise", "--spec", "spec.json", "--model", "m.safetensors"]
+    return subprocess.run([*command, *options], cwd=folder, capture_output=True, text=True, check=False)
+
+
+def export(folder: Path, spec) -> None:
+    model = learn(definition_from_spec(spec), random_steps(spec, 8, seed=0)).model
+    (folder / "spec.json").write_text(spec.model_dump_json())
+    (folder / "m.safetensors").write_bytes(to_bytes(model))
+
+
+def test_a_policy_and_its_card_are_written(tmp_path: Path):
+    export(tmp_path, pendulum())
+    said = optimise(tmp_path, "--updates", "2", "--horizon", "3", "--seed", "4")
+    assert said.returncode == 0, said.stderr
+    assert "next: surrogym evaluate policy.zip" in said.stdout
+    policy = tmp_path / "policy.zip"
+    assert Network.is_at(policy)
+    card = read_card(policy)
+    assert (card.algorithm, card.seed, card.spec) == ("gradient", 4, pendulum())
+    assert json.loads((tmp_path / "policy.json").read_text())["settings"]["updates"] == 2
+
+
+@pytest.mark.parametrize("missing", [True, False], ids=["no file", "discrete"])
+def test_what_can_not_be_optimised_is_one_sentence(tmp_path: Path, missing: bool):
+    if not missing:
+        export(tmp_path, cartpole())
+    said = optimise(tmp_path)
+    assert said.returncode == 1
+    assert said.stderr.startswith("error: ")
+    assert ("spec.json" if missing else "expected continuous actions") in said.stderr
+    assert not (tmp_path / "policy.zip").exists()
