@@ -19,6 +19,7 @@ HEADING = (
     *("task", "arm", "seeds", "real steps", "real return", "worst seed", "worst episode"),
     *("success", "other starts", "imagined", "target reached", "seconds"),
 )
+FEW = 3  # seeds; fewer have no interval worth the name
 CONTRASTS = (  # what a pair of arms tells, at the same budget
     ("adaptive queries", "no_loop", "latin_hypercube"),
     ("adaptive queries, in the paper's representation", "paper", "paper_hypercube"),
@@ -29,9 +30,9 @@ CONTRASTS = (  # what a pair of arms tells, at the same budget
     ("surrogate or original", "default", "oracle"),
 )
 NOTES = """\
-Real steps: median (smallest to largest). Real return: interquartile mean over seeds of the mean over episodes, with its
-95 % bootstrap interval. Worst seed: its mean. Success and other starts: share of the episodes, worst seed. Imagined:
-what the surrogate promised. Target reached: by how many seeds of all. Seconds: median (largest).
+Real steps: median (smallest to largest). Real return: interquartile mean over seeds of the mean over episodes; from three
+seeds on with a 95 % bootstrap interval. Worst seed: its mean. Success and other starts: share of the episodes, worst
+seed. Imagined: what the surrogate promised. Target reached: by how many seeds of all. Seconds: median (largest).
 """
 
 
@@ -86,14 +87,13 @@ def _line(group: Group, rows: Sequence[Row]) -> Sequence[str]:
     means = column(rows, "mean")
     if not len(means):
         return task, name, seeds, *["-"] * (len(HEADING) - 3)
-    low, high = bootstrap_interval(means)
     imagined = column(rows, "imagined")
     return (
         task,
         name,
         seeds,
         _spread(column(rows, "real_steps")),
-        f"{_number(interquartile_mean(means))} ({_number(low)} to {_number(high)})",
+        _with_interval(means),
         _number(means.min()),
         _number(column(rows, "min").min()),
         _share(column(rows, "success")),
@@ -109,7 +109,7 @@ def _contrasts(groups: dict[Group, list[Row]]) -> str:
     for task, budget in dict.fromkeys((task, budget) for task, _, budget in groups):
         for question, first, second in CONTRASTS:
             pair = [column(groups.get((task, arm, budget), []), "mean") for arm in (first, second)]
-            if min(map(len, pair)) > 1:
+            if min(map(len, pair)) >= FEW:
                 low, high = difference_interval(*pair)
                 difference = interquartile_mean(pair[0]) - interquartile_mean(pair[1])
                 lines.append(
@@ -142,6 +142,14 @@ def _listed(rows: Sequence[Row], name: str) -> str:
 
 def _reached(rows: Sequence[Row]) -> str:
     return f"{sum(row.reached for row in rows)} of {len(rows)}"
+
+
+def _with_interval(means: NDArray[np.float64]) -> str:
+    middle = _number(interquartile_mean(means))
+    if len(means) < FEW:
+        return middle
+    low, high = bootstrap_interval(means)
+    return f"{middle} ({_number(low)} to {_number(high)})"
 
 
 def _spread(values: NDArray[np.float64]) -> str:
