@@ -30,8 +30,8 @@ CONTRASTS = (  # what a pair of arms tells, at the same budget
     ("surrogate or original", "default", "oracle"),
 )
 NOTES = """\
-Real steps: median (smallest to largest). Real return: interquartile mean over seeds of the mean over episodes; from three
-seeds on with a 95 % bootstrap interval. Worst seed: its mean. Success and other starts: share of the episodes, worst
+Real steps: median (smallest to largest). Real return: interquartile mean over seeds of their means; from three seeds
+on with a 95 % bootstrap interval. Worst seed: its mean. Success and other starts: share of the episodes, worst
 seed. Imagined: what the surrogate promised. Target reached: by how many seeds of all. Seconds: median (largest).
 """
 
