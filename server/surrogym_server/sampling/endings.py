@@ -1,4 +1,5 @@
-"""Queries reserved for the end of an episode: what it pays, and where it is if that is learned, must be seen."""
+"""Queries reserved for the end of an episode and a reward's edge: what an ending pays, and where both are, must be
+seen."""
 
 from __future__ import annotations
 
@@ -17,14 +18,18 @@ def ending(model: SurrogateModel, samples: Samples, points: Points) -> Tensor | 
     """Which of m points to take a query from for the sake of the episodes' end, (m,) bool; None if none is needed.
 
     Declared: those predicted to end one, as long as no sample has. Learned: those most in doubt, until little doubt is
-    left; then those that go farthest beyond where episodes are known to go on, for there may be another end.
+    left; then those that go farthest beyond where episodes are known to go on, for there may be another end. Either
+    way, where the reward jumps, those of which it is in doubt on which side they lie.
     """
-    if not model.definition.learns_termination:
-        return None if bool(samples.terminated.any()) else _predicted(model, points)
     q_next = model.transition(points.q, points.u).q_next
+    if not model.definition.learns_termination:
+        unseen = None if bool(samples.terminated.any()) else _predicted(model, points, q_next)
+        return _edges(model, points, q_next) if unseen is None else unseen
     doubt = in_doubt(model, q_next)
     if float(doubt.mean()) > DOUBT:
         return doubt >= 0.5 * doubt.max()
+    if (edges := _edges(model, points, q_next)) is not None:
+        return edges
     beyond = unexplored(model.definition, samples.q_next[~samples.terminated], q_next) * ~model.terminated(q_next)
     return beyond >= 0.9 * beyond.max() if float(beyond.max()) > FRONTIER else None
 
@@ -35,6 +40,17 @@ def in_doubt(model: SurrogateModel, q_next: Tensor) -> Tensor:
     return probability.minimum(1 - probability)
 
 
-def _predicted(model: SurrogateModel, points: Points) -> Tensor | None:
-    ends = model.terminated(model.transition(points.q, points.u).q_next) & ~model.terminated(points.q)
+def _edges(model: SurrogateModel, points: Points, q_next: Tensor) -> Tensor | None:
+    """Where it is most in doubt on which side of a reward's edge points lie."""
+    state = q_next if model.reward.feature_map.after else points.q
+    for jump in model.jumps:
+        inside = jump.region.probability(state)
+        doubt = inside.minimum(1 - inside)
+        if float(doubt.mean()) > DOUBT:
+            return doubt >= 0.5 * doubt.max()
+    return None
+
+
+def _predicted(model: SurrogateModel, points: Points, q_next: Tensor) -> Tensor | None:
+    ends = model.terminated(q_next) & ~model.terminated(points.q)
     return ends if bool(ends.any()) else None

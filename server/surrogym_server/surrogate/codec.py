@@ -12,12 +12,19 @@ from torch import Tensor
 
 from surrogym_server.errors import InvalidInput
 from surrogym_server.surrogate.codec_outputs import output_header, output_tensors, read_output, require_output
-from surrogym_server.surrogate.codec_regions import read_region, region_header, region_tensors, require_region
+from surrogym_server.surrogate.codec_regions import (
+    read_jumps,
+    read_region,
+    region_header,
+    region_tensors,
+    require_region,
+)
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.endings import TERMINATION
 from surrogym_server.surrogate.model import OutputModel, SurrogateModel
 
 FORMAT = 3
+JUMP = "jump"  # before the names of its arrays
 MALFORMED = (SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError)
 READABLE = (1, 2, 3)  # 1: a reward's timing was the definition's alone; 2: no drift
 
@@ -26,6 +33,8 @@ def to_bytes(model: SurrogateModel) -> bytes:
     """The whole model, serving arrays included."""
     outputs = (*model.transitions, model.reward)
     tensors: dict[str, Tensor] = {} if model.ending is None else region_tensors(model.ending, TERMINATION)
+    for index, jump in enumerate(model.jumps):
+        tensors |= region_tensors(jump.region, f"{JUMP}.{index}")
     for index, output in enumerate(outputs):
         tensors |= output_tensors(output, str(index))
     header = {
@@ -34,6 +43,7 @@ def to_bytes(model: SurrogateModel) -> bytes:
         "terminal_reward": model.terminal_reward,
         "samples": model.samples,
         "digest": model.digest,
+        "jumps": [[jump.size, region_header(jump.region)] for jump in model.jumps],
         "termination": None if model.ending is None else region_header(model.ending),
     }
     return save(tensors, {"surrogym": json.dumps(header)})
@@ -55,6 +65,7 @@ def from_bytes(definition: EnvironmentDefinition, data: bytes) -> SurrogateModel
             outputs = (*outputs[:-1], _read_after(outputs[-1]))
         samples, digest = int(header["samples"]), str(header["digest"])
         ending = read_region(definition, header.get("termination"), tensors, TERMINATION)
+        jumps = read_jumps(definition, header.get("jumps", []), tensors, JUMP)
     except MALFORMED as error:
         raise InvalidInput(f"expected a Surrogym model in safetensors form, got {len(data)} bytes: {error}") from error
     names = tuple(output.name for output in outputs)
@@ -76,9 +87,11 @@ def from_bytes(definition: EnvironmentDefinition, data: bytes) -> SurrogateModel
         raise InvalidInput("expected a model without a reward of its own, as the environment's is declared")
     for output in outputs:
         require_output(definition, output)
-    if ending is not None:
-        require_region(ending)
-    return SurrogateModel(definition, outputs[:-1], outputs[-1], terminal_reward, samples, digest, ending)
+    for region in (*(jump.region for jump in jumps), *([] if ending is None else [ending])):
+        require_region(region)
+    if not all(math.isfinite(jump.size) for jump in jumps):
+        raise InvalidInput(f"expected jumps of finite sizes, got {[jump.size for jump in jumps][:4]}")
+    return SurrogateModel(definition, outputs[:-1], outputs[-1], terminal_reward, samples, digest, ending, jumps)
 
 
 def _read_after(reward: OutputModel) -> OutputModel:

@@ -11,7 +11,7 @@ from torch import Tensor
 from surrogym_server.errors import InvalidInput
 from surrogym_server.surrogate.codec_outputs import output_header, output_tensors, read_output, require_output
 from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.surrogate.regions import Axes, Classifier, Cut, Form, Region, Thresholds
+from surrogym_server.surrogate.regions import Axes, Classifier, Cut, Form, Jump, Region, Thresholds
 
 
 def region_header(region: Region) -> dict[str, Any]:
@@ -39,6 +39,19 @@ def read_region(
         for index, (weight, form) in enumerate(entry["forms"])
     )
     return Region(forms, tuple((str(name), float(score)) for name, score in entry["scores"]))
+
+
+def read_jumps(
+    definition: EnvironmentDefinition, entries: Any, tensors: Mapping[str, Tensor], prefix: str
+) -> tuple[Jump, ...]:
+    """The jumps of a header's entries. Raises LookupError, TypeError or ValueError."""
+    jumps = []
+    for index, (size, entry) in enumerate(entries):
+        region = read_region(definition, entry, tensors, f"{prefix}.{index}")
+        if region is None:
+            raise ValueError("a jump without a region")
+        jumps.append(Jump(region, float(size)))
+    return tuple(jumps)
 
 
 def require_region(region: Region) -> None:

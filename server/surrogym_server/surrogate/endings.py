@@ -1,10 +1,11 @@
-"""Learning where episodes end, from samples that say whether they did."""
+"""Learning a region from labelled states; above all where episodes end, from samples that say whether they did."""
 
 from __future__ import annotations
 
 import math
 
 import torch
+from torch import Tensor
 
 from surrogym_server.surrogate.features import candidates, encode
 from surrogym_server.surrogate.learner import Learner
@@ -18,12 +19,15 @@ FAINT = 0.05  # a form of less weight beside the best one's is dropped
 
 
 def ending(learner: Learner, samples: Samples) -> Region:
-    """Where episodes end: thresholds and a classifier, weighed by how well they foretell left-out labels.
+    """Where episodes end. As long as no sample ended, nothing does."""
+    return region(learner, TERMINATION, samples.q_next, samples.terminated)
 
-    As long as no sample ended, nothing does.
-    """
-    found: list[tuple[Form, float]] = [_classifier(learner, samples)]
-    found += thresholds(learner.definition, samples.q_next, samples.terminated)
+
+def region(learner: Learner, name: str, q: Tensor, inside: Tensor) -> Region:
+    """Which of q (n, C) lie inside (n,): thresholds and a classifier, weighed by how well they foretell left-out
+    labels."""
+    found: list[tuple[Form, float]] = [_classifier(learner, name, q, inside)]
+    found += thresholds(learner.definition, q, inside)
     names = [str(form.description.get("inside", "classifier")) for form, _ in found]
     scores = torch.tensor([score for _, score in found], dtype=torch.float64)
     weights = torch.where(scores - scores.max() > math.log(FAINT), scores, -torch.inf).softmax(0).tolist()
@@ -31,15 +35,14 @@ def ending(learner: Learner, samples: Samples) -> Region:
     return Region(forms, tuple(zip(names, scores.tolist(), strict=True)))
 
 
-def _classifier(learner: Learner, samples: Samples) -> tuple[Classifier, float]:
+def _classifier(learner: Learner, name: str, q: Tensor, inside: Tensor) -> tuple[Classifier, float]:
     definition = learner.definition
-    everything = torch.ones_like(samples.terminated)
-    label = 2 * samples.terminated.double() - 1
+    everything, u = torch.ones_like(inside), q.new_zeros(len(q), definition.action.size)
     maps = [m for m in candidates(definition, follows=False) if m.action == "value"]
-    inputs = {m: encode(definition, m, samples.q_next, torch.zeros_like(samples.u)) for m in maps}
-    process = learner.output(TERMINATION, label, inputs, everything, everything)
+    inputs = {m: encode(definition, m, q, u) for m in maps}
+    process = learner.output(name, 2 * inside.double() - 1, inputs, everything, everything)
     if process.posterior is None:
         return Classifier(definition, process), 0.0
     mean, variance = process.posterior.leave_one_out()
     probability = likely(process.centre + process.scale * mean, process.scale * variance.sqrt())
-    return Classifier(definition, process), log_probability(probability, samples.terminated) - HANDICAP
+    return Classifier(definition, process), log_probability(probability, inside) - HANDICAP

@@ -42,9 +42,9 @@ def learn(definition: EnvironmentDefinition, samples: Samples, warm: Thetas | No
         raise InvalidInput(f"a model needs at least {MIN_POINTS} samples, got {len(samples)}")
     learner = Learner(definition, warm or {}, {})
     transitions = _transitions(learner, samples)
-    paying, terminal_reward = reward(learner, samples)
+    paying, terminal_reward, jumps = reward(learner, samples)
     ends = ending(learner, samples) if definition.learns_termination else None
-    model = SurrogateModel(definition, transitions, paying, terminal_reward, len(samples), samples.digest, ends)
+    model = SurrogateModel(definition, transitions, paying, terminal_reward, len(samples), samples.digest, ends, jumps)
     return Learned(model, learner.thetas)
 
 

@@ -18,7 +18,7 @@ from surrogym_server.gp import Output, Posterior, in_blocks
 from surrogym_server.surrogate.definition import EnvironmentDefinition, wrap
 from surrogym_server.surrogate.features import Encoder, FeatureMap, leading
 from surrogym_server.surrogate.recover import ObservationInverse
-from surrogym_server.surrogate.regions import Region
+from surrogym_server.surrogate.regions import Jump, Region, jumped
 from surrogym_server.surrogate.stage import Stage
 
 
@@ -72,6 +72,7 @@ class SurrogateModel:
     samples: int
     digest: str
     ending: Region | None = None  # where episodes end, if that is learned
+    jumps: tuple[Jump, ...] = ()  # of the reward, beyond its process
 
     @property
     def description(self) -> dict[str, Any]:
@@ -80,7 +81,9 @@ class SurrogateModel:
         if self.definition.declared_reward is not None:
             outputs[-1]["kernel"] = "declared"
         ending = {} if self.ending is None else {"termination": self.ending.description}
-        return {"outputs": outputs, "terminal_reward": self.terminal_reward, "samples": self.samples, **ending}
+        jumps = [{"size": jump.size, **jump.region.description} for jump in self.jumps]
+        beyond = {"terminal_reward": self.terminal_reward, "jumps": jumps}
+        return {"outputs": outputs, **beyond, "samples": self.samples, **ending}
 
     def transition(
         self,
@@ -103,11 +106,12 @@ class SurrogateModel:
         wanted += (self._reward_column,) if reward_deviation else ()
         rows = min(stage.serving.rows for stage in self._stages if stage)
         q_next, mean, spread = in_blocks(rows, partial(self._step, wanted), q, u, noise, process, paths)
+        reward, edges = self._rewarded(q, u, q_next, mean[:, -1])
         return Transition(
             q_next,
-            self._rewarded(q, u, q_next, mean[:, -1]),
+            reward,
             spread[:, list(self._columns)] if deviations else None,
-            spread[:, -1] if reward_deviation else None,
+            (spread[:, -1].square() + edges).sqrt() if reward_deviation else None,
         )
 
     def draw(self, noise: Tensor) -> Tensor:
@@ -136,7 +140,7 @@ class SurrogateModel:
     def means(self, q: Tensor, u: Tensor) -> Tensor:
         """Posterior mean of every output, increments and then the reward, at q (m, C) and u (m, F): (m, O)."""
         q_next, mean, _ = self._step((), q, u, None, None, None)
-        reward = self._rewarded(q, u, q_next, mean[:, -1])
+        reward, _ = self._rewarded(q, u, q_next, mean[:, -1])
         reward = paid(self.terminal_reward, reward, self.terminated(q_next))
         return torch.cat([mean[:, list(self._columns)], reward[:, None]], -1)
 
@@ -167,10 +171,14 @@ class SurrogateModel:
             mean, spread = _sum((mean, spread), reward)
         return q_next, mean, spread
 
-    def _rewarded(self, q: Tensor, u: Tensor, q_next: Tensor, mean: Tensor) -> Tensor:
-        """Reward (m,) of steps from q (m, C) under u (m, F) to q_next (m, C): the process' mean and what is known."""
-        known = self.definition.declared_reward
-        return mean if known is None else mean + known(q_next if known.after else q, u)
+    def _rewarded(self, q: Tensor, u: Tensor, q_next: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
+        """Rewards (m,) of steps from q (m, C) under u (m, F) to q_next (m, C), the process' mean and what jumps and a
+        declared reward add, and the variance (m,) of where the jumps are."""
+        state = q_next if self.reward.feature_map.after else q
+        if (known := self.definition.declared_reward) is not None:
+            mean = mean + known(state, u)
+        added, variance = jumped(self.jumps, state)
+        return mean + added, variance
 
     def _moved(self, q: Tensor, change: Tensor) -> Tensor:
         if self.definition.design.preset == "paper":

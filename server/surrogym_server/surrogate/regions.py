@@ -7,7 +7,7 @@ A region is a mixture of forms, of two kinds. ``Thresholds``: levels of single a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
@@ -160,6 +160,28 @@ class Region:
         """Every form in words, and how it was judged."""
         forms = [{"weight": weight, **form.description} for weight, form in self.forms]
         return {"forms": forms, "scores": dict(self.scores)}
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A reward that is higher by ``size`` (lower, if negative) inside a region."""
+
+    region: Region
+    size: float
+
+
+def jumped(jumps: Sequence[Jump], q: Tensor) -> tuple[Tensor, Tensor]:
+    """What jumps add to the reward of states q (m, C), and its variance from their doubtful edges, (m,) each.
+
+    Of jumps whose regions overlap the first one counts.
+    """
+    added, variance, free = q.new_zeros(len(q)), q.new_zeros(len(q)), torch.ones(len(q), dtype=torch.bool)
+    for jump in jumps:
+        inside = jump.region.probability(q)
+        added = added + jump.size * ((inside > 0.5) & free)
+        variance = variance + jump.size**2 * inside * (1 - inside) * free
+        free = free & (inside <= 0.5)
+    return added, variance
 
 
 def likely(mean: Tensor, deviation: Tensor) -> Tensor:

@@ -7,29 +7,38 @@ import torch
 from surrogym_server.surrogate.declared import DeclaredReward
 from surrogym_server.surrogate.definition import REWARD
 from surrogym_server.surrogate.features import FeatureMap, encode, reward_candidates
+from surrogym_server.surrogate.jumps import with_jumps
 from surrogym_server.surrogate.learner import Learner
 from surrogym_server.surrogate.model import OutputModel
+from surrogym_server.surrogate.regions import Jump, jumped
 from surrogym_server.surrogate.samples import Samples
 
 FEW = 2  # steps that go on: fewer tell nothing without those that end
 
 
-def reward(learner: Learner, samples: Samples) -> tuple[OutputModel, float]:
-    """The reward process of steps that go on, and what a step that ends the episode pays beyond it."""
+def reward(learner: Learner, samples: Samples) -> tuple[OutputModel, float, tuple[Jump, ...]]:
+    """The reward process of steps that go on, what a step that ends the episode pays beyond it, and its jumps.
+
+    Preset ``paper`` learns one process, as printed.
+    """
     definition = learner.definition
     if (known := definition.declared_reward) is not None:
-        return _declared(known, samples), known.terminal
+        return _declared(known, samples), known.terminal, ()
     inputs = {
         m: encode(definition, m, samples.q_next if m.after else samples.q, samples.u)
         for m in reward_candidates(definition)
     }
     going = ~samples.terminated if int((~samples.terminated).sum()) >= FEW else torch.ones_like(samples.terminated)
     output = learner.output(REWARD, samples.reward, inputs, going, going)
+    jumps: tuple[Jump, ...] = ()
+    if definition.design.preset == "default":
+        output, jumps = with_jumps(learner, samples, inputs, going, output)
     ended = ~going
     if not bool(ended.any()):
-        return output, 0.0
-    bonus = samples.reward[ended] - output.mean(inputs[output.feature_map][ended])
-    return output, float(bonus.mean())
+        return output, 0.0, jumps
+    state = samples.q_next if output.feature_map.after else samples.q
+    bonus = (samples.reward - output.mean(inputs[output.feature_map]) - jumped(jumps, state)[0])[ended]
+    return output, float(bonus.mean()), jumps
 
 
 def _declared(known: DeclaredReward, samples: Samples) -> OutputModel:

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from support.plane import drifting, plane
 from support.real_steps import answer, join, random_steps
 from surrogym_client.original.classic import cartpole
 from surrogym_server.convert import definition_from_spec
@@ -48,6 +49,20 @@ def test_a_boundary_in_doubt_is_asked_for(steps):
 def test_a_declared_end_is_never_in_doubt(steps):
     model = learn(definition_from_spec(cartpole()), steps).model
     assert float(in_doubt(model, steps.q_next).max()) == 0
+
+
+def test_a_rewards_edge_in_doubt_is_asked_for():
+    seen = drifting(lambda q, _: (q[:, 0] > 0.5).double(), 12)
+    model = learn(definition_from_spec(plane()), seen).model
+    (jump,) = model.jumps
+    points = Points(
+        2 * torch.rand(200, 2, generator=torch.Generator().manual_seed(1)).double() - 1, torch.zeros(200, 1)
+    )
+    reserved = ending(model, seen, Points(points.q, points.u.double()))
+    assert reserved is not None
+    chance = jump.region.probability(model.transition(points.q, points.u.double()).q_next)[reserved]
+    assert float(chance.min()) > 0.1
+    assert float(chance.max()) < 0.9
 
 
 @pytest.mark.parametrize("seed", [0, 1])
