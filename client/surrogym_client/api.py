@@ -148,15 +148,18 @@ class Api:
     def ask(
         self,
         name: str,
-        coordinates: Sequence[Sequence[float]],
-        action: Sequence[Sequence[float]],
+        coordinates: Sequence[Sequence[float]] = (),
+        action: Sequence[Sequence[float]] = (),
         *,
+        rollouts: Sequence[Sequence[Sequence[float]]] = (),
         idempotency_key: str | None = None,
     ) -> list[wire.QueryView]:
-        """Put queries of one's own into the queue: coordinates (n, C), action (n, F)."""
+        """Put queries of one's own into the queue: coordinates (n, C) and action (n, F); or, where the original
+        environment can only be reset, action sequences, each (T, F)."""
         body = wire.AskQueries(
-            coordinates=[list(row) for row in coordinates],
-            action=[list(row) for row in action],
+            coordinates=[list(row) for row in coordinates] or None,
+            action=[list(row) for row in action] or None,
+            rollouts=[[list(row) for row in actions] for actions in rollouts] or None,
             idempotency_key=idempotency_key or new_key(),
         )
         return self._post(wire.QueryList, f"{_surrogate(name)}/queries", body).queries

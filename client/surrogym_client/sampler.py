@@ -10,18 +10,19 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from types import TracebackType
-from typing import Any, Literal, Self, TypeVar
+from typing import Literal, Self, TypeVar
 
 import numpy as np
-from pydantic import ValidationError
 
+from surrogym_client.answers import reset_seed, sample_of
 from surrogym_client.api import Api
 from surrogym_client.connection import Retries
 from surrogym_client.errors import InvalidInput, LeaseExpired, NotThere, ServerUnreachable, SurrogymClientError
 from surrogym_client.original.errors import StepFailed, UnknownEnvironment
-from surrogym_client.original.protocol import OriginalEnvironment, RealStep
+from surrogym_client.original.protocol import Environment, OriginalEnvironment, RolloutEnvironment
+from surrogym_client.original.rollouts import answering
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query
+from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, StepQuery
 
 FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "failed")
 PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)  # with a server that is away
@@ -59,6 +60,7 @@ class SamplerReport:
 
     answered: int
     failed: int
+    steps: int  # real ones, handed in
     seconds: float
     phase: Phase | None
 
@@ -66,8 +68,8 @@ class SamplerReport:
 class Sampler:
     """Answers the queries of one surrogate.
 
-    A step that fails gives its query back with the error; a server that is away is waited for, and an answer is not
-    given up meanwhile.
+    A step that fails gives its query back with the error; in a rollout, the steps before it are the answer. A server
+    that is away is waited for, and an answer is not given up meanwhile.
 
     Args:
         api: the server.
@@ -85,7 +87,7 @@ class Sampler:
         self,
         api: Api,
         surrogate: str,
-        environment: OriginalEnvironment,
+        environment: Environment,
         settings: SamplerSettings | None = None,
         report: Callable[[Query, Outcome, str], None] | None = None,
     ) -> None:
@@ -95,7 +97,9 @@ class Sampler:
         self._settings = settings or SamplerSettings()
         self._report = report
         self._counts: dict[Outcome, int] = {"answered": 0, "failed": 0}
+        self._steps = 0
         self._phase: Phase | None = None
+        self._spec: EnvironmentSpec
         self._started = time.monotonic()
         self._stopping = threading.Event()
 
@@ -123,13 +127,15 @@ class Sampler:
         return self._summary()
 
     def _check(self) -> None:
-        """Refuse an environment whose coordinates or action are not the surrogate's."""
+        """Refuse an environment whose coordinates, action or kind of query are not the surrogate's."""
+        self._environment = answering(self._environment)
         asked, own = self._api.surrogate(self._surrogate).spec, self._environment.spec()
         expected, got = _shape(asked), _shape(own)
         if expected != got:
             raise UnknownEnvironment(
                 f"the environment does not fit surrogate {self._surrogate!r}: expected {expected}, got {got}"
             )
+        self._spec = asked
 
     def _claim(self, limit: int) -> ClaimedQueries:
         s = self._settings
@@ -157,20 +163,48 @@ class Sampler:
                 self._give_back(query, "the sampler was stopped")
 
     def _answer(self, query: Query) -> None:
+        taken: list[NewSample] = []
+        error = ""
         try:
-            step = self._environment.step_from(np.array(query.coordinates), np.array(query.action))
-            self._hand_in(sample_of(query, step))
-        except (StepFailed, InvalidInput) as error:
-            self._fail(query, str(error))
-        except SurrogymClientError:
+            self._take(query, taken)
+        except StepFailed as failed:
+            error = str(failed)
+        except Exception as raised:  # an environment that is not isolated may raise anything
+            error = f"{type(raised).__name__}: {raised}"
+        except BaseException:  # a person interrupts: what was done to the original environment is told all the same
+            self._hand_in(taken)
             raise
-        except Exception as error:  # an environment that is not isolated may raise anything
-            self._fail(query, f"{type(error).__name__}: {error}")
+        try:
+            self._hand_in(taken)
+        except InvalidInput as refused:
+            taken, error = [], str(refused)
+        if taken:
+            self._count(query, "answered", error)
         else:
-            self._count(query, "answered", "")
+            self._fail(query, error or "the sampler was stopped")
 
-    def _hand_in(self, sample: NewSample) -> None:
-        _patiently(lambda: self._api.add_samples(self._surrogate, self._settings.name, [sample]))
+    def _take(self, query: Query, taken: list[NewSample]) -> None:
+        """Take the real steps of a query, and put each into ``taken`` as soon as it is done."""
+        environment, size = self._environment, len(self._spec.coordinates)
+        if isinstance(query, StepQuery):
+            assert isinstance(environment, OriginalEnvironment)
+            step = environment.step_from(np.array(query.coordinates), np.array(query.action))
+            taken.append(sample_of(query, step, size))
+            return
+        assert isinstance(environment, RolloutEnvironment)
+        environment.begin(reset_seed(query, self._spec.design.seed))
+        for number, action in enumerate(query.actions):
+            if self._stopping.is_set():
+                return
+            step = environment.act(np.array(action))
+            taken.append(sample_of(query, step, size, number))
+            if step.terminated or step.truncated:
+                return
+
+    def _hand_in(self, samples: list[NewSample]) -> None:
+        if samples:
+            _patiently(lambda: self._api.add_samples(self._surrogate, self._settings.name, samples))
+            self._steps += len(samples)
 
     def _fail(self, query: Query, error: str) -> None:
         _patiently(lambda: self._give_back(query, error or "no reason given"))
@@ -204,7 +238,7 @@ class Sampler:
 
     def _summary(self) -> SamplerReport:
         seconds = time.monotonic() - self._started
-        return SamplerReport(self._counts["answered"], self._counts["failed"], seconds, self._phase)
+        return SamplerReport(self._counts["answered"], self._counts["failed"], self._steps, seconds, self._phase)
 
 
 class Heartbeat:
@@ -253,51 +287,9 @@ class Heartbeat:
             self.release(query)  # a late answer is still a true observation, so the step goes on
 
 
-def sample_of(query: Query, step: RealStep) -> NewSample:
-    """The sample that answers a query.
-
-    Raises:
-        StepFailed: the step has numbers that are not finite, or of the wrong shape.
-    """
-    try:
-        return NewSample(
-            query_id=query.id,
-            lease_token=query.lease_token,
-            coordinates=_numbers(step.coordinates, len(query.coordinates), "coordinates"),
-            action=_numbers(step.action, len(query.action), "action"),
-            next_coordinates=_numbers(step.next_coordinates, len(query.coordinates), "next_coordinates"),
-            reward=float(step.reward),
-            terminated=bool(step.terminated),
-            truncated=bool(step.truncated),
-            observation=_entries(step.observation),
-            next_observation=_entries(step.next_observation),
-        )
-    except (ValidationError, TypeError) as error:
-        raise StepFailed(f"a step that can't be used: {_first(error)}") from error
-
-
 def _shape(spec: EnvironmentSpec) -> str:
     names = ", ".join(spec.coordinate_names)
-    return f"coordinates ({names}) and a {spec.action.kind} action of {spec.action.size}"
-
-
-def _numbers(values: Any, size: int, what: str) -> list[float]:
-    array = np.asarray(values, dtype=np.float64)
-    if array.shape != (size,):
-        raise StepFailed(f"a step of the wrong shape: expected ({size},) for {what}, got {array.shape}")
-    numbers: list[float] = array.tolist()
-    return numbers
-
-
-def _entries(values: Any) -> list[float] | None:
-    return None if values is None else np.asarray(values, dtype=np.float64).ravel().tolist()
-
-
-def _first(error: Exception) -> str:
-    if not isinstance(error, ValidationError):
-        return str(error)
-    first = error.errors()[0]
-    return f"{'.'.join(map(str, first['loc']))}: {first['msg']}, got {first['input']}"
+    return f"coordinates ({names}), a {spec.action.kind} action of {spec.action.size}, and {spec.query} queries"
 
 
 def _patiently(request: Callable[[], T]) -> T:

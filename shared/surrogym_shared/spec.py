@@ -30,6 +30,7 @@ MAX_TERM_PARTS = 64
 MAX_DISCRETE_ACTIONS = 4096
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 MAX_INEQUALITIES = 16  # in a group, and groups
+MAX_ROLLOUT_QUERY = 4_096  # real steps that one query may ask for
 REWARD = "reward"
 
 Name = Annotated[str, Field(min_length=1, max_length=64)]
@@ -421,6 +422,13 @@ class EnvironmentSpec(Frozen):
     start: dict[Name, StartDistribution]
     termination: Termination = ()
     time_limit: Annotated[int, Field(ge=1, le=10_000_000, strict=True)] | None = None
+    query: Literal["step", "rollout"] = Field(
+        default="step",
+        description="``step``: it can be set to any state; ``rollout``: it can only be reset, and acted on from there",
+    )
+    max_rollout: Annotated[int, Field(ge=1, le=MAX_ROLLOUT_QUERY, strict=True)] | None = Field(
+        default=None, description="longest action sequence of one query; None: the time limit, 200 at most"
+    )
     reward: AnyReward = Reward()
     tolerances: dict[Name, Positive] = Field(
         default_factory=dict,
@@ -476,6 +484,14 @@ class EnvironmentSpec(Frozen):
             low = -math.inf if entry.low is None else entry.low
             high = math.inf if entry.high is None else entry.high
             require(low < high, f"observation {entry.name!r} crosses: expected low < high, got [{low}, {high}]")
+        require(
+            self.max_rollout is None or self.query == "rollout",
+            f"max_rollout {self.max_rollout} needs query 'rollout', got {self.query!r}",
+        )
+        require(
+            self.query == "step" or self.design.preset != "paper",
+            "preset 'paper' starts from a Latin hypercube over states: expected query 'step', got 'rollout'",
+        )
         if self.design.budget is not None and self.design.initial is not None:
             require(
                 self.design.initial <= self.design.budget,

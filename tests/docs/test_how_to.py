@@ -46,6 +46,17 @@ def test_a_policy_of_another_algorithm_is_trained_and_its_states_are_known(
     assert view["budget"] == 7
 
 
+def test_the_cart_that_can_only_be_reset_is_registered_and_sampled(server: ServerProcess, tmp_path: Path) -> None:
+    (program,) = programs("no-teleport.md")
+    (tmp_path / "cart.py").write_text(program, encoding="utf-8")
+    common = ["--server", server.url, "--json", "--quiet"]
+    run(tmp_path, "-m", "surrogym_client", "register", "cart:Cart", "--name", "cart", "--budget", "14", *common)
+    sample = ["sample", "cart", "--env", "cart:Cart", "--until-done"]
+    report = json.loads(run(tmp_path, "-m", "surrogym_client", *sample, *common))
+    assert report["failed"] == 0
+    assert 12 <= report["steps"] <= 14
+
+
 def test_the_rail_is_registered_and_sampled(server: ServerProcess, tmp_path: Path) -> None:
     (program,) = programs("own-environment.md")
     (tmp_path / "rail.py").write_text(program, encoding="utf-8")

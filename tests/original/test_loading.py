@@ -86,7 +86,7 @@ def test_ones_own_environment_is_loaded_by_name(own_module):
         ("no_such_module:x", "No module named 'no_such_module'"),
         (":x", "expected package.module:factory, got ':x'"),
         ("own_cart:a_number", "to be callable, got a int"),
-        ("own_cart:NoEnvironment", "spec, step_from and close, got a NoEnvironment"),
+        ("own_cart:NoEnvironment", "reset, step, coordinates and close, got a NoEnvironment"),
     ],
 )
 def test_names_that_give_nothing(own_module, name, message):

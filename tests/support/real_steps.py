@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from surrogym_client.original import RealStep
 from surrogym_client.original.gymnasium import GymnasiumEnvironment
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.sampling.latin_hypercube import random_points
@@ -18,6 +21,10 @@ def answer(spec: EnvironmentSpec, q: Tensor, u: Tensor) -> Samples:
     original = GymnasiumEnvironment(spec)
     steps = [original.step_from(*point) for point in zip(q.numpy(), u.numpy(), strict=True)]
     original.close()
+    return _samples(steps)
+
+
+def _samples(steps: Sequence[RealStep]) -> Samples:
     return Samples(
         q=torch.tensor(np.array([s.coordinates for s in steps])),
         u=torch.tensor(np.array([s.action for s in steps])),
@@ -27,10 +34,23 @@ def answer(spec: EnvironmentSpec, q: Tensor, u: Tensor) -> Samples:
     )
 
 
+def roll(spec: EnvironmentSpec, actions: Tensor, seed: int) -> Samples:
+    """The real steps of one action sequence (T, F) from a reset, up to the end of the episode."""
+    original = GymnasiumEnvironment(spec)
+    original.begin(seed)
+    steps = []
+    for action in actions.numpy():
+        steps.append(original.act(action))
+        if steps[-1].terminated:
+            break
+    original.close()
+    return _samples(steps)
+
+
 def random_steps(spec: EnvironmentSpec, count: int, seed: int) -> Samples:
     """Real steps from anywhere in the sampling range."""
     return answer(spec, *random_points(definition_from_spec(spec), count, np.random.default_rng(seed)))
 
 
-def join(a: Samples, b: Samples) -> Samples:
-    return Samples(*(torch.cat([getattr(a, name), getattr(b, name)]) for name in a.__dataclass_fields__))
+def join(*parts: Samples) -> Samples:
+    return Samples(*(torch.cat([getattr(part, name) for part in parts]) for name in Samples.__dataclass_fields__))

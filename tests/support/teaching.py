@@ -26,11 +26,12 @@ def teach(api: Api, name: str, spec: EnvironmentSpec, queries: int, seconds: flo
         if claimed.phase == "failed":
             raise AssertionError(f"the design of {name} failed: {api.surrogate(name).error}")
         if claimed.queries:
-            api.add_samples(name, "teacher", [answer(original, query) for query in claimed.queries])
+            steps = [query for query in claimed.queries if isinstance(query, wire.StepQuery)]
+            api.add_samples(name, "teacher", [answer(original, query) for query in steps])
     raise AssertionError(f"the design of {name} was not done after {seconds} s: {api.surrogate(name)}")
 
 
-def answer(original: GymnasiumEnvironment, query: wire.Query) -> wire.NewSample:
+def answer(original: GymnasiumEnvironment, query: wire.StepQuery) -> wire.NewSample:
     """One real step, as the sample that answers a claimed query."""
     step = original.step_from(np.array(query.coordinates), np.array(query.action))
     return wire.NewSample(

@@ -31,6 +31,12 @@ def command(
     target: Annotated[float | None, typer.Option(help="Confidence index to reach.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the design.")] = None,
     bins: Annotated[int | None, typer.Option(min=2, help="Offer a continuous action as so many values.")] = None,
+    teleport: Annotated[
+        bool, typer.Option("--teleport/--no-teleport", help="Whether it can be set to any state, or only be reset.")
+    ] = True,
+    max_rollout: Annotated[
+        int | None, typer.Option(min=1, help="Longest action sequence of a query, without teleport.")
+    ] = None,
     print_spec: Annotated[
         bool, typer.Option("--print-spec", help="Print the specification and register nothing.")
     ] = False,
@@ -55,6 +61,8 @@ def command(
         target=target,
         seed=seed,
         bins=bins,
+        teleport=teleport,
+        max_rollout=max_rollout,
     )
     if print_spec:
         typer.echo(chosen.model_dump_json(indent=2))
@@ -81,8 +89,8 @@ def _specification(environment: str | None, spec: EnvironmentSpec | None, **choi
             original.close()
             return original.spec()
         if spec is not None:
-            bins = given.pop("bins", None)
-            return with_choices(spec, given, bins if isinstance(bins, int) else None)
+            others = {name: given.pop(name) for name in ("bins", "teleport", "max_rollout") if name in given}
+            return with_choices(spec, given, **others)  # type: ignore[arg-type]
     except ValueError as error:
         raise CommandError(invalid(error)) from error
     raise CommandError("expected an environment or --spec FILE, got neither")

@@ -45,7 +45,7 @@ def command(
     ] = False,
     max_queries: Annotated[int | None, typer.Option(min=1, help="Stop after so many queries.")] = None,
     time_limit: Annotated[float | None, typer.Option(min=0, help="Stop after so many seconds.")] = None,
-    step_limit: Annotated[float, typer.Option(min=0.001, help="Seconds one real step may take.")] = 30.0,
+    step_limit: Annotated[float, typer.Option(min=0.001, help="Seconds one real step, or a reset, may take.")] = 30.0,
     batch: Annotated[int, typer.Option(min=1, max=256, help="Queries to claim at once.")] = 4,
     worker: Annotated[str | None, typer.Option(help="Name of this worker. [default: host and process]")] = None,
     wait: Wait = 0.0,
@@ -55,7 +55,8 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Answer queries: set the original environment to a state, take one real step, report it. Ctrl-C ends it.
+    """Answer queries: set the original environment to a state, take one real step, report it; or reset it and act,
+    where it can't be set to a state. Ctrl-C ends it.
 
     Example: surrogym sample pendulum --until-done
     """
@@ -105,14 +106,15 @@ def _factory(env: str | None, given: EnvironmentSpec | None, asked: EnvironmentS
 def _tell(query: Query, outcome: Outcome, error: str) -> None:
     from surrogym_client.cli.output import say
 
-    say(f"query {query.id} ({query.purpose}) {outcome}{': ' if error else ''}{error}")
+    asked = f", {len(query.actions)} steps" if query.kind == "rollout" else ""
+    say(f"query {query.id} ({query.purpose}{asked}) {outcome}{': ' if error else ''}{error}")
 
 
 def _words(surrogate: str, report: SamplerReport) -> str:
     from surrogym_client.waiting import FINISHED, IN_WORDS
 
     failed = f", {report.failed} failed" if report.failed else ""
-    said = f"{report.answered} queries answered{failed} in {report.seconds:.1f} s"
+    said = f"{report.answered} queries answered with {report.steps} real steps{failed} in {report.seconds:.1f} s"
     if report.phase in IN_WORDS:
         said += f"; {IN_WORDS[report.phase]}"
     return f"{said}; next: surrogym train {surrogate}" if report.phase in FINISHED else said

@@ -8,6 +8,6 @@ Example:
 """
 
 from surrogym_client.original.loading import make
-from surrogym_client.original.protocol import OriginalEnvironment, RealStep
+from surrogym_client.original.protocol import OriginalEnvironment, RealStep, ResettableEnvironment
 
-__all__ = ["OriginalEnvironment", "RealStep", "make"]
+__all__ = ["OriginalEnvironment", "RealStep", "ResettableEnvironment", "make"]

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from surrogym_client.original.classic import TASKS
-from surrogym_client.original.errors import NotPerturbable
+from surrogym_client.original.errors import NotPerturbable, NotSettable
 from surrogym_client.original.gymnasium import native_action, task_for, wrapped
 from surrogym_client.original.mujoco import Joints, is_known, open_mujoco
 from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
-from surrogym_client.original.protocol import Array, Factory, OriginalEnvironment
+from surrogym_client.original.protocol import Array, Factory, OriginalEnvironment, RealStep, RolloutEnvironment
+from surrogym_client.original.rollouts import answering
 from surrogym_client.original.terms import observe
 from surrogym_shared.spec import EnvironmentSpec, Fixed, Normal, Uniform, limits
 
@@ -134,8 +135,43 @@ class MujocoEpisode(GymnasiumEpisode):
             self._env.model.body_mass[body] *= _factor(rng, sigma)
 
 
-class SteppedEpisode(Episode):
-    """An episode of one's own environment, made of real steps, each from where the last one ended."""
+class OwnEpisode(Episode):
+    """An episode of one's own environment."""
+
+    def perturb(self, rng: np.random.Generator, sigma: float) -> None:
+        del rng, sigma
+        raise NotPerturbable("only environments with a built-in adapter can be perturbed")
+
+    def _started(self, coordinates: Array) -> Moment:
+        return Moment(self._shown(coordinates), 0.0, False, coordinates)
+
+    def _stepped(self, step: RealStep) -> Moment:
+        reached = np.asarray(step.next_coordinates, dtype=np.float64)
+        return Moment(self._shown(reached), float(step.reward), bool(step.terminated), reached)
+
+
+class RolloutEpisode(OwnEpisode):
+    """One of an environment that can only be reset and acted on."""
+
+    def __init__(self, environment: RolloutEnvironment) -> None:
+        super().__init__(environment.spec())
+        self._environment = environment
+
+    def reset(self, seed: int) -> Moment:
+        return self._started(self._environment.begin(seed))
+
+    def place(self, coordinates: Array) -> Moment:
+        raise NotSettable(f"this environment can't be set to {coordinates.tolist()}: it can only be reset")
+
+    def step(self, action: Array) -> Moment:
+        return self._stepped(self._environment.act(action))
+
+    def close(self) -> None:
+        self._environment.close()
+
+
+class SteppedEpisode(OwnEpisode):
+    """One made of real steps, each from where the last one ended."""
 
     def __init__(self, environment: OriginalEnvironment) -> None:
         super().__init__(environment.spec())
@@ -147,16 +183,12 @@ class SteppedEpisode(Episode):
 
     def place(self, coordinates: Array) -> Moment:
         self._at = coordinates
-        return Moment(self._shown(coordinates), 0.0, False, coordinates)
+        return self._started(coordinates)
 
     def step(self, action: Array) -> Moment:
-        step = self._environment.step_from(self._at, action)
-        self._at = np.asarray(step.next_coordinates, dtype=np.float64)
-        return Moment(self._shown(self._at), float(step.reward), bool(step.terminated), self._at)
-
-    def perturb(self, rng: np.random.Generator, sigma: float) -> None:
-        del rng, sigma
-        raise NotPerturbable("only environments with a built-in adapter can be perturbed")
+        moment = self._stepped(self._environment.step_from(self._at, action))
+        self._at = moment.coordinates
+        return moment
 
     def close(self) -> None:
         self._environment.close()
@@ -168,7 +200,10 @@ def open_episode(name: str, spec: EnvironmentSpec | None, factory: Factory) -> E
         return GymnasiumEpisode(spec or factory().spec())
     if is_known(name):
         return MujocoEpisode(spec or factory().spec())
-    return SteppedEpisode(factory())
+    environment = answering(factory())
+    if isinstance(environment, OriginalEnvironment):
+        return SteppedEpisode(environment)
+    return RolloutEpisode(environment)
 
 
 def draw(spec: EnvironmentSpec, rng: np.random.Generator, *, wide: bool, scale: float = 1.0) -> Array:

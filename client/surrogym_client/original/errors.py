@@ -3,6 +3,7 @@
 OriginalError
 ├── UnknownEnvironment      nothing can be made of this name, or no specification can express it
 ├── NotPerturbable          its masses, lengths and limits are unknown here
+├── NotSettable             it can only be reset and acted on
 └── StepFailed              the environment did not give a step; the query fails, the worker goes on
     ├── StepTimedOut        it took longer than its limit and was killed; the next step starts a fresh one
     └── EnvironmentDied     its process ended; the next step starts a fresh one
@@ -21,6 +22,10 @@ class UnknownEnvironment(OriginalError):
 
 class NotPerturbable(OriginalError):
     """Only environments with a built-in adapter can be perturbed."""
+
+
+class NotSettable(OriginalError):
+    """The environment can't be set to a state: an episode can only begin with a reset."""
 
 
 class StepFailed(OriginalError):

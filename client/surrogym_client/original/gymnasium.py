@@ -23,7 +23,7 @@ def task_for(environment: str, preset: str) -> Task:
 
 
 class GymnasiumEnvironment:
-    """A classic control task that is set to given coordinates: unwrapped, so without a time limit."""
+    """A classic control task that is set to given coordinates, or reset: unwrapped, so without a time limit."""
 
     def __init__(self, spec: EnvironmentSpec) -> None:
         import gymnasium
@@ -39,6 +39,15 @@ class GymnasiumEnvironment:
     def step_from(self, coordinates: Array, action: Array) -> RealStep:
         """Set the state to coordinates (C,), apply action (F,)."""
         self._task.write(self._env, coordinates)
+        return self.act(action)
+
+    def begin(self, seed: int | None = None) -> Array:
+        """Reset the environment; the coordinates (C,) it starts at."""
+        self._env.reset(seed=seed)
+        return wrapped(self._spec, self._task.read(self._env))
+
+    def act(self, action: Array) -> RealStep:
+        """Apply action (F,) where the environment stands."""
         achieved = wrapped(self._spec, self._task.read(self._env))
         native = native_action(self._spec, action)
         observation, reward, terminated, truncated, _ = self._env.step(native)

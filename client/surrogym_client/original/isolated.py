@@ -13,8 +13,9 @@ from multiprocessing.process import BaseProcess
 from types import TracebackType
 from typing import Any, Self
 
-from surrogym_client.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
-from surrogym_client.original.protocol import Array, Factory, OriginalEnvironment, RealStep
+from surrogym_client.original.errors import EnvironmentDied, OriginalError, StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_client.original.protocol import Array, Environment, Factory, RealStep
+from surrogym_client.original.rollouts import answering
 from surrogym_shared.spec import EnvironmentSpec
 
 START_LIMIT = 120.0  # seconds; importing a simulator may take long
@@ -22,7 +23,7 @@ CLOSE_LIMIT = 2.0
 
 
 class IsolatedEnvironment:
-    """An OriginalEnvironment whose steps run in a child process, each within a time limit.
+    """An environment whose steps run in a child process, each within a time limit; so does a reset.
 
     After a step that hung or a process that died, the next step starts a fresh environment.
 
@@ -46,6 +47,14 @@ class IsolatedEnvironment:
 
     def step_from(self, coordinates: Array, action: Array) -> RealStep:
         step: RealStep = self._ask("step_from", (coordinates, action), self._step_limit)
+        return step
+
+    def begin(self, seed: int | None = None) -> Array:
+        start: Array = self._ask("begin", (seed,), self._step_limit)
+        return start
+
+    def act(self, action: Array) -> RealStep:
+        step: RealStep = self._ask("act", (action,), self._step_limit)
         return step
 
     def close(self) -> None:
@@ -120,9 +129,7 @@ def _serve(pipe: Connection, factory: Factory) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     try:
-        environment = factory()
-        if not isinstance(environment, OriginalEnvironment):
-            raise TypeError(f"expected spec, step_from and close, got a {type(environment).__name__}")
+        environment = answering(factory())
     except Exception as error:
         pipe.send((False, _sentence(error)))
         return
@@ -135,7 +142,7 @@ def _serve(pipe: Connection, factory: Factory) -> None:
         pipe.send(_answer(environment, method, arguments))
 
 
-def _answer(environment: OriginalEnvironment, method: str, arguments: tuple[Any, ...]) -> tuple[bool, Any]:
+def _answer(environment: Environment, method: str, arguments: tuple[Any, ...]) -> tuple[bool, Any]:
     try:
         value = getattr(environment, method)(*arguments)
         return True, value.model_dump() if isinstance(value, EnvironmentSpec) else value
@@ -144,6 +151,8 @@ def _answer(environment: OriginalEnvironment, method: str, arguments: tuple[Any,
 
 
 def _sentence(error: Exception) -> str:
+    if isinstance(error, OriginalError):  # says it all; where it was raised is of no use to who made the environment
+        return str(error)
     frame = traceback.extract_tb(error.__traceback__)[-1:]
     where = f" ({os.path.basename(frame[0].filename)}:{frame[0].lineno})" if frame else ""
     return f"{type(error).__name__}: {error}{where}"

@@ -5,13 +5,18 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Literal
 
 from surrogym_client.original.errors import UnknownEnvironment
-from surrogym_client.original.protocol import OriginalEnvironment
+from surrogym_client.original.protocol import Environment
+from surrogym_client.original.rollouts import answering
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 
 Preset = Literal["default", "paper"]
+Choose = Callable[[EnvironmentSpec], EnvironmentSpec]
+METHODS = ("step_from", "reset", "step", "coordinates", "begin", "act", "close")
 
 
 def make(
@@ -24,7 +29,9 @@ def make(
     target: float | None = None,
     seed: int | None = None,
     bins: int | None = None,
-) -> OriginalEnvironment:
+    teleport: bool = True,
+    max_rollout: int | None = None,
+) -> Environment:
     """Build an original environment.
 
     Args:
@@ -32,6 +39,8 @@ def make(
         spec: a specification that replaces the adapter's own.
         preset, budget, initial, target, seed: choices of the design; None keeps the specification's.
         bins: offer a continuous action to policies as so many discrete values a dimension.
+        teleport: False asks for rollouts from resets, as if no state could be set.
+        max_rollout: the longest of them.
 
     Raises:
         UnknownEnvironment: no adapter knows the name, or its module or factory can't be found.
@@ -43,9 +52,10 @@ def make(
     """
     design = {"preset": preset, "budget": budget, "initial": initial, "target": target, "seed": seed}
     chosen = {key: value for key, value in design.items() if value is not None}
+    choose = partial(with_choices, design=chosen, bins=bins, teleport=teleport, max_rollout=max_rollout)
     if ":" in name:
-        return _Respecified.of(load_factory(name)(), spec, chosen, bins)
-    return _known(name, spec, chosen, bins)
+        return _own(load_factory(name)(), spec, choose)
+    return _known(name, spec, choose, preset or "default")
 
 
 def is_known(name: str) -> bool:
@@ -55,14 +65,28 @@ def is_known(name: str) -> bool:
     return name in classic.TASKS or mujoco.is_known(name)
 
 
-def with_choices(spec: EnvironmentSpec, design: dict[str, Any], bins: int | None) -> EnvironmentSpec:
-    """The specification with some choices of its design replaced, checked again."""
+def with_choices(
+    spec: EnvironmentSpec,
+    design: Mapping[str, Any],
+    bins: int | None = None,
+    teleport: bool = True,
+    max_rollout: int | None = None,
+) -> EnvironmentSpec:
+    """The specification with some choices of its design replaced, and what ``make`` calls its others, checked again.
+
+    Raises:
+        ValueError: they contradict it.
+    """
     fields = spec.model_dump()
     fields["design"].update(design)
     if bins is not None:
         if not isinstance(spec.action, BoxAction):
             raise ValueError(f"bins need a continuous action, got a {spec.action.kind} one")
         fields["action"]["bins"] = (bins,) * spec.action.size
+    if not teleport:
+        fields["query"] = "rollout"
+    if max_rollout is not None:
+        fields["max_rollout"] = max_rollout
     return EnvironmentSpec.model_validate(fields)
 
 
@@ -80,7 +104,7 @@ def load_factory(name: str) -> Any:
     return factory
 
 
-def _known(name: str, spec: EnvironmentSpec | None, design: dict[str, Any], bins: int | None) -> OriginalEnvironment:
+def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str) -> Environment:
     from surrogym_client.original import classic, mujoco
     from surrogym_client.original.gymnasium import GymnasiumEnvironment, task_for
     from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
@@ -89,11 +113,11 @@ def _known(name: str, spec: EnvironmentSpec | None, design: dict[str, Any], bins
         raise UnknownEnvironment(f"expected a specification of {name}, got one of {spec.environment}")
     if name in classic.TASKS:
         spec = spec and spec.model_copy(update={"environment": name})
-        base = spec or task_for(name, design.get("preset", "default")).spec()
-        return GymnasiumEnvironment(with_choices(base, design, bins))
+        base = spec or task_for(name, preset).spec()
+        return GymnasiumEnvironment(choose(base))
     if mujoco.is_known(name):
         base = spec or mujoco.specification(name)
-        return mujoco.MujocoEnvironment(name, with_choices(base, design, bins))
+        return mujoco.MujocoEnvironment(name, choose(base))
     known = ", ".join((*classic.TASKS, *SPECIFICATIONS))
     raise UnknownEnvironment(
         f"no adapter knows the environment {name!r}: expected one of {known}, "
@@ -102,29 +126,21 @@ def _known(name: str, spec: EnvironmentSpec | None, design: dict[str, Any], bins
 
 
 class _Respecified:
-    """An environment whose specification was replaced on the command line."""
+    """One's own environment whose specification was replaced on the command line."""
 
-    def __init__(self, environment: OriginalEnvironment, spec: EnvironmentSpec) -> None:
-        self._environment = environment
+    def __init__(self, environment: object, spec: EnvironmentSpec) -> None:
         self._spec = spec
-        self.step_from = environment.step_from
-        self.close = environment.close
+        for name in METHODS:
+            if hasattr(environment, name):
+                setattr(self, name, getattr(environment, name))
 
     def spec(self) -> EnvironmentSpec:
         return self._spec
 
-    @classmethod
-    def of(
-        cls,
-        environment: OriginalEnvironment,
-        spec: EnvironmentSpec | None,
-        design: dict[str, Any],
-        bins: int | None,
-    ) -> OriginalEnvironment:
-        if not isinstance(environment, OriginalEnvironment):
-            raise UnknownEnvironment(
-                f"expected an object with spec, step_from and close, got a {type(environment).__name__}"
-            )
-        if spec is None and not design and bins is None:
-            return environment
-        return cls(environment, with_choices(spec or environment.spec(), design, bins))
+
+def _own(made: Any, spec: EnvironmentSpec | None, choose: Choose) -> Environment:
+    if not callable(getattr(made, "spec", None)):
+        return answering(made)  # says what it lacks
+    own = made.spec()
+    given = choose(spec or own)
+    return answering(made if given == own else _Respecified(made, given))

@@ -41,7 +41,7 @@ def specification(name: str) -> EnvironmentSpec:
 
 
 class MujocoEnvironment:
-    """Any Gymnasium environment with ``set_state(qpos, qvel)``, set to given coordinates."""
+    """Any Gymnasium environment with ``set_state(qpos, qvel)``, set to given coordinates or reset."""
 
     def __init__(self, name: str, spec: EnvironmentSpec) -> None:
         self._spec = spec
@@ -55,6 +55,15 @@ class MujocoEnvironment:
     def step_from(self, coordinates: Array, action: Array) -> RealStep:
         """Set positions and velocities to coordinates (C,), apply action (F,)."""
         self._joints.write(self._columns, coordinates)
+        return self.act(action)
+
+    def begin(self, seed: int | None = None) -> Array:
+        """Reset the environment; the coordinates (C,) it starts at."""
+        self._env.reset(seed=seed)
+        return wrapped(self._spec, self._joints.read(self._columns))
+
+    def act(self, action: Array) -> RealStep:
+        """Apply action (F,) where the environment stands."""
         achieved = wrapped(self._spec, self._joints.read(self._columns))
         native = native_action(self._spec, action)
         observation, reward, terminated, truncated, _ = self._env.step(native)

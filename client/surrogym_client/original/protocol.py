@@ -1,4 +1,5 @@
-"""What the sampler needs of an original environment: its specification, and one real step from anywhere.
+"""What the sampler needs of an original environment: its specification, and real steps: one from anywhere, or, where
+no state can be set, several from a reset.
 
 Shapes: C coordinates, F action entries, D observation entries.
 """
@@ -65,5 +66,77 @@ class OriginalEnvironment(Protocol):
         ...
 
 
-Factory = Callable[[], OriginalEnvironment]
+@runtime_checkable
+class ResettableEnvironment(Protocol):
+    """An environment that can only be reset and acted on. Any class with these five methods will do; ``reset`` and
+    ``step`` are Gymnasium's, so that a Gymnasium environment needs the other three alone. Its specification says
+    ``query="rollout"``.
+
+    Example:
+        A cart that finds its own way back::
+
+            class Cart:
+                def spec(self):
+                    return EnvironmentSpec.model_validate_json(Path("cart.json").read_text())
+
+                def reset(self, *, seed=None):
+                    self.rail.home()
+                    return self.rail.read(), {}
+
+                def step(self, action):
+                    self.rail.push(action[0])
+                    observation = self.rail.read()
+                    return observation, -abs(observation[0]), False, False, {}
+
+                def coordinates(self, observation):
+                    return observation
+
+                def close(self):
+                    self.rail.park()
+    """
+
+    def spec(self) -> EnvironmentSpec:
+        """What is known of the environment before the first query."""
+        ...
+
+    def reset(self, *, seed: int | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode; observation and info. What can't be seeded leaves the seed alone."""
+        ...
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Apply an action; observation, reward, terminated, truncated and info."""
+        ...
+
+    def coordinates(self, observation: Any) -> ArrayLike:
+        """The coordinates (C,) that an observation tells of."""
+        ...
+
+    def close(self) -> None:
+        """Release what the environment holds."""
+        ...
+
+
+@runtime_checkable
+class RolloutEnvironment(Protocol):
+    """What answers a rollout query: ``FromReset`` makes one of a ``ResettableEnvironment``."""
+
+    def spec(self) -> EnvironmentSpec:
+        """What is known of the environment before the first query."""
+        ...
+
+    def begin(self, seed: int | None = None) -> Array:
+        """Reset the environment; the coordinates (C,) it starts at."""
+        ...
+
+    def act(self, action: Array) -> RealStep:
+        """Apply action (F,) where the last step, or the reset, has led to."""
+        ...
+
+    def close(self) -> None:
+        """Release what the environment holds."""
+        ...
+
+
+Environment = OriginalEnvironment | RolloutEnvironment
+Factory = Callable[[], Environment | ResettableEnvironment]
 Native = Any  # an unwrapped Gymnasium environment, whose attributes differ from class to class

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from surrogym_client.api import Api
 from surrogym_client.evaluate import EvaluationSettings, Predict, Trace, evaluate
-from surrogym_client.original import make
+from surrogym_client.original import OriginalEnvironment, make
 from surrogym_client.original.episodes import GymnasiumEpisode, Moment, draw
 from surrogym_client.original.protocol import RealStep
 from surrogym_client.original.terms import observe
@@ -96,6 +96,7 @@ class Unseen:
         coordinates = [draw(spec, rng, wide=True) for _ in range(count)]
         actions = [_random_action(spec, rng) for _ in range(count)]
         environment = make(spec.environment, spec=spec)
+        assert isinstance(environment, OriginalEnvironment)
         try:
             steps = [environment.step_from(q, u) for q, u in zip(coordinates, actions, strict=True)]
         finally:

@@ -77,9 +77,10 @@ def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.F
 )
 def ask(name: str, body: Annotated[AskQueries, example(examples.ASK)], use: Use) -> QueryList:
     """Queued behind those of the design, whose model learns from the answers too."""
-    q = convert.numbers("coordinates", body.coordinates)
-    u = convert.numbers("action", body.action)
-    return convert.query_list(use.queries.ask(name, q, u, body.idempotency_key))
+    q = convert.numbers("coordinates", body.coordinates or ())
+    u = convert.numbers("action", body.action or ())
+    rollouts = [convert.numbers("rollouts", actions) for actions in body.rollouts or ()]
+    return convert.query_list(use.queries.ask(name, q, u, body.idempotency_key, rollouts))
 
 
 @router.get(

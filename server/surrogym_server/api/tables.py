@@ -14,7 +14,8 @@ from surrogym_server.storage.records import SampleRecord
 CSV = "text/csv"
 NPZ = "application/x-npz"
 
-PLAIN = ("id", "purpose", "query_id", "sampler", "attempt", "late", "reward", "terminated", "truncated")
+SOURCE = ("id", "purpose", "query_id", "sampler", "attempt", "late", "trajectory", "step")
+PLAIN = (*SOURCE, "reward", "terminated", "truncated")
 ARRAYS = ("id", "purpose", "coordinates", "action", "next_coordinates", "reward", "terminated", "truncated")
 
 

@@ -12,6 +12,7 @@ from surrogym_shared import spec as wire
 
 PENALTY = {"default": 0.0, "paper": 3.0}  # k of eq. 14
 MONTE_CARLO = 1024
+LONGEST_ROLLOUT = 200  # where the specification names none
 
 
 def definition_from_spec(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
@@ -36,6 +37,7 @@ def definition_from_spec(spec: wire.EnvironmentSpec) -> core.EnvironmentDefiniti
         design=_design(spec),
         learns_termination=spec.termination == "learned",
         declared_reward=_declared_reward(spec),
+        max_rollout=_max_rollout(spec) if spec.query == "rollout" else None,
     )
     if definition.design.preset == "paper":
         ObservationInverse.of(definition)
@@ -44,21 +46,25 @@ def definition_from_spec(spec: wire.EnvironmentSpec) -> core.EnvironmentDefiniti
 
 def default_budget(spec: wire.EnvironmentSpec) -> int:
     """Real steps the design may take where the specification names none: ten per dimension for the default preset,
-    three times the initial design for the paper's (it took 125 and 120 in all after 40 and 50)."""
+    twenty where it can only reset and act; three times the initial design for the paper's (it took 125 and 120 in all
+    after 40 and 50)."""
     if spec.design.budget is not None:
         return spec.design.budget
     initial = _design(spec).initial
     if spec.design.preset == "paper":
         return 3 * initial
-    return max(10 * (len(spec.coordinates) + spec.action.size), initial)
+    per_dimension = 10 if spec.query == "step" else 20
+    return max(per_dimension * (len(spec.coordinates) + spec.action.size), initial)
 
 
 def _design(spec: wire.EnvironmentSpec) -> core.DesignDefinition:
     design, paper = spec.design, spec.design.preset == "paper"
     if paper:  # 10 (D + F), section 3.1
         initial = 10 * (len(spec.observation) + spec.action.size)
-    else:
+    elif spec.query == "step":
         initial = max(4, len(spec.coordinates) + spec.action.size)
+    else:
+        initial = 4 * (len(spec.coordinates) + spec.action.size)
     if design.initial is not None:
         initial = design.initial
     if design.budget is not None:
@@ -71,6 +77,11 @@ def _design(spec: wire.EnvironmentSpec) -> core.DesignDefinition:
         monte_carlo=design.monte_carlo or MONTE_CARLO,
         seed=design.seed,
     )
+
+
+def _max_rollout(spec: wire.EnvironmentSpec) -> int:
+    longest = spec.max_rollout or LONGEST_ROLLOUT
+    return longest if spec.time_limit is None else min(longest, spec.time_limit)
 
 
 def _coordinate(coordinate: wire.Coordinate, spec: wire.EnvironmentSpec) -> core.CoordinateDefinition:

@@ -16,6 +16,7 @@ from surrogym_server.services.samples import Added
 from surrogym_server.services.surrogates import SurrogateStatus
 from surrogym_server.storage.records import (
     EventRecord,
+    LeasedQuery,
     LedgerRecord,
     ModelRecord,
     NewSample,
@@ -66,19 +67,21 @@ def ledger(record: LedgerRecord) -> replies.Ledger:
 
 
 def claimed(claim: Claim, lease_seconds: float) -> replies.ClaimedQueries:
-    queries = [
-        replies.Query(
-            id=query.id,
-            purpose=query.purpose,
-            coordinates=list(query.coordinates),
-            action=list(query.action),
-            attempt=query.attempt,
-            lease_token=query.token,
-            lease_seconds=lease_seconds,
-        )
-        for query in claim.queries
-    ]
+    queries = [_leased(query, lease_seconds) for query in claim.queries]
     return replies.ClaimedQueries(queries=queries, phase=claim.phase, paused=claim.paused)
+
+
+def _leased(query: LeasedQuery, lease_seconds: float) -> replies.Query:
+    common = {
+        "id": query.id,
+        "purpose": query.purpose,
+        "attempt": query.attempt,
+        "lease_token": query.token,
+        "lease_seconds": lease_seconds,
+    }
+    if query.kind == "rollout":
+        return replies.RolloutQuery(**common, actions=query.actions.tolist())
+    return replies.StepQuery(**common, coordinates=list(query.coordinates), action=list(query.action))
 
 
 def query_list(records: Iterable[QueryRecord]) -> replies.QueryList:
@@ -86,7 +89,18 @@ def query_list(records: Iterable[QueryRecord]) -> replies.QueryList:
 
 
 def query_view(record: QueryRecord) -> replies.QueryView:
-    return replies.QueryView.model_validate(with_lists(asdict(record)))
+    return replies.QueryView(
+        id=record.id,
+        purpose=record.purpose,
+        status=record.status,
+        round=record.round,
+        kind=record.kind,
+        coordinates=list(record.coordinates) or None,
+        actions=record.actions.tolist(),
+        attempts=record.attempts,
+        sampler=record.sampler,
+        error=record.error,
+    )
 
 
 def new_sample(sample: replies.NewSample) -> NewSample:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from surrogym_server.engine.fidelity import fidelity_fields
-from surrogym_server.sampling.design import Decision, DesignState, Request, advance, initial_design
+from surrogym_server.sampling.design import Decision, DesignState, Request, advance, initial_design, initial_rollouts
 from surrogym_server.sampling.outlook import Points
 from surrogym_server.surrogate.codec import to_bytes
 from surrogym_server.surrogate.definition import EnvironmentDefinition
@@ -40,7 +40,8 @@ class DesignJob:
     target: float  # confidence index
     pending_coordinates: Array | None = None  # (p, C) queries asked and not answered: open, or set aside
     pending_action: Array | None = None  # (p, F)
-    extra_queries: int = 0  # asked for with improve: chosen whatever the verdict
+    pending_rollouts: tuple[Array, ...] = ()  # the same where it can only reset and act, each (T, F)
+    extra_queries: int = 0  # real steps asked for with improve: chosen whatever the verdict
     occupancy: Array | None = None  # (m, C) states that policies visited
     threads: int = 1
 
@@ -58,12 +59,19 @@ class DesignResult:
     seconds: float
     query_coordinates: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (m, C)
     query_action: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (m, F)
+    query_rollouts: tuple[Array, ...] = ()  # each (T, F)
 
 
-def initial_queries(definition: EnvironmentDefinition, budget: int) -> tuple[dict[str, Any], Array, Array]:
-    """The Latin hypercube of the first round: (state, coordinates (m, C), action (m, F))."""
+def initial_queries(
+    definition: EnvironmentDefinition, budget: int
+) -> tuple[dict[str, Any], Array, Array, tuple[Array, ...]]:
+    """The first round: (state, coordinates (m, C), action (m, F), rollouts (T, F) each): a Latin hypercube, or rollouts
+    where no state can be set."""
+    state, none = DesignState().to_json(), np.zeros((0, 0))
+    if definition.max_rollout is not None:
+        return state, none, none, tuple(actions.numpy() for actions in initial_rollouts(definition, budget))
     q, u = initial_design(definition, budget)
-    return DesignState().to_json(), q.numpy(), u.numpy()
+    return state, q.numpy(), u.numpy(), ()
 
 
 def run_design_job(job: DesignJob) -> DesignResult:
@@ -82,6 +90,7 @@ def run_design_job(job: DesignJob) -> DesignResult:
         seconds=time.perf_counter() - started,
         query_coordinates=decision.q.numpy(),
         query_action=decision.u.numpy(),
+        query_rollouts=tuple(actions.numpy() for actions in decision.rollouts),
     )
 
 
@@ -104,6 +113,7 @@ def _request(job: DesignJob) -> Request:
             rows(job.pending_coordinates, len(job.definition.coordinates)),
             rows(job.pending_action, job.definition.action.size),
         ),
+        pending_rollouts=tuple(torch.from_numpy(actions) for actions in job.pending_rollouts),
         extra=job.extra_queries,
         states=None if job.occupancy is None else torch.from_numpy(job.occupancy),
     )

@@ -41,16 +41,16 @@ class Hyperparameters:
 
 
 def covariance(hyper: Hyperparameters, a: Tensor, b: Tensor) -> Tensor:
-    """Latent covariance of inputs a (m, d) and b (n, d), shape (m, n).
+    """Latent covariance of inputs a (..., m, d) and b (..., n, d), shape (..., m, n).
 
     Distances are taken by differences: the expansion |a|^2 + |b|^2 - 2 a.b loses the digits that a small noise needs.
     """
     distance = torch.cdist(a / hyper.lengthscale, b / hyper.lengthscale, compute_mode="donot_use_mm_for_euclid_dist")
     k = hyper.signal_variance * torch.exp(-0.5 * distance.square())
     if hyper.linear_variance > 0:
-        k = k + hyper.linear_variance * (1 + a @ b.T)
+        k = k + hyper.linear_variance * (1 + a @ b.mT)
     if hyper.quadratic_variance > 0:
-        k = k + hyper.quadratic_variance * (a.square() @ b.square().T)
+        k = k + hyper.quadratic_variance * (a.square() @ b.square().mT)
     return k
 
 

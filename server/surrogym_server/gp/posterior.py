@@ -44,6 +44,14 @@ class Posterior:
             variances.append((variance(self.hyper, block) - v.square().sum(0)).clamp_min(0))
         return torch.cat(means), torch.cat(variances)
 
+    def joint_covariance(self, x: Tensor) -> Tensor:
+        """Latent covariance of m points with each other, for each of b sets x (b, m, d): (b, m, m)."""
+        sets, points, _ = x.shape
+        k = covariance(self.hyper, x.flatten(0, 1), self.x)
+        v = torch.linalg.solve_triangular(self.factor, k.T, upper=False).reshape(-1, sets, points).transpose(0, 1)
+        joint: Tensor = covariance(self.hyper, x, x) - v.mT @ v
+        return joint
+
     def leave_one_out(self) -> tuple[Tensor, Tensor]:
         """Predictive mean and variance (noise included) of each y from all others, (n,) each; R&W (2006), eq. 5.12."""
         precision = torch.cholesky_inverse(self.factor).diagonal()

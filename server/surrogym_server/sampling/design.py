@@ -18,12 +18,14 @@ from surrogym_server.sampling.confidence import OutputConfidence, confidence, de
 from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import latin_hypercube, random_points
 from surrogym_server.sampling.outlook import Points
+from surrogym_server.sampling.rollouts import Aim, first_rollouts, plan_round
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.learn import learn
 from surrogym_server.surrogate.model import SurrogateModel
 from surrogym_server.surrogate.samples import Samples, increments
 
 Verdict = Literal["continue", "ready", "over_budget"]
+SHORTEST_ROUND = 4  # real steps
 TOLERANCE = 0.05  # of the output's deviation over the initial design
 HYPERCUBE_TRIES = 50
 FEW_POINTS = 500  # more of them leave no gap worth a comparison of all pairs, whose memory grows with their square
@@ -58,8 +60,9 @@ class Request:
     budget: int
     target: float
     pending: Points  # p
-    extra: int = 0  # queries to choose whatever the verdict
+    extra: int = 0  # real steps to choose whatever the verdict
     states: Tensor | None = None  # (v, C) visited by policies
+    pending_rollouts: tuple[Tensor, ...] = ()  # each (T, F)
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,7 @@ class Decision:
     verdict: Verdict
     q: Tensor  # (m, C) next queries
     u: Tensor  # (m, F)
+    rollouts: tuple[Tensor, ...] = ()  # next ones where it can only reset and act, each (T, F)
 
 
 def initial_design(definition: EnvironmentDefinition, budget: int) -> tuple[Tensor, Tensor]:
@@ -80,6 +84,13 @@ def initial_design(definition: EnvironmentDefinition, budget: int) -> tuple[Tens
         count = budget
     tries = 1 if paper or count > FEW_POINTS else HYPERCUBE_TRIES
     return latin_hypercube(definition, count, _rng(definition, "initial"), tries)
+
+
+def initial_rollouts(definition: EnvironmentDefinition, budget: int) -> list[Tensor]:
+    """What everything starts from where no state can be set: action sequences (T, F), in all at most the budget."""
+    random = definition.design.acquisition == "latin_hypercube"  # nothing is ever planned
+    steps = budget if random else min(definition.design.initial, budget)
+    return first_rollouts(definition, steps, _rng(definition, "initial"))
 
 
 def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignState, request: Request) -> Decision:
@@ -95,11 +106,16 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     reserved = ending(learned.model, samples, candidates.points)
     settled = reserved is None or not definition.learns_termination
     verdict = judge(definition, confidences, tolerances, len(samples), request, settled)
-    chosen = _choose(learned.model, samples, candidates, confidences, tolerances, verdict, request, reserved)
-    if verdict == "continue" and not len(chosen):
+    chosen, rollouts = points[:0], tuple[Tensor, ...]()
+    if definition.max_rollout is None:
+        chosen = _choose(learned.model, samples, candidates, confidences, tolerances, verdict, request, reserved)
+    else:
+        rng = _rng(definition, f"rollouts {state.round}")
+        rollouts = _plan(learned.model, samples, confidences, tolerances, verdict, request, rng, reserved is not None)
+    if verdict == "continue" and not len(chosen) and not rollouts:
         verdict = "over_budget"  # the rest of the budget is pending, or nothing distinct is left to ask
     new_state = DesignState(state.round + 1, tolerances, learned.thetas)
-    return Decision(learned.model, confidences, new_state, verdict, chosen.q, chosen.u)
+    return Decision(learned.model, confidences, new_state, verdict, chosen.q, chosen.u, rollouts)
 
 
 def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
@@ -153,14 +169,40 @@ def _choose(
     reserved: Tensor | None,
 ) -> Points:
     """One query for each output below its target, least confident first; the first one of those reserved."""
-    order = sorted(range(len(confidences)), key=lambda i: confidences[i].confidence_index)
-    below = [i for i in order if confidences[i].confidence_index < request.target] or order[:1]
+    below = _below(confidences, request.target)
     if verdict == "continue":
         wanted = below[: max(0, request.budget - len(samples) - len(request.pending))]
     else:
         wanted = [below[i % len(below)] for i in range(request.extra)]
     taken = Points.joined([Points(samples.q, samples.u), request.pending])
     return candidates.points[choose(model, candidates, taken, request.pending, wanted, tolerances, reserved)]
+
+
+def _plan(
+    model: SurrogateModel,
+    samples: Samples,
+    confidences: tuple[OutputConfidence, ...],
+    tolerances: tuple[float, ...],
+    verdict: Verdict,
+    request: Request,
+    rng: np.random.Generator,
+    ending: bool,
+) -> tuple[Tensor, ...]:
+    """Rollouts for the outputs below their target: a quarter as many real steps as there are samples, so that a model
+    is trusted with longer plans the more it has seen, and fits are few."""
+    steps = request.extra
+    if verdict == "continue":
+        room = request.budget - len(samples) - sum(len(actions) for actions in request.pending_rollouts)
+        steps = min(room, max(SHORTEST_ROUND, len(samples) // 4))
+    longest = model.definition.max_rollout or 1
+    aim = Aim(_below(confidences, request.target), tolerances, longest, request.states, ending)
+    return tuple(plan_round(model, aim, steps, request.pending_rollouts, rng))
+
+
+def _below(confidences: tuple[OutputConfidence, ...], target: float) -> list[int]:
+    """Outputs below their target, least confident first; where there is none, the least confident."""
+    order = sorted(range(len(confidences)), key=lambda i: confidences[i].confidence_index)
+    return [i for i in order if confidences[i].confidence_index < target] or order[:1]
 
 
 def _rng(definition: EnvironmentDefinition, purpose: str) -> np.random.Generator:

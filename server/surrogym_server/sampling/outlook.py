@@ -52,7 +52,9 @@ class Outlook:
         outputs = (
             None
             if output.posterior is None
-            else OutputOutlook.of(output, _inputs(model, output, everywhere, q_next), _counts(model, i, q_next), spans)
+            else OutputOutlook.of(
+                output, inputs_of(model, output, everywhere, q_next), counts_of(model, i, q_next), spans
+            )
             for i, output in enumerate((*model.transitions, model.reward))
         )
         return cls(tuple(outputs))
@@ -102,14 +104,14 @@ class OutputOutlook:
         return replace(self, joint=joint, shared=torch.addr(self.shared, row[m : m + r], row[:m], alpha=-1))
 
 
-def _inputs(model: SurrogateModel, output: OutputModel, points: Points, q_next: Tensor) -> Tensor:
+def inputs_of(model: SurrogateModel, output: OutputModel, points: Points, q_next: Tensor) -> Tensor:
     """What one output's process reads at points whose predicted next coordinates are q_next (m, C): (m, d)."""
     after = output.feature_map.after
     lead = q_next[:, leading(model.definition)]
     return encode(model.definition, output.feature_map, q_next if after else points.q, points.u, lead)
 
 
-def _counts(model: SurrogateModel, column: int, q_next: Tensor) -> Tensor:
+def counts_of(model: SurrogateModel, column: int, q_next: Tensor) -> Tensor:
     """Which samples that end at q_next (m, C) an output would learn from, (m,) bool."""
     definition = model.definition
     if column == len(model.transitions):

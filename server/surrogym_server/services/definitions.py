@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from threading import Lock
 from typing import Any
 
@@ -56,6 +56,19 @@ def check_points(definition: EnvironmentDefinition, q: Array, u: Array) -> tuple
     if len(q) != len(u):
         raise InvalidInput(f"expected as many actions as coordinates, got {len(u)} and {len(q)}")
     return q, model_actions(definition.action, u)
+
+
+def check_rollouts(definition: EnvironmentDefinition, rollouts: Sequence[Array]) -> list[Array]:
+    """Action sequences, each (T, F), in the model's units.
+
+    Raises:
+        InvalidInput: one that is too long, of another shape, or out of bounds.
+    """
+    longest = definition.max_rollout or 0
+    for actions in rollouts:
+        if len(actions) > longest:
+            raise InvalidInput(f"rollouts: expected at most {longest} actions, got {len(actions)}")
+    return [model_actions(definition.action, actions) for actions in rollouts]
 
 
 def check_settable(definition: EnvironmentDefinition, q: Array) -> Array:

@@ -138,6 +138,7 @@ class Designer:
         name = lease.surrogate
         record, samples = self._storage.surrogates.get(name), self._storage.samples.arrays(name)
         pending = self._storage.queries.list(name, (*OPEN_STATUSES, "set_aside"))
+        steps = [query for query in pending if query.kind == "step"]
         visited = None if lease.checkpoint is None else self._storage.occupancy.get(name, lease.checkpoint)
         return DesignJob(
             definition=self._definitions.get(name),
@@ -149,8 +150,9 @@ class Designer:
             state=record.state,
             budget=record.budget,
             target=record.target,
-            pending_coordinates=np.array([query.coordinates for query in pending]) if pending else None,
-            pending_action=np.array([query.action for query in pending]) if pending else None,
+            pending_coordinates=np.array([query.coordinates for query in steps]) if steps else None,
+            pending_action=np.array([query.action for query in steps]) if steps else None,
+            pending_rollouts=tuple(query.actions for query in pending if query.kind == "rollout"),
             extra_queries=lease.extra_queries,
             occupancy=None if visited is None else visited.states,
             threads=self._threads,
@@ -171,6 +173,7 @@ class Designer:
             phase=phase_after(result),
             query_coordinates=result.query_coordinates,
             query_action=result.query_action,
+            query_rollouts=result.query_rollouts,
         )
         version = self._storage.designs.commit(lease, design)
         self._models.publish(lease.surrogate, version)
@@ -197,6 +200,6 @@ class Designer:
 
 def phase_after(result: DesignResult) -> Phase:
     """The phase that a fit leads to."""
-    if len(result.query_coordinates):
+    if len(result.query_coordinates) or result.query_rollouts:
         return "sampling"
     return "ready" if result.verdict == "ready" else "over_budget"

@@ -10,13 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_server.services.definitions import Definitions, check_points, check_settable
+from surrogym_server.errors import InvalidInput
+from surrogym_server.services.definitions import Definitions, check_points, check_rollouts, check_settable
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LeasedQuery, Phase, QueryRecord, QueryStatus
 
 Array = NDArray[np.float64]
 
+NO_STEPS = (np.zeros((0, 0)), np.zeros((0, 0)))
 POLL_SECONDS = 2.0  # notices cross no process border, so another server's queries are found by looking
 FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "failed")
 
@@ -61,16 +63,27 @@ class QueryService:
         self._notices.post(name)
         return record
 
-    def ask(self, name: str, coordinates: Array, action: Array, key: str | None) -> list[QueryRecord]:
-        """Queue queries by hand: coordinates (m, C), action (m, F).
+    def ask(
+        self, name: str, coordinates: Array, action: Array, key: str | None, rollouts: Sequence[Array] = ()
+    ) -> list[QueryRecord]:
+        """Queue queries by hand: coordinates (m, C) and action (m, F), or action sequences, each (T, F).
 
         Raises:
-            InvalidInput: wrong shape, or out of bounds.
+            InvalidInput: wrong shape, out of bounds, or of another kind than the original environment can answer.
             IdempotencyConflict: the same key with other queries.
         """
         definition = self._definitions.get(name)
-        q, u = check_points(definition, check_settable(definition, coordinates), action)
-        ids = self._storage.queries.enqueue(name, q, u, key=key)
+        if definition.max_rollout is None:
+            if len(rollouts) or not len(coordinates):
+                raise InvalidInput(
+                    "expected coordinates and action alone: the original environment can be set to any state"
+                )
+            q, u = check_points(definition, check_settable(definition, coordinates), action)
+            ids = self._storage.queries.enqueue(name, q, u, key=key)
+        else:
+            if len(coordinates) or len(action) or not len(rollouts):
+                raise InvalidInput("expected rollouts alone: the original environment can only be reset and act")
+            ids = self._storage.queries.enqueue(name, *NO_STEPS, check_rollouts(definition, rollouts), key=key)
         self._notices.post(name)
         return [self._storage.queries.get(name, id) for id in ids]
 

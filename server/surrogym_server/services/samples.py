@@ -40,6 +40,7 @@ class SampleService:
         """
         definition = self._definitions.get(name)
         checked = [_checked(definition, index, sample) for index, sample in enumerate(samples)]
+        check_trajectories(checked)
         if key is None and any(sample.query_id is None for sample in checked):
             raise InvalidInput("samples without a query_id: expected an idempotency_key, got none")
         added = self._storage.samples.add(name, sampler, checked, key=key)
@@ -66,6 +67,26 @@ class SampleService:
     def report_steps(self, name: str, steps: int, episodes: int, note: str, key: str) -> LedgerRecord:
         """Count evaluation steps, once per key."""
         return self._storage.ledger.report(name, steps, key=key, episodes=episodes, note=note)
+
+
+def check_trajectories(samples: Sequence[NewSample]) -> None:
+    """Check that each step of a rollout begins where the one before it ended, and that none follows an end.
+
+    Raises:
+        InvalidInput: says which does not.
+    """
+    steps = {(s.query_id, s.lease_token, s.step): s for s in samples}
+    for index, sample in enumerate(samples):
+        before = steps.get((sample.query_id, sample.lease_token, sample.step - 1))
+        if before is None or sample.query_id is None:
+            continue
+        if before.terminated or before.truncated:
+            raise InvalidInput(f"samples.{index}: expected no step after the end of an episode, got {sample.step}")
+        if before.next_coordinates != sample.coordinates:
+            raise InvalidInput(
+                f"samples.{index}.coordinates: expected {list(before.next_coordinates)}, where step {before.step} "
+                f"ended, got {list(sample.coordinates)}"
+            )
 
 
 def _checked(definition: EnvironmentDefinition, index: int, sample: NewSample) -> NewSample:

@@ -26,7 +26,7 @@ from surrogym_server.storage.records import (
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 
 Array = NDArray[np.float64]
-Plan = Callable[[EnvironmentDefinition, int], tuple[dict[str, Any], Array, Array]]
+Plan = Callable[[EnvironmentDefinition, int], tuple[dict[str, Any], Array, Array, tuple[Array, ...]]]
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,8 @@ class SurrogateService:
         live: LiveSessions,
         notices: Notices,
     ) -> None:
-        """``plan`` gives the first queries under a budget: (state, coordinates (m, C), action (m, F))."""
+        """``plan`` gives the first queries under a budget: (state, coordinates (m, C), action (m, F),
+        rollouts (T, F) each)."""
         self._storage = storage
         self._define = define
         self._plan = plan
@@ -66,7 +67,7 @@ class SurrogateService:
             SpecConflict: the name exists with another spec.
             InvalidSpec: a spec that the preset can't represent.
         """
-        state, coordinates, action = self._plan(self._define(spec), budget)
+        state, coordinates, action, rollouts = self._plan(self._define(spec), budget)
         self._storage.surrogates.create(
             NewSurrogate(
                 name=name,
@@ -76,6 +77,7 @@ class SurrogateService:
                 state=state,
                 query_coordinates=coordinates,
                 query_action=action,
+                query_rollouts=rollouts,
             )
         )
         self._notices.post(name)

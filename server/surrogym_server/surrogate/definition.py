@@ -94,6 +94,7 @@ class EnvironmentDefinition:
     design: DesignDefinition
     learns_termination: bool = False  # from samples; no groups are declared then
     declared_reward: DeclaredReward | None = None
+    max_rollout: int | None = None  # longest action sequence from a reset; None where any state can be set
 
     @cached_property
     def coordinate_names(self) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ MAX_MEASURED = 1e30  # beyond it variances overflow, and one such sample would l
 
 Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "failed"]
 Purpose = Literal["initial", "adaptive", "manual"]
+QueryKind = Literal["step", "rollout"]
 QueryStatus = Literal["pending", "leased", "answered", "set_aside"]
 Variant = Literal["deterministic", "probabilistic", "pathwise"]
 AutoresetMode = Literal["next_step", "same_step", "disabled"]

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from surrogym_shared.spec import MAX_ROLLOUT_QUERY
 from surrogym_shared.wire.base import (
     MAX_CLAIM,
     Key,
@@ -13,12 +14,15 @@ from surrogym_shared.wire.base import (
     Measured,
     Phase,
     Purpose,
+    QueryKind,
     QueryStatus,
     Reply,
     Request,
     Vector,
 )
 from surrogym_shared.wire.surrogates import Ledger
+
+ActionSequence = Annotated[list[Vector], Field(min_length=1, max_length=MAX_ROLLOUT_QUERY)]
 
 
 class ClaimQueries(Request):
@@ -28,17 +32,33 @@ class ClaimQueries(Request):
     lease_seconds: Annotated[float, Field(gt=0, le=86_400)] = 60.0
 
 
-class Query(Reply):
-    """One query to answer: set the original environment to ``coordinates``, apply ``action``, report one sample."""
+class LeasedQuery(Reply):
+    """What every query to answer has."""
 
     id: int
-    kind: Literal["step"] = "step"
     purpose: Purpose
-    coordinates: list[float]
-    action: list[float] = Field(description="(F,) continuous value, or the number of each discrete action")
     attempt: int = Field(description="1 for the first lease of this query")
     lease_token: str
     lease_seconds: float
+
+
+class StepQuery(LeasedQuery):
+    """Set the original environment to ``coordinates``, apply ``action``, report one sample."""
+
+    kind: Literal["step"] = "step"
+    coordinates: list[float]
+    action: list[float] = Field(description="(F,) continuous value, or the number of each discrete action")
+
+
+class RolloutQuery(LeasedQuery):
+    """Reset the original environment, apply ``actions`` one after the other, report a sample of each step taken: fewer
+    where the episode ends, or the environment fails, before the last."""
+
+    kind: Literal["rollout"] = "rollout"
+    actions: list[list[float]] = Field(description="(T, F)")
+
+
+Query = Annotated[StepQuery | RolloutQuery, Field(discriminator="kind")]
 
 
 class ClaimedQueries(Reply):
@@ -62,8 +82,9 @@ class QueryView(Reply):
     purpose: Purpose
     status: QueryStatus
     round: int
-    coordinates: list[float]
-    action: list[float]
+    kind: QueryKind
+    coordinates: list[float] | None = Field(description="(C,) of a step; null for a rollout")
+    actions: list[list[float]] = Field(description="(T, F), with T = 1 for a step")
     attempts: int
     sampler: str | None
     error: str | None
@@ -74,10 +95,12 @@ class QueryList(Reply):
 
 
 class AskQueries(Request):
-    """Queries by hand."""
+    """Queries by hand: steps from ``coordinates`` under ``action``, or, where the original environment can only be
+    reset, ``rollouts`` of action sequences."""
 
-    coordinates: Matrix
-    action: Matrix
+    coordinates: Matrix | None = None
+    action: Matrix | None = None
+    rollouts: Annotated[list[ActionSequence], Field(min_length=1, max_length=MAX_CLAIM)] | None = None
     idempotency_key: Key | None = None
 
 
@@ -86,6 +109,9 @@ class NewSample(Request):
 
     query_id: Annotated[int, Field(ge=1)] | None = None
     lease_token: Key | None = None
+    step: Annotated[int, Field(ge=0, lt=MAX_ROLLOUT_QUERY)] = Field(
+        default=0, description="place in the rollout; each begins where the one before ended"
+    )
     coordinates: Vector
     action: Vector
     next_coordinates: Vector
@@ -119,6 +145,8 @@ class SampleView(Reply):
     sampler: str
     attempt: int
     late: bool = Field(description="answered under a lease that had expired")
+    trajectory: int | None = Field(description="equal for the samples of one rollout; null for others")
+    step: int = Field(description="place in the rollout")
     requested_coordinates: list[float] | None
     coordinates: list[float]
     action: list[float]
@@ -147,6 +175,6 @@ class ReportSteps(Request):
 class Improve(Request):
     """Ask the design for more queries, chosen by the acquisition; budget is raised to fit them."""
 
-    queries: Annotated[int, Field(ge=1, le=10_000)]
+    queries: Annotated[int, Field(ge=1, le=10_000, description="real steps: a rollout's count one by one")]
     checkpoint: Key | None = Field(default=None, description="weigh by the occupancy submitted under this name")
     idempotency_key: Key | None = None

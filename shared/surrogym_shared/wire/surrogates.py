@@ -53,8 +53,8 @@ class Fidelity(Reply):
 
 class Ledger(Reply):
     """Acknowledged real steps by purpose. ``total`` is what the design cost: initial + adaptive + manual; evaluation is
-    apart, and ``unresolved`` counts leases that began and were never answered, so the true number of real steps lies
-    between total and total + unresolved."""
+    apart, and ``unresolved`` counts the steps that leases which began and were never answered may have taken, so the
+    true number of real steps lies between total and total + unresolved."""
 
     initial: int = 0
     adaptive: int = 0

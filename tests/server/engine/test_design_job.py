@@ -22,7 +22,7 @@ SPEC = pendulum().model_copy(update={"design": Design(monte_carlo=64)})
 @pytest.fixture(scope="module")
 def job() -> DesignJob:
     definition = definition_from_spec(SPEC)
-    state, q, u = initial_queries(definition, budget=20)
+    state, q, u, _ = initial_queries(definition, budget=20)
     steps = answer(SPEC, torch.from_numpy(q), torch.from_numpy(u))
     arrays = (steps.q, steps.u, steps.q_next, steps.reward, steps.terminated)
     return DesignJob(definition, *(a.numpy() for a in arrays), state=state, budget=20, target=0.999)

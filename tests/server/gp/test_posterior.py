@@ -91,3 +91,16 @@ def test_what_no_jitter_repairs_is_a_numerical_failure():
         factorise(hopeless)
     with pytest.raises(NumericalFailure):
         factorise(torch.full((2, 2), torch.nan, dtype=torch.float64))
+
+
+def test_the_joint_covariance_of_points_has_their_variances_and_their_correlations(hyper, points, rng):
+    """What is left of one point's variance after another is observed: by the joint covariance, and by extending."""
+    x, y = points
+    known = condition(hyper, x, y)
+    sets = torch.from_numpy(rng.normal(size=(2, 5, 3)))
+    joint = known.joint_covariance(sets)
+    for part, own in zip(sets, joint, strict=True):
+        torch.testing.assert_close(own.diagonal(), known.mean_and_variance(part)[1], rtol=1e-9, atol=1e-12)
+        _, left = known.extend(part[0], y[0]).mean_and_variance(part[1:])
+        expected = own.diagonal()[1:] - own[0, 1:].square() / (own[0, 0] + hyper.noise_variance)
+        torch.testing.assert_close(left, expected, rtol=1e-7, atol=1e-10)

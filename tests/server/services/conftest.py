@@ -29,7 +29,7 @@ def storage(tmp_path: Path) -> Iterator[Storage]:
     """With one surrogate whose initial queries are open."""
     opened = open_storage(f"sqlite:///{tmp_path / 'surrogym.db'}")
     spec = pendulum.spec()
-    state, q, u = initial_queries(define(spec), pendulum.BUDGET)
+    state, q, u, _ = initial_queries(define(spec), pendulum.BUDGET)
     opened.surrogates.create(NewSurrogate(NAME, spec, pendulum.BUDGET, 0.999, state, q, u))
     yield opened
     opened.close()

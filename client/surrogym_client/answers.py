@@ -1,0 +1,65 @@
+"""From a real step to the sample that answers a query."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from surrogym_client.original.errors import StepFailed
+from surrogym_client.original.protocol import RealStep
+from surrogym_shared.wire import NewSample, Query, StepQuery
+
+
+def reset_seed(query: Query, design_seed: int) -> int:
+    """The seed of a rollout's reset: one of its own for each attempt, the same when the same is asked again."""
+    return int(np.random.SeedSequence([design_seed, query.id, query.attempt]).generate_state(1)[0])
+
+
+def sample_of(query: Query, step: RealStep, size: int, number: int = 0) -> NewSample:
+    """The sample that step ``number`` gives a query of ``size`` coordinates.
+
+    Raises:
+        StepFailed: the step has numbers that are not finite, or of the wrong shape.
+    """
+    try:
+        return NewSample(
+            query_id=query.id,
+            lease_token=query.lease_token,
+            step=number,
+            coordinates=_numbers(step.coordinates, size, "coordinates"),
+            action=_numbers(step.action, len(_asked(query)[number]), "action"),
+            next_coordinates=_numbers(step.next_coordinates, size, "next_coordinates"),
+            reward=float(step.reward),
+            terminated=bool(step.terminated),
+            truncated=bool(step.truncated),
+            observation=_entries(step.observation),
+            next_observation=_entries(step.next_observation),
+        )
+    except (ValidationError, TypeError) as error:
+        raise StepFailed(f"a step that can't be used: {_first(error)}") from error
+
+
+def _asked(query: Query) -> list[list[float]]:
+    """The actions (T, F) of a query."""
+    return [query.action] if isinstance(query, StepQuery) else query.actions
+
+
+def _numbers(values: Any, size: int, what: str) -> list[float]:
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != (size,):
+        raise StepFailed(f"a step of the wrong shape: expected ({size},) for {what}, got {array.shape}")
+    numbers: list[float] = array.tolist()
+    return numbers
+
+
+def _entries(values: Any) -> list[float] | None:
+    return None if values is None else np.asarray(values, dtype=np.float64).ravel().tolist()
+
+
+def _first(error: Exception) -> str:
+    if not isinstance(error, ValidationError):
+        return str(error)
+    first = error.errors()[0]
+    return f"{'.'.join(map(str, first['loc']))}: {first['msg']}, got {first['input']}"

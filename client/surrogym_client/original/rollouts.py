@@ -1,0 +1,109 @@
+"""Environments that can only be reset and acted on, as the sampler uses them."""
+
+from __future__ import annotations
+
+from typing import Any, TypeGuard
+
+import numpy as np
+
+from surrogym_client.original.errors import StepFailed, UnknownEnvironment
+from surrogym_client.original.gymnasium import native_action, wrapped
+from surrogym_client.original.protocol import (
+    Array,
+    Environment,
+    OriginalEnvironment,
+    RealStep,
+    ResettableEnvironment,
+    RolloutEnvironment,
+)
+from surrogym_shared.spec import EnvironmentSpec
+
+
+class FromReset:
+    """A ``ResettableEnvironment`` as a ``RolloutEnvironment``: each step begins where the one before ended."""
+
+    def __init__(self, environment: ResettableEnvironment) -> None:
+        self._environment = environment
+        self._spec = environment.spec()
+        self._at: Array | None = None
+
+    def spec(self) -> EnvironmentSpec:
+        return self._spec
+
+    def begin(self, seed: int | None = None) -> Array:
+        """Reset the environment; the coordinates (C,) it starts at.
+
+        Raises:
+            StepFailed: ``reset`` gives no pair, or ``coordinates`` no (C,).
+        """
+        self._at = None
+        begun: Any = self._environment.reset(seed=seed)
+        if not isinstance(begun, tuple) or len(begun) != 2:
+            raise StepFailed(f"expected (observation, info) of reset, got a {type(begun).__name__}")
+        self._at = self._read(begun[0])
+        return self._at
+
+    def act(self, action: Array) -> RealStep:
+        """Apply action (F,).
+
+        Raises:
+            StepFailed: no episode is running, or ``coordinates`` gives no (C,).
+        """
+        if self._at is None:
+            raise StepFailed("expected an action in a running episode, got one after its end or before a reset")
+        before, self._at = self._at, None
+        native = native_action(self._spec, action)
+        observation, reward, terminated, truncated, _ = self._environment.step(native)
+        reached = self._read(observation)
+        if not (terminated or truncated):
+            self._at = reached
+        return RealStep(
+            coordinates=before,
+            action=np.atleast_1d(np.asarray(native, dtype=np.float64)),
+            next_coordinates=reached,
+            reward=float(reward),
+            terminated=bool(terminated),
+            truncated=bool(truncated),
+        )
+
+    def close(self) -> None:
+        self._environment.close()
+
+    def _read(self, observation: Any) -> Array:
+        read = np.asarray(self._environment.coordinates(observation), dtype=np.float64)
+        names = self._spec.coordinate_names
+        if read.shape != (len(names),):
+            raise StepFailed(f"expected coordinates ({', '.join(names)}), got an array of shape {read.shape}")
+        return wrapped(self._spec, read)
+
+
+def _only_resets(environment: object) -> TypeGuard[ResettableEnvironment]:
+    if isinstance(environment, RolloutEnvironment) or not isinstance(environment, ResettableEnvironment):
+        return False
+    return environment.spec().query == "rollout" or not isinstance(environment, OriginalEnvironment)
+
+
+def answering(environment: object) -> Environment:
+    """What answers the kind of query that an environment's specification declares.
+
+    Raises:
+        UnknownEnvironment: it lacks the methods for it.
+    """
+    if _only_resets(environment):
+        environment = FromReset(environment)
+    if not isinstance(environment, (OriginalEnvironment, RolloutEnvironment)):
+        raise UnknownEnvironment(
+            "expected an object with spec, step_from and close, or with spec, reset, step, coordinates and close, "
+            f"got a {type(environment).__name__}"
+        )
+    query = environment.spec().query
+    needed, methods = (
+        (RolloutEnvironment, "reset, step and coordinates")
+        if query == "rollout"
+        else (OriginalEnvironment, "step_from")
+    )
+    if not isinstance(environment, needed):
+        raise UnknownEnvironment(
+            f"its specification declares query={query!r}, for which it needs {methods}: it lacks some of them"
+        )
+    return environment

@@ -1,0 +1,242 @@
+"""Action sequences for an environment that can only be reset and act: random ones first, then planned in the model.
+
+A sequence is worth the information that it gives per real step. Of output j the first t points of a predicted path give
+
+    I_j(t) = 1/2 log det(1 + W S_j W / tau_j^2),
+
+S_j (t, t) the posterior covariance of the process at these points, tau_j the output's tolerance, W a diagonal of
+weights. The determinant counts each point after those before it, so a repeat gives nothing. A weight is 0 outside the
+sampling range and after the end of an episode, and falls with the deviation gathered on the way: a plan ends where it
+can't be predicted.
+Reference: A. Krause, A. Singh, C. Guestrin (2008), JMLR 9, section 2 (information of a set of observations).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from surrogym_server.sampling.endings import in_doubt
+from surrogym_server.sampling.occupancy import log_occupancy
+from surrogym_server.sampling.outlook import Points, counts_of, inputs_of
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.surrogate.distributions import scaling
+from surrogym_server.surrogate.model import OutputModel, SurrogateModel
+
+STARTS = 6  # drawn from the start distribution for each plan
+POPULATION = 48  # action sequences compared at once
+ELITE = 12  # of them that the next generation varies
+GENERATIONS = 3
+DOUBTFUL = 0.25  # chance of an ending that is worth a rollout of its own
+BLOCK = 4_000_000  # numbers in a matrix of covariances at once
+
+Sequences = NDArray[np.float64]  # (k, T, F)
+
+
+@dataclass(frozen=True)
+class Aim:
+    """What a plan is to find out."""
+
+    columns: Sequence[int]  # outputs to learn of
+    tolerances: Sequence[float]  # of every output
+    longest: int  # actions in a sequence
+    states: Tensor | None = None  # (v, C) that policies visited: information is weighed by their density
+    ending: bool = False  # look for an end of the episode first, if one is within reach
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Predicted paths of b lanes over T steps."""
+
+    q: Tensor  # (b, T, C)
+    u: Tensor  # (b, T, F)
+    q_next: Tensor  # (b, T, C)
+    running: Tensor  # (b, T) 1 while the episode goes on, 0 after its end
+    ended: Tensor  # (b, T) 1 from the step on that ended it
+    drift: Tensor  # (b, T) squared deviation gathered before the step, in those of the sampling range
+
+
+def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random.Generator) -> list[Tensor]:
+    """Random sequences of 1, 2, 3, ... actions, each (T, F), that take ``steps`` in all: short first, and each held for
+    a time of its own, so that states spread."""
+    rollouts: list[Tensor] = []
+    while steps > 0:
+        length = min(len(rollouts) + 1, steps, definition.max_rollout or 1)
+        rollouts.append(torch.from_numpy(random_sequences(definition, 1, length, rng)[0]))
+        steps -= length
+    return rollouts
+
+
+def plan_round(
+    model: SurrogateModel, aim: Aim, steps: int, pending: Sequence[Tensor], rng: np.random.Generator
+) -> list[Tensor]:
+    """Sequences that take ``steps`` real steps in all, each as if those before it and the pending were answered."""
+    rollouts: list[Tensor] = []
+    done = list(pending)
+    while steps > 0:
+        for actions in done:
+            model = as_if_done(model, actions, rng)
+        done = [plan_rollout(model, replace(aim, longest=min(steps, aim.longest)), rng)]
+        rollouts += done
+        steps -= len(done[0])
+        aim = replace(aim, ending=False)
+    return rollouts
+
+
+def plan_rollout(model: SurrogateModel, aim: Aim, rng: np.random.Generator) -> Tensor:
+    """The sequence (T, F), 1 <= T <= ``aim.longest``, that gives most per expected real step: shooting, refined by
+    varying the best."""
+    starts = start_points(model.definition, STARTS, rng)
+    population = random_sequences(model.definition, POPULATION, aim.longest, rng)
+    value, length = _worth(model, aim, starts, population)
+    for _ in range(GENERATIONS - 1):
+        elite = population[value.argsort(descending=True)[:ELITE].numpy()]
+        population = np.concatenate([elite, _varied(model.definition, elite, POPULATION - ELITE, rng)])
+        value, length = _worth(model, aim, starts, population)
+    best = int(value.argmax())
+    return torch.from_numpy(population[best, : int(length[best])])
+
+
+def as_if_done(model: SurrogateModel, actions: Tensor, rng: np.random.Generator) -> SurrogateModel:
+    """The model as if a sequence (T, F) had been answered along a predicted path: variances shrink, means stay."""
+    path = predict_paths(model, start_points(model.definition, 1, rng), actions[None])
+    outputs = [_extended(model, column, path) for column in range(len(model.transitions) + 1)]
+    return replace(model, transitions=tuple(outputs[:-1]), reward=outputs[-1])
+
+
+def _extended(model: SurrogateModel, column: int, path: Paths) -> OutputModel:
+    output, posterior = output_of(model, column), output_of(model, column).posterior
+    if posterior is not None:
+        x, learns = _inputs(model, column, path)
+        for point in x[0][(learns * path.running)[0] > 0]:
+            posterior = posterior.extend(point, posterior.mean(point[None])[0])
+    return replace(output, posterior=posterior)
+
+
+def start_points(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> Tensor:
+    """Starts (count, C), stratified over the declared distribution."""
+    columns = [
+        c.start.quantile(torch.from_numpy((rng.permutation(count) + rng.random(count)) / count))
+        for c in definition.coordinates
+    ]
+    return torch.stack(columns, -1)
+
+
+def random_sequences(definition: EnvironmentDefinition, count: int, length: int, rng: np.random.Generator) -> Sequences:
+    """Piecewise constant action sequences (count, length, F); holding times double from 1 to the whole length."""
+    times = 2 ** np.arange(int(np.log2(length)) + 1)
+    sequences = np.empty((count, length, definition.action.size))
+    for sequence in sequences:
+        hold = int(rng.choice(times))
+        values = _random_actions(definition, -(-length // hold), rng)
+        sequence[:] = np.repeat(values, hold, axis=0)[:length]
+    return sequences
+
+
+def predict_paths(model: SurrogateModel, starts: Tensor, actions: Tensor) -> Paths:
+    """Mean paths from starts (b, C) under actions (b, T, F)."""
+    spread = [scaling(c.sampling)[1] for c in (model.definition.coordinates[i] for i in model.definition.moving)]
+    q, running, drift = starts, starts.new_ones(len(starts)), starts.new_zeros(len(starts))
+    steps: list[tuple[Tensor, ...]] = []
+    for u in actions.unbind(1):
+        step = model.transition(q, u, deviations=True)
+        assert step.deviation is not None
+        still = running * ~model.terminated(step.q_next)
+        steps.append((q, u, step.q_next, running, 1 - still, drift))
+        drift = drift + (step.deviation / starts.new_tensor(spread)).square().sum(-1)
+        q, running = step.q_next, still
+    return Paths(*(torch.stack(column, 1) for column in zip(*steps, strict=True)))
+
+
+def information(model: SurrogateModel, aim: Aim, paths: Paths) -> Tensor:
+    """I(t) summed over the outputs asked for, after each step of paths (b, T): (b, T)."""
+    weight = _weights(model.definition, aim, paths)
+    total = torch.zeros_like(weight)
+    for column in aim.columns:
+        output = output_of(model, column)
+        if output.posterior is None:
+            continue
+        x, learns = _inputs(model, column, paths)
+        room = max(1, BLOCK // (x.shape[1] * (x.shape[1] + len(output.posterior.y))))
+        blocks = zip(torch.split(x, room), torch.split(weight * learns, room), strict=True)
+        ratio = (output.scale / aim.tolerances[column]) ** 2
+        total += torch.cat([_log_determinants(ratio * output.posterior.joint_covariance(b), w) for b, w in blocks])
+    return total
+
+
+def output_of(model: SurrogateModel, column: int) -> OutputModel:
+    return (*model.transitions, model.reward)[column]
+
+
+def _worth(model: SurrogateModel, aim: Aim, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:
+    """Information per expected real step of the best beginning of each sequence (k, T, F), and its length, (k,)."""
+    count, lanes = len(sequences), len(starts)
+    actions = torch.from_numpy(sequences).repeat_interleave(lanes, 0)
+    paths = predict_paths(model, starts.repeat(count, 1), actions)
+    gain = _endings(model, paths) if aim.ending else paths.ended.new_zeros(1)
+    if not bool((gain > DOUBTFUL).any()):
+        gain = information(model, aim, paths)
+    gains, costs = (x.reshape(count, lanes, -1).mean(1) for x in (gain, paths.running.cumsum(1)))
+    best = (gains / costs).max(1)
+    return best.values, best.indices + 1
+
+
+def _endings(model: SurrogateModel, paths: Paths) -> Tensor:
+    """Whether paths have ended, (b, T); where that is learned, the chance that the model was wrong about an end."""
+    if not model.definition.learns_termination:
+        return paths.ended
+    doubt = in_doubt(model, paths.q_next.flatten(0, 1)).reshape(paths.running.shape)
+    return (doubt * paths.running).cummax(1).values
+
+
+def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tensor:
+    """How much each step (b, T) counts."""
+    low = torch.tensor([c.sampling.low for c in definition.coordinates], dtype=paths.q.dtype)
+    high = torch.tensor([c.sampling.high for c in definition.coordinates], dtype=paths.q.dtype)
+    inside = ((paths.q >= low) & (paths.q <= high)).all(-1)
+    weight = paths.running * inside * (-0.5 * paths.drift).exp()
+    if aim.states is None or not len(aim.states):
+        return weight
+    density = log_occupancy(definition, aim.states, paths.q.flatten(0, 1)).exp().reshape(weight.shape)
+    return weight * (density / density.max()).sqrt()
+
+
+def _inputs(model: SurrogateModel, column: int, paths: Paths) -> tuple[Tensor, Tensor]:
+    """What one output's process reads along paths, (b, T, d), and whether it would learn from it, (b, T) bool."""
+    points, q_next = Points(paths.q.flatten(0, 1), paths.u.flatten(0, 1)), paths.q_next.flatten(0, 1)
+    x = inputs_of(model, output_of(model, column), points, q_next)
+    learns = counts_of(model, column, q_next)
+    return x.reshape(*paths.running.shape, -1), learns.reshape(paths.running.shape)
+
+
+def _log_determinants(covariance: Tensor, weight: Tensor) -> Tensor:
+    """1/2 log det(1 + W S W) of all leading parts of S (b, T, T), W of diagonal weight (b, T): (b, T)."""
+    one = torch.eye(weight.shape[1], dtype=weight.dtype)
+    factor = torch.linalg.cholesky(one + weight[:, :, None] * covariance * weight[:, None, :])
+    halves: Tensor = factor.diagonal(dim1=-2, dim2=-1).log().cumsum(-1)
+    return halves
+
+
+def _varied(definition: EnvironmentDefinition, elite: Sequences, count: int, rng: np.random.Generator) -> Sequences:
+    """Sequences of the elite (e, T, F), each with one stretch held at another action: (count, T, F)."""
+    varied = elite[rng.integers(len(elite), size=count)]
+    for sequence in varied:
+        first, last = sorted(rng.integers(sequence.shape[0] + 1, size=2))
+        sequence[first : last + 1] = _random_actions(definition, 1, rng)
+    return varied
+
+
+def _random_actions(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> Sequences:
+    """Actions (count, F); of a continuous one, half lie at its limits, which reach farthest."""
+    action = definition.action
+    if action.nvec:
+        return rng.integers(action.nvec, size=(count, action.size)).astype(np.float64)
+    low, high = action.limits
+    p = rng.random((count, action.size))
+    extreme = rng.random((count, action.size)) < 0.5
+    return np.asarray(low + (high - low) * np.where(extreme, p.round(), p))

@@ -1,0 +1,133 @@
+"""Environments that can only be reset and acted on: each step begins where the one before ended, and ends are told."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from support.rail import DiesRight, HangsRight, Rail, RaisesRight
+from surrogym_client import original
+from surrogym_client.original.episodes import RolloutEpisode, open_episode
+from surrogym_client.original.errors import EnvironmentDied, NotSettable, StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_client.original.isolated import IsolatedEnvironment
+from surrogym_client.original.protocol import OriginalEnvironment, RolloutEnvironment
+from surrogym_client.original.rollouts import FromReset, answering
+
+RIGHT, LEFT = np.array([1.0]), np.array([-1.0])
+
+
+@pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1", "Acrobot-v1", "InvertedPendulum-v5"])
+def test_a_builtin_environment_rolls_out_as_gymnasium_does(name):
+    import gymnasium
+
+    environment = original.make(name, teleport=False)
+    native = gymnasium.make(name).unwrapped
+    assert environment.spec().query == "rollout"
+    assert isinstance(environment, RolloutEnvironment)
+    at = environment.begin(seed=5)
+    native.reset(seed=5)
+    action = np.zeros(environment.spec().action.size)
+    for _ in range(4):
+        step = environment.act(action)
+        _, reward, terminated, _, _ = native.step(action.astype(np.float32) if name[0] in "PI" else 0)
+        np.testing.assert_array_equal(step.coordinates, at)
+        assert (step.reward, step.terminated) == (float(reward), terminated)
+        at = np.asarray(step.next_coordinates)
+    environment.close()
+
+
+def test_a_class_with_reset_step_and_coordinates_rolls_out():
+    environment = answering(Rail())
+    assert isinstance(environment, FromReset)
+    start = environment.begin(seed=3)
+    np.testing.assert_array_equal(start, environment.begin(seed=3))
+    one, two = environment.act(RIGHT), environment.act(LEFT)
+    np.testing.assert_array_equal(one.coordinates, start)
+    np.testing.assert_array_equal(two.coordinates, one.next_coordinates)
+    assert np.asarray(one.action).shape == (1,)
+
+
+def test_no_step_before_a_reset_nor_after_an_end():
+    environment = answering(Rail())
+    with pytest.raises(StepFailed, match="running episode"):
+        environment.act(RIGHT)
+    environment.begin()
+    while not (step := environment.act(RIGHT)).terminated:
+        pass
+    assert np.asarray(step.next_coordinates)[0] >= 1
+    with pytest.raises(StepFailed, match="running episode"):
+        environment.act(RIGHT)
+
+
+def test_a_reset_that_is_not_gymnasiums_and_coordinates_of_the_wrong_size_say_so():
+    class Old(Rail):
+        def reset(self, *, seed=None):
+            return super().reset(seed=seed)[0]
+
+    class Wide(Rail):
+        def coordinates(self, observation):
+            return observation
+
+    with pytest.raises(StepFailed, match=r"\(observation, info\) of reset, got a ndarray"):
+        answering(Old()).begin()
+    with pytest.raises(StepFailed, match=r"coordinates \(x\), got an array of shape \(2,\)"):
+        answering(Wide()).begin()
+
+
+def test_what_a_specification_declares_its_class_must_be_able_to_do():
+    class Says(Rail):
+        def spec(self):
+            return super().spec().model_copy(update={"query": "step"})
+
+    with pytest.raises(UnknownEnvironment, match="query='step', for which it needs step_from"):
+        answering(Says())
+    with pytest.raises(UnknownEnvironment, match="reset, step, coordinates and close, got a int"):
+        answering(3)
+
+
+@pytest.mark.parametrize(
+    ("factory", "error"), [(RaisesRight, StepFailed), (HangsRight, StepTimedOut), (DiesRight, EnvironmentDied)]
+)
+def test_in_a_process_of_its_own_one_that_fails_in_the_middle_begins_anew(factory, error):
+    with IsolatedEnvironment(factory, step_limit=1.0) as environment:
+        environment.begin(seed=0)
+        environment.act(LEFT)
+        with pytest.raises(error):
+            environment.act(RIGHT)
+        with pytest.raises(StepFailed, match="running episode"):
+            environment.act(LEFT)
+        environment.begin(seed=0)
+        environment.act(LEFT)
+
+
+def test_a_name_that_is_no_module_is_told_without_where_in_surrogym_that_was_noticed():
+    environment = IsolatedEnvironment(partial(original.make, "nomod:F"))
+    with pytest.raises(UnknownEnvironment) as told:
+        environment.spec()
+    assert str(told.value) == "expected package.module:factory, got 'nomod:F': No module named 'nomod'"
+
+
+def test_an_evaluation_of_ones_own_resets_and_refuses_to_place():
+    episode = open_episode("rail:Rail", None, Rail)
+    assert isinstance(episode, RolloutEpisode)
+    start = episode.reset(10_000)
+    moment = episode.step(RIGHT)
+    assert moment.coordinates[0] > start.coordinates[0]
+    with pytest.raises(NotSettable, match="only be reset"):
+        episode.place(np.zeros(1))
+    episode.close()
+
+
+def test_a_choice_can_take_teleport_away_from_ones_own_class_that_has_both():
+    class Both(Rail):
+        def spec(self):
+            return super().spec().model_copy(update={"query": "step", "max_rollout": None})
+
+        def step_from(self, coordinates, action):
+            raise NotImplementedError
+
+    assert isinstance(answering(Both()), OriginalEnvironment)
+    assert isinstance(answering(Both()), Both)
+    assert isinstance(answering(Rail()), FromReset)

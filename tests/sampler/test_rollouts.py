@@ -1,0 +1,206 @@
+"""Rollouts against a real server: every real step taken is a sample, whatever ends the rollout."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from itertools import pairwise
+
+import pytest
+
+from support.rail import SPEC, HangsRight, Rail, RaisesRight
+from surrogym_client import original
+from surrogym_client.answers import reset_seed
+from surrogym_client.api import Api
+from surrogym_client.errors import InvalidInput
+from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.isolated import IsolatedEnvironment
+from surrogym_client.sampler import Sampler, SamplerSettings
+from surrogym_shared.wire import NewSample
+
+RIGHT, LEFT = [1.0], [-1.0]
+ONE = SamplerSettings(name="worker", batch=1, once=True, wait_seconds=5.0)
+KILLED = """
+import sys
+from support.rail import Slow
+from surrogym_client.api import Api
+from surrogym_client.sampler import Sampler, SamplerSettings
+
+with Api(sys.argv[1]) as api:
+    Sampler(api, sys.argv[2], Slow(), SamplerSettings(name="killed", batch=1, lease_seconds=3.0)).run()
+"""
+
+
+@pytest.fixture
+def api(server_process):
+    with Api(server_process.url) as api:
+        yield api
+
+
+@pytest.fixture
+def rail(api):
+    name = f"rail-{uuid.uuid4().hex[:8]}"
+    api.create_surrogate(name, SPEC)
+    yield name
+    api.delete_surrogate(name)
+
+
+@pytest.fixture
+def asked(api, rail):
+    """A surrogate whose only open query is one rollout: twice to the left, once to the right, once to the left."""
+    for query in api.claim(rail, "nobody", max_queries=100).queries:
+        for _ in range(3):
+            api.fail(rail, query.id, query.lease_token, "not today")
+            again = api.claim(rail, "nobody", max_queries=1).queries
+            query = again[0] if again else query
+    api.ask(rail, rollouts=[[LEFT, LEFT, RIGHT, LEFT]])
+    return rail
+
+
+def test_a_design_is_answered_by_resetting_and_acting(api, rail):
+    with IsolatedEnvironment(Rail) as environment:
+        report = Sampler(api, rail, environment, SamplerSettings(until_done=True, time_limit=90.0)).run()
+    view, samples = api.surrogate(rail), list(api.samples(rail))
+    assert report.phase == view.phase
+    assert view.phase in ("ready", "over_budget")
+    assert report.steps == len(samples) == view.ledger.total <= 10
+    assert view.ledger.initial == 6
+    trajectories: dict[int, list] = {}
+    for sample in samples:
+        trajectories.setdefault(sample.trajectory, []).append(sample)
+    assert report.answered == len(trajectories) == view.queries.answered
+    for steps in trajectories.values():
+        assert [sample.step for sample in steps] == list(range(len(steps)))
+        assert all(before.next_coordinates == after.coordinates for before, after in pairwise(steps))
+
+
+def test_an_episode_that_ends_early_gives_the_rest_of_its_steps_back(api, rail):
+    api.ask(rail, rollouts=[[RIGHT] * 20])
+    Sampler(api, rail, Rail(), SamplerSettings(max_queries=4, wait_seconds=5.0, time_limit=60.0)).run()
+    last = list(api.samples(rail))[-1]
+    assert last.terminated
+    assert last.step < 13
+    assert api.surrogate(rail).ledger.manual == last.step + 1
+
+
+def test_a_failure_in_the_middle_leaves_the_steps_before_it_as_the_answer(api, asked):
+    told = []
+    report = Sampler(api, asked, RaisesRight(), ONE, lambda *seen: told.append(seen)).run()
+    assert (report.answered, report.failed, report.steps) == (1, 0, 2)
+    assert [(outcome, error) for _, outcome, error in told] == [("answered", "RuntimeError: the rail is blocked")]
+    assert api.queries(asked)[-1].status == "answered"
+    assert api.surrogate(asked).ledger.manual == 2
+
+
+def test_a_hang_in_the_middle_is_killed_and_the_steps_before_it_are_the_answer(api, asked):
+    with IsolatedEnvironment(HangsRight, step_limit=0.5) as environment:
+        assert Sampler(api, asked, environment, ONE).run().steps == 2
+    assert api.surrogate(asked).ledger.manual == 2
+
+
+def test_a_failure_at_the_first_step_fails_the_query(api, asked):
+    api.ask(asked, rollouts=[[RIGHT, LEFT]])
+    settings = SamplerSettings(name="worker", max_queries=2, batch=1, wait_seconds=5.0)
+    report = Sampler(api, asked, RaisesRight(), settings).run()
+    assert (report.answered, report.failed, report.steps) == (1, 1, 2)
+    assert "the rail is blocked" in api.queries(asked)[-1].error
+
+
+def test_stop_in_the_middle_hands_in_what_was_done(api, asked):
+    class Stops(Rail):
+        def step(self, action):
+            sampler.stop()
+            return super().step(action)
+
+    sampler = Sampler(api, asked, Stops(), ONE)
+    assert (sampler.run().steps, api.surrogate(asked).ledger.manual) == (1, 1)
+
+
+def test_an_interrupt_in_the_middle_hands_in_what_was_done(api, asked):
+    class Interrupted(Rail):
+        def step(self, action):
+            if action[0] > 0:
+                raise KeyboardInterrupt
+            return super().step(action)
+
+    with pytest.raises(KeyboardInterrupt):
+        Sampler(api, asked, Interrupted(), ONE).run()
+    assert api.surrogate(asked).ledger.manual == 2
+    assert api.queries(asked)[-1].status == "answered"
+
+
+def test_a_sampler_killed_in_a_rollout_may_have_taken_all_its_steps_and_the_next_takes_them(api, server_process, asked):
+    command = [sys.executable, "-c", KILLED, server_process.url, asked]
+    paths = os.pathsep.join(path for path in sys.path if path)
+    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths}) as killed:
+        _until(lambda: api.surrogate(asked).queries.leased == 1)
+        time.sleep(1.5)  # in the middle of the second of its four steps
+        killed.send_signal(signal.SIGKILL)
+    settings = SamplerSettings(name="next", batch=1, once=True, wait_seconds=30.0)
+    report = Sampler(api, asked, Rail(), settings).run()
+    ledger, samples = api.surrogate(asked).ledger, list(api.samples(asked))
+    assert report.steps == 4
+    assert (ledger.manual, ledger.unresolved) == (4, 4)
+    assert {(s.sampler, s.attempt, s.late) for s in samples} == {("next", 2, False)}
+
+
+def _until(happened):
+    deadline = time.monotonic() + 60
+    while not happened():
+        assert time.monotonic() < deadline, "it never happened"
+        time.sleep(0.05)
+
+
+def test_the_server_refuses_a_trajectory_that_jumps_or_goes_on_after_an_end(api, asked):
+    [query] = api.claim(asked, "worker", max_queries=1).queries
+    values = {"query_id": query.id, "lease_token": query.lease_token, "action": LEFT, "reward": 0.0}
+
+    def step(number, x, x_next, terminated=False):
+        return NewSample(**values, step=number, coordinates=[x], next_coordinates=[x_next], terminated=terminated)
+
+    with pytest.raises(InvalidInput, match=r"samples.1.coordinates: expected \[0.1\], where step 0 ended, got \[0.2\]"):
+        api.add_samples(asked, "worker", [step(0, 0.0, 0.1), step(1, 0.2, 0.3)])
+    with pytest.raises(InvalidInput, match="after the end of an episode"):
+        api.add_samples(asked, "worker", [step(0, 0.0, 0.1, True), step(1, 0.1, 0.2)])
+    with pytest.raises(InvalidInput, match="4 at most"):
+        api.add_samples(asked, "worker", [step(i, float(i), i + 1.0) for i in range(5)])
+    assert api.surrogate(asked).ledger.total == 0
+    assert len(api.add_samples(asked, "worker", [step(0, 0.0, 0.1), step(1, 0.1, 0.2)]).sample_ids) == 2
+
+
+def test_a_query_of_the_wrong_kind_or_too_long_is_refused(api, rail):
+    with pytest.raises(InvalidInput, match="can only be reset and act"):
+        api.ask(rail, [[0.0]], [[0.0]])
+    with pytest.raises(InvalidInput, match="at most 20 actions, got 21"):
+        api.ask(rail, rollouts=[[LEFT] * 21])
+    with pytest.raises(InvalidInput, match=r"entry 0 in \[-1, 1\], got 3"):
+        api.ask(rail, rollouts=[[LEFT], [[3.0]]])
+
+
+def test_an_environment_that_answers_another_kind_of_query_is_refused(api, rail):
+    from support.moody import Line
+
+    with pytest.raises(UnknownEnvironment, match=r"expected coordinates .* rollout queries, got .* step queries"):
+        Sampler(api, rail, Line()).run()
+
+
+def test_starts_differ_between_attempts_queries_and_designs_and_are_the_same_again(api, rail):
+    queries = api.claim(rail, "worker", max_queries=3).queries
+    seeds = {reset_seed(query, design) for query in queries for design in (0, 1)}
+    assert len(seeds) == 2 * len(queries)
+    assert reset_seed(queries[0], 0) == reset_seed(queries[0].model_copy(update={"lease_token": "other"}), 0)
+
+
+def test_classic_control_without_teleport_is_learned_from_resets(api):
+    name = f"pendulum-{uuid.uuid4().hex[:8]}"
+    environment = original.make("Pendulum-v1", teleport=False, budget=24, seed=1)
+    api.create_surrogate(name, environment.spec())
+    report = Sampler(api, name, environment, SamplerSettings(until_done=True, time_limit=120.0)).run()
+    view = api.surrogate(name)
+    assert report.steps == view.ledger.total <= 24
+    assert view.fidelity.confidence_index > 0.99
+    api.delete_surrogate(name)

@@ -1,0 +1,242 @@
+"""Action sequences: random ones that spread, and planned ones that give more information per real step."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from support.real_steps import join, roll
+from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_server.convert import default_budget, definition_from_spec
+from surrogym_server.sampling.confidence import deviations
+from surrogym_server.sampling.design import DesignState, Request, advance, initial_rollouts
+from surrogym_server.sampling.outlook import Points
+from surrogym_server.sampling.rollouts import (
+    Aim,
+    as_if_done,
+    first_rollouts,
+    information,
+    plan_rollout,
+    plan_round,
+    predict_paths,
+    random_sequences,
+    start_points,
+)
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.surrogate.learn import learn
+from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.surrogate.samples import Samples
+from surrogym_shared.spec import EnvironmentSpec
+
+NOTHING = Points(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 1, dtype=torch.float64))
+ALL = (0, 1, 2)
+
+
+def only_resets(spec: EnvironmentSpec, **changes: object) -> EnvironmentSpec:
+    return EnvironmentSpec.model_validate({**spec.model_dump(), "query": "rollout", **changes})
+
+
+SPEC = only_resets(pendulum(), max_rollout=40)
+
+
+def rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+@pytest.fixture(scope="module")
+def swinging() -> EnvironmentDefinition:
+    return definition_from_spec(SPEC)
+
+
+@pytest.fixture(scope="module")
+def begun(swinging: EnvironmentDefinition) -> Samples:
+    """The answers to the first rollouts, cut to so few that the model has something left to learn."""
+    return join(*(roll(SPEC, actions, seed) for seed, actions in enumerate(first_rollouts(swinging, 6, rng())[:2])))
+
+
+@pytest.fixture(scope="module")
+def model(swinging: EnvironmentDefinition, begun: Samples) -> SurrogateModel:
+    return learn(swinging, begun).model
+
+
+@pytest.fixture(scope="module")
+def aim(model: SurrogateModel) -> Aim:
+    outputs = (*model.transitions, model.reward)
+    return Aim(ALL, [0.05 * output.scale for output in outputs], longest=12)
+
+
+def test_first_rollouts_are_short_first_and_take_the_steps_they_may(swinging: EnvironmentDefinition):
+    rollouts = first_rollouts(swinging, 12, rng())
+    assert [len(actions) for actions in rollouts] == [1, 2, 3, 4, 2]
+    assert all(actions.shape[1] == 1 and bool((actions.abs() <= 2).all()) for actions in rollouts)
+    assert [len(a) for a in first_rollouts(replace(swinging, max_rollout=2), 7, rng())] == [1, 2, 2, 2]
+
+
+def test_sequences_are_held_for_times_of_their_own(swinging: EnvironmentDefinition):
+    sequences = random_sequences(swinging, 64, 16, rng())
+    changes = (np.diff(sequences[..., 0], axis=1) != 0).sum(1)
+    assert {0, 1, 3, 7} <= set(changes.tolist()), "all of it, a half, a quarter, an eighth"
+    assert np.abs(sequences).max() == 2, "limits reach farthest"
+
+
+def test_discrete_actions_stay_numbers_of_actions():
+    sequences = random_sequences(definition_from_spec(only_resets(cartpole())), 32, 8, rng())
+    assert set(np.unique(sequences)) == {0.0, 1.0}
+
+
+def test_starts_are_the_declared_ones_and_stratified(swinging: EnvironmentDefinition):
+    starts = start_points(swinging, 8, rng())
+    assert sorted(((starts[:, 0] + torch.pi) / (2 * torch.pi) * 8).int().tolist()) == list(range(8))
+    assert bool((starts[:, 1].abs() <= 1).all())
+
+
+def test_a_predicted_path_goes_on_where_it_was(model: SurrogateModel):
+    actions = torch.from_numpy(random_sequences(model.definition, 5, 7, rng()))
+    paths = predict_paths(model, start_points(model.definition, 5, rng()), actions)
+    torch.testing.assert_close(paths.q[:, 1:], paths.q_next[:, :-1])
+    torch.testing.assert_close(paths.q_next[:, 3], model.transition(paths.q[:, 3], paths.u[:, 3]).q_next)
+    assert bool((paths.drift.diff(dim=1) >= 0).all())
+
+
+def test_information_is_that_of_points_each_after_those_before_it(model: SurrogateModel, aim: Aim):
+    """Against the chain rule: 1/2 log(1 + var / tau^2) of each point, given those before with noise tau^2."""
+    paths = predict_paths(model, start_points(model.definition, 1, rng()), torch.zeros(1, 6, 1, dtype=torch.float64))
+    paths = replace(paths, drift=torch.zeros_like(paths.drift))
+    posterior = model.reward.posterior
+    assert posterior is not None
+    tolerance = aim.tolerances[2] / model.reward.scale
+    x = _reward_inputs(model, paths.q[0], paths.u[0], paths.q_next[0])
+    joint = posterior.joint_covariance(x[None])[0]
+    expected, known = [], 0.0
+    for t in range(6):
+        before, own = joint[:t, :t] + tolerance**2 * torch.eye(t), joint[t, t]
+        left = own - joint[t, :t] @ torch.linalg.solve(before, joint[:t, t]) if t else own
+        known += 0.5 * float(torch.log1p(left / tolerance**2))
+        expected.append(known)
+    got = information(model, replace(aim, columns=(2,)), paths)
+    torch.testing.assert_close(got[0], torch.tensor(expected, dtype=torch.float64), rtol=1e-6, atol=1e-9)
+
+
+def _reward_inputs(model, q, u, q_next):
+    from surrogym_server.sampling.outlook import inputs_of
+
+    return inputs_of(model, model.reward, Points(q, u), q_next)
+
+
+def test_a_point_seen_twice_on_a_path_gives_almost_nothing_the_second_time(model: SurrogateModel, aim: Aim):
+    paths = predict_paths(model, start_points(model.definition, 1, rng()), torch.ones(1, 4, 1, dtype=torch.float64))
+    stuck = {name: getattr(paths, name)[:, :1].expand(-1, 4, -1) for name in ("q", "u", "q_next")}
+    gain = information(model, aim, replace(paths, **stuck, drift=torch.zeros_like(paths.drift)))[0]
+    first, *later = torch.cat([gain[:1], gain.diff()]).tolist()
+    assert max(later) < 0.35 * first
+
+
+def test_what_lies_outside_the_sampling_range_or_after_an_end_counts_nothing(model: SurrogateModel, aim: Aim):
+    paths = predict_paths(model, start_points(model.definition, 1, rng()), torch.ones(1, 4, 1, dtype=torch.float64))
+    away = torch.tensor([0.0, 30.0], dtype=torch.float64)
+    outside = replace(paths, q=torch.cat([paths.q[:, :2], (paths.q + away)[:, 2:]], 1))
+    ended = replace(paths, running=torch.tensor([[1.0, 1.0, 0.0, 0.0]], dtype=torch.float64))
+    for cut in (outside, ended):
+        gain = information(model, aim, cut)[0]
+        assert gain[1] > 0
+        torch.testing.assert_close(gain[2:], gain[1].expand(2))
+
+
+def test_a_step_counts_less_the_worse_it_can_be_predicted(model: SurrogateModel, aim: Aim):
+    paths = predict_paths(model, start_points(model.definition, 3, rng()), torch.ones(3, 4, 1, dtype=torch.float64))
+    known, lost = (replace(paths, drift=torch.full_like(paths.drift, d)) for d in (0.0, 20.0))
+    assert bool((information(model, aim, lost) < 0.01 * information(model, aim, known)).all())
+
+
+def test_occupancy_draws_the_plan_to_where_policies_go(model: SurrogateModel, aim: Aim):
+    paths = predict_paths(model, start_points(model.definition, 8, rng()), torch.ones(8, 2, 1, dtype=torch.float64))
+    near = 0.1 * torch.randn(200, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + paths.q[5, 0]
+    plain, drawn = (information(model, replace(aim, states=states), paths)[:, 0] for states in (None, near))
+    assert int((drawn / plain).argmax()) == 5
+
+
+def test_a_planned_rollout_gives_more_per_step_than_random_ones(model: SurrogateModel, aim: Aim):
+    actions = plan_rollout(model, aim, rng())
+    assert 1 <= len(actions) <= aim.longest
+    starts = start_points(model.definition, 32, rng(7))
+
+    def worth(sequence: torch.Tensor) -> float:
+        paths = predict_paths(model, starts, sequence.expand(32, -1, -1))
+        return float(information(model, aim, paths)[:, -1].mean()) / len(sequence)
+
+    others = [worth(torch.from_numpy(s)[: len(actions)]) for s in random_sequences(model.definition, 20, 12, rng(1))]
+    assert worth(actions) > 0.98 * max(others)
+    assert worth(actions) > 1.1 * float(np.median(others))
+
+
+def test_the_same_plan_again_for_the_same_seed(model: SurrogateModel, aim: Aim):
+    torch.testing.assert_close(plan_rollout(model, aim, rng(3)), plan_rollout(model, aim, rng(3)))
+
+
+def test_a_rollout_that_is_pending_leaves_less_to_learn(model: SurrogateModel, aim: Aim):
+    actions = torch.full((6, 1), 2.0, dtype=torch.float64)
+    done = as_if_done(model, actions, rng())
+    paths = predict_paths(model, start_points(model.definition, 1, rng()), actions[None])
+    again, first = (float(information(m, aim, paths)[0, -1]) for m in (done, model))
+    assert again < 0.1 * first
+    q, u = start_points(model.definition, 50, rng(2)), torch.full((50, 1), 2.0, dtype=torch.float64)
+    before, after = deviations(model, q, u), deviations(done, q, u)
+    assert bool((after <= before + 1e-9).all())
+    torch.testing.assert_close(done.transition(q, u).q_next, model.transition(q, u).q_next, rtol=0, atol=1e-6)
+
+
+def test_a_round_takes_its_steps_and_no_more(model: SurrogateModel, aim: Aim):
+    rollouts = plan_round(model, replace(aim, longest=3), 7, [torch.ones(2, 1, dtype=torch.float64)], rng())
+    assert sum(len(actions) for actions in rollouts) == 7
+    assert max(len(actions) for actions in rollouts) <= 3
+
+
+def test_an_end_of_the_episode_is_looked_for_until_one_was_seen():
+    spec = only_resets(cartpole())
+    definition = definition_from_spec(spec)
+    samples = join(*(roll(spec, actions, seed) for seed, actions in enumerate(first_rollouts(definition, 20, rng()))))
+    assert not bool(samples.terminated.any())
+    learned = learn(definition, samples).model
+    aim = Aim(tuple(range(5)), [0.05] * 5, longest=30, ending=True)
+    starts = start_points(definition, 16, rng(5))
+
+    def ends(sequence: torch.Tensor) -> float:
+        return float(predict_paths(learned, starts, sequence.expand(16, -1, -1)).ended[:, -1].mean())
+
+    assert ends(plan_rollout(learned, aim, rng())) > 0.75
+    assert ends(plan_rollout(learned, replace(aim, ending=False), rng())) < 0.5
+
+
+def test_a_design_without_teleport_spends_its_budget_in_real_steps(swinging: EnvironmentDefinition, begun: Samples):
+    def ask(**options: object) -> list[int]:
+        values = {"budget": len(begun) + 9, "target": 1 - 1e-12, "pending": NOTHING} | options
+        decision = advance(swinging, begun, DesignState(), Request(**values))
+        assert len(decision.q) == 0
+        return [len(actions) for actions in decision.rollouts]
+
+    assert sum(ask()) == 4, "a round is a quarter of the samples, four at least"
+    assert sum(ask(budget=len(begun) + 2)) == 2
+    pending = (torch.ones(7, 1, dtype=torch.float64),)
+    assert sum(ask(pending_rollouts=pending)) == 2, "its seven steps are spoken for"
+    assert sum(ask(budget=len(begun), extra=5)) == 5
+    assert ask(budget=len(begun)) == []
+
+
+def test_the_latin_hypercube_arm_is_random_rollouts_alone():
+    spec = only_resets(pendulum(), design={"acquisition": "latin_hypercube"})
+    assert sum(len(a) for a in initial_rollouts(definition_from_spec(spec), 30)) == 30
+    assert sum(len(a) for a in initial_rollouts(definition_from_spec(SPEC), 30)) == 12
+
+
+def test_the_budget_is_counted_from_the_dimensions():
+    assert default_budget(SPEC) == 60
+    assert default_budget(only_resets(cartpole())) == 100
+
+
+def test_a_rollout_is_no_longer_than_an_episode():
+    assert definition_from_spec(only_resets(pendulum(), max_rollout=300)).max_rollout == 200
+    assert definition_from_spec(only_resets(pendulum(), time_limit=None)).max_rollout == 200
+    assert definition_from_spec(pendulum()).max_rollout is None

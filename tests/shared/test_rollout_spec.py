@@ -1,0 +1,33 @@
+"""What a specification may say of an environment that can only be reset and acted on."""
+
+from __future__ import annotations
+
+import pytest
+from pydantic import ValidationError
+
+from surrogym_client.original.classic import pendulum
+from surrogym_shared.spec import EnvironmentSpec
+
+
+def changed(**changes: object) -> EnvironmentSpec:
+    return EnvironmentSpec.model_validate({**pendulum().model_dump(), **changes})
+
+
+def test_states_can_be_set_unless_the_specification_says_otherwise() -> None:
+    assert pendulum().query == "step"
+    assert changed(query="rollout", max_rollout=50).max_rollout == 50
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"max_rollout": 5}, "max_rollout 5 needs query 'rollout', got 'step'"),
+        ({"query": "rollout", "design": {"preset": "paper"}}, "Latin hypercube over states: expected query 'step'"),
+        ({"query": "rollout", "max_rollout": 0}, "greater than or equal to 1"),
+        ({"query": "rollout", "max_rollout": 5000}, "less than or equal to 4096"),
+        ({"query": "teleport"}, "'step' or 'rollout'"),
+    ],
+)
+def test_contradictions_are_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        changed(**changes)
