@@ -128,7 +128,10 @@ def test_a_quick_run_gives_table_and_pictures_and_is_not_made_twice(surrogym, tm
     said = surrogym(*quick)
     assert said.code == 0, said.err
     table_of = {line[0]: line for line in said.json["tables"]["cartpole"]}
-    assert table_of["real steps"][1:] == ["50 + 70 = 120", "12", "", "6"]
+    assert table_of["real steps"][1:] == ["50 + 70 = 120", "12", "6"]  # no hypercube, no column of it
+    numbers = (tmp_path / "results.csv").read_text().splitlines()
+    assert numbers[0] == "task,arm,seed,what,value"
+    assert "cartpole,paper,0,real steps,12.0" in numbers
     assert {p.name for p in tmp_path.glob("*.png")} == {"figure14.png", "figure15.png"}
     assert "| starts +-0.1, trials of 200 (%) |" in (tmp_path / "results.md").read_text()
     rows = json.loads((tmp_path / "rows.json").read_text())

@@ -6,6 +6,7 @@ the server's database keeps the real steps of a design that was interrupted.
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -20,7 +21,7 @@ from surrogym_client.original import make
 from surrogym_client.policy_file import load_policy
 from surrogym_client.reproduce.paper_cases import Cell
 from surrogym_client.reproduce.paper_measures import Unseen, confidences, run_variation, some
-from surrogym_client.reproduce.paper_table import markdown, table
+from surrogym_client.reproduce.paper_table import markdown, per_seed, table
 from surrogym_client.sampler import Outcome, Sampler, SamplerSettings
 from surrogym_client.train import TrainProgress, TrainSettings, train
 from surrogym_client.transport import HttpSurrogate
@@ -71,6 +72,8 @@ def _write_results(rows: Sequence[Row], folder: Path) -> None:
     from surrogym_client.reproduce.paper_pictures import draw_all
 
     (folder / "rows.json").write_text(json.dumps(rows) + "\n", encoding="utf-8")
+    with (folder / "results.csv").open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([("task", "arm", "seed", "what", "value"), *per_seed(rows)])
     text = "\n".join(f"{task}\n\n{markdown(lines)}" for task, lines in tables(rows).items())
     (folder / "results.md").write_text(text, encoding="utf-8")
     draw_all(rows, folder)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,18 @@ def table(rows: Sequence[Row], task: str) -> list[tuple[str, ...]]:
         lines.append((what, paper, *(_cell(mine, arm, number, shown) for arm in ARMS)))
     printed = [row for row in mine if row["arm"] == "printed"]
     lines.append(("real steps, index as printed", "", _spread(printed, _real_steps, "{:.0f}"), "", ""))
-    return lines
+    used = [i for i in range(len(HEADING)) if any(line[i] for line in lines[1:])]
+    return [tuple(line[i] for i in used) for line in lines]
+
+
+def per_seed(rows: Sequence[Row]) -> Iterator[tuple[str, str, int, str, float]]:
+    """Every number behind the tables: task, arm, seed, what, value."""
+    for row in rows:
+        numbers = (
+            [("real steps", _real_steps)] if row["arm"] == "printed" else [(n[0], n[2]) for n in LINES[row["task"]]]
+        )
+        for what, number in numbers:
+            yield row["task"], row["arm"], row["seed"], what, number(row)
 
 
 def markdown(lines: Sequence[Sequence[str]]) -> str:
