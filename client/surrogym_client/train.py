@@ -41,9 +41,9 @@ def _decaying(remaining: float) -> float:
     return LEARNING_RATE * max(remaining, LAST_RATE)
 
 
+PPO_BATCH = 1_024  # most of a training is the update, and its cost goes by the batch
 PPO_DEFAULTS: dict[str, Any] = {
     "n_steps": 32,
-    "batch_size": 1_024,  # most of a training is the update, and its cost goes by the batch
     "n_epochs": 10,
     "learning_rate": _decaying,
     "gae_lambda": 0.9,
@@ -129,6 +129,11 @@ def suggested_gamma(spec: EnvironmentSpec) -> float:
     return float(np.clip(1 - 3 / (spec.time_limit or 1_000), 0.9, 0.999))
 
 
+def even_batch(rollout: int) -> int:
+    """Rows of a batch, about 1,024, of which a rollout is a whole number; the whole rollout where it is smaller."""
+    return next(rollout // k for k in range(max(rollout // PPO_BATCH, 1), rollout + 1) if rollout % k == 0)
+
+
 def suggested_lanes(algorithm: type[BaseAlgorithm]) -> int:
     """On-policy algorithms want many lanes, the others learn once for each step of all of them."""
     return 256 if issubclass(algorithm, OnPolicyAlgorithm) else 4
@@ -158,6 +163,8 @@ def _learner(
     policy_kwargs: dict[str, Any] = {"features_extractor_class": Standardise, "features_extractor_kwargs": extractor}
     if algorithm is stable_baselines3.PPO:
         defaults |= PPO_DEFAULTS
+        rollout = env.num_envs * settings.hyperparameters.get("n_steps", PPO_DEFAULTS["n_steps"])
+        defaults["batch_size"] = even_batch(rollout)
     own = issubclass(algorithm, OnPolicyAlgorithm)
     if own and spec.design.preset == "default":
         policy_kwargs["net_arch"] = WIDER

@@ -21,7 +21,7 @@ def test_help_has_an_example(surrogym, command):
 def test_the_command_alone_lists_all_commands(surrogym):
     said = surrogym("--help")
     assert said.code == 0
-    assert all(f"  {command} " in said.out for command in (*COMMANDS, "serve"))
+    assert all(f"  {command} " in said.out for command in (*COMMANDS, "serve", "optimise"))
 
 
 def test_version(surrogym):

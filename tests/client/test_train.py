@@ -18,6 +18,7 @@ from surrogym_client.train import (
     TrainProgress,
     TrainSettings,
     algorithm_by_name,
+    even_batch,
     imagined_return,
     observation_statistics,
     suggested_gamma,
@@ -193,6 +194,11 @@ def test_settings_follow_from_the_specification(surrogate):
     assert suggested_gamma(pendulum().model_copy(update={"time_limit": 20})) == 0.9
     assert suggested_gamma(pendulum().model_copy(update={"time_limit": None})) == pytest.approx(0.997)
     assert suggested_lanes(PPO) > suggested_lanes(SAC)
+
+
+@pytest.mark.parametrize(("rollout", "batch"), [(8_192, 1_024), (128, 128), (1_536, 1_536), (3_072, 1_024), (1, 1)])
+def test_a_rollout_is_a_whole_number_of_batches(rollout, batch):
+    assert even_batch(rollout) == batch
 
 
 def test_statistics_are_of_the_sampling_range(surrogate):

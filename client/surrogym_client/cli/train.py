@@ -44,6 +44,10 @@ def command(
     num_envs: Annotated[
         int | None, typer.Option(min=1, help="Lanes of the session. [default: from the specification]")
     ] = None,
+    chosen: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="A hyperparameter of the algorithm as NAME=VALUE; may be given several times."),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of policy and virtual environment.")] = 0,
     variant: Annotated[
         Variant, typer.Option(help="The state moves by the mean, as particles, or along a drawn function.")
@@ -99,6 +103,7 @@ def command(
         watch_parent()
     if start_from is not None and not start_from.exists():
         raise CommandError(f"{start_from}: no such policy file")
+    hyperparameters = _hyperparameters(chosen or [])
     spec, url = _trainable(surrogate, server, token, wait)
     from surrogym_client.train import TrainSettings  # torch; imported once there is something to train on
 
@@ -119,6 +124,7 @@ def command(
         start_box=start_box,
         start_from=start_from,
         tensorboard=tensorboard,
+        hyperparameters=hyperparameters,
         session={key: value for key, value in options.items() if value is not None},
     )
     with progress("train", quiet=quiet) as update, _recording(progress_file, update) as record:
@@ -126,6 +132,22 @@ def command(
         result = _train(url, token, surrogate, out, settings, rounds_of, record)
     summary = _write_card(result, surrogate, spec, url, seed)
     give(summary, lambda: _words(result), as_json=as_json, quiet=quiet)
+
+
+def _hyperparameters(chosen: list[str]) -> dict[str, Any]:
+    """What ``--set`` was given: values are JSON, or text where they are none."""
+    from surrogym_client.cli.errors import CommandError
+
+    found: dict[str, Any] = {}
+    for pair in chosen:
+        name, equals, value = pair.partition("=")
+        if not (name and equals):
+            raise CommandError(f"--set: expected NAME=VALUE, got {pair!r}")
+        try:
+            found[name] = json.loads(value)
+        except ValueError:
+            found[name] = value
+    return found
 
 
 def _trainable(surrogate: str, server: str | None, token: str | None, wait: float) -> tuple[EnvironmentSpec, str]:
