@@ -11,7 +11,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint
 PINS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: demo test format-check lint types imports unit chaos bench format postgresql clean help
+.PHONY: demo test format-check lint types imports unit chaos bench acquisition format postgresql clean help
 
 demo: .venv/all  ## Solve Pendulum with server, sampler and trainer on this machine (ARGS="--seed 1")
 	@exec $(BIN)/surrogym demo pendulum $(ARGS)
@@ -40,6 +40,9 @@ bench: .venv/dev  ## What a step costs on this machine, beside bare echoes (ARGS
 	$(BIN)/python tests/benchmarks/bench_step.py $(ARGS)
 	$(BIN)/python tests/benchmarks/bench_predict.py
 
+acquisition: .venv/dev  ## Adaptive queries beside a Latin hypercube, by model error (ARGS="--tasks pendulum --seeds 10")
+	$(BIN)/python tests/benchmarks/acquisition.py $(ARGS)
+
 format: .venv/dev  ## Put the code into shape
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
@@ -58,7 +61,7 @@ clean:  ## Remove the virtual environment, caches and builds; run folders stay
 	find client server shared tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:  ## This list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
