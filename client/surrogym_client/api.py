@@ -96,10 +96,16 @@ class Api:
         return self._get(wire.SurrogateView, _surrogate(name))
 
     def patch_surrogate(
-        self, name: str, *, paused: bool | None = None, budget: int | None = None, target: float | None = None
+        self,
+        name: str,
+        *,
+        paused: bool | None = None,
+        budget: int | None = None,
+        target: float | None = None,
+        tolerances: dict[str, float] | None = None,
     ) -> wire.SurrogateView:
-        """Pause or resume the design, or change its budget or target; None leaves a field as it is."""
-        body = wire.PatchSurrogate(paused=paused, budget=budget, target=target)
+        """Pause or resume the design, or change its budget, target or tolerances; None leaves a field as it is."""
+        body = wire.PatchSurrogate(paused=paused, budget=budget, target=target, tolerances=tolerances)
         return self._post(wire.SurrogateView, _surrogate(name), body, method="PATCH")
 
     def delete_surrogate(self, name: str) -> None:

@@ -57,6 +57,16 @@ def test_register_twice_is_harmless_and_another_specification_is_refused(on_serv
     assert pendulum in other.err
 
 
+def test_tolerances_are_given_at_registration_and_changed_later(on_server, name):
+    registered = on_server("register", "Pendulum-v1", "--name", name, "--tolerance", "theta=0.01", "--json")
+    assert registered.json["spec"]["tolerances"] == {"theta": 0.01}
+    assert on_server("change", name, "--tolerance", "reward=0.5", "--json").json["tolerances"] == {"reward": 0.5}
+    for bad, words in (("angle=1", "'angle'"), ("theta=-1", "greater than 0"), ("theta", "output=number")):
+        said = on_server("register", "Pendulum-v1", "--name", name, "--tolerance", bad)
+        assert said.code == 1
+        assert words in said.err
+
+
 def test_print_spec_asks_no_server_and_gives_what_register_takes(surrogym, on_server, name, tmp_path):
     said = surrogym("register", "Pendulum-v1", "--seed", "5", "--bins", "3", "--print-spec")
     assert said.code == 0

@@ -11,7 +11,19 @@ import typer
 
 from surrogym_client.cli.errors import sentence
 
-COMMANDS = ("register", "sample", "train", "evaluate", "status", "improve", "export", "delete", "demo", "reproduce")
+COMMANDS = (
+    "register",
+    "sample",
+    "train",
+    "evaluate",
+    "status",
+    "improve",
+    "change",
+    "export",
+    "delete",
+    "demo",
+    "reproduce",
+)
 ENTRY_POINTS = "surrogym.commands"
 INTERRUPTED = 130
 

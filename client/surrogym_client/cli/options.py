@@ -25,6 +25,10 @@ ExitWithParent = Annotated[
 SpecFile = Annotated[
     Path | None, typer.Option("--spec", help="JSON file with a specification, instead of the environment's own.")
 ]
+Tolerances = Annotated[
+    list[str] | None,
+    typer.Option("--tolerance", help="Error an output may have, in its own unit, such as theta=0.01. May be repeated."),
+]
 Preset = Literal["default", "paper"]
 
 QUICK = 1.0  # seconds a person waits for a server that is not there
@@ -63,3 +67,21 @@ def read_spec(path: Path | None) -> EnvironmentSpec | None:
         return EnvironmentSpec.model_validate_json(path.read_bytes())
     except ValidationError as error:
         raise CommandError(f"{path} is no specification: {invalid(error)}") from error
+
+
+def read_tolerances(given: list[str]) -> dict[str, float]:
+    """Tolerances by output, from ``output=number`` each.
+
+    Raises:
+        CommandError: one is not of this form.
+    """
+    from surrogym_client.cli.errors import CommandError
+
+    tolerances: dict[str, float] = {}
+    for text in given:
+        name, _, number = text.partition("=")
+        try:
+            tolerances[name] = float(number)
+        except ValueError as error:
+            raise CommandError(f"--tolerance: expected output=number, such as theta=0.01, got {text!r}") from error
+    return tolerances

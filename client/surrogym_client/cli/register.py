@@ -7,7 +7,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Preset, Quiet, Server, SpecFile, Token, Wait, connect, read_spec
+from surrogym_client.cli.options import (
+    AsJson,
+    Preset,
+    Quiet,
+    Server,
+    SpecFile,
+    Token,
+    Tolerances,
+    Wait,
+    connect,
+    read_spec,
+    read_tolerances,
+)
 
 if TYPE_CHECKING:
     from surrogym_shared.spec import EnvironmentSpec
@@ -29,6 +41,7 @@ def command(
     budget: Annotated[int | None, typer.Option(min=2, help="Real steps the design may take.")] = None,
     initial: Annotated[int | None, typer.Option(min=2, help="Real steps before the first model.")] = None,
     target: Annotated[float | None, typer.Option(help="Confidence index to reach.")] = None,
+    tolerance: Tolerances = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the design.")] = None,
     bins: Annotated[int | None, typer.Option(min=2, help="Offer a continuous action as so many values.")] = None,
     teleport: Annotated[
@@ -64,6 +77,8 @@ def command(
         teleport=teleport,
         max_rollout=max_rollout,
     )
+    if tolerance:
+        chosen = _with_tolerances(chosen, read_tolerances(tolerance))
     if print_spec:
         typer.echo(chosen.model_dump_json(indent=2))
         return
@@ -94,6 +109,15 @@ def _specification(environment: str | None, spec: EnvironmentSpec | None, **choi
     except ValueError as error:
         raise CommandError(invalid(error)) from error
     raise CommandError("expected an environment or --spec FILE, got neither")
+
+
+def _with_tolerances(spec: EnvironmentSpec, tolerances: dict[str, float]) -> EnvironmentSpec:
+    from surrogym_client.cli.errors import CommandError, invalid
+
+    try:
+        return type(spec).model_validate(spec.model_dump() | {"tolerances": spec.tolerances | tolerances})
+    except ValueError as error:
+        raise CommandError(invalid(error)) from error
 
 
 def _words(view: SurrogateView, environment: str) -> str:

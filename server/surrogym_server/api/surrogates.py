@@ -54,14 +54,14 @@ def get(name: str, use: Use) -> SurrogateView:
 
 @router.patch(
     "/{name}",
-    summary="Pause, resume, change budget or target",
+    summary="Pause, resume, change budget, target or tolerances",
     dependencies=[ADMIN],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def patch(name: str, body: Annotated[PatchSurrogate, example(examples.PATCH)], use: Use) -> SurrogateView:
-    """What is left out stays. A raised budget or target sets a finished design going again, and resuming a
-    failed one tries it again."""
-    return convert.surrogate_view(use.surrogates.change(name, body.paused, body.budget, body.target))
+    """What is left out stays. A raised budget or target sets a finished design going again, a tolerance has the
+    model judged anew, and resuming a failed one tries it again."""
+    return convert.surrogate_view(use.surrogates.change(name, **dict(body)))
 
 
 @router.delete(

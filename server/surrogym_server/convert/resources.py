@@ -39,6 +39,7 @@ def surrogate_view(status: SurrogateStatus) -> replies.SurrogateView:
         spec=wire.EnvironmentSpec.model_validate(record.spec),
         budget=record.budget,
         target=record.target,
+        tolerances=record.tolerances,
         outputs=list(status.outputs),
         fidelity=None if model is None else replies.Fidelity.model_validate(model.fidelity),
         ledger=ledger(status.ledger),

@@ -96,7 +96,9 @@ def initial_rollouts(definition: EnvironmentDefinition, budget: int) -> list[Ten
 def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignState, request: Request) -> Decision:
     """One round. Raises InvalidInput or NumericalFailure as ``learn`` does."""
     learned = learn(definition, samples, state.thetas)
-    tolerances = state.tolerances or default_tolerances(definition, samples)
+    frozen = state.tolerances or default_tolerances(definition, samples)
+    declared = dict(definition.tolerances)  # a person may have set them since
+    tolerances = tuple(declared.get(name, usual) for name, usual in zip(definition.outputs, frozen, strict=True))
     points = Points(*monte_carlo(definition))
     deviation = deviations(learned.model, points.q, points.u)
     outputs = (*learned.model.transitions, learned.model.reward)

@@ -141,7 +141,7 @@ class Designer:
         steps = [query for query in pending if query.kind == "step"]
         visited = None if lease.checkpoint is None else self._storage.occupancy.get(name, lease.checkpoint)
         return DesignJob(
-            definition=self._definitions.get(name),
+            definition=self._definitions.get(name).with_tolerances(record.tolerances),
             coordinates=samples.coordinates,
             action=samples.action,
             next_coordinates=samples.next_coordinates,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import LiveSessions
-from surrogym_server.errors import NoModel
+from surrogym_server.errors import InvalidInput, NoModel
 from surrogym_server.services.definitions import Define
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
@@ -91,9 +91,25 @@ class SurrogateService:
         """All of them, oldest first."""
         return [self._status(record) for record in self._storage.surrogates.list()]
 
-    def change(self, name: str, paused: bool | None, budget: int | None, target: float | None) -> SurrogateStatus:
-        """Change what is not None; raises ``UnknownSurrogate``."""
-        self._storage.surrogates.change(name, paused=paused, budget=budget, target=target)
+    def change(
+        self,
+        name: str,
+        *,
+        paused: bool | None = None,
+        budget: int | None = None,
+        target: float | None = None,
+        tolerances: dict[str, float] | None = None,
+    ) -> SurrogateStatus:
+        """Change what is not None.
+
+        Raises:
+            UnknownSurrogate: there is none of this name.
+            InvalidInput: a tolerance for what is no output.
+        """
+        outputs = self._define(self._storage.surrogates.get(name).spec).outputs
+        if unknown := sorted(set(tolerances or ()) - set(outputs)):
+            raise InvalidInput(f"tolerances: unknown output {unknown[0]!r}, expected some of {list(outputs)}")
+        self._storage.surrogates.change(name, paused=paused, budget=budget, target=target, tolerances=tolerances)
         self._notices.post(name)
         return self.status(name)
 

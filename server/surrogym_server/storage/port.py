@@ -65,9 +65,16 @@ class Surrogates(ABC):
 
     @abstractmethod
     def change(
-        self, name: str, *, paused: bool | None = None, budget: int | None = None, target: float | None = None
+        self,
+        name: str,
+        *,
+        paused: bool | None = None,
+        budget: int | None = None,
+        target: float | None = None,
+        tolerances: dict[str, float] | None = None,
     ) -> SurrogateRecord:
-        """Change what is not None. Another budget or target, or resuming a failed design, makes a fit due."""
+        """Change what is not None; of ``tolerances`` those of the outputs named. Another budget, target or tolerance,
+        or resuming a failed design, makes a fit due."""
 
     @abstractmethod
     def set_phase(self, name: str, phase: Phase, error: str | None = None) -> None: ...

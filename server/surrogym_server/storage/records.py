@@ -53,6 +53,7 @@ class SurrogateRecord:
     spec: JSON
     budget: int
     target: float
+    tolerances: dict[str, float]  # set since it was created, by output
     phase: Phase
     paused: bool
     round: int  # designs committed so far

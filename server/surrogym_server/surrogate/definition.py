@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -95,6 +96,10 @@ class EnvironmentDefinition:
     learns_termination: bool = False  # from samples; no groups are declared then
     declared_reward: DeclaredReward | None = None
     max_rollout: int | None = None  # longest action sequence from a reset; None where any state can be set
+
+    def with_tolerances(self, tolerances: Mapping[str, float]) -> EnvironmentDefinition:
+        """The same with these tolerances, by output, in the place of its own."""
+        return replace(self, tolerances=tuple((dict(self.tolerances) | dict(tolerances)).items()))
 
     @cached_property
     def coordinate_names(self) -> tuple[str, ...]:

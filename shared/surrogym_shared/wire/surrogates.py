@@ -6,6 +6,7 @@ from typing import Annotated
 
 from pydantic import ConfigDict, Field
 
+from surrogym_shared.checks import Positive
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire.base import Phase, Reply, Request, SurrogateName
 
@@ -23,6 +24,9 @@ class PatchSurrogate(Request):
     paused: bool | None = None
     budget: Annotated[int, Field(ge=2, le=100_000)] | None = None
     target: Annotated[float, Field(gt=0.5, lt=1)] | None = None
+    tolerances: dict[str, Positive] | None = Field(
+        default=None, description="by output, in its own unit; those of other outputs stay as they are"
+    )
 
 
 class OutputFidelity(Reply):
@@ -87,6 +91,7 @@ class SurrogateView(SurrogateSummary):
     spec: EnvironmentSpec
     budget: int
     target: float
+    tolerances: dict[str, float] = Field(description="set since the surrogate was created, by output, in its own unit")
     outputs: list[str]
     fidelity: Fidelity | None
     ledger: Ledger

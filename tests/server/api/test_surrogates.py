@@ -77,6 +77,23 @@ def test_a_raised_budget_sets_a_finished_design_going(client: httpx.Client, name
     assert pendulum.finish(client, name)["samples"] == 8
 
 
+def test_a_tolerance_has_a_finished_design_judged_anew(client: httpx.Client, name: str):
+    pendulum.teach(client, name, budget=6)
+    changed = client.patch(f"/v1/surrogates/{name}", json={"tolerances": {"theta_dot": 0.25}, "budget": 7})
+    assert changed.raise_for_status().json()["tolerances"] == {"theta_dot": 0.25}
+    judged = pendulum.finish(client, name)["fidelity"]["outputs"]
+    assert next(output for output in judged if output["name"] == "theta_dot")["tolerance"] == 0.25
+    for refused, words in (
+        ({"cos": 0.1}, "'cos'"),
+        ({"theta_dot": 0}, "greater than 0"),
+        ({"theta_dot": "1"}, "number"),
+    ):
+        problem = client.patch(f"/v1/surrogates/{name}", json={"tolerances": refused})
+        assert problem.status_code == 422
+        assert words in problem.text
+    assert view(client, name).tolerances == {"theta_dot": 0.25}
+
+
 def test_a_paused_design_hands_out_nothing(client: httpx.Client, fresh: str):
     assert client.patch(f"/v1/surrogates/{fresh}", json={"paused": True}).json()["paused"]
     claimed = pendulum.claim(client, fresh, wait_seconds=0)

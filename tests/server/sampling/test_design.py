@@ -238,6 +238,13 @@ def test_declared_tolerances_hold(few):
     assert default_tolerances(definition_from_spec(spec), still)[2] == pytest.approx(0.05)
 
 
+def test_a_tolerance_set_later_takes_the_place_of_the_frozen_one(definition, few):
+    frozen = DesignState(1, (0.5, 0.5, 0.5))
+    made = advance(definition.with_tolerances({"speed": 1e-12}), few, frozen, request())
+    assert made.state.tolerances == (0.5, 1e-12, 0.5)
+    assert made.confidences[1].confidence_index < 0.999
+
+
 def test_a_tolerance_is_declared_for_what_the_preset_learns():
     """Preset ``paper`` moves the observation: it has no error in an angle to compare with a tolerance."""
     design = Design(preset="paper", initial=10)

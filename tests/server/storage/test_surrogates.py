@@ -65,6 +65,14 @@ def test_change_touches_what_is_given_and_no_more(storage: Storage, make: Callab
     assert not storage.surrogates.change(name, paused=False).paused
 
 
+def test_tolerances_are_set_one_by_one(storage: Storage, make: Callable[..., str]) -> None:
+    name = make()
+    assert storage.surrogates.get(name).tolerances == {}
+    storage.surrogates.change(name, tolerances={"theta": 0.1, "reward": 2.0})
+    storage.surrogates.change(name, tolerances={"theta": 0.01})
+    assert storage.surrogates.get(name).tolerances == {"theta": 0.01, "reward": 2.0}
+
+
 def test_set_phase_keeps_the_error(storage: Storage, make: Callable[..., str]) -> None:
     name = make()
     storage.surrogates.set_phase(name, "failed", "it broke")

@@ -19,7 +19,7 @@ from surrogym_server.storage.sql.tables import surrogates
 COLUMNS = [
     getattr(surrogates.c, name)
     for name in (
-        *("name", "spec", "budget", "target", "phase", "paused", "round", "state", "error"),
+        *("name", "spec", "budget", "target", "tolerances", "phase", "paused", "round", "state", "error"),
         *("extra_queries", "checkpoint", "created_at"),
     )
 ]
@@ -52,12 +52,19 @@ class SqlSurrogates(port.Surrogates):
             return [_record(row) for row in rows]
 
     def change(
-        self, name: str, *, paused: bool | None = None, budget: int | None = None, target: float | None = None
+        self,
+        name: str,
+        *,
+        paused: bool | None = None,
+        budget: int | None = None,
+        target: float | None = None,
+        tolerances: dict[str, float] | None = None,
     ) -> SurrogateRecord:
-        asked = {"paused": paused, "budget": budget, "target": target}
         with self._database.write() as connection:
             held = hold(connection, name)
             before = read(connection, name)
+            merged = None if tolerances is None else before.tolerances | tolerances
+            asked = {"paused": paused, "budget": budget, "target": target, "tolerances": merged}
             changes: dict[str, Any] = {
                 field: value for field, value in asked.items() if value is not None and value != getattr(before, field)
             }

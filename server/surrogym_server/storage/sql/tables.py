@@ -73,6 +73,7 @@ surrogates = sa.Table(
     sa.Column("spec", Json, nullable=False),
     sa.Column("budget", sa.Integer, nullable=False),
     sa.Column("target", sa.Double, nullable=False),
+    sa.Column("tolerances", Json, nullable=False, server_default="{}"),
     sa.Column("phase", sa.Text, nullable=False),
     sa.Column("paused", sa.Boolean, nullable=False),
     sa.Column("round", sa.Integer, nullable=False),

@@ -1,0 +1,40 @@
+"""``surrogym change``: pause or resume a design, or ask more or less of it."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from surrogym_client.cli.options import AsJson, Quiet, Server, Token, Tolerances, connect, read_tolerances
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("change")(command)
+
+
+def command(
+    surrogate: Annotated[str, typer.Argument(help="Name of the surrogate.")],
+    tolerance: Tolerances = None,
+    budget: Annotated[int | None, typer.Option(min=2, help="Real steps the design may take.")] = None,
+    target: Annotated[float | None, typer.Option(help="Confidence index to reach.")] = None,
+    paused: Annotated[bool | None, typer.Option("--pause/--resume", help="Stop asking for queries, or go on.")] = None,
+    server: Server = None,
+    token: Token = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Change a living surrogate; its model is judged anew, and what is left out stays.
+
+    Example: surrogym change pendulum --tolerance theta=0.01 --budget 30
+    """
+    from surrogym_client.cli.output import give
+
+    tolerances = read_tolerances(tolerance) if tolerance else None
+    with connect(server, token) as api:
+        view = api.patch_surrogate(surrogate, paused=paused, budget=budget, target=target, tolerances=tolerances)
+    set_by_hand = "".join(f", {name} to {value:g}" for name, value in view.tolerances.items())
+    state = "paused" if view.paused else view.phase
+    words = f"{view.name}: {state}, budget of {view.budget} real steps, target {view.target:g}{set_by_hand}"
+    give(view.model_dump(mode="json"), lambda: words, as_json=as_json, quiet=quiet)
