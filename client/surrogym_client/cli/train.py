@@ -59,6 +59,9 @@ def command(
     weighting: Annotated[
         Weighting | None, typer.Option(help="Of the particles' rewards. [default: inverse_variance]")
     ] = None,
+    spread: Annotated[
+        float | None, typer.Option(help="First deviation of particles, as a share of the range. [default: 0.01]")
+    ] = None,
     process_noise: Annotated[
         bool, typer.Option("--process-noise", help="Let the learned noise move the state.")
     ] = False,
@@ -112,6 +115,7 @@ def command(
         "particles": particles,
         "propagation": propagation,
         "weighting": weighting,
+        "spread": spread,
         "process_noise": process_noise or None,
         "trust": trust,
         "penalty": penalty,
