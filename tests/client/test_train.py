@@ -12,6 +12,7 @@ from surrogym_client.imagined import imagined_returns
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_client.original.loading import make
 from surrogym_client.policies import WIDER, PaperPolicy
+from surrogym_client.policy_file import load_policy
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.train import (
     MAX_STEPS,
@@ -168,6 +169,15 @@ def test_other_algorithms_by_name(surrogate, tmp_path: Path, algorithm):
     result = train(surrogate, tmp_path / "policy.zip", settings)
     assert result.virtual_steps == 64
     assert algorithm_by_name(algorithm).load(tmp_path / "policy.zip", device="cpu") is not None
+
+
+def test_dqn_takes_one_discrete_action_and_sac_none(tmp_path: Path):
+    surrogate, quick = local(cartpole()), {"learning_starts": 32, "batch_size": 16}
+    settings = small(algorithm="dqn", num_envs=4, total_steps=64, hyperparameters=quick)
+    result = train(surrogate, tmp_path / "policy.zip", settings)
+    assert load_policy(result.path, "dqn")(np.zeros((5, 4), np.float32)).shape == (5,)
+    with pytest.raises(ValueError, match=r"SAC can't be trained here: .*Discrete"):
+        train(surrogate, tmp_path / "policy.zip", small(algorithm="SAC", hyperparameters=quick))
 
 
 @pytest.mark.parametrize(
