@@ -65,3 +65,14 @@ def test_the_rail_is_registered_and_sampled(server: ServerProcess, tmp_path: Pat
     sample = ["sample", "rail", "--env", "rail:Rail", "--until-done"]
     report = json.loads(run(tmp_path, "-m", "surrogym_client", *sample, *common))
     assert (report["answered"], report["failed"]) == (5, 0)
+
+
+def test_a_reward_that_jumps_and_an_end_that_is_learned(server: ServerProcess, tmp_path: Path) -> None:
+    (tmp_path / "track.py").write_text(programs("rewards-and-terminations.md")[0], encoding="utf-8")
+    common = ["--server", server.url, "--json", "--quiet"]
+    run(tmp_path, "-m", "surrogym_client", "register", "track:Track", "--name", "track", "--budget", "6", *common)
+    sample = ["sample", "track", "--env", "track:Track", "--until-done"]
+    report = json.loads(run(tmp_path, "-m", "surrogym_client", *sample, *common))
+    assert (report["answered"], report["failed"]) == (6, 0)
+    for program in programs("rewards-and-terminations.md")[1:]:
+        run(tmp_path, "-c", program)
