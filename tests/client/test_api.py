@@ -35,6 +35,8 @@ def sample(number: int) -> wire.SampleView:
         sampler="a",
         attempt=1,
         late=False,
+        trajectory=None,
+        step=0,
         requested_coordinates=[0.0],
         coordinates=[0.0],
         action=[0.0],
