@@ -16,7 +16,7 @@ from surrogym_server.sampling.acquisition import choose
 from surrogym_server.sampling.candidates import Candidates, candidates_of
 from surrogym_server.sampling.confidence import OutputConfidence, confidence, deviations
 from surrogym_server.sampling.endings import ending
-from surrogym_server.sampling.latin_hypercube import latin_hypercube, random_points
+from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
 from surrogym_server.sampling.outlook import Points
 from surrogym_server.sampling.rollouts import Aim, first_rollouts, plan_round
 from surrogym_server.surrogate.definition import EnvironmentDefinition
@@ -83,7 +83,8 @@ def initial_design(definition: EnvironmentDefinition, budget: int) -> tuple[Tens
     if definition.design.acquisition == "latin_hypercube":
         count = budget
     tries = 1 if paper or count > FEW_POINTS else HYPERCUBE_TRIES
-    return latin_hypercube(definition, count, _rng(definition, "initial"), tries)
+    rng = _rng(definition, "initial")
+    return going_on(definition, *latin_hypercube(definition, count, rng, tries), rng)
 
 
 def initial_rollouts(definition: EnvironmentDefinition, budget: int) -> list[Tensor]:
@@ -122,7 +123,8 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
 
 def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
     """The Monte Carlo set of eq. 8, the same in every round: coordinates (m, C), actions (m, F)."""
-    return random_points(definition, definition.design.monte_carlo, _rng(definition, "monte carlo"))
+    rng = _rng(definition, "monte carlo")
+    return going_on(definition, *random_points(definition, definition.design.monte_carlo, rng), rng)
 
 
 def default_tolerances(definition: EnvironmentDefinition, samples: Samples) -> tuple[float, ...]:

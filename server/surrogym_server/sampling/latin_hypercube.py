@@ -11,6 +11,7 @@ from torch import Tensor
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 
 Array = NDArray[np.float64]
+REDRAWS = 100
 
 
 def latin_hypercube(
@@ -32,6 +33,21 @@ def random_points(definition: EnvironmentDefinition, count: int, rng: np.random.
     """Independent draws from the sampling distributions: coordinates (count, C) and actions (count, F)."""
     dimensions = len(definition.coordinates) + definition.action.size
     return from_unit(definition, torch.from_numpy(rng.random((count, dimensions))))
+
+
+def going_on(
+    definition: EnvironmentDefinition, q: Tensor, u: Tensor, rng: np.random.Generator
+) -> tuple[Tensor, Tensor]:
+    """The points q (n, C), u (n, F), those where the declared termination already holds replaced by independent draws
+    where it does not: no episode passes there, so a query would teach nothing. A range that is all termination stays.
+    """
+    q, u = q.clone(), u.clone()
+    for _ in range(REDRAWS):
+        over = definition.terminated(q)
+        if not bool(over.any()):
+            break
+        q[over], u[over] = random_points(definition, int(over.sum()), rng)
+    return q, u
 
 
 def from_unit(definition: EnvironmentDefinition, p: Tensor) -> tuple[Tensor, Tensor]:

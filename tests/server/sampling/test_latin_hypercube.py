@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 from scipy.stats import truncnorm
 
-from surrogym_client.original.classic import pendulum
+from surrogym_client.original.classic import acrobot, pendulum
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.sampling.latin_hypercube import latin_hypercube, random_points
+from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
 from surrogym_server.surrogate.definition import ActionDefinition, CoordinateDefinition
 from surrogym_server.surrogate.distributions import Distribution, Fixed, Normal, Uniform
 
@@ -104,3 +104,23 @@ def test_random_points_follow_the_sampling_distributions():
     np.testing.assert_allclose(np.quantile(p, [0.1, 0.5, 0.9]), [0.1, 0.5, 0.9], atol=0.03)
     assert -2 <= float(u.min()) < -1.9
     assert 1.9 < float(u.max()) <= 2
+
+
+def test_no_point_is_where_an_episode_is_over_and_the_others_stay():
+    definition = definition_from_spec(acrobot())
+    rng = np.random.default_rng(0)
+    q, u = random_points(definition, 400, rng)
+    over = definition.terminated(q)
+    kept_q, kept_u = going_on(definition, q, u, rng)
+    assert over.sum() > 20
+    assert not definition.terminated(kept_q).any()
+    assert torch.equal(kept_q[~over], q[~over])
+    assert torch.equal(kept_u[~over], u[~over])
+
+
+def test_a_range_that_is_all_termination_stays():
+    definition = definition_from_spec(acrobot())
+    everywhere = replace(definition.termination_groups[0][0], value=-10.0)
+    definition = replace(definition, termination_groups=((everywhere,),))
+    q, u = random_points(definition, 5, np.random.default_rng(0))
+    assert len(going_on(definition, q, u, np.random.default_rng(0))[0]) == 5
