@@ -187,7 +187,9 @@ BY_CODE: dict[Code, type[ProblemError]] = {
     Code.NO_MODEL: NoModel,
     Code.TOO_LARGE: TooLarge,
     Code.UNSUPPORTED_MEDIA_TYPE: InvalidInput,
+    Code.REQUEST_TIMEOUT: Unavailable,
     Code.TOO_MANY_REQUESTS: Overloaded,
+    Code.DEADLINE_EXCEEDED: Unavailable,
     Code.UNAVAILABLE: Unavailable,
     Code.INTERNAL: ServerFailure,
 }

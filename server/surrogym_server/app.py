@@ -37,7 +37,7 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
 from surrogym_server.engine.fits import Fits
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.engine.sessions import LiveSessions
+from surrogym_server.engine.sessions import MEBIBYTE, Limits, LiveSessions
 from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import Designer
@@ -107,7 +107,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     app.state.notices = None
     app.state.counts = Counts()
     problems.install(app)
-    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes)
+    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, max_together=settings.max_bodies_bytes)
     if settings.loopback and not settings.tokens:
         app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", settings.host}))
     app.add_middleware(Observed, counts=app.state.counts)
@@ -150,7 +150,8 @@ async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: 
 
 def _build_engine(settings: Settings, design: DesignPort) -> _Engine:
     threads = ThreadPoolExecutor(STEP_THREADS, thread_name_prefix="step")
-    live = LiveSessions(threads, limit=settings.max_sessions, idle_seconds=settings.session_idle_seconds)
+    limits = Limits(settings.max_sessions, settings.max_sessions_mib * MEBIBYTE, settings.max_waiting)
+    live = LiveSessions(threads, limits=limits, idle_seconds=settings.session_idle_seconds, workers=STEP_THREADS)
     return _Engine(Fits(design.run), live, threads, Notices())
 
 

@@ -22,7 +22,8 @@ SurrogymError
 │   ├── Unauthenticated
 │   └── Forbidden
 ├── Unavailable             storage or engine can't serve this now; try again later
-│   └── Overloaded          a queue or a cap is full; try again later
+│   ├── Overloaded          a queue or a cap is full; try again later
+│   └── DeadlineExceeded    its answer would come after the deadline it brought
 └── NumericalFailure        a covariance matrix that no jitter repairs
 """
 
@@ -123,6 +124,10 @@ class Unavailable(SurrogymError):
 
 class Overloaded(Unavailable):
     """A queue or a cap is full; try again later."""
+
+
+class DeadlineExceeded(Unavailable):
+    """The answer would come after the deadline of the request; nothing was computed."""
 
 
 class NumericalFailure(SurrogymError):

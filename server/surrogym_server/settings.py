@@ -35,7 +35,12 @@ class Settings(BaseModel):
     threads: Annotated[int, Field(ge=1, le=1024, description="of one torch operation")] = 1
     session_idle_seconds: Annotated[float, Field(gt=0)] = 3_600.0
     max_body_bytes: Annotated[int, Field(ge=1_024)] = 32 * 1024 * 1024
+    max_bodies_bytes: Annotated[int, Field(ge=1_024, description="of all requests at once")] = 256 * 1024 * 1024
+    max_connections: Annotated[int, Field(ge=1)] = 16_384
+    request_seconds: Annotated[float, Field(gt=0, description="for a request to arrive whole")] = 30.0
     max_sessions: Annotated[int, Field(ge=1)] = 256
+    max_sessions_mib: Annotated[int, Field(ge=1, description="memory of the lanes of all sessions")] = 2_048
+    max_waiting: Annotated[int, Field(ge=1, description="requests of sessions, at work or waiting")] = 1_024
     max_lanes: Annotated[int, Field(ge=1, le=MAX_LANES, description="of one session")] = MAX_LANES
     sweep_seconds: Annotated[float, Field(gt=0, description="between looks at leases and sessions")] = 1.0
     log_level: LogLevel = "info"

@@ -32,7 +32,9 @@ class Code(StrEnum):
     NO_MODEL = "no_model"  # nothing has been fitted yet
     TOO_LARGE = "too_large"
     UNSUPPORTED_MEDIA_TYPE = "unsupported_media_type"
-    TOO_MANY_REQUESTS = "too_many_requests"
+    REQUEST_TIMEOUT = "request_timeout"  # the request itself did not arrive in time
+    TOO_MANY_REQUESTS = "too_many_requests"  # a queue or a cap is full
+    DEADLINE_EXCEEDED = "deadline_exceeded"  # it would have been late, so it was not computed
     UNAVAILABLE = "unavailable"
     INTERNAL = "internal"
 
@@ -58,7 +60,9 @@ STATUS: dict[Code, int] = {
     Code.NO_MODEL: 409,
     Code.TOO_LARGE: 413,
     Code.UNSUPPORTED_MEDIA_TYPE: 415,
+    Code.REQUEST_TIMEOUT: 408,
     Code.TOO_MANY_REQUESTS: 429,
+    Code.DEADLINE_EXCEEDED: 503,
     Code.UNAVAILABLE: 503,
     Code.INTERNAL: 500,
 }

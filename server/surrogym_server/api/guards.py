@@ -6,16 +6,18 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from surrogym_server.api.problems import problem_response
+from surrogym_server.api.problems import RETRY_AFTER_SECONDS, problem_response
 from surrogym_shared.codes import Code
 
 
 class BodyLimit:
-    """Refuses bodies of more than ``max_bytes``, announced or chunked."""
+    """Refuses bodies of more than ``max_bytes``, announced or chunked, and of more in all requests at once."""
 
-    def __init__(self, app: ASGIApp, max_bytes: int) -> None:
+    def __init__(self, app: ASGIApp, max_bytes: int, max_together: int) -> None:
         self._app = app
         self._max_bytes = max_bytes
+        self._max_together = max_together
+        self._together = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -31,12 +33,20 @@ class BodyLimit:
         async def counted() -> Message:
             nonlocal received
             message = await receive()
-            received += len(message.get("body", b""))
+            size = len(message.get("body", b""))
+            received += size
+            self._together += size
             if received > self._max_bytes:
                 raise HTTPException(413, self._detail("more"))
+            if self._together > self._max_together:
+                detail = f"expected bodies of at most {self._max_together} bytes in all requests at once, got more"
+                raise HTTPException(429, detail, {"retry-after": RETRY_AFTER_SECONDS})
             return message
 
-        await self._app(scope, counted, send)
+        try:
+            await self._app(scope, counted, send)
+        finally:
+            self._together -= received
 
     def _detail(self, got: str) -> str:
         return f"expected a body of at most {self._max_bytes} bytes, got {got}"

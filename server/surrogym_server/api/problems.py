@@ -9,6 +9,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from surrogym_server import errors
 from surrogym_server.logs import REQUEST_ID
@@ -34,6 +35,7 @@ CODES: dict[type[errors.SurrogymError], Code] = {
     errors.Unauthenticated: Code.UNAUTHENTICATED,
     errors.Forbidden: Code.FORBIDDEN,
     errors.Overloaded: Code.TOO_MANY_REQUESTS,
+    errors.DeadlineExceeded: Code.DEADLINE_EXCEEDED,
     errors.Unavailable: Code.UNAVAILABLE,
     errors.NumericalFailure: Code.INTERNAL,
 }
@@ -43,6 +45,7 @@ HTTP_CODES = {
     403: Code.FORBIDDEN,
     404: Code.NOT_FOUND,
     405: Code.METHOD_NOT_ALLOWED,
+    408: Code.REQUEST_TIMEOUT,
     413: Code.TOO_LARGE,
     415: Code.UNSUPPORTED_MEDIA_TYPE,
     429: Code.TOO_MANY_REQUESTS,
@@ -61,6 +64,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(FrameError, _refused)
     app.add_exception_handler(RequestValidationError, _request_invalid)
     app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(ClientDisconnect, _gone)
     app.add_exception_handler(Exception, _unexpected)
 
 
@@ -167,7 +171,7 @@ async def _refused(_: Request, error: Exception) -> Response:
 def _headers(code: Code) -> dict[str, str]:
     if code is Code.UNAUTHENTICATED:
         return {"www-authenticate": "Bearer"}
-    if code in (Code.TOO_MANY_REQUESTS, Code.UNAVAILABLE):
+    if code in (Code.TOO_MANY_REQUESTS, Code.UNAVAILABLE, Code.DEADLINE_EXCEEDED):
         return {"retry-after": RETRY_AFTER_SECONDS}
     return {}
 
@@ -185,6 +189,12 @@ async def _http_error(request: Request, error: Exception) -> Response:
         Code.METHOD_NOT_ALLOWED: f"{request.method} is not allowed on {request.url.path!r}",
     }.get(code, str(error.detail))
     return problem_response(code, detail, status=error.status_code, headers=error.headers)
+
+
+async def _gone(_: Request, error: Exception) -> Response:
+    """For the log alone: who would read it has left in the middle of a request."""
+    assert isinstance(error, ClientDisconnect)
+    return problem_response(Code.REQUEST_TIMEOUT, "the connection ended before the request did")
 
 
 async def _unexpected(_: Request, error: Exception) -> Response:

@@ -14,6 +14,7 @@ from starlette.routing import WebSocketRoute
 from surrogym_server.api import examples, forms
 from surrogym_server.api.auth import TRAIN
 from surrogym_server.api.body import BINARY, LeanRoute, described
+from surrogym_server.api.deadline import PARAMETER, seconds_left
 from surrogym_server.api.problems import documented
 from surrogym_server.api.stream import StepStream
 from surrogym_shared.codes import Code
@@ -30,6 +31,8 @@ ERRORS = documented(
     Code.NOT_RESET,
     Code.TOO_LARGE,
     Code.UNSUPPORTED_MEDIA_TYPE,
+    Code.TOO_MANY_REQUESTS,
+    Code.DEADLINE_EXCEEDED,
 )
 
 
@@ -37,7 +40,7 @@ def _documented(body: type[BaseModel], example: dict[str, Any], reply: type[Base
     return {
         "response_model": reply,
         "dependencies": [TRAIN],
-        "openapi_extra": described(body, example),
+        "openapi_extra": {**described(body, example), "parameters": [PARAMETER]},
         "responses": {200: {"content": BINARY}, **ERRORS},
     }
 
@@ -67,5 +70,6 @@ async def _carried(by_type: Mapping[str, forms.Carry], id: str, request: Request
     carry = by_type.get(media_type)
     if carry is None:
         raise HTTPException(415, f"expected content type {' or '.join(by_type)}, got {media_type or 'none'}")
-    content = await carry(request.state.services.sessions, id, await request.body())
+    sessions = request.state.services.sessions.within(seconds_left(request.headers))
+    content = await carry(sessions, id, await request.body())
     return Response(content, media_type=media_type)

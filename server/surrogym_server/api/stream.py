@@ -15,6 +15,7 @@ from starlette.types import Receive, Scope, Send
 
 from surrogym_server import convert
 from surrogym_server.api.auth import Gate, bearer_token
+from surrogym_server.api.deadline import seconds_left
 from surrogym_server.api.forms import carry_out
 from surrogym_server.api.problems import problem_of, response_of
 from surrogym_server.errors import Forbidden, SurrogymError
@@ -34,12 +35,13 @@ class StepStream:
         try:
             _admit(scope)
             shape = convert.session_shape(sessions.get(id))
+            limit = seconds_left(Headers(scope=scope))
         except SurrogymError as error:
             await response_of(problem_of(error))(scope, receive, send)
             return
         await send({"type": "websocket.accept"})
         while (message := await receive())["type"] == "websocket.receive":
-            reply = await _reply(sessions, id, shape, message.get("bytes"))
+            reply = await _reply(sessions.within(limit), id, shape, message.get("bytes"))
             await send({"type": "websocket.send", "bytes": reply})
             await asyncio.sleep(0)  # others' turn, also while this client has sent ahead
 

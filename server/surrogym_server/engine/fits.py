@@ -16,6 +16,8 @@ from threading import Thread
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
 from surrogym_server.errors import Unavailable
 
+NICENESS = 10  # to a step on the same core a fit leaves nine tenths of it
+
 
 class Fits:
     """A pool of one process. It ends with this one, however this one ends.
@@ -73,6 +75,7 @@ def _interrupt_blocked() -> Iterator[None]:
 
 
 def _live_with(lifeline: Connection) -> None:
+    os.nice(NICENESS)
     Thread(target=_exit_when_closed, args=(lifeline,), daemon=True).start()
 
 

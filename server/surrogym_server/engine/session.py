@@ -55,6 +55,13 @@ class Session:
     opened_by: tuple[str, str] | None = None  # idempotency key and digest of the opening
 
     @property
+    def nbytes(self) -> int:
+        """Bytes of its lanes and of its kept answer, roughly."""
+        outcome = None if self.answer is None else self.answer.outcome
+        kept = [outcome] if isinstance(outcome, ResetResult) else outcome or ()
+        return self.lanes.nbytes + sum(result.observation.nbytes for result in kept[:1]) * len(kept)
+
+    @property
     def seq(self) -> int:
         """The last seq that was answered."""
         return 0 if self.answer is None else self.answer.seq

@@ -13,11 +13,12 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field
 
 from surrogym_server.engine.session import Answer, Outcome, Session, answered, check_opening, replay
-from surrogym_server.errors import Overloaded, SessionExpired, UnknownSession
+from surrogym_server.errors import DeadlineExceeded, Overloaded, SessionExpired, TooLarge, UnknownSession
 
 # Work below this is done in the event loop: a hop to a thread and back costs about 70 us idle and several times
 # that on a busy machine, and nobody else notices a wait of two milliseconds.
 INLINE_SECONDS = 2e-3
+MEBIBYTE = 2**20
 REMEMBERED_EXPIRED = 10_000
 FORGETTING = 0.2
 
@@ -29,24 +30,50 @@ class _Live:
     session: Session
     used: float
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+    reserved: int = 0  # bytes its lanes are expected to take
     seconds_per_step: float = float("inf")  # measured, so unknown before the first
+
+    @property
+    def nbytes(self) -> int:
+        return max(self.reserved, self.session.nbytes)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What all sessions together may take of this process."""
+
+    sessions: int = 256
+    nbytes: int = 2048 * MEBIBYTE  # of lanes and kept answers
+    requests: int = 1_024  # at work or waiting
 
 
 class LiveSessions:
-    """Sessions by id: one request at a time in each, long ones in a thread."""
+    """Sessions by id: one request at a time in each, long ones in a thread.
+
+    Args:
+        threads: where long work is done.
+        workers: how many threads those are.
+        limits: beyond them requests are refused.
+        idle_seconds: a session that is not used for so long expires.
+        clock: seconds, of which deadlines speak too.
+    """
 
     def __init__(
         self,
         threads: Executor,
         *,
-        limit: int,
+        limits: Limits,
         idle_seconds: float,
+        workers: int = 1,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.idle_seconds = idle_seconds
+        self.clock = clock
         self._threads = threads
-        self._limit = limit
-        self._clock = clock
+        self._workers = workers
+        self._limits = limits
+        self._requests = 0
+        self._queued: list[float] = []  # seconds that the work given to threads will take
         self._live: dict[str, _Live] = {}
         self._expired: OrderedDict[str, None] = OrderedDict()
 
@@ -56,15 +83,29 @@ class LiveSessions:
     def __iter__(self) -> Iterator[Session]:
         return iter([live.session for live in self._live.values()])
 
-    def add(self, session: Session) -> Session:
-        """Keep a session.
+    def check_room(self, nbytes: int) -> None:
+        """Whether a session of so many bytes may be opened.
 
         Raises:
-            Overloaded: as many as the limit are open.
+            TooLarge: it alone takes more than all may.
+            Overloaded: as many as the limit are open, or they take too much already.
         """
-        if len(self._live) >= self._limit:
-            raise Overloaded(f"expected fewer than {self._limit} open sessions: close some, or try again later")
-        self._live[session.id] = _Live(session, self._clock())
+        most, taken = self._limits.nbytes, sum(live.nbytes for live in self._live.values())
+        if nbytes > most:
+            raise TooLarge(f"expected lanes of at most {_mebibytes(most)}, got {_mebibytes(nbytes)}")
+        if len(self._live) >= self._limits.sessions:
+            raise Overloaded(f"expected fewer than {self._limits.sessions} open sessions: close some, or try later")
+        if taken + nbytes > most:
+            raise Overloaded(
+                f"expected the lanes of all sessions to take at most {_mebibytes(most)}, got {_mebibytes(taken)} "
+                f"and {_mebibytes(nbytes)} more: close some, or try later"
+            )
+
+    def add(self, session: Session, reserved: int = 0) -> Session:
+        """Keep a session, which may grow to ``reserved`` bytes. Raises as ``check_room``."""
+        live = _Live(session, self.clock(), reserved=reserved)
+        self.check_room(live.nbytes)
+        self._live[session.id] = live
         return session
 
     def get(self, id: str) -> Session:
@@ -81,7 +122,9 @@ class LiveSessions:
                 return check_opening(session, digest)
         return None
 
-    async def advance(self, id: str, seq: int | None, digest: str, work: Work, steps: int = 1) -> Answer:
+    async def advance(
+        self, id: str, seq: int | None, digest: str, work: Work, steps: int = 1, deadline: float | None = None
+    ) -> Answer:
         """Do the work of a request once, and keep its outcome as the session's last answer.
 
         The same seq with the same digest gets the kept answer, also when it comes while the first is being
@@ -93,20 +136,29 @@ class LiveSessions:
             digest: fingerprint of the request.
             work: from the session to the new session and the outcome; pure.
             steps: how many virtual steps it takes, to predict how long.
+            deadline: by the clock; work that would end later is not begun.
 
         Raises:
             SeqConflict: neither the next seq nor a repeat.
+            Overloaded: too many requests are at work or waiting.
+            DeadlineExceeded: it would be late.
             SessionExpired, UnknownSession: as the classes say.
         """
         live = self._get(id)
-        async with live.lock:
-            self._get(id).used = self._clock()
-            if kept := replay(live.session, seq, digest):
-                return kept
-            session, outcome = await self._do(live, work, steps)
-            live.session, answer = answered(session, digest, outcome)
-            live.used = self._clock()
-            return answer
+        if self._requests >= self._limits.requests:
+            raise Overloaded(f"expected at most {self._limits.requests} requests of sessions at once: try again later")
+        self._requests += 1
+        try:
+            async with live.lock:
+                self._get(id).used = self.clock()
+                if kept := replay(live.session, seq, digest):
+                    return kept
+                session, outcome = await self._do(live, work, steps, deadline)
+                live.session, answer = answered(session, digest, outcome)
+                live.used = self.clock()
+                return answer
+        finally:
+            self._requests -= 1
 
     def close(self, id: str) -> None:
         """End a session; harmless when it has ended."""
@@ -120,7 +172,7 @@ class LiveSessions:
 
     def sweep(self) -> list[str]:
         """Expire the sessions that were idle for too long; returns their ids."""
-        now = self._clock()
+        now = self.clock()
         idle = [id for id, live in self._live.items() if now - live.used > self.idle_seconds and not live.lock.locked()]
         for id in idle:
             del self._live[id]
@@ -136,16 +188,43 @@ class LiveSessions:
             raise SessionExpired(f"session {id!r} was idle for more than {self.idle_seconds:g} s: open a new one")
         raise UnknownSession(f"no session {id!r}: open a new one")
 
-    async def _do(self, live: _Live, work: Work, steps: int) -> tuple[Session, Outcome]:
-        session, inline = live.session, live.seconds_per_step * steps < INLINE_SECONDS
-        if inline:
-            done, seconds = _timed(work, session)
+    async def _do(self, live: _Live, work: Work, steps: int, deadline: float | None) -> tuple[Session, Outcome]:
+        expected = live.seconds_per_step * steps
+        if expected < INLINE_SECONDS:
+            self._check_deadline(deadline, expected)
+            done, seconds = _timed(work, live.session)
         else:
-            loop = asyncio.get_running_loop()
-            done, seconds = await loop.run_in_executor(self._threads, _timed, work, session)
+            done, seconds = await self._in_thread(live.session, work, expected, deadline)
         known = live.seconds_per_step if live.seconds_per_step < float("inf") else seconds / steps
         live.seconds_per_step = (1 - FORGETTING) * known + FORGETTING * seconds / steps
         return done
+
+    async def _in_thread(
+        self, session: Session, work: Work, expected: float, deadline: float | None
+    ) -> tuple[tuple[Session, Outcome], float]:
+        expected = expected if expected < float("inf") else 0.0
+        waiting = sum(self._queued) / self._workers if len(self._queued) >= self._workers else 0.0
+        self._check_deadline(deadline, waiting + expected)
+
+        def in_time(session: Session) -> tuple[Session, Outcome]:
+            self._check_deadline(deadline, expected)  # the wait may have been longer than was thought
+            return work(session)
+
+        self._queued.append(expected)
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self._threads, _timed, in_time, session)
+        finally:
+            self._queued.remove(expected)
+
+    def _check_deadline(self, deadline: float | None, seconds: float) -> None:
+        if deadline is not None and (left := deadline - self.clock()) < seconds:
+            raise DeadlineExceeded(
+                f"expected an answer within {1e3 * max(left, 0):.0f} ms, but it would take {1e3 * seconds:.0f} ms"
+            )
+
+
+def _mebibytes(nbytes: int) -> str:
+    return f"{nbytes / MEBIBYTE:.1f} MiB"
 
 
 def _timed(work: Work, session: Session) -> tuple[tuple[Session, Outcome], float]:

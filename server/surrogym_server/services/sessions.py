@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import copy
 import secrets
 import time
 from collections.abc import Sequence
@@ -32,7 +33,7 @@ from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import SavedSession
 from surrogym_server.surrogate.actions import policy_actions
 from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.virtual import VirtualSettings
+from surrogym_server.virtual import VirtualSettings, expected_bytes
 
 Bools = NDArray[np.bool_]
 Array = NDArray[np.float64]
@@ -72,24 +73,35 @@ class SessionService:
         self._max_lanes = max_lanes
         self._counts = counts
         self._opening = asyncio.Lock()
+        self._deadline: float | None = None
 
     @property
     def idle_seconds(self) -> float:
         return self._live.idle_seconds
+
+    def within(self, seconds: float | None) -> SessionService:
+        """This service for one request, that is refused where its answer would take longer from now."""
+        if seconds is None:
+            return self
+        bound = copy.copy(self)
+        bound._deadline = self._live.clock() + seconds
+        return bound
 
     async def open(self, surrogate: str, opening: Opening) -> Session:
         """Open a session; the same key and body again give the session they opened.
 
         Raises:
             UnknownSurrogate, NoModel, UnknownModel, IdempotencyConflict, Overloaded: as the classes say.
-            TooLarge: more lanes or particles than the limit.
+            TooLarge: more lanes, particles or memory than the limit.
         """
         self._check_size(opening.settings)
         digest = digest_of("open", opening)
         async with self._opening:
             if opening.key and (known := self._live.opened_by(surrogate, opening.key, digest)):
                 return known
-            return self._live.add(await asyncio.to_thread(self._open, surrogate, opening, digest))
+            needed = await asyncio.to_thread(self._expected_bytes, surrogate, opening)
+            self._live.check_room(needed)
+            return self._live.add(await asyncio.to_thread(self._open, surrogate, opening, digest), needed)
 
     def get(self, id: str) -> Session:
         """Raises ``UnknownSession`` or ``SessionExpired``."""
@@ -110,7 +122,7 @@ class SessionService:
         def work(session: Session) -> tuple[Session, Outcome]:
             return reset_session(session, seed, mask, self._latest(session))
 
-        return await self._live.advance(id, seq, digest_of("reset", seed, mask), work)
+        return await self._live.advance(id, seq, digest_of("reset", seed, mask), work, deadline=self._deadline)
 
     async def step(self, id: str, seq: int | None, action: Array, mask: Bools | None, deviations: bool) -> Answer:
         """One step of the lanes of the mask (N,) with a policy's actions (N, F) or (N,).
@@ -118,7 +130,7 @@ class SessionService:
         Raises:
             InvalidInput: wrong shape, not finite, out of bounds.
             NotReset: a lane to step has not been reset.
-            SeqConflict, UnknownSession, SessionExpired: as the classes say.
+            SeqConflict, UnknownSession, SessionExpired, Overloaded, DeadlineExceeded: as the classes say.
         """
 
         def work(session: Session) -> tuple[Session, Outcome]:
@@ -185,7 +197,7 @@ class SessionService:
 
     async def _counted(self, id: str, seq: int | None, digest: str, work: Work, steps: int) -> Answer:
         started = time.perf_counter()
-        answer = await self._live.advance(id, seq, digest, work, steps=steps)
+        answer = await self._live.advance(id, seq, digest, work, steps, self._deadline)
         self._counts.steps.observe(time.perf_counter() - started)
         self._counts.lane_steps += steps * self._live.get(id).settings.num_envs
         return answer
@@ -198,6 +210,11 @@ class SessionService:
             raise TooLarge(f"expected at most {MAX_PARTICLES} particles in all lanes, got {particles}")
         if settings.variant == "pathwise" and settings.num_envs > MAX_PATHWISE_LANES:
             raise TooLarge(f"expected at most {MAX_PATHWISE_LANES} lanes of variant pathwise, got {settings.num_envs}")
+
+    def _expected_bytes(self, surrogate: str, opening: Opening) -> int:
+        version = self._models.latest(surrogate) if opening.model == "latest" else opening.model
+        model = self._models.get(surrogate, version)
+        return expected_bytes(self._definitions.get(surrogate), opening.settings, model.path_size)
 
     def _open(self, surrogate: str, opening: Opening, digest: str) -> Session:
         definition = self._definitions.get(surrogate)

@@ -59,6 +59,13 @@ class Transition:
     untrusted: Bools | None  # (N,) truncated for leaving the trusted range; None without one
 
 
+def expected_bytes(definition: EnvironmentDefinition, settings: VirtualSettings, path_size: int) -> int:
+    """Memory of the lanes of a session, roughly: coordinates, particles, and functions of ``path_size`` numbers."""
+    particles = settings.particles if settings.variant == "probabilistic" else 0
+    path = path_size if settings.variant == "pathwise" else 0
+    return 8 * settings.num_envs * (len(definition.coordinates) * (1 + particles) + path)
+
+
 def create(definition: EnvironmentDefinition, settings: VirtualSettings, seed: int) -> LaneState:
     """N lanes that have not been reset yet."""
     count, size = settings.num_envs, len(definition.coordinates)

@@ -60,6 +60,11 @@ class LaneState:
             replaced.append(tensor)
         return LaneState(*replaced)
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of memory."""
+        return sum(int(getattr(self, f.name).nbytes) for f in fields(self))
+
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         return {f.name: getattr(self, f.name).numpy() for f in fields(self)}
 

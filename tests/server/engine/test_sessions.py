@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from surrogym_server.engine.session import Outcome, Session, reset_session
-from surrogym_server.engine.sessions import LiveSessions
-from surrogym_server.errors import Overloaded, SeqConflict, SessionExpired, UnknownSession
+from surrogym_server.engine.sessions import MEBIBYTE, Limits, LiveSessions
+from surrogym_server.errors import (
+    DeadlineExceeded,
+    Overloaded,
+    SeqConflict,
+    SessionExpired,
+    TooLarge,
+    UnknownSession,
+)
 
 Open = Callable[..., Session]
+LIMITS = Limits(sessions=2, nbytes=MEBIBYTE, requests=3)
 
 
 class Clock:
@@ -31,7 +40,7 @@ def clock() -> Clock:
 @pytest.fixture
 def live(clock: Clock) -> Iterator[LiveSessions]:
     with ThreadPoolExecutor(2) as threads:
-        yield LiveSessions(threads, limit=2, idle_seconds=10, clock=clock)
+        yield LiveSessions(threads, limits=LIMITS, idle_seconds=10, workers=2, clock=clock)
 
 
 def work(session: Session) -> tuple[Session, Outcome]:
@@ -157,3 +166,61 @@ def test_no_more_than_the_limit_are_open(live: LiveSessions, opened: Open):
     live.close("a")
     live.add(opened("c"))
     assert {session.id for session in live} == {"b", "c"}
+
+
+def test_all_sessions_together_have_a_limit_of_memory(live: LiveSessions, opened: Open):
+    particles = {"variant": "probabilistic", "particles": 10_000}  # 4 lanes of 2 coordinates: 0.6 MiB
+    live.add(opened("a", **particles))
+    with pytest.raises(Overloaded, match=r"at most 1\.0 MiB, got 0\.6 MiB and 0\.6 MiB more"):
+        live.add(opened("b", **particles))
+    with pytest.raises(TooLarge, match=r"at most 1\.0 MiB, got 1\.1 MiB"):
+        live.add(opened("c"), reserved=int(1.1 * MEBIBYTE))
+    live.add(opened("small"))
+    assert {session.id for session in live} == {"a", "small"}
+
+
+def test_requests_beyond_the_queue_are_refused(live: LiveSessions, opened: Open):
+    slow = Slow()
+    live.add(opened())
+
+    async def run() -> None:
+        queue = [asyncio.create_task(live.advance("s", 1, "d", slow)) for _ in range(LIMITS.requests)]
+        await asyncio.sleep(0.01)
+        with pytest.raises(Overloaded, match="at most 3 requests"):
+            await live.advance("s", 1, "d", slow)
+        slow.go.set()
+        await asyncio.gather(*queue)
+        await live.advance("s", 2, "d", work)
+
+    asyncio.run(run())
+
+
+def test_what_would_be_late_is_refused_before_it_is_computed(live: LiveSessions, opened: Open, clock: Clock):
+    slow = Slow()
+    live.add(opened("known"))
+    live.add(opened("waiting"))
+    begun = []
+
+    def lasting(session: Session) -> tuple[Session, Outcome]:
+        begun.append(session.id)
+        time.sleep(0.05)
+        return session, ()
+
+    async def run() -> None:
+        await live.advance("known", None, "d", lasting)
+        with pytest.raises(DeadlineExceeded, match=r"within 20 ms, but it would take [5-9]"):
+            await live.advance("known", None, "d", lasting, deadline=clock.now + 0.02)
+        await live.advance("known", None, "d", lasting, deadline=clock.now + 60)
+        before = asyncio.create_task(live.advance("waiting", 1, "d", slow))
+        late = asyncio.create_task(live.advance("waiting", 2, "e", lasting, deadline=clock.now + 1))
+        while not slow.begun:
+            await asyncio.sleep(0.001)
+        clock.now += 2
+        slow.go.set()
+        with pytest.raises(DeadlineExceeded, match="within 0 ms"):
+            await late
+        assert (await before).seq == 1, "a kept answer has no deadline"
+        assert (await live.advance("waiting", 1, "d", slow, deadline=clock.now)).seq == 1
+
+    asyncio.run(run())
+    assert begun == ["known", "known"]
