@@ -1,4 +1,5 @@
-"""Connections that break in the middle of steps: the step happens once, and nobody can tell from the numbers."""
+"""Replies that are dropped, late, cut, or answer a request sent twice: each step happens once, and nobody can tell
+from the numbers."""
 
 from __future__ import annotations
 
@@ -8,29 +9,33 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from support.chaos import SEED, times
 from support.cutting_proxy import cutting_proxy
+from support.fault_proxy import fault_proxy
 from support.server import ServerProcess
-from surrogym_client.connection import Retries
+from support.walks import trajectory
+from surrogym_client.connection import Retries, Timeouts
 from surrogym_client.transport import HttpSurrogate, Transport
-from surrogym_shared.wire import OpenSession
 
-LANES, STEPS, PLANNED = 3, 150, 8
+STEPS = times(short=200, full=10_000)
 QUICK = Retries(seconds=60, first_delay=0.001, longest_delay=0.01)
-SESSION = OpenSession(num_envs=LANES, seed=3, time_limit=7)
+IMPATIENT = Timeouts(request=0.5, step=0.5, rollout=2.0)
+DROPPED, DELAYED, DUPLICATED = 0.01, 0.05, 0.2
+LONGEST_DELAY = 0.02
+
+pytestmark = [pytest.mark.timeout(3_600), pytest.mark.parametrize("transport", ["auto", "stream", "binary", "json"])]
 
 
-def trajectory(port: HttpSurrogate) -> list[np.ndarray]:
-    """Everything that a trainer sees in so many steps, and a rollout at the end."""
-    session = port.open(SESSION).id
-    actions = np.random.default_rng(1).uniform(-2, 2, (STEPS, LANES, 1)).astype(np.float32)
-    seen = [port.reset(session).observation]
-    for action in actions:
-        result = port.step(session, action)
-        seen += [result.observation, result.reward, result.truncated]
-    for result in port.rollout(session, actions[:PLANNED]):
-        seen += [result.observation, result.reward, result.truncated]
-    port.close(session)
-    return seen
+@pytest.fixture(scope="module")
+def expected(pendulum_server: ServerProcess) -> list[np.ndarray]:
+    """The trajectory without faults."""
+    with HttpSurrogate(pendulum_server.url, "pendulum", transport="json") as port:
+        return trajectory(port, STEPS)
+
+
+def same(found: list[np.ndarray], expected: list[np.ndarray]) -> None:
+    for ours, theirs in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
 
 
 def short_lives(seed: int, longest: int = 1_500) -> Iterator[int]:
@@ -40,15 +45,46 @@ def short_lives(seed: int, longest: int = 1_500) -> Iterator[int]:
         yield source.randint(0, longest) if source.random() < 0.8 else 6_000
 
 
-@pytest.mark.parametrize("transport", ["auto", "stream", "binary", "json"])
-def test_cut_connections_change_no_number(pendulum_server: ServerProcess, transport: Transport):
-    with HttpSurrogate(pendulum_server.url, "pendulum", transport="json") as port:
-        expected = trajectory(port)
+def test_cut_connections_change_no_number(
+    pendulum_server: ServerProcess, expected: list[np.ndarray], transport: Transport
+):
     with (
-        cutting_proxy(pendulum_server.url, short_lives(seed=0)) as proxy,
+        cutting_proxy(pendulum_server.url, short_lives(SEED)) as proxy,
         HttpSurrogate(proxy.url, "pendulum", retries=QUICK, transport=transport) as port,
     ):
-        found = trajectory(port)
+        same(trajectory(port, STEPS), expected)
         assert proxy.cuts > 3, "the proxy did its worst"
-    for ours, theirs in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_replies_that_never_come_change_no_number(
+    pendulum_server: ServerProcess, expected: list[np.ndarray], transport: Transport
+):
+    with (
+        fault_proxy(pendulum_server.url, "drop", DROPPED) as proxy,
+        HttpSurrogate(proxy.url, "pendulum", timeouts=IMPATIENT, retries=QUICK, transport=transport) as port,
+    ):
+        same(trajectory(port, STEPS), expected)
+        assert proxy.count > 0, "the proxy did its worst"
+
+
+def test_late_replies_change_no_number(
+    pendulum_server: ServerProcess, expected: list[np.ndarray], transport: Transport
+):
+    with (
+        fault_proxy(pendulum_server.url, "delay", DELAYED, LONGEST_DELAY) as proxy,
+        HttpSurrogate(proxy.url, "pendulum", retries=QUICK, transport=transport) as port,
+    ):
+        same(trajectory(port, STEPS), expected)
+        assert proxy.count > 3, "the proxy did its worst"
+
+
+def test_requests_sent_twice_change_no_number(
+    pendulum_server: ServerProcess, expected: list[np.ndarray], transport: Transport
+):
+    """The stream's own messages are sent once by its protocol; what is sent twice are its requests over HTTP."""
+    with (
+        fault_proxy(pendulum_server.url, "duplicate", DUPLICATED) as proxy,
+        HttpSurrogate(proxy.url, "pendulum", retries=QUICK, transport=transport) as port,
+    ):
+        same(trajectory(port, STEPS), expected)
+        assert proxy.count > 3 or transport in ("auto", "stream"), "the proxy did its worst"
