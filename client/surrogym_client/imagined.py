@@ -25,7 +25,8 @@ def imagined_returns(
 ) -> NDArray[np.float64]:
     """Undiscounted returns (episodes,) of whole virtual episodes side by side, any penalty included.
 
-    The imagined return of a policy is their mean: from the declared starts, without exploration.
+    The imagined return of a policy is their mean: from the declared starts, without exploration. Where the server loses
+    the session they begin anew: cut short, they would earn more where rewards are costs.
 
     Args:
         port: the surrogate.
@@ -39,7 +40,10 @@ def imagined_returns(
     try:
         observation = lanes.reset(seed).observation
         for _ in range(port.spec().time_limit or LONGEST_EPISODE):
-            result = lanes.step(predict(observation)).result
+            step = lanes.step(predict(observation))
+            if step.lost is not None:
+                return imagined_returns(port, predict, episodes, seed, **options)
+            result = step.result
             observation = result.observation
             returns += np.where(running, result.reward, 0.0)
             running &= ~(result.terminated | result.truncated)

@@ -65,7 +65,7 @@ def train_and_improve(
         ValueError, SurrogymClientError: as ``train``.
     """
     whole, part = shares(settings, improve.rounds)
-    trained, visited, seconds, policy = 0, 0, 0.0, settings.start_from
+    trained, visited, seconds, lost, policy = 0, 0, 0.0, 0, settings.start_from
     for _ in range(improve.rounds):
         view = api.surrogate(name)
         if view.phase == "ready":
@@ -73,6 +73,7 @@ def train_and_improve(
         now = replace(settings, total_steps=part, start_from=policy)
         result = train(port, out, now, _shifted(progress, trained + visited, whole))
         trained, seconds, policy = trained + result.virtual_steps, seconds + result.seconds, out
+        lost += result.lost_episodes
         checkpoint = f"seed {settings.seed}, round {view.round}"
         visited += visit(port, out, settings, checkpoint)
         api.improve(name, improve.queries, checkpoint=checkpoint)
@@ -80,7 +81,12 @@ def train_and_improve(
     left = whole - trained if settings.total_steps else min(planned_steps(settings), whole - trained)
     last = replace(settings, total_steps=max(left, 1), start_from=policy)
     result = train(port, out, last, _shifted(progress, trained + visited, trained + visited + left))
-    return replace(result, virtual_steps=trained + visited + result.virtual_steps, seconds=seconds + result.seconds)
+    return replace(
+        result,
+        virtual_steps=trained + visited + result.virtual_steps,
+        seconds=seconds + result.seconds,
+        lost_episodes=lost + result.lost_episodes,
+    )
 
 
 def shares(settings: TrainSettings, rounds: int) -> tuple[int, int]:

@@ -135,7 +135,7 @@ def command(
         rounds_of = None if improve == 0 else (improve, rounds)
         result = _train(url, token, surrogate, out, settings, rounds_of, record)
     summary = _write_card(result, surrogate, spec, url, seed)
-    give(summary, lambda: _words(result), as_json=as_json, quiet=quiet)
+    give(summary, lambda: words_of_result(result), as_json=as_json, quiet=quiet)
 
 
 def _hyperparameters(chosen: list[str]) -> dict[str, Any]:
@@ -233,13 +233,19 @@ def _write_card(result: TrainResult, surrogate: str, spec: EnvironmentSpec, url:
         versions=versions(),
     )
     write_card(Path(result.path), card)
-    return {"policy": str(result.path), **card.model_dump(mode="json", exclude={"spec"})}
+    return {
+        "policy": str(result.path),
+        "lost_episodes": result.lost_episodes,
+        **card.model_dump(mode="json", exclude={"spec"}),
+    }
 
 
-def _words(result: TrainResult) -> str:
+def words_of_result(result: TrainResult) -> str:
+    lost = result.lost_episodes
+    cut = f"; {lost} episode{'s' * (lost > 1)} cut short, lost with the server's sessions" if lost else ""
     return (
         f"{result.path}: {result.virtual_steps} virtual steps in {result.seconds:.1f} s"
-        f"{_imagined(result.imagined_return)}; next: surrogym evaluate {result.path}"
+        f"{_imagined(result.imagined_return)}{cut}; next: surrogym evaluate {result.path}"
     )
 
 
