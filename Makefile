@@ -33,8 +33,8 @@ imports: .venv/dev  ## Check which room imports which
 unit: .venv/dev postgresql  ## The tests alone (ARGS="-k pendulum")
 	$(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
 
-chaos: .venv/dev postgresql  ## Faults in full length; make test has a short form (ARGS="-k killed")
-	CHAOS=full $(BIN)/pytest --durations 0 tests/chaos $(ARGS)
+chaos: .venv/dev postgresql  ## Faults and attacks in full length; make test has a short form (ARGS="-k killed")
+	CHAOS=full $(BIN)/pytest --durations 0 tests/chaos tests/security $(ARGS)
 
 bench: .venv/dev  ## What a step costs on this machine, beside bare echoes (ARGS="--lanes 1 16")
 	$(BIN)/python tests/benchmarks/bench_step.py $(ARGS)

@@ -46,6 +46,9 @@ def patient(seconds: float, most: int) -> type[HttpToolsProtocol]:
             self._arrived()
             super().on_message_complete()
 
+        def send_400_response(self, msg: str) -> None:
+            self._refuse(Code.INVALID_REQUEST, f"expected a request of HTTP/1.1, got none: {msg}", status=400)
+
         def _wait(self) -> None:
             self._timer = asyncio.get_running_loop().call_later(seconds, self._late)
 
@@ -61,8 +64,8 @@ def patient(seconds: float, most: int) -> type[HttpToolsProtocol]:
             else:
                 self._refuse(Code.REQUEST_TIMEOUT, f"expected a whole request within {seconds:g} s")
 
-        def _refuse(self, code: Code, detail: str) -> None:
-            reply = problem_response(code, detail, headers={"connection": "close"})
+        def _refuse(self, code: Code, detail: str, status: int | None = None) -> None:
+            reply = problem_response(code, detail, status=status, headers={"connection": "close"})
             lines = b"".join(name + b": " + value + b"\r\n" for name, value in reply.raw_headers)
             self.transport.write(b"HTTP/1.1 %d \r\n%s\r\n%s" % (reply.status_code, lines, bytes(reply.body)))
             self.transport.close()

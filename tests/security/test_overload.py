@@ -1,0 +1,217 @@
+"""Too much, too slow, too many: refused in words before it costs anything, and others are served meanwhile."""
+
+from __future__ import annotations
+
+import contextlib
+import resource
+import socket
+import statistics
+import threading
+import time
+from collections.abc import Iterator
+
+import httpx
+import numpy as np
+import pytest
+
+from support.chaos import times
+from support.hostile import connected, head, read_all, resident_mib
+from support.server import ServerProcess, running_server
+from support.teaching import teach
+from surrogym_client.api import Api
+from surrogym_client.original.classic import pendulum
+from surrogym_shared.codes import Code, Problem
+
+GIGABYTE = 10**9
+REQUEST_SECONDS, MEMORY_MIB, BODY_MIB = 4, 64, 32
+IDLE = times(short=300, full=10_000)
+SLOWER = 10.0  # a step beside an attack, in those before it; a queue behind it would be hundreds
+ACTION = {"action": [[0.5]]}
+PATH = "/v1/surrogates/pendulum/add_sample"
+
+pytestmark = pytest.mark.timeout(900)
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
+    limits = {"SURROGYM_REQUEST_SECONDS": str(REQUEST_SECONDS), "SURROGYM_MAX_SESSIONS_MIB": str(MEMORY_MIB)}
+    with running_server(tmp_path_factory.mktemp("overload"), **limits) as server:
+        with Api(server.url) as api:
+            teach(api, "pendulum", pendulum(), queries=12)
+        yield server
+
+
+@pytest.fixture
+def client(server: ServerProcess) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=server.url, timeout=60) as client:
+        yield client
+
+
+def opened(client: httpx.Client, **request: object) -> httpx.Response:
+    return client.post("/v1/surrogates/pendulum/sessions", json={"seed": 0, "num_envs": 1, **request})
+
+
+@pytest.fixture
+def session(client: httpx.Client) -> Iterator[str]:
+    id: str = opened(client).raise_for_status().json()["id"]
+    client.post(f"/v1/sessions/{id}/reset", json={}).raise_for_status()
+    yield id
+    client.delete(f"/v1/sessions/{id}")
+
+
+def refused(reply: httpx.Response, code: Code, *said: str) -> None:
+    problem = Problem.model_validate_json(reply.content)
+    assert problem.code == code, reply.text
+    for words in said:
+        assert words in problem.detail
+
+
+def step_seconds(client: httpx.Client, session: str, steps: int = 60) -> float:
+    """Median time of a step."""
+    taken = []
+    for _ in range(steps):
+        started = time.perf_counter()
+        client.post(f"/v1/sessions/{session}/step", json=ACTION).raise_for_status()
+        taken.append(time.perf_counter() - started)
+    return statistics.median(taken)
+
+
+def test_the_memory_of_all_sessions_is_bounded(client: httpx.Client):
+    particles = {"variant": "probabilistic", "particles": 1_000_000}  # of two coordinates: 15.3 MiB
+    refused(opened(client, **particles, num_envs=5), Code.TOO_LARGE, "4000000 particles")
+    ids = [opened(client, **particles).raise_for_status().json()["id"] for _ in range(4)]
+    full = opened(client, **particles)
+    refused(full, Code.TOO_MANY_REQUESTS, "at most 64.0 MiB, got 61.0 MiB and 15.3 MiB more")
+    assert int(full.headers["retry-after"]) > 0
+    for id in ids:
+        client.delete(f"/v1/sessions/{id}")
+    client.delete(f"/v1/sessions/{opened(client, **particles).raise_for_status().json()['id']}")
+
+
+def test_a_step_that_would_be_late_is_not_computed(client: httpx.Client, session: str):
+    step_seconds(client, session, steps=5)  # now the server knows what one takes
+    path, seq = f"/v1/sessions/{session}", client.get(f"/v1/sessions/{session}").json()["seq"]
+    body = {"seq": seq + 1, "actions": [[[0.5]]] * 2_000}
+    late = client.post(f"{path}/rollout", json=body, headers={"x-deadline-ms": "50"})
+    refused(late, Code.DEADLINE_EXCEEDED, "expected an answer within", "it would take")
+    assert (late.status_code, int(late.headers["retry-after"]) > 0) == (503, True)
+    assert client.get(path).json()["seq"] == seq
+    client.post(f"{path}/rollout", json=body, headers={"x-deadline-ms": "60000"}).raise_for_status()
+    refused(client.post(f"{path}/step", json=ACTION, headers={"x-deadline-ms": "soon"}), Code.INVALID_REQUEST, "'soon'")
+
+
+NOT_FINITE = ["NaN", "Infinity", "-Infinity", "1e999"]
+
+
+@pytest.mark.parametrize("number", [*NOT_FINITE, "[]", '"1"', "1e300"])
+def test_numbers_that_are_none_of_an_action(client: httpx.Client, session: str, number: str):
+    reply = client.post(f"/v1/sessions/{session}/step", content=f'{{"action": [[{number}]]}}')
+    assert reply.status_code in (415, 422)
+    content = {"content-type": "application/json"}
+    reply = client.post(f"/v1/sessions/{session}/step", content=f'{{"action": [[{number}]]}}', headers=content)
+    refused(reply, Code.INVALID_REQUEST, "action")
+
+
+@pytest.mark.parametrize("action", [5e-324, -5e-324, 0.0, -0.0])
+def test_the_smallest_numbers_are_numbers(client: httpx.Client, session: str, action: float):
+    reply = client.post(f"/v1/sessions/{session}/step", json={"action": [[action]]}).raise_for_status().json()
+    assert np.isfinite(reply["observation"]).all()
+
+
+def test_arrays_of_another_size_are_refused(client: httpx.Client, session: str):
+    for action in ([], [[0.5]] * 1_000_000, [[0.5] * 1_000_000]):
+        reply = client.post(f"/v1/sessions/{session}/step", json={"action": action})
+        refused(reply, Code.INVALID_REQUEST, "action", "got")
+
+
+def test_an_announced_gigabyte_is_refused_unread(server: ServerProcess):
+    with connected(server.url) as attacker:
+        started = time.monotonic()
+        attacker.sendall(head(PATH, f"content-length: {GIGABYTE}", "", ""))
+        reply = b""
+        while not reply.endswith(b"}"):
+            reply += attacker.recv(65_536)
+    assert reply.startswith(b"HTTP/1.1 413")
+    assert f"{BODY_MIB * 2**20} bytes, got {GIGABYTE}".encode() in reply
+    assert time.monotonic() - started < REQUEST_SECONDS
+
+
+def test_a_chunked_gigabyte_is_refused_at_the_limit(server: ServerProcess):
+    """What is still read of it is thrown away, until the time for a request is over."""
+    before, sent, chunk = resident_mib(server.process.pid), 0, b"x" * 2**20
+    with connected(server.url) as attacker, contextlib.suppress(ConnectionError):
+        attacker.sendall(head(PATH, "transfer-encoding: chunked", "", ""))
+        while sent < GIGABYTE:
+            attacker.sendall(b"%x\r\n%s\r\n" % (len(chunk), chunk))
+            sent += len(chunk)
+            attacker.setblocking(False)
+            with contextlib.suppress(BlockingIOError):
+                assert attacker.recv(12) == b"HTTP/1.1 413"
+                break
+            attacker.settimeout(60)
+    assert BODY_MIB * 2**20 <= sent < 2 * BODY_MIB * 2**20
+    assert resident_mib(server.process.pid) < before + 4 * BODY_MIB
+
+
+def test_what_is_no_http_is_refused_in_words(server: ServerProcess):
+    with connected(server.url) as attacker:
+        attacker.sendall(b"\x16\x03\x01 hello\r\n\r\n")
+        reply = read_all(attacker)
+    assert reply.startswith(b"HTTP/1.1 400")
+    assert b"expected a request of HTTP/1.1" in reply
+
+
+SLOW = [head(PATH)[:30], head(PATH, "content-length: 100", "", "") + b'{"sampler"']
+
+
+@pytest.mark.parametrize("begun", SLOW, ids=["head", "body"])
+def test_slow_senders_are_told_so_and_others_are_served(
+    server: ServerProcess, client: httpx.Client, session: str, begun: bytes
+):
+    """Fifty requests that come a byte a second."""
+    calm = step_seconds(client, session)
+    stop = threading.Event()
+
+    def trickle() -> None:
+        while not stop.wait(1.0):
+            for attacker in attackers:
+                with contextlib.suppress(OSError):
+                    attacker.sendall(b"a")
+
+    with contextlib.ExitStack() as stack:
+        attackers = [stack.enter_context(connected(server.url)) for _ in range(50)]
+        for attacker in attackers:
+            attacker.sendall(begun)
+        trickling, started = threading.Thread(target=trickle), time.monotonic()
+        trickling.start()
+        stack.callback(trickling.join)
+        stack.callback(stop.set)
+        assert step_seconds(client, session) < SLOWER * calm
+        for attacker in attackers:
+            told(attacker, f"a whole request within {REQUEST_SECONDS} s")
+        assert time.monotonic() - started < 10 * REQUEST_SECONDS
+
+
+def told(attacker: socket.socket, words: str) -> None:
+    reply = read_all(attacker)
+    assert reply.startswith(b"HTTP/1.1 408") or not reply, reply  # nothing, where its next byte came too late
+    assert words.encode() in reply or not reply
+
+
+def test_idle_connections_are_closed_and_others_are_served(server: ServerProcess, client: httpx.Client, session: str):
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < IDLE + 512:
+        pytest.skip(f"{IDLE} connections need {IDLE + 512} open files; this machine allows {hard}")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    try:
+        calm, before = step_seconds(client, session), resident_mib(server.process.pid)
+        with contextlib.ExitStack() as stack:
+            idle = [stack.enter_context(connected(server.url)) for _ in range(IDLE)]
+            assert step_seconds(client, session) < SLOWER * calm
+            for attacker in idle:
+                assert read_all(attacker).startswith(b"HTTP/1.1 408"), "closed, and told why"
+            grown = resident_mib(server.process.pid) - before
+        assert grown < 16 + IDLE * 0.04, "some ten thousand bytes each"
+        assert step_seconds(client, session) < SLOWER * calm
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
