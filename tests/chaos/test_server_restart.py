@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
@@ -15,7 +16,8 @@ from surrogym_client.api import Api
 from surrogym_client.env import LOST
 from surrogym_client.original.classic import pendulum
 from surrogym_client.sb3 import SurrogateVecEnv
-from surrogym_client.transport import Retries
+from surrogym_client.transport import HttpSurrogate, Retries
+from surrogym_shared.wire import OpenSession
 
 LANES = 3
 PATIENT = Retries(seconds=120)
@@ -54,6 +56,28 @@ def test_a_clean_restart_goes_unnoticed(restarting: RestartingServer):
             np.testing.assert_array_equal(our, their)
         assert not any(LOST in info for info in ours[3])
     touched.close()
+
+
+def test_a_stop_lets_long_polls_end_and_running_steps_finish(restarting: RestartingServer):
+    design = pendulum().design.model_copy(update={"initial": 2, "budget": 2})
+    with (
+        Api(restarting.url) as api,
+        HttpSurrogate(restarting.url, "pendulum", transport="json", retries=Retries(seconds=0)) as port,
+        ThreadPoolExecutor(2) as pool,
+    ):
+        api.create_surrogate("leased", pendulum().model_copy(update={"design": design}))
+        assert len(api.claim("leased", "first", max_queries=2, wait_seconds=5.0).queries) == 2
+        session = port.open(OpenSession(num_envs=LANES, seed=0)).id
+        port.reset(session)
+        poll = pool.submit(api.claim, "leased", "second", max_queries=1, wait_seconds=50.0)
+        rollout = pool.submit(port.rollout, session, actions(2_000))
+        time.sleep(0.2)  # both are under way
+        stopping = time.monotonic()
+        assert restarting.stop() == 0
+        assert time.monotonic() - stopping < 30
+        assert poll.result(timeout=10).queries == []
+        assert len(rollout.result(timeout=10)) == 2_000
+    restarting.start()
 
 
 def test_a_crash_truncates_the_episodes_and_training_goes_on(restarting: RestartingServer):

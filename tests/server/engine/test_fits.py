@@ -13,7 +13,7 @@ import pytest
 
 from support import jobs
 from surrogym_server.engine.design_job import DesignJob, DesignResult
-from surrogym_server.engine.fits import Fits
+from surrogym_server.engine.fits import NICENESS, Fits
 from surrogym_server.errors import Unavailable
 
 Started = Callable[[Callable[[DesignJob], DesignResult]], Fits]
@@ -47,6 +47,12 @@ def test_a_job_is_done_in_another_process(started: Started):
     fits = started(jobs.answer)
     assert run(fits).data_hash not in ("", str(os.getpid()))
     assert run(fits).data_hash == run(fits).data_hash, "one process does them all"
+
+
+def test_it_yields_to_whoever_steps(started: Started):
+    process = int(run(started(jobs.answer)).data_hash)
+    mine = os.getpriority(os.PRIO_PROCESS, 0)
+    assert os.getpriority(os.PRIO_PROCESS, process) == min(mine + NICENESS, 19)
 
 
 def test_what_a_job_raises_comes_here(started: Started):

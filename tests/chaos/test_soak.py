@@ -1,0 +1,98 @@
+"""Many sessions step for a long time while queries are claimed and models fitted: no error, and no memory kept."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.chaos import times
+from support.hostile import resident_mib
+from support.server import running_server
+from support.teaching import teach
+from surrogym_client.api import Api
+from surrogym_client.original.classic import pendulum
+from surrogym_client.original.gymnasium import GymnasiumEnvironment
+from surrogym_client.original.protocol import Array, RealStep
+from surrogym_client.sampler import Sampler, SamplerSettings
+from surrogym_client.sb3 import SurrogateVecEnv
+
+SESSIONS, LANES, THREADS = times(short=8, full=64), 16, 4
+SECONDS, WARM_SECONDS = times(short=8, full=600), times(short=2, full=60)
+GROWTH = 1.05
+NEVER = 1e-9  # a tolerance that no model reaches
+REAL_STEP_SECONDS = 0.2
+
+
+class Slow(GymnasiumEnvironment):
+    def step_from(self, coordinates: Array, action: Array) -> RealStep:
+        time.sleep(REAL_STEP_SECONDS)
+        return super().step_from(coordinates, action)
+
+
+@contextmanager
+def learning(url: str) -> Iterator[None]:
+    """A design that goes on for the time of the context: claims, samples and fits."""
+    spec = pendulum()
+    design = spec.design.model_copy(update={"initial": 6, "budget": 10_000, "monte_carlo": 64})
+    tolerances = dict.fromkeys(("theta", "speed", "reward"), NEVER)
+    with Api(url) as api:
+        api.create_surrogate("learning", spec.model_copy(update={"design": design, "tolerances": tolerances}))
+        sampler = Sampler(api, "learning", Slow(spec), SamplerSettings(name="soak", batch=2, wait_seconds=0.5))
+        thread = threading.Thread(target=sampler.run)
+        thread.start()
+        try:
+            yield
+        finally:
+            sampler.stop()
+            thread.join(timeout=120)
+
+
+def steps(envs: list[SurrogateVecEnv], until: float) -> list[float]:
+    """Step all of some sessions in turn until a time; the seconds that each request took."""
+    source, taken = np.random.default_rng(0), []
+    for env in envs:
+        env.reset()
+    while time.monotonic() < until:
+        for env in envs:
+            action = source.uniform(-2, 2, (LANES, 1)).astype(np.float32)
+            started = time.perf_counter()
+            observation, *_ = env.step(action)
+            taken.append(time.perf_counter() - started)
+            assert np.isfinite(observation).all()
+    return taken
+
+
+@pytest.mark.timeout(1_200)
+def test_a_long_time_under_load(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    with running_server(tmp_path) as server, ExitStack() as stack:
+        with Api(server.url) as api:
+            teach(api, "pendulum", pendulum(), queries=12)
+        envs = [SurrogateVecEnv(server.url, "pendulum", LANES, seed=seed) for seed in range(SESSIONS)]
+        for env in envs:
+            stack.callback(env.close)
+        stack.enter_context(learning(server.url))
+        pool, started = stack.enter_context(ThreadPoolExecutor(THREADS)), time.monotonic()
+        working = [pool.submit(steps, envs[i::THREADS], started + SECONDS) for i in range(THREADS)]
+        time.sleep(WARM_SECONDS)
+        before = resident_mib(server.process.pid)
+        taken = np.concatenate([work.result() for work in working])
+        after = resident_mib(server.process.pid)
+        with Api(server.url) as api:
+            view = api.surrogate("learning")
+        median, slow = 1e3 * np.quantile(taken, [0.5, 0.99])
+        with capsys.disabled():
+            print(
+                f"\n{SESSIONS} sessions of {LANES} lanes, {SECONDS} s: {len(taken)} steps, median {median:.1f} ms, "
+                f"p99 {slow:.1f} ms; {view.ledger.total} samples, model {view.model_version}; "
+                f"{before:.0f} MiB, then {after:.0f} MiB"
+            )
+    assert (view.model_version or 0) > 1, "fits were under way"
+    assert after < GROWTH * before
+    assert "Traceback" not in server.log
