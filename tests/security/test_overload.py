@@ -9,10 +9,12 @@ import statistics
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
+from websockets.sync.client import connect
 
 from support.chaos import times
 from support.hostile import connected, head, read_all, resident_mib
@@ -20,6 +22,7 @@ from support.server import ServerProcess, running_server
 from support.teaching import teach
 from surrogym_client.api import Api
 from surrogym_client.original.classic import pendulum
+from surrogym_shared import frames
 from surrogym_shared.codes import Code, Problem
 
 GIGABYTE = 10**9
@@ -153,6 +156,35 @@ def test_a_chunked_gigabyte_is_refused_at_the_limit(server: ServerProcess):
     assert resident_mib(server.process.pid) < before + 4 * BODY_MIB
 
 
+@pytest.fixture
+def narrow(tmp_path: Path) -> Iterator[ServerProcess]:
+    """A server of three connections, and a megabyte for all bodies at once."""
+    limits = {"SURROGYM_MAX_CONNECTIONS": "3", "SURROGYM_MAX_BODIES_BYTES": str(2**20)}
+    with running_server(tmp_path, **limits) as server:
+        yield server
+
+
+def test_connections_and_bodies_beyond_the_limit_are_refused(narrow: ServerProcess):
+    body, unlike = b"x" * 700_000, "expected bodies of at most 1048576 bytes in all requests at once"
+    with contextlib.ExitStack() as stack:
+        first, second, _ = (stack.enter_context(connected(narrow.url)) for _ in range(3))
+        time.sleep(0.5)
+        with connected(narrow.url) as fourth:
+            full = read_all(fourth)
+        assert full.startswith(b"HTTP/1.1 503")
+        assert b"retry-after" in full
+        assert b"expected at most 3 connections" in full
+        first.sendall(head(PATH, f"content-length: {len(body) + 1}", "", "") + body)
+        time.sleep(0.5)
+        second.sendall(head(PATH, f"content-length: {len(body)}", "connection: close", "", "") + body)
+        reply = read_all(second)
+        assert reply.startswith(b"HTTP/1.1 429")
+        assert unlike.encode() in reply
+    time.sleep(0.5)
+    content = {"content-type": "application/json"}
+    assert httpx.post(narrow.url + PATH, content=body, headers=content).status_code == 422, "there is room again"
+
+
 def test_what_is_no_http_is_refused_in_words(server: ServerProcess):
     with connected(server.url) as attacker:
         attacker.sendall(b"\x16\x03\x01 hello\r\n\r\n")
@@ -203,13 +235,18 @@ def test_idle_connections_are_closed_and_others_are_served(server: ServerProcess
     if hard != resource.RLIM_INFINITY and hard < IDLE + 512:
         pytest.skip(f"{IDLE} connections need {IDLE + 512} open files; this machine allows {hard}")
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    address = f"{server.url.replace('http', 'ws', 1)}/v1/sessions/{session}/stream"
     try:
         calm, before = step_seconds(client, session), resident_mib(server.process.pid)
         with contextlib.ExitStack() as stack:
+            stream = stack.enter_context(connect(address, compression=None, open_timeout=60))
             idle = [stack.enter_context(connected(server.url)) for _ in range(IDLE)]
             assert step_seconds(client, session) < SLOWER * calm
             for attacker in idle:
                 assert read_all(attacker).startswith(b"HTTP/1.1 408"), "closed, and told why"
+            stream.send(frames.encode(frames.step_request(None, np.array([[0.5]]), None, False)))
+            reply = frames.read_reply(bytes(stream.recv(timeout=60)))
+            assert isinstance(reply, frames.StepReply), "a stream may be idle for longer"
             grown = resident_mib(server.process.pid) - before
         assert grown < 16 + IDLE * 0.04, "some ten thousand bytes each"
         assert step_seconds(client, session) < SLOWER * calm
