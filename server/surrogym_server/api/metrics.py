@@ -67,6 +67,8 @@ class _Reading:
         sessions, lanes = self._use.sessions.alive()
         yield GaugeMetricFamily("surrogym_sessions", "Open sessions.", sessions)
         yield GaugeMetricFamily("surrogym_lanes", "Lanes of all open sessions.", lanes)
+        requests = self._use.sessions.requests
+        yield GaugeMetricFamily("surrogym_session_requests", "Of sessions, at work or waiting.", requests)
 
 
 def _requests(counts: Counts) -> Metric:

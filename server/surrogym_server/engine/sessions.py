@@ -83,6 +83,11 @@ class LiveSessions:
     def __iter__(self) -> Iterator[Session]:
         return iter([live.session for live in self._live.values()])
 
+    @property
+    def requests(self) -> int:
+        """How many are at work or waiting."""
+        return self._requests
+
     def check_room(self, nbytes: int) -> None:
         """Whether a session of so many bytes may be opened.
 

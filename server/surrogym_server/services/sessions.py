@@ -177,6 +177,11 @@ class SessionService:
         """How many sessions are open, and how many lanes they have."""
         return len(self._live), sum(session.settings.num_envs for session in self._live)
 
+    @property
+    def requests(self) -> int:
+        """How many requests that advance a session are at work or waiting."""
+        return self._live.requests
+
     def save(self) -> int:
         """Hand all live sessions to storage; returns how many."""
         saved = [SavedSession(s.id, s.surrogate, session_to_bytes(s)) for s in self._live]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,20 @@ def test_steps_and_lanes_are_counted(client: httpx.Client, open_session: Callabl
     assert grown("surrogym_step_seconds_count") == 4
     assert grown("surrogym_request_seconds_count", "POST", "/v1/sessions/{id}/step", "200") == 4
     assert before["surrogym_lanes", ()] >= 3
+
+
+def test_the_queue_before_the_sessions_is_shown(client: httpx.Client, open_session: Callable[..., dict[str, Any]]):
+    id = open_session(num_envs=1)["id"]
+    client.post(f"/v1/sessions/{id}/reset", json={}).raise_for_status()
+    body = {"actions": [[0.0]] * 5_000}
+    with ThreadPoolExecutor(1) as pool:
+        rollout = pool.submit(client.post, f"/v1/sessions/{id}/rollout", json=body)
+        seen = 0.0
+        while not rollout.done() and not seen:
+            seen = read(client)["surrogym_session_requests", ()]
+        rollout.result().raise_for_status()
+    assert seen >= 1
+    assert read(client)["surrogym_session_requests", ()] == 0
 
 
 def test_the_reply_carries_the_caller_s_own_id_or_a_new_one(client: httpx.Client):

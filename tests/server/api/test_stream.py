@@ -257,3 +257,18 @@ def test_too_large_a_message_and_a_shutdown_end_the_stream(tmp_path: Path):
             assert closed.value.rcvd.code == 1012
     finally:
         server.stop(signal.SIGKILL)
+
+
+def test_a_deadline_of_the_handshake_holds_for_each_message(
+    server_process: ServerProcess, client: httpx.Client, session: str
+):
+    client.post(f"/v1/sessions/{session}/reset", json={}).raise_for_status()
+    client.post(f"/v1/sessions/{session}/step", json={"action": ACTION.tolist()}).raise_for_status()
+    headers = {"x-deadline-ms": "20"}
+    with connect(address(server_process.url, session), compression=None, additional_headers=headers) as stream:
+        late = over_stream(stream)(frames.rollout_request(None, np.stack([ACTION] * 2_000)))
+        assert isinstance(late, frames.ProblemReply)
+        assert (late.status, late.code) == (503, Code.DEADLINE_EXCEEDED)
+    with pytest.raises(InvalidStatus) as refusal:
+        connect(address(server_process.url, session), additional_headers={"x-deadline-ms": "0"})
+    assert refusal.value.response.status_code == 422
