@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FilePath, ValidationError, model_validator
 
 from surrogym_server.errors import InvalidInput
 from surrogym_server.logs import LogFormat
@@ -31,6 +31,8 @@ class Settings(BaseModel):
     database: str = Field(default="surrogym.db", min_length=1, description="SQLite file, or a SQLAlchemy URL")
     tokens: dict[str, Role] = Field(default_factory=dict, description="role of each bearer token")
     insecure: bool = Field(default=False, description="allow another address than loopback without a token")
+    tls_certificate: FilePath | None = Field(default=None, description="chain of certificates, as PEM")
+    tls_key: FilePath | None = Field(default=None, description="its private key, as PEM")
     device: str = "cpu"
     threads: Annotated[int, Field(ge=1, le=1024, description="of one torch operation")] = 1
     session_idle_seconds: Annotated[float, Field(gt=0)] = 3_600.0
@@ -53,6 +55,13 @@ class Settings(BaseModel):
             raise ValueError(f"expected tokens of at least {MIN_TOKEN_LENGTH} characters, got {len(short[0])}")
         if not (self.tokens or self.insecure or self.loopback):
             raise ValueError(f"host {self.host} is not loopback: expected a token (or --insecure), got none")
+        return self
+
+    @model_validator(mode="after")
+    def _certificate_with_its_key(self) -> Self:
+        if (self.tls_certificate is None) != (self.tls_key is None):
+            came = "the key" if self.tls_certificate is None else "the certificate"
+            raise ValueError(f"TLS: expected a certificate and its key, got {came} alone")
         return self
 
     @property

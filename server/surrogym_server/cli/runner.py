@@ -35,6 +35,8 @@ class Runner(uvicorn.Server):
             log_config=None,
             access_log=False,  # ours names the request
             server_header=False,
+            ssl_certfile=settings.tls_certificate,
+            ssl_keyfile=settings.tls_key,
             timeout_graceful_shutdown=GRACE_SECONDS,
             ws_max_size=settings.max_body_bytes,
             ws_per_message_deflate=False,  # frames are numbers: packing them costs more than it saves
@@ -70,7 +72,7 @@ def run(settings: Settings, ready_file: Path | None, exit_with_parent: bool) -> 
     """
     logs.configure(settings.log_level, settings.log_format)
     with _listen(settings.host, settings.port) as listener:
-        runner = Runner(create_app(settings), settings, _url(listener, settings.host), ready_file)
+        runner = Runner(create_app(settings), settings, _url(listener, settings), ready_file)
         if exit_with_parent:
             threading.Thread(target=_end_with_parent, args=(runner, os.getppid()), daemon=True).start()
         runner.run(sockets=[listener])
@@ -88,10 +90,11 @@ def _listen(host: str, port: int) -> socket.socket:
     return listener
 
 
-def _url(listener: socket.socket, host: str) -> str:
+def _url(listener: socket.socket, settings: Settings) -> str:
     """The address under which a client on this machine finds the server."""
-    name = ANY_ADDRESS.get(host, host)
-    return f"http://{f'[{name}]' if ':' in name else name}:{listener.getsockname()[1]}"
+    name = ANY_ADDRESS.get(settings.host, settings.host)
+    scheme = "http" if settings.tls_certificate is None else "https"
+    return f"{scheme}://{f'[{name}]' if ':' in name else name}:{listener.getsockname()[1]}"
 
 
 def _write_at_once(path: Path, text: str) -> None:

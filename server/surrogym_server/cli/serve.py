@@ -30,6 +30,8 @@ def serve(
     insecure: Annotated[
         bool | None, typer.Option("--insecure", help="Allow another address than loopback without a token.")
     ] = None,
+    tls_certificate: Annotated[Path | None, typer.Option(help="PEM file; the server then speaks HTTPS alone.")] = None,
+    tls_key: Annotated[Path | None, typer.Option(help="PEM file with the certificate's private key.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads of one torch operation. [default: 1]")] = None,
     session_idle_seconds: Annotated[
         float | None, typer.Option(help="Idle time after which a session expires. [default: 3600]")
@@ -62,6 +64,8 @@ def serve(
             database=database,
             token_file=token_file,
             insecure=insecure,
+            tls_certificate=tls_certificate,
+            tls_key=tls_key,
             threads=threads,
             session_idle_seconds=session_idle_seconds,
             log_level=log_level,
