@@ -28,6 +28,9 @@ ModelOf = Callable[[int], SurrogateModel]
 Seeds = int | Sequence[int] | None
 Outcome = ResetResult | tuple[StepResult, ...]
 
+RESULT_BYTES = 2_048  # of one step's arrays, beside the numbers in them
+LANE_BYTES = 48  # of one lane in them, beside its observations
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -58,8 +61,12 @@ class Session:
     def nbytes(self) -> int:
         """Bytes of its lanes and of its kept answer, roughly."""
         outcome = None if self.answer is None else self.answer.outcome
-        kept = [outcome] if isinstance(outcome, ResetResult) else outcome or ()
-        return self.lanes.nbytes + sum(result.observation.nbytes for result in kept[:1]) * len(kept)
+        return self.lanes.nbytes + self.answer_bytes(len(outcome) if isinstance(outcome, tuple) else 1)
+
+    def answer_bytes(self, steps: int) -> int:
+        """Bytes that the answer to so many steps takes while it is kept, roughly."""
+        lane = 8 * len(self.definition.observation_names) + LANE_BYTES
+        return steps * (RESULT_BYTES + self.settings.num_envs * lane)
 
     @property
     def seq(self) -> int:

@@ -95,16 +95,9 @@ class LiveSessions:
             TooLarge: it alone takes more than all may.
             Overloaded: as many as the limit are open, or they take too much already.
         """
-        most, taken = self._limits.nbytes, sum(live.nbytes for live in self._live.values())
-        if nbytes > most:
-            raise TooLarge(f"expected lanes of at most {_mebibytes(most)}, got {_mebibytes(nbytes)}")
         if len(self._live) >= self._limits.sessions:
             raise Overloaded(f"expected fewer than {self._limits.sessions} open sessions: close some, or try later")
-        if taken + nbytes > most:
-            raise Overloaded(
-                f"expected the lanes of all sessions to take at most {_mebibytes(most)}, got {_mebibytes(taken)} "
-                f"and {_mebibytes(nbytes)} more: close some, or try later"
-            )
+        self._check_memory(nbytes)
 
     def add(self, session: Session, reserved: int = 0) -> Session:
         """Keep a session, which may grow to ``reserved`` bytes. Raises as ``check_room``."""
@@ -158,6 +151,8 @@ class LiveSessions:
                 self._get(id).used = self.clock()
                 if kept := replay(live.session, seq, digest):
                     return kept
+                if steps > 1:
+                    self._check_memory(live.session.answer_bytes(steps))
                 session, outcome = await self._do(live, work, steps, deadline)
                 live.session, answer = answered(session, digest, outcome)
                 live.used = self.clock()
@@ -192,6 +187,16 @@ class LiveSessions:
         if id in self._expired:
             raise SessionExpired(f"session {id!r} was idle for more than {self.idle_seconds:g} s: open a new one")
         raise UnknownSession(f"no session {id!r}: open a new one")
+
+    def _check_memory(self, nbytes: int) -> None:
+        most, taken = self._limits.nbytes, sum(live.nbytes for live in self._live.values())
+        if nbytes > most:
+            raise TooLarge(f"expected lanes and answers of at most {_mebibytes(most)}, got {_mebibytes(nbytes)}")
+        if taken + nbytes > most:
+            raise Overloaded(
+                f"expected all sessions to take at most {_mebibytes(most)}, got {_mebibytes(taken)} "
+                f"and {_mebibytes(nbytes)} more: close some, or try later"
+            )
 
     async def _do(self, live: _Live, work: Work, steps: int, deadline: float | None) -> tuple[Session, Outcome]:
         expected = live.seconds_per_step * steps

@@ -176,6 +176,11 @@ def test_all_sessions_together_have_a_limit_of_memory(live: LiveSessions, opened
     with pytest.raises(TooLarge, match=r"at most 1\.0 MiB, got 1\.1 MiB"):
         live.add(opened("c"), reserved=int(1.1 * MEBIBYTE))
     live.add(opened("small"))
+    with pytest.raises(Overloaded, match="all sessions to take at most"):
+        asyncio.run(live.advance("small", 1, "d", work, steps=200))
+    with pytest.raises(TooLarge, match="lanes and answers"):
+        asyncio.run(live.advance("small", 1, "d", work, steps=10_000))
+    asyncio.run(live.advance("small", 1, "d", work, steps=10))
     assert {session.id for session in live} == {"a", "small"}
 
 
