@@ -21,6 +21,7 @@ COMMANDS = (
     "change",
     "export",
     "delete",
+    "conformance",
     "demo",
     "reproduce",
 )

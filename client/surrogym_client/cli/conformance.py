@@ -1,0 +1,41 @@
+"""``surrogym conformance``: whether a server keeps the protocol."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from surrogym_client.cli.options import AsJson, Server, Token
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("conformance")(command)
+
+
+def command(
+    server: Server = None,
+    surrogate: Annotated[
+        str, typer.Option("--surrogate", help="A free name; the surrogate is deleted at the end.")
+    ] = "conformance",
+    token: Token = None,
+    as_json: AsJson = False,
+) -> None:
+    """Check a server against the protocol, one line a check; exit status 1 where it fails one.
+
+    Example: surrogym conformance --server http://127.0.0.1:8000
+    """
+    from surrogym_client.cli.output import give
+    from surrogym_client.conformance import conformance
+
+    outcomes = []
+    for outcome in conformance(server, token, surrogate):
+        outcomes.append(outcome)
+        if not as_json:
+            typer.echo(f"✗ {outcome.name}: {outcome.failure}" if outcome.failure else f"✓ {outcome.name}")
+    failed = [outcome for outcome in outcomes if outcome.failure]
+    result = {"passed": len(outcomes) - len(failed), "failed": {o.name: o.failure for o in failed}}
+    give(result, lambda: f"{result['passed']} of {len(outcomes)} checks passed", as_json=as_json)
+    if failed:
+        raise typer.Exit(1)
