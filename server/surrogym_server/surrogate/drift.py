@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import torch
 
-from surrogym_server.surrogate.definition import EnvironmentDefinition, wrap
+from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.distributions import scaling
 from surrogym_server.surrogate.samples import Samples
+from surrogym_server.surrogate.turns import turning
 
 Drift = tuple[tuple[float, ...], ...]  # weights (C,) of q for each angle
 POINTS_A_WEIGHT = 3
@@ -24,10 +25,8 @@ def drift_of(definition: EnvironmentDefinition, samples: Samples) -> Drift:
         return ()
     centre, scale = torch.tensor([scaling(definition.coordinates[i].sampling) for i in moved_by], dtype=torch.float64).T
     basis = torch.cat([torch.ones(len(samples), 1, dtype=torch.float64), (samples.q[:, moved_by] - centre) / scale], 1)
-    change = wrap((samples.q_next - samples.q)[:, definition.angles])
+    change = turning(definition, samples.q, samples.q_next)
     fitted = torch.linalg.lstsq(basis, change, driver="gelsd").solution
-    turns = ((basis @ fitted - change) / (2 * torch.pi)).round()  # more than half a turn was wrapped
-    fitted = torch.linalg.lstsq(basis, change + 2 * torch.pi * turns, driver="gelsd").solution
     weights = torch.zeros(len(definition.angles), len(definition.coordinates), dtype=torch.float64)
     weights[:, moved_by] = fitted[1:].T / scale
     return tuple(tuple(row) for row in weights.tolist())

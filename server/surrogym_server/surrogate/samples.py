@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surrogym_server.surrogate.definition import EnvironmentDefinition, wrap
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.surrogate.turns import turning
 
 
 @dataclass(frozen=True)
@@ -34,15 +35,13 @@ class Samples:
 
 
 def increments(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
-    """Targets of the transition outputs, (n, M): q' - q of the moving coordinates, angles wrapped; preset ``paper``:
-    o' - o of the observation."""
+    """Targets of the transition outputs, (n, M): q' - q of the moving coordinates, angles by what they turned;
+    preset ``paper``: o' - o of the observation."""
     if definition.design.preset == "paper":
         return definition.observe(samples.q_next) - definition.observe(samples.q)
     change = samples.q_next - samples.q
-    columns = [
-        wrap(change[:, i]) if definition.coordinates[i].kind == "angle" else change[:, i] for i in definition.moving
-    ]
-    return torch.stack(columns, -1)
+    change[:, definition.angles] = turning(definition, samples.q, samples.q_next)
+    return change[:, definition.moving]
 
 
 def saturated(definition: EnvironmentDefinition, q_next: Tensor) -> Tensor:
