@@ -73,6 +73,22 @@ class Api:
         check_protocol(health.protocol, self.url)
         return health
 
+    def ready(self) -> wire.Ready:
+        """That the server can work: its database answers.
+
+        Raises:
+            Unavailable: it does not.
+        """
+        return self._get(wire.Ready, "/readyz")
+
+    def access(self) -> wire.Access:
+        """What this token may do.
+
+        Raises:
+            Unauthenticated: the server asks for a token, and there is none, or an unknown one.
+        """
+        return self._get(wire.Access, "/v1/access")
+
     def wait_until_ready(self, seconds: float = 60.0) -> wire.Health:
         """Wait for the server to come up.
 

@@ -21,6 +21,7 @@ COMMANDS = (
     "change",
     "export",
     "delete",
+    "doctor",
     "conformance",
     "demo",
     "reproduce",

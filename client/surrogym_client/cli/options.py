@@ -29,6 +29,7 @@ Tolerances = Annotated[
     list[str] | None,
     typer.Option("--tolerance", help="Error an output may have, in its own unit, such as theta=0.01. May be repeated."),
 ]
+StepLimit = Annotated[float, typer.Option(min=0.001, help="Seconds one real step, or a reset, may take.")]
 Preset = Literal["default", "paper"]
 
 QUICK = 1.0  # seconds a person waits for a server that is not there

@@ -9,11 +9,11 @@ from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.openapi.utils import get_openapi
 from fastapi.responses import HTMLResponse, JSONResponse
 
-from surrogym_server.api.auth import READ
+from surrogym_server.api.auth import READ, Gate, bearer_token
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_shared.codes import Code, Problem
-from surrogym_shared.wire import Health, Ready
+from surrogym_shared.wire import Access, Health, Ready
 
 router = APIRouter(tags=["service"])
 
@@ -31,6 +31,14 @@ def readyz(use: Use) -> Ready:
     """Whether the database answers. Needs no token."""
     use.storage.ping()
     return Ready(status="ready", storage="ok")
+
+
+@router.get("/v1/access", summary="What the caller may do", dependencies=[READ])
+async def access(request: Request) -> Access:
+    """The role of the token that came with the request."""
+    gate: Gate = request.app.state.gate
+    token = bearer_token(request.headers)
+    return Access(role="admin" if gate.open or token is None else gate.role_of(token), tokens=not gate.open)
 
 
 @router.get("/openapi.json", include_in_schema=False, dependencies=[READ])

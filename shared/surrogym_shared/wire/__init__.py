@@ -51,7 +51,7 @@ from surrogym_shared.wire.queries import (
     SampleView,
     StepQuery,
 )
-from surrogym_shared.wire.service import Event, Health, Ready
+from surrogym_shared.wire.service import Access, Event, Health, Ready
 from surrogym_shared.wire.sessions import (
     ActionRow,
     Actions,
@@ -90,6 +90,7 @@ __all__ = [
     "MAX_PARTICLES",
     "MAX_ROLLOUT",
     "PROTOCOL",
+    "Access",
     "ActionRow",
     "ActionSpace",
     "Actions",

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from surrogym_shared.wire.base import PROTOCOL, Reply
+from pydantic import Field
+
+from surrogym_shared.wire.base import PROTOCOL, Reply, Role
 
 
 class Health(Reply):
@@ -16,6 +18,13 @@ class Health(Reply):
 class Ready(Reply):
     status: Literal["ready", "not_ready"]
     storage: str
+
+
+class Access(Reply):
+    """What the caller may do."""
+
+    role: Role
+    tokens: bool = Field(description="whether the server has any tokens; where it has none, everybody is admin")
 
 
 class Event(Reply):

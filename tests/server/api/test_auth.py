@@ -64,6 +64,16 @@ def test_a_role_may_do_its_part_alone(guarded: httpx.Client, role: str, call: st
         assert (reply.status_code, reply.json()["code"]) == (403, "forbidden")
 
 
+@pytest.mark.parametrize("role", ROLES)
+def test_a_token_can_ask_for_its_role(guarded: httpx.Client, role: str):
+    reply = guarded.get("/v1/access", headers={"authorization": f"Bearer {TOKENS[role]}"})
+    assert reply.json() == {"role": role, "tokens": True}
+
+
+def test_where_there_are_no_tokens_everybody_is_admin(client: httpx.Client):
+    assert client.get("/v1/access").json() == {"role": "admin", "tokens": False}
+
+
 @pytest.mark.parametrize("header", [None, "Bearer wrong", "Bearer", "Basic eDp5", TOKENS["admin"]])
 def test_without_a_known_token_nothing_but_health_and_the_page(guarded: httpx.Client, header: str | None):
     headers = {"authorization": header} if header else {}

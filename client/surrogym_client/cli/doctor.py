@@ -1,0 +1,67 @@
+"""``surrogym doctor``: whether everything is in place."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from surrogym_client.cli.options import AsJson, Quiet, Server, SpecFile, StepLimit, Token, connect, read_spec
+
+if TYPE_CHECKING:
+    from surrogym_client.doctor import Finding
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("doctor")(command)
+
+
+def command(
+    env: Annotated[
+        str | None, typer.Option(help="Also make this environment and take one real step: an id, or module:factory.")
+    ] = None,
+    spec: SpecFile = None,
+    step_limit: StepLimit = 30.0,
+    server: Server = None,
+    token: Token = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Check versions, server, token, round trip and, if one is named, an environment; one line each, with the way out
+    of what is wrong. Exit status 1 where anything is; with --quiet, problems alone are shown.
+
+    Example: surrogym doctor --env Pendulum-v1
+    """
+    from dataclasses import asdict
+
+    from surrogym_client.cli.output import give
+    from surrogym_client.doctor import environment, installation, service
+
+    def findings() -> Iterator[Finding]:
+        given = read_spec(spec)
+        yield from installation()
+        with connect(server, token) as api:
+            yield from service(api)
+        if env is not None:
+            from surrogym_client.original.loading import make
+
+            yield from environment(partial(make, env, spec=given), step_limit)
+
+    found: list[Finding] = []
+    for finding in findings():
+        found.append(finding)
+        if not as_json and not (quiet and finding.way_out is None):
+            typer.echo(_line(finding))
+    problems = sum(finding.way_out is not None for finding in found)
+    if as_json:
+        give({"problems": problems, "findings": [asdict(finding) for finding in found]}, str, as_json=True)
+    if problems:
+        raise typer.Exit(1)
+
+
+def _line(finding: Finding) -> str:
+    verdict, way_out = ("ok", "") if finding.way_out is None else ("problem", f"; {finding.way_out}")
+    return f"{verdict:<7}  {finding.name:<11}  {finding.said}{way_out}"

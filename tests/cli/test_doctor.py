@@ -1,0 +1,102 @@
+"""What is not in place is found, and said with the way out of it."""
+
+from __future__ import annotations
+
+import pytest
+
+from support.scripted_server import problem, reply, scripted_server
+from surrogym_client.cli.errors import EXTRAS
+from surrogym_shared import wire
+from surrogym_shared.codes import Code
+
+BROKEN = """
+from surrogym_client.original.classic import pendulum
+from surrogym_client.original import RealStep
+
+class Pendulum:
+    def spec(self):
+        return pendulum().model_copy(update={"environment": "broken:Pendulum"})
+
+    def step_from(self, coordinates, action):
+        return RealStep(coordinates, action, coordinates[:1], 0.0)
+
+    def close(self):
+        pass
+"""
+EVERYTHING = {"python", "packages", "server", "ready", "token", "round trip", "environment", "step"}
+
+
+def lines(said) -> dict[str, tuple[str, str]]:
+    """Verdict and words of each finding."""
+    return {line[9:20].strip(): (line[:7].strip(), line[22:]) for line in said.out.splitlines()}
+
+
+def found(said) -> dict[str, dict[str, str | None]]:
+    return {finding["name"]: finding for finding in said.json["findings"]}
+
+
+def test_everything_in_place(on_server):
+    said = on_server("doctor", "--env", "Pendulum-v1")
+    assert said.code == 0, said.out
+    assert set(lines(said)) == EVERYTHING
+    assert {verdict for verdict, _ in lines(said).values()} == {"ok"}
+    assert f"protocol {wire.PROTOCOL}" in lines(said)["server"][1]
+    assert "coordinates (theta, speed)" in lines(said)["environment"][1]
+    assert on_server("doctor", "--quiet").out == ""
+
+
+def test_no_server(surrogym):
+    said = surrogym("doctor", "--server", "http://127.0.0.1:9", "--json")
+    assert said.code == 1
+    assert said.json["problems"] == 1
+    assert set(found(said)) == {"python", "packages", "server"}
+    assert "surrogym serve" in found(said)["server"]["way_out"]
+
+
+def test_a_server_of_another_protocol(surrogym):
+    newer = wire.Health(version="9", protocol=wire.PROTOCOL + 1)
+    with scripted_server(reply(newer.model_dump_json())) as server:
+        said = surrogym("doctor", "--server", server.url)
+    assert said.code == 1
+    assert lines(said)["server"][0] == "problem"
+    assert f"got {wire.PROTOCOL + 1}" in lines(said)["server"][1]
+
+
+@pytest.mark.parametrize(
+    ("ready", "access", "broken", "way_out"),
+    [
+        (problem(Code.UNAVAILABLE), reply('{"role": "read", "tokens": true}'), "ready", "database"),
+        (reply('{"status": "ready", "storage": "ok"}'), problem(Code.UNAUTHENTICATED), "token", "SURROGYM_TOKEN"),
+    ],
+)
+def test_one_thing_out_of_place_does_not_hide_the_others(surrogym, monkeypatch, ready, access, broken, way_out):
+    monkeypatch.setattr("surrogym_client.cli.options.QUICK", 0.0)
+    alive = reply(wire.Health(version="0.1.0").model_dump_json())
+    with scripted_server(alive, ready, access, alive) as server:
+        said = surrogym("doctor", "--server", server.url)
+    assert said.code == 1
+    assert [name for name, (verdict, _) in lines(said).items() if verdict == "problem"] == [broken]
+    assert way_out in lines(said)[broken][1]
+
+
+def test_the_role_of_a_token_is_told(surrogym):
+    alive = reply(wire.Health(version="0.1.0").model_dump_json())
+    access = reply(wire.Access(role="sample", tokens=True).model_dump_json())
+    with scripted_server(alive, reply('{"status": "ready", "storage": "ok"}'), access, alive) as server:
+        said = surrogym("doctor", "--server", server.url)
+    assert lines(said)["token"] == ("ok", "role sample")
+
+
+def test_an_environment_that_can_not_be_stepped_or_made(on_server, tmp_path):
+    (tmp_path / "broken.py").write_text(BROKEN)
+    said = on_server("doctor", "--env", "broken:Pendulum", "--quiet")
+    assert said.code == 1
+    assert list(lines(said)) == ["step"]
+    assert "expected (2,) for next_coordinates, got (1,)" in lines(said)["step"][1]
+    missing = on_server("doctor", "--env", "Nowhere-v1", "--quiet")
+    assert "no adapter knows the environment 'Nowhere-v1'" in lines(missing)["environment"][1]
+
+
+def test_an_extra_that_is_not_installed_is_named(on_server, monkeypatch):
+    monkeypatch.setitem(EXTRAS, "rare", ("no_such_module",))
+    assert "not installed: surrogym[rare]" in lines(on_server("doctor"))["packages"][1]
