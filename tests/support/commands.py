@@ -16,7 +16,8 @@ def command_line() -> Any:
 
 
 def options(*names: str) -> set[str]:
-    """All spellings of a command's options; ``options("reproduce", "paper")`` for one within a group.
+    """All spellings of a command's options, without a name those of the program; ``options("reproduce", "paper")`` for
+    one within a group.
 
     Raises:
         KeyError: no such command.
@@ -24,7 +25,7 @@ def options(*names: str) -> set[str]:
     command = command_line()
     for name in names:
         command = command.commands[name]
-    return {spelling for parameter in command.params for spelling in parameter.opts}
+    return {spelling for parameter in command.params for spelling in parameter.opts} | {"--help"}
 
 
 def parse(arguments: list[str]) -> dict[str, Any]:

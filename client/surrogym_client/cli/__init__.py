@@ -50,7 +50,6 @@ def build() -> typer.Typer:
         name="surrogym",
         help="Learn a virtual environment from a handful of real steps, serve it, and train on it.",
         no_args_is_help=True,
-        add_completion=False,
         rich_markup_mode=None,
         pretty_exceptions_enable=False,
     )

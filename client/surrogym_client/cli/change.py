@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, Token, Tolerances, connect, read_tolerances
+from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, Tolerances, connect, read_tolerances
 
 
 def register(app: typer.Typer) -> None:
@@ -15,7 +15,7 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
-    surrogate: Annotated[str, typer.Argument(help="Name of the surrogate.")],
+    surrogate: Surrogate,
     tolerance: Tolerances = None,
     budget: Annotated[int | None, typer.Option(min=2, help="Real steps the design may take.")] = None,
     target: Annotated[float | None, typer.Option(help="Confidence index to reach.")] = None,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Server, Token
+from surrogym_client.cli.options import AsJson, Quiet, Server, Token
 
 
 def register(app: typer.Typer) -> None:
@@ -21,8 +21,10 @@ def command(
     ] = "conformance",
     token: Token = None,
     as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
-    """Check a server against the protocol, one line a check; exit status 1 where it fails one.
+    """Check a server against the protocol, one line a check; exit status 1 where it fails one. With --quiet, failed
+    checks alone are shown.
 
     Example: surrogym conformance --server http://127.0.0.1:8000
     """
@@ -32,10 +34,10 @@ def command(
     outcomes = []
     for outcome in conformance(server, token, surrogate):
         outcomes.append(outcome)
-        if not as_json:
+        if not as_json and (outcome.failure or not quiet):
             typer.echo(f"✗ {outcome.name}: {outcome.failure}" if outcome.failure else f"✓ {outcome.name}")
     failed = [outcome for outcome in outcomes if outcome.failure]
     result = {"passed": len(outcomes) - len(failed), "failed": {o.name: o.failure for o in failed}}
-    give(result, lambda: f"{result['passed']} of {len(outcomes)} checks passed", as_json=as_json)
+    give(result, lambda: f"{result['passed']} of {len(outcomes)} checks passed", as_json=as_json, quiet=quiet)
     if failed:
         raise typer.Exit(1)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, Token, connect
+from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, connect
 
 
 def register(app: typer.Typer) -> None:
@@ -15,7 +15,7 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
-    surrogate: Annotated[str, typer.Argument(help="Name of the surrogate.")],
+    surrogate: Surrogate,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
     server: Server = None,
     token: Token = None,

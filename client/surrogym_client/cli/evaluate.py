@@ -134,7 +134,7 @@ def _settings(settings: EvaluationSettings) -> dict[str, Any]:
 
 
 def _words(result: Evaluation) -> str:
-    from surrogym_client.cli.output import columns
+    from surrogym_client.cli.columns import columns
 
     summary = result.summary()
     names = ("mean", "iqm", "min", "max", "std", "mean_length", "success_rate", "episodes", "steps")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, Token, connect
+from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, connect
 
 if TYPE_CHECKING:
     from surrogym_client.api import Api
@@ -19,7 +19,7 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
-    surrogate: Annotated[str, typer.Argument(help="Name of the surrogate.")],
+    surrogate: Surrogate,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="File to write; its ending says what: .csv, .npz, .safetensors, .json.")
     ],

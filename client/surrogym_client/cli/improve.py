@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, Token, connect
+from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, connect
 
 
 def register(app: typer.Typer) -> None:
@@ -15,7 +15,7 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
-    surrogate: Annotated[str, typer.Argument(help="Name of the surrogate.")],
+    surrogate: Surrogate,
     queries: Annotated[int, typer.Option("--queries", "-n", min=1, help="How many more real steps.")] = 10,
     checkpoint: Annotated[
         str | None, typer.Option(help="Weigh by the states that policies visited up to this checkpoint.")

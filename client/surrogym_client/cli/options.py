@@ -11,6 +11,24 @@ if TYPE_CHECKING:
     from surrogym_client.api import Api
     from surrogym_shared.spec import EnvironmentSpec
 
+QUICK = 1.0  # seconds a person waits for a server that is not there
+
+
+def names_of_surrogates(ctx: typer.Context, incomplete: str) -> list[str]:
+    """What a shell completes a surrogate's name to; nothing where no server answers within a second."""
+    from surrogym_client.api import Api
+    from surrogym_client.connection import Retries, Timeouts
+    from surrogym_client.errors import SurrogymClientError
+
+    limits, at_once = Timeouts(connect=QUICK, request=QUICK), Retries(seconds=0)
+    try:
+        with Api(ctx.params.get("server"), ctx.params.get("token"), timeouts=limits, retries=at_once) as api:
+            return [surrogate.name for surrogate in api.surrogates() if surrogate.name.startswith(incomplete)]
+    except SurrogymClientError:
+        return []
+
+
+Surrogate = Annotated[str, typer.Argument(help="Name of the surrogate.", autocompletion=names_of_surrogates)]
 Server = Annotated[
     str | None,
     typer.Option("--server", envvar="SURROGYM_URL", help="Address of the server. [default: http://127.0.0.1:8000]"),
@@ -31,8 +49,6 @@ Tolerances = Annotated[
 ]
 StepLimit = Annotated[float, typer.Option(min=0.001, help="Seconds one real step, or a reset, may take.")]
 Preset = Literal["default", "paper"]
-
-QUICK = 1.0  # seconds a person waits for a server that is not there
 
 
 def connect(server: str | None, token: str | None, wait: float = 0.0) -> Api:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import typer
 
 PLAIN_SECONDS = 5.0  # between lines of progress where no bar can be drawn
+WATCH_SECONDS = 1.0  # between looks at what is watched
 
 Update = Callable[[float, str], None]  # share done in [0, 1], a few words
 
@@ -30,12 +31,31 @@ def give(result: dict[str, Any], text: Callable[[], str], *, as_json: bool, quie
         typer.echo(text())
 
 
-def columns(rows: Sequence[Sequence[object]]) -> str:
-    """Rows as aligned columns; the first row is the heading."""
-    cells = [[_cell(value) for value in row] for row in rows]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
-    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in cells)
-    return "\n".join(line.rstrip() for line in lines)
+def watch(look: Callable[[], str], seconds: float = WATCH_SECONDS) -> None:
+    """Show what ``look`` says until Ctrl-C: in place on a terminal, elsewhere anew whenever it has changed."""
+    with suppress(KeyboardInterrupt), _screen() as show:
+        while True:
+            show(look())
+            time.sleep(seconds)
+
+
+@contextmanager
+def _screen() -> Iterator[Callable[[str], None]]:
+    if not sys.stdout.isatty():
+        shown: list[str] = []
+
+        def show(text: str) -> None:
+            if shown[-1:] != [text]:
+                shown[:] = [text]
+                typer.echo(text)
+
+        yield show
+        return
+    from rich.live import Live
+    from rich.text import Text
+
+    with Live(auto_refresh=False) as live:
+        yield lambda text: live.update(Text(text), refresh=True)
 
 
 @contextmanager
@@ -83,9 +103,3 @@ class _Lines:
 
 def _silent(share: float, words: str) -> None:
     del share, words
-
-
-def _cell(value: object) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -16,6 +16,7 @@ from surrogym_client.cli.options import (
     Server,
     SpecFile,
     StepLimit,
+    Surrogate,
     Token,
     Wait,
     connect,
@@ -35,7 +36,7 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
-    surrogate: Annotated[str, typer.Argument(help="Name of the surrogate.")],
+    surrogate: Surrogate,
     env: Annotated[
         str | None, typer.Option(help="Gymnasium id or package.module:factory. [default: the surrogate's id]")
     ] = None,

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+import json
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Server, Token, connect
+from surrogym_client.cli.options import AsJson, Server, Token, connect, names_of_surrogates
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
+    from surrogym_client.api import Api
     from surrogym_shared.wire import OutputFidelity, SurrogateSummary, SurrogateView
+
+Form = Literal["json", "short", "words"]
 
 FIDELITY = (
     *("output", "confidence", "as in the paper", "tolerance", "coverage"),
@@ -25,49 +30,87 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
-    surrogate: Annotated[str | None, typer.Argument(help="One surrogate. [default: all]")] = None,
+    surrogate: Annotated[
+        str | None, typer.Argument(help="One surrogate. [default: all]", autocompletion=names_of_surrogates)
+    ] = None,
+    watching: Annotated[bool, typer.Option("--watch", "-w", help="Stay, and show it anew until Ctrl-C.")] = False,
     server: Server = None,
     token: Token = None,
     as_json: AsJson = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Names and phases alone, without a heading.")] = False,
 ) -> None:
     """Show all surrogates, or one with its fidelity and its ledger of real steps.
 
-    Example: surrogym status pendulum
-    """
-    from surrogym_client.cli.output import give
+    With --watch --json, every change is a line of JSON.
 
+    Example: surrogym status pendulum --watch
+    """
+    from surrogym_client.cli.output import watch
+
+    form: Form = "json" if as_json else "short" if quiet else "words"
     with connect(server, token) as api:
-        if surrogate is None:
-            all_of_them = api.surrogates()
-            listed = {"server": api.url, "surrogates": [s.model_dump(mode="json") for s in all_of_them]}
-            give(listed, lambda: _table(all_of_them), as_json=as_json)
+        look = partial(_all, api, form) if surrogate is None else partial(_one, api, surrogate, form)
+        seen = look()  # an unknown name or a wrong address ends it here, also with --watch
+        if watching:
+            watch(partial(_patiently, look, as_json))
         else:
-            view = api.surrogate(surrogate)
-            give(view.model_dump(mode="json"), lambda: _detail(view), as_json=as_json)
+            typer.echo(json.dumps(json.loads(seen), indent=2) if as_json else seen)
+
+
+def _all(api: Api, form: Form) -> str:
+    surrogates = api.surrogates()
+    if form == "json":
+        return json.dumps({"server": api.url, "surrogates": [s.model_dump(mode="json") for s in surrogates]})
+    return "\n".join(map(_short, surrogates)) if form == "short" else _table(surrogates)
+
+
+def _one(api: Api, name: str, form: Form) -> str:
+    view = api.surrogate(name)
+    if form == "json":
+        return view.model_dump_json()
+    return _short(view) if form == "short" else _detail(view)
+
+
+def _patiently(look: Callable[[], str], as_json: bool) -> str:
+    """What there is to see, or that the server is away."""
+    from surrogym_client.errors import ServerUnreachable
+
+    try:
+        return look()
+    except ServerUnreachable as error:
+        return json.dumps({"error": str(error)}) if as_json else f"{error}; trying again, Ctrl-C ends it"
+
+
+def _short(seen: SurrogateSummary) -> str:
+    return f"{seen.name} {_phase(seen)}"
+
+
+def _phase(seen: SurrogateSummary) -> str:
+    return "paused" if seen.paused else seen.phase
 
 
 def _table(surrogates: Sequence[SurrogateSummary]) -> str:
-    from surrogym_client.cli.output import columns
+    from surrogym_client.cli.columns import columns
 
     if not surrogates:
         return "no surrogates yet; next: surrogym register Pendulum-v1 --name pendulum"
-    heading = ("name", "environment", "phase", "samples", "model", "confidence index")
-    rows = [
-        (
-            s.name,
-            s.environment or "own",
-            "paused" if s.paused else s.phase,
-            s.samples,
-            s.model_version,
-            s.confidence_index,
-        )
-        for s in surrogates
-    ]
-    return columns([heading, *rows])
+    heading = ("name", "environment", "phase", "real steps", "queries", "model", "confidence index", "target")
+    return columns([heading, *map(_row, surrogates)])
+
+
+def _row(seen: SurrogateSummary) -> tuple[str | float | None, ...]:
+    queries = seen.queries
+    waiting = f"{queries.pending} pending, {queries.leased} leased" if queries.pending + queries.leased else "none"
+    steps = f"{seen.ledger.total} of {seen.budget}"
+    environment = seen.environment or "own"
+    return (
+        *(seen.name, environment, _phase(seen), steps, waiting),
+        *(seen.model_version, seen.confidence_index, f"{seen.target:g}"),
+    )
 
 
 def _detail(view: SurrogateView) -> str:
-    from surrogym_client.cli.output import columns
+    from surrogym_client.cli.columns import columns
 
     ledger = view.ledger
     lines = [

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from surrogym_client.cli.options import AsJson, ExitWithParent, Quiet, Server, Token, Wait, connect
+from surrogym_client.cli.options import AsJson, ExitWithParent, Quiet, Server, Surrogate, Token, Wait, connect
 
 if TYPE_CHECKING:
     from surrogym_client.cli.output import Update
@@ -32,7 +32,7 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
-    surrogate: Annotated[str, typer.Argument(help="Name of the surrogate.")],
+    surrogate: Surrogate,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write the policy to.")] = Path("policy.zip"),
     algorithm: Annotated[
         str, typer.Option(help="Algorithm of Stable-Baselines3 (ppo, a2c, sac, td3, ddpg, dqn), or cmaes.")

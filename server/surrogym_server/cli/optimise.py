@@ -27,7 +27,8 @@ def optimise(
     horizon: Annotated[
         int | None, typer.Option(min=1, help="Steps of an episode to differentiate. [default: from the specification]")
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no remarks.")] = False,
 ) -> None:
     """Optimise a policy by the gradient of its return through a model; continuous actions only, no server is asked.
 
@@ -70,6 +71,9 @@ def optimise(
     out.with_suffix(".json").write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
     if not quiet:
         typer.echo("", err=True)
+    if as_json:
+        typer.echo(json.dumps({"policy": str(out), **{name: card[name] for name in card if name != "spec"}}, indent=2))
+    elif not quiet:
         typer.echo(
             f"{out}: {found.virtual_steps} virtual steps in {seconds:.1f} s, imagined return "
             f"{found.imagined_return:.1f} (in the model); next: surrogym evaluate {out}"

@@ -37,13 +37,9 @@ def surrogate_view(status: SurrogateStatus) -> replies.SurrogateView:
     return replies.SurrogateView(
         **_summary_fields(status),
         spec=wire.EnvironmentSpec.model_validate(record.spec),
-        budget=record.budget,
-        target=record.target,
         tolerances=record.tolerances,
         outputs=list(status.outputs),
         fidelity=None if model is None else replies.Fidelity.model_validate(model.fidelity),
-        ledger=ledger(status.ledger),
-        queries=replies.QueryCounts(**asdict(status.queries)),
         error=record.error,
     )
 
@@ -59,6 +55,10 @@ def _summary_fields(status: SurrogateStatus) -> dict[str, Any]:
         "samples": status.samples,
         "model_version": None if model is None else model.version,
         "confidence_index": None if model is None else model.fidelity["confidence_index"],
+        "target": record.target,
+        "budget": record.budget,
+        "ledger": ledger(status.ledger),
+        "queries": replies.QueryCounts(**asdict(status.queries)),
         "created_at": record.created_at,
     }
 

@@ -84,18 +84,18 @@ class SurrogateSummary(Reply):
     samples: int
     model_version: int | None
     confidence_index: float | None
+    target: float = Field(description="confidence index to reach")
+    budget: int = Field(description="real steps the design may take")
+    ledger: Ledger
+    queries: QueryCounts
     created_at: float = Field(description="seconds since 1970, the server's clock")
 
 
 class SurrogateView(SurrogateSummary):
     spec: EnvironmentSpec
-    budget: int
-    target: float
     tolerances: dict[str, float] = Field(description="set since the surrogate was created, by output, in its own unit")
     outputs: list[str]
     fidelity: Fidelity | None
-    ledger: Ledger
-    queries: QueryCounts
     error: str | None = Field(default=None, description="why the phase is failed, or the last query was set aside")
 
 

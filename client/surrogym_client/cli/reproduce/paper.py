@@ -37,8 +37,9 @@ def command(
     """
     from dataclasses import replace
 
+    from surrogym_client.cli.columns import columns
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.cli.output import columns, give, progress
+    from surrogym_client.cli.output import give, progress
     from surrogym_client.reproduce.paper import run_cells, tables
     from surrogym_client.reproduce.paper_cases import QUICK, TASKS, WHOLE, cells
 

@@ -1,0 +1,104 @@
+"""Status: what is shown, for people and for programs, once or until Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from support.scripted_server import lost_reply, reply, scripted_server
+from support.terminal import on_terminal
+from surrogym_client.api import Api
+from surrogym_client.cli.columns import columns
+from surrogym_shared import wire
+
+EMPTY = reply(wire.SurrogateList(surrogates=[]).model_dump_json())
+
+
+@pytest.fixture
+def looks(monkeypatch):
+    """Ctrl-C is pressed after so many looks."""
+
+    def press_after(count: int) -> None:
+        left = iter(range(count - 1))
+
+        def sleep(_: float) -> None:
+            if next(left, None) is None:
+                raise KeyboardInterrupt
+
+        monkeypatch.setattr("surrogym_client.cli.output.time.sleep", sleep)
+
+    return press_after
+
+
+def test_quiet_gives_names_and_phases_for_scripts(on_server, name):
+    on_server("register", "Pendulum-v1", "--name", name)
+    assert on_server("status", name, "--quiet").out == f"{name} collecting\n"
+    assert f"{name} collecting" in on_server("status", "--quiet").out.splitlines()
+
+
+def test_all_say_what_was_spent_and_what_is_asked_for(on_server, server_process, name):
+    on_server("register", "Pendulum-v1", "--name", name, "--budget", "8", "--initial", "4")
+    (line,) = (line for line in on_server("status").out.splitlines() if line.startswith(name))
+    assert "0 of 8" in line
+    assert "4 pending, 0 leased" in line
+    (summary,) = (s for s in on_server("status", "--json").json["surrogates"] if s["name"] == name)
+    assert (summary["budget"], summary["target"], summary["queries"]["pending"]) == (8, 0.999, 4)
+
+
+def test_watching_shows_changes_alone_and_ends_cleanly(on_server, server_process, name, looks):
+    """Not on a terminal: as lines."""
+    on_server("register", "Pendulum-v1", "--name", name)
+    looks(5)
+    watched = on_server("status", name, "--watch", "--json")
+    assert watched.code == 0
+    (seen,) = map(json.loads, watched.out.splitlines())
+    assert seen["name"] == name
+    looks(2)
+    with Api(server_process.url) as api:
+        assert api.patch_surrogate(name, paused=True).paused
+    assert on_server("status", name, "--watch", "--quiet").out == f"{name} paused\n"
+
+
+def test_a_server_that_goes_away_is_told_and_looked_for(surrogym, looks, monkeypatch):
+    monkeypatch.setattr("surrogym_client.cli.options.QUICK", 0.0)
+    looks(3)
+    with scripted_server(EMPTY, lost_reply, EMPTY) as server:
+        said = surrogym("status", "--watch", "--server", server.url)
+    assert said.code == 0
+    lost, found = said.out.splitlines()
+    assert "trying again" in lost
+    assert found.startswith("no surrogates yet")
+
+
+def test_watching_nothing_known_ends_at_once(on_server):
+    said = on_server("status", "nobody", "--watch")
+    assert (said.code, said.out) == (1, "")
+
+
+def test_on_a_narrow_terminal_nothing_is_cut_and_ctrl_c_ends_it(pendulum_server):
+    with on_terminal("status", "pendulum", "--watch", "--server", pendulum_server.url, width=60) as terminal:
+        terminal.await_text("leave-one-out")
+        assert terminal.interrupt() == 0
+    lines = terminal.shown.splitlines()
+    assert max(map(len, lines)) <= 60
+    assert "Traceback" not in terminal.shown
+    assert {f"output               {name}" for name in ("theta", "speed", "reward")} <= set(lines)
+
+
+def test_columns_fit():
+    rows = [("name", "a long heading"), ("pendulum", 0.123456), ("x", None)]
+    assert columns(rows).splitlines() == ["name      a long heading", "pendulum  0.1235", "x         -"]
+    assert columns(rows, 17).splitlines() == [
+        "          a long",
+        "name      heading",
+        "pendulum  0.1235",
+        "x         -",
+    ]
+    assert columns(rows, 16).splitlines() == [
+        "name            pendulum",
+        "a long heading  0.1235",
+        "",
+        "name            x",
+        "a long heading  -",
+    ]

@@ -1,0 +1,71 @@
+"""A program on a terminal of its own, as wide as a test wants it."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import re
+import select
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+PATIENCE = 60.0
+CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
+
+
+@dataclass
+class Terminal:
+    process: subprocess.Popen[bytes]
+    descriptor: int
+    shown: str = ""  # without control sequences
+
+    def await_text(self, text: str) -> None:
+        """Read until ``text`` has been shown since the start."""
+        deadline = time.monotonic() + PATIENCE
+        while text not in self.shown:
+            assert time.monotonic() < deadline, self.shown[-2_000:]
+            assert self._read(0.2) or self.process.poll() is None, self.shown[-2_000:]
+
+    def interrupt(self) -> int:
+        """Press Ctrl-C; the exit status, once everything it said is read."""
+        self.process.send_signal(signal.SIGINT)
+        while self._read(0.2) or self.process.poll() is None:
+            pass
+        return self.process.wait()
+
+    def _read(self, seconds: float) -> bool:
+        if not select.select([self.descriptor], [], [], seconds)[0]:
+            return False
+        try:
+            said = os.read(self.descriptor, 65_536)
+        except OSError:  # the other end is closed
+            return False
+        self.shown += CONTROL.sub("", said.decode(errors="replace"))
+        return bool(said)
+
+
+@contextmanager
+def on_terminal(*arguments: str, width: int = 80, folder: str | None = None) -> Iterator[Terminal]:
+    """``surrogym ARGUMENTS`` on a terminal of ``width`` characters; killed at the end if it still runs."""
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, width, 0, 0))
+    command = [sys.executable, "-m", "surrogym_client", *arguments]
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")}
+    environment = kept | {"TERM": "xterm", "COLUMNS": str(width)}
+    process = subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs, env=environment, cwd=folder)
+    os.close(theirs)
+    try:
+        yield Terminal(process, ours)
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+        os.close(ours)
