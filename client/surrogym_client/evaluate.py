@@ -81,6 +81,14 @@ class Evaluation:
         }
 
 
+class EvaluationInterrupted(KeyboardInterrupt):
+    """Ctrl-C came in an evaluation, after ``steps`` real steps."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self.steps = steps
+
+
 def evaluate(
     policy: Predict,
     open_episode: Callable[[], Episode],
@@ -100,6 +108,7 @@ def evaluate(
 
     Raises:
         ValueError: the policy gives actions of the wrong shape.
+        EvaluationInterrupted: Ctrl-C came; its real steps count all the same.
     """
     settings = settings or EvaluationSettings()
     episodes = [open_episode() for _ in range(settings.episodes)]
@@ -165,6 +174,16 @@ def _run(
     spec = episodes[0].spec
     tallies = [_Tally(_start(e, settings, i)) for i, e in enumerate(episodes)]
     start = tallies[0].moment.coordinates
+    try:
+        _finish(policy, episodes, tallies, progress)
+    except KeyboardInterrupt:
+        raise EvaluationInterrupted(sum(tally.length for tally in tallies)) from None
+    return _account(spec, tallies, start)
+
+
+def _finish(policy: Predict, episodes: Sequence[Episode], tallies: Sequence[_Tally], progress: Progress | None) -> None:
+    """Step every episode to its end."""
+    spec = episodes[0].spec
     running = list(range(len(episodes)))
     limit = spec.time_limit or LONGEST_EPISODE
     for step in range(1, limit + 1):
@@ -177,7 +196,6 @@ def _run(
             progress(step / limit if running else 1.0, len(episodes) - len(running))
         if not running:
             break
-    return _account(spec, tallies, start)
 
 
 def _start(episode: Episode, settings: EvaluationSettings, index: int) -> Moment:

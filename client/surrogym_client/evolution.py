@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,14 @@ from cmaes import CMA, SepCMA
 from numpy.typing import NDArray
 
 from surrogym_client.imagined import LONGEST_EPISODE, imagined_returns, observation_statistics
-from surrogym_client.training import CHECK_EPISODES, CHECKS, TrainProgress, TrainResult, TrainSettings
+from surrogym_client.training import (
+    CHECK_EPISODES,
+    CHECKS,
+    TrainingInterrupted,
+    TrainProgress,
+    TrainResult,
+    TrainSettings,
+)
 from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
 
@@ -56,32 +64,38 @@ def evolve(
     Raises:
         ValueError: an unknown or impossible hyperparameter, or a file to go on from that is no network of this size.
         SurrogymClientError: the surrogate can't be reached, or has no model yet.
+        TrainingInterrupted: Ctrl-C came; the best so far is saved.
     """
     search = _Search(port, settings, _evolution(settings))
     started, spec = time.perf_counter(), port.spec()
     cost = search.choices.population * search.choices.starts * (spec.time_limit or LONGEST_EPISODE)
     generations = max(total_steps // cost, 1)
-    best, kept, latest = -np.inf, search.policy, None
-    for number in range(1, generations + 1):
-        search.generation(number)
-        if number * CHECKS // generations > (number - 1) * CHECKS // generations:
-            latest = search.imagined()
-            if latest >= best:
-                best, kept = latest, search.policy
-        if progress is not None:
-            progress(TrainProgress(number * cost, generations * cost, latest, 0.0))
+    best, kept, latest, done = -np.inf, None, None, 0
+    with suppress(KeyboardInterrupt):
+        for number in range(1, generations + 1):
+            search.generation(number)
+            done = number
+            if number * CHECKS // generations > (number - 1) * CHECKS // generations:
+                latest = search.imagined()
+                if latest >= best:
+                    best, kept = latest, search.policy
+            if progress is not None:
+                progress(TrainProgress(number * cost, generations * cost, latest, 0.0))
+    kept = kept or search.policy
     out.parent.mkdir(parents=True, exist_ok=True)
     kept.save(out)
     result = TrainResult(
         path=out,
         algorithm=EVOLUTION,
-        virtual_steps=generations * cost,
+        virtual_steps=done * cost,
         seconds=time.perf_counter() - started,
-        imagined_return=best,
+        imagined_return=None if latest is None else best,
         lost_episodes=0,
         settings={**asdict(settings), **asdict(search.choices), "total_steps": generations * cost},
     )
     out.with_suffix(".json").write_text(json.dumps(asdict(result), indent=2, default=str) + "\n")
+    if done < generations:
+        raise TrainingInterrupted(result)
     return result
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from surrogym_client.evaluate import Predict
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.train import (
     MAX_STEPS,
+    TrainingInterrupted,
     TrainProgress,
     TrainResult,
     TrainSettings,
@@ -22,6 +23,7 @@ from surrogym_client.train import (
 from surrogym_client.waiting import wait_for_design
 from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
+from surrogym_shared.wire import SurrogateView
 
 ROUND_SHARE = 0.25  # of a whole training, in each round before the last
 VISIT_LANES = 32
@@ -45,6 +47,7 @@ def train_and_improve(
     settings: TrainSettings,
     improve: ImproveSettings,
     progress: Callable[[TrainProgress], None] | None = None,
+    waiting: Callable[[SurrogateView], None] | None = None,
 ) -> TrainResult:
     """Learn a policy, with rounds of queries where it goes as long as the design is not ready.
 
@@ -59,33 +62,54 @@ def train_and_improve(
         settings: of each training.
         improve: of the rounds.
         progress: called after every rollout, with steps summed over the rounds.
+        waiting: called with every look at a round's queries, while a sampler answers them.
 
     Raises:
         DesignUnfinished: the queries of a round were not answered in time.
+        TrainingInterrupted: Ctrl-C came when there was a policy already.
         ValueError, SurrogymClientError: as ``train``.
     """
+    rounds: list[TrainResult] = []
+    visited = 0
     whole, part = shares(settings, improve.rounds)
-    trained, visited, seconds, lost, policy = 0, 0, 0.0, 0, settings.start_from
-    for _ in range(improve.rounds):
-        view = api.surrogate(name)
-        if view.phase == "ready":
-            break
-        now = replace(settings, total_steps=part, start_from=policy)
-        result = train(port, out, now, _shifted(progress, trained + visited, whole))
-        trained, seconds, policy = trained + result.virtual_steps, seconds + result.seconds, out
-        lost += result.lost_episodes
-        checkpoint = f"seed {settings.seed}, round {view.round}"
-        visited += visit(port, out, settings, checkpoint)
-        api.improve(name, improve.queries, checkpoint=checkpoint)
-        wait_for_design(api, name, improve.patience_seconds, after_round=view.round)
-    left = whole - trained if settings.total_steps else min(planned_steps(settings), whole - trained)
-    last = replace(settings, total_steps=max(left, 1), start_from=policy)
-    result = train(port, out, last, _shifted(progress, trained + visited, trained + visited + left))
+
+    def learn(steps: int, whole: int) -> None:
+        now = replace(settings, total_steps=steps, start_from=out if rounds else settings.start_from)
+        rounds.append(train(port, out, now, _shifted(progress, _steps(rounds) + visited, whole)))
+
+    try:
+        for _ in range(improve.rounds):
+            view = api.surrogate(name)
+            if view.phase == "ready":
+                break
+            learn(part, whole)
+            checkpoint = f"seed {settings.seed}, round {view.round}"
+            visited += visit(port, out, settings, checkpoint)
+            api.improve(name, improve.queries, checkpoint=checkpoint)
+            wait_for_design(api, name, improve.patience_seconds, waiting, after_round=view.round)
+        left = whole - _steps(rounds)
+        left = max(left if settings.total_steps else min(planned_steps(settings), left), 1)
+        learn(left, _steps(rounds) + visited + left)
+    except TrainingInterrupted as interruption:
+        raise TrainingInterrupted(_together([*rounds, interruption.result], visited)) from None
+    except KeyboardInterrupt:
+        if rounds:
+            raise TrainingInterrupted(_together(rounds, visited)) from None
+        raise
+    return _together(rounds, visited)
+
+
+def _steps(rounds: Sequence[TrainResult]) -> int:
+    return sum(result.virtual_steps for result in rounds)
+
+
+def _together(rounds: Sequence[TrainResult], visited: int) -> TrainResult:
+    """The last round's result, with what all of them took; ``visited`` are virtual steps beside the trainings."""
     return replace(
-        result,
-        virtual_steps=trained + visited + result.virtual_steps,
-        seconds=seconds + result.seconds,
-        lost_episodes=lost + result.lost_episodes,
+        rounds[-1],
+        virtual_steps=_steps(rounds) + visited,
+        seconds=sum(r.seconds for r in rounds),
+        lost_episodes=sum(r.lost_episodes for r in rounds),
     )
 
 

@@ -124,7 +124,12 @@ class Sampler:
                 self._work(claimed.queries, heartbeat)
                 if self._enough(claimed):
                     break
-        return self._summary()
+        return self.summary()
+
+    def summary(self) -> SamplerReport:
+        """What was done so far."""
+        seconds = time.monotonic() - self._started
+        return SamplerReport(self._counts["answered"], self._counts["failed"], self._steps, seconds, self._phase)
 
     def _check(self) -> None:
         """Refuse an environment whose coordinates, action or kind of query are not the surrogate's."""
@@ -235,10 +240,6 @@ class Sampler:
         if self._settings.once and claimed.queries:
             return True
         return self._settings.until_done and not claimed.queries and claimed.phase in FINISHED
-
-    def _summary(self) -> SamplerReport:
-        seconds = time.monotonic() - self._started
-        return SamplerReport(self._counts["answered"], self._counts["failed"], self._steps, seconds, self._phase)
 
 
 class Heartbeat:

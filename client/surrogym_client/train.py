@@ -26,7 +26,14 @@ from surrogym_client.evolution import EVOLUTION, EVOLUTION_STEPS, evolve
 from surrogym_client.imagined import imagined_returns, observation_statistics
 from surrogym_client.policies import WIDER, PaperPolicy, Standardise
 from surrogym_client.sb3 import SurrogateVecEnv
-from surrogym_client.training import CHECK_EPISODES, CHECKS, TrainProgress, TrainResult, TrainSettings
+from surrogym_client.training import (
+    CHECK_EPISODES,
+    CHECKS,
+    TrainingInterrupted,
+    TrainProgress,
+    TrainResult,
+    TrainSettings,
+)
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import EnvironmentSpec
 
@@ -67,6 +74,7 @@ def train(
     Raises:
         ValueError: an unknown algorithm, one that can't take the action space, or too many steps.
         SurrogymClientError: the surrogate can't be reached, or has no model yet.
+        TrainingInterrupted: Ctrl-C came; the policy with the best imagined return so far is saved.
     """
     settings = settings or TrainSettings()
     if settings.algorithm.upper() == EVOLUTION:
@@ -86,7 +94,7 @@ def train(
         learner = _learner(algorithm, wrapped, settings, spec, statistics, gamma)
         total = _whole_rollouts(learner, total)
         report = _Report(total, progress, lambda: imagined_return(port, learner, settings))
-        learner.learn(total, callback=report, reset_num_timesteps=True)
+        whole = _learned(learner, total, report)
         report.restore_best()
         out.parent.mkdir(parents=True, exist_ok=True)
         learner.save(out)
@@ -103,7 +111,18 @@ def train(
         settings={**asdict(settings), "num_envs": num_envs, "total_steps": total, **effective(learner)},
     )
     out.with_suffix(".json").write_text(json.dumps(asdict(result), indent=2, default=str) + "\n")
+    if not whole:
+        raise TrainingInterrupted(result)
     return result
+
+
+def _learned(learner: BaseAlgorithm, total: int, report: _Report) -> bool:
+    """Whether the training came to its end, and not to an interruption."""
+    try:
+        learner.learn(total, callback=report, reset_num_timesteps=True)
+    except KeyboardInterrupt:
+        return False
+    return True
 
 
 def algorithm_by_name(name: str) -> type[BaseAlgorithm]:
@@ -222,8 +241,9 @@ class _Report(BaseCallback):
         self.lost = 0
 
     def restore_best(self) -> None:
-        """Give the learner the policy with the best imagined return of all checks."""
-        self.model.policy.load_state_dict(self._kept)
+        """Give the learner the policy with the best imagined return of all checks; without any it keeps its own."""
+        if self._kept:
+            self.model.policy.load_state_dict(self._kept)
 
     @property
     def episode_penalty(self) -> float | None:
@@ -262,4 +282,4 @@ class _Report(BaseCallback):
             self._kept = {name: tensor.clone() for name, tensor in self.model.policy.state_dict().items()}
 
 
-__all__ = ["TrainProgress", "TrainResult", "TrainSettings", "algorithm_by_name", "train"]
+__all__ = ["TrainProgress", "TrainResult", "TrainSettings", "TrainingInterrupted", "algorithm_by_name", "train"]

@@ -49,3 +49,11 @@ class TrainResult:
     lost_episodes: int  # cut because the server lost the session
     settings: dict[str, Any]
     episode_penalty: float | None = None  # what it takes off a training episode's return; mean of the last 100
+
+
+class TrainingInterrupted(KeyboardInterrupt):
+    """Ctrl-C came in a training; ``result`` is of the policy that was saved then."""
+
+    def __init__(self, result: TrainResult) -> None:
+        super().__init__()
+        self.result = result

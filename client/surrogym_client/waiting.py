@@ -18,6 +18,18 @@ IN_WORDS: dict[Phase, str] = {  # of the phases in which a sampler stops
 }
 
 
+def share_of_design(view: SurrogateView) -> float:
+    """How much of a design is done, in [0, 1]: all of it when it ended, else by its budget."""
+    return 1.0 if view.phase in FINISHED else min(1.0, view.ledger.total / view.budget)
+
+
+def words_of_design(view: SurrogateView) -> str:
+    """One look at a design."""
+    ledger = view.ledger
+    fidelity = "" if view.fidelity is None else f", confidence index {view.fidelity.confidence_index:.4f}"
+    return f"{ledger.total} of {view.budget} real steps ({ledger.adaptive} adaptive){fidelity}"
+
+
 class DesignUnfinished(SurrogymClientError):
     """The design has failed, or was not done in time; ``surrogym status`` says more."""
 

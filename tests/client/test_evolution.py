@@ -11,6 +11,7 @@ from surrogym_client.imagined import imagined_returns
 from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
 from surrogym_client.policy_file import load_policy
 from surrogym_client.train import TrainSettings, train
+from surrogym_client.training import TrainingInterrupted
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.surrogate.learn import learn
@@ -80,3 +81,14 @@ def test_a_goal_far_from_the_start_is_found(tmp_path: Path):
     surrogate = local(mountain_car_continuous())
     settings = TrainSettings(algorithm="cmaes", hyperparameters={"population": 16, "starts": 2, "units": 4})
     assert evolve(surrogate, tmp_path / "policy.zip", settings, 8 * 16 * 2 * 999).imagined_return > 80
+
+
+def test_an_interruption_keeps_what_was_found(surrogate, tmp_path: Path):
+    def interrupt(now):
+        raise KeyboardInterrupt
+
+    with pytest.raises(TrainingInterrupted) as interrupted:
+        evolve(surrogate, tmp_path / "policy.zip", small(), 3_000, interrupt)
+    result = interrupted.value.result
+    assert 0 < result.virtual_steps < 3_000
+    assert Network.load(result.path).vector.size

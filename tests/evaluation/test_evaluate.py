@@ -9,6 +9,7 @@ import pytest
 from support.moody import Line
 from surrogym_client import original
 from surrogym_client.evaluate import (
+    EvaluationInterrupted,
     EvaluationSettings,
     decode_actions,
     evaluate,
@@ -182,3 +183,13 @@ def test_scaled_starts_are_declared_ones_spread_about_their_middle():
     assert 0.09 < np.abs(starts[0]).max() <= 0.1
     with pytest.raises(ValueError, match="got both"):
         EvaluationSettings(wide=True, start_scale=2.0)
+
+
+def test_an_interruption_tells_the_real_steps_that_were_taken():
+    def interrupt(share, _):
+        if share >= 3 / 200:
+            raise KeyboardInterrupt
+
+    with pytest.raises(EvaluationInterrupted) as interrupted:
+        evaluate(pendulum_policy, opener("Pendulum-v1"), EvaluationSettings(episodes=2), interrupt)
+    assert interrupted.value.steps == 3 * 2

@@ -28,14 +28,15 @@ def command(
 
     Example: surrogym conformance --server http://127.0.0.1:8000
     """
-    from surrogym_client.cli.output import give
+    from surrogym_client.cli.output import give, on_interrupt
     from surrogym_client.conformance import conformance
 
     outcomes = []
-    for outcome in conformance(server, token, surrogate):
-        outcomes.append(outcome)
-        if not as_json and (outcome.failure or not quiet):
-            typer.echo(f"✗ {outcome.name}: {outcome.failure}" if outcome.failure else f"✓ {outcome.name}")
+    with on_interrupt(lambda: f"interrupted; nothing stays of {surrogate!r}"):
+        for outcome in conformance(server, token, surrogate):
+            outcomes.append(outcome)
+            if not as_json and (outcome.failure or not quiet):
+                typer.echo(f"✗ {outcome.name}: {outcome.failure}" if outcome.failure else f"✓ {outcome.name}")
     failed = [outcome for outcome in outcomes if outcome.failure]
     result = {"passed": len(outcomes) - len(failed), "failed": {o.name: o.failure for o in failed}}
     give(result, lambda: f"{result['passed']} of {len(outcomes)} checks passed", as_json=as_json, quiet=quiet)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -54,8 +55,8 @@ def command(
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 100
     """
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.cli.output import give, progress
-    from surrogym_client.evaluate import EvaluationSettings, evaluate
+    from surrogym_client.cli.output import give, progress, say
+    from surrogym_client.evaluate import EvaluationInterrupted, EvaluationSettings, evaluate
     from surrogym_client.policy_file import load_policy, read_card
 
     card = read_card(policy)
@@ -64,16 +65,22 @@ def command(
     settings = EvaluationSettings(episodes, first_seed, wide, start_scale, perturb)
     opener = _opener(env, read_spec(spec), card)
     predict = load_policy(policy, algorithm or card.algorithm)
-    with progress("evaluate", quiet=quiet) as update:
-        result = _checked(
-            lambda: evaluate(
-                predict,
-                opener,
-                settings,
-                lambda share, ended: update(share, f"{episodes} real episodes, {ended} terminated"),
+    enter = partial(_enter, surrogate or card.surrogate, server or card.server, token, quiet=quiet)
+    try:
+        with progress("evaluate", quiet=quiet) as update:
+            result = _checked(
+                lambda: evaluate(
+                    predict,
+                    opener,
+                    settings,
+                    lambda share, ended: update(share, f"{episodes} real episodes, {ended} terminated"),
+                )
             )
-        )
-    _enter(result, settings, surrogate or card.surrogate, server or card.server, token, quiet=quiet)
+    except EvaluationInterrupted as interruption:
+        say(f"interrupted after {interruption.steps} real steps; no result was kept, the same command begins anew")
+        enter(interruption.steps, 0, "interrupted")
+        raise
+    enter(result.steps, episodes, f"{episodes} episodes from seed {first_seed}")
     summary = {"policy": str(policy), **_settings(settings), **result.summary()}
     give(summary, lambda: _words(result), as_json=as_json)
 
@@ -105,11 +112,12 @@ def _checked(run: Callable[[], Evaluation]) -> Evaluation:
 
 
 def _enter(
-    result: Evaluation,
-    settings: EvaluationSettings,
     surrogate: str | None,
     server: str | None,
     token: str | None,
+    steps: int,
+    episodes: int,
+    note: str,
     *,
     quiet: bool,
 ) -> None:
@@ -118,12 +126,11 @@ def _enter(
     from surrogym_client.cli.output import say
     from surrogym_client.errors import SurrogymClientError
 
-    if surrogate is None:
+    if surrogate is None or steps == 0:
         return
-    note = f"{settings.episodes} episodes from seed {settings.first_seed}"
     try:
         with connect(server, token) as api:
-            api.report_steps(surrogate, result.steps, episodes=settings.episodes, note=note)
+            api.report_steps(surrogate, steps, episodes=episodes, note=note)
     except SurrogymClientError as error:
         say(f"not entered into the ledger of {surrogate!r}: {error}", quiet=quiet)
 

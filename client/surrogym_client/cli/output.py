@@ -14,7 +14,7 @@ import typer
 PLAIN_SECONDS = 5.0  # between lines of progress where no bar can be drawn
 WATCH_SECONDS = 1.0  # between looks at what is watched
 
-Update = Callable[[float, str], None]  # share done in [0, 1], a few words
+Update = Callable[[float | None, str], None]  # share done in [0, 1], None for as before; a few words
 
 
 def say(text: str, *, quiet: bool = False) -> None:
@@ -59,6 +59,16 @@ def _screen() -> Iterator[Callable[[str], None]]:
 
 
 @contextmanager
+def on_interrupt(words: Callable[[], str]) -> Iterator[None]:
+    """Say after Ctrl-C what was saved and how to go on; the interruption goes on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        say(words())
+        raise
+
+
+@contextmanager
 def progress(title: str, *, quiet: bool = False) -> Iterator[Update]:
     """A bar on a terminal, plain lines elsewhere, nothing when quiet."""
     if quiet:
@@ -94,12 +104,12 @@ class _Lines:
         self._next = 0.0
         self._last = ""
 
-    def __call__(self, share: float, words: str) -> None:
-        due = time.monotonic() >= self._next or share >= 1.0
+    def __call__(self, share: float | None, words: str) -> None:
+        due = time.monotonic() >= self._next or (share or 0.0) >= 1.0
         if due and words != self._last:
             self._next, self._last = time.monotonic() + PLAIN_SECONDS, words
             say(f"{self._title}: {words}")
 
 
-def _silent(share: float, words: str) -> None:
+def _silent(share: float | None, words: str) -> None:
     del share, words

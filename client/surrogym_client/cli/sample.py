@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Annotated
@@ -24,10 +27,13 @@ from surrogym_client.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from surrogym_client.api import Api
     from surrogym_client.original.protocol import Factory
     from surrogym_client.sampler import Outcome, SamplerReport
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import Query
+
+    Tell = Callable[[Query, Outcome, str], None]
 
 
 def register(app: typer.Typer) -> None:
@@ -62,7 +68,7 @@ def command(
 
     Example: surrogym sample pendulum --until-done
     """
-    from surrogym_client.cli.output import give
+    from surrogym_client.cli.output import give, on_interrupt
     from surrogym_client.lifetime import exit_with_parent as watch_parent
     from surrogym_client.original.isolated import IsolatedEnvironment
     from surrogym_client.sampler import Sampler, SamplerSettings, worker_name
@@ -81,10 +87,11 @@ def command(
     with connect(server, token, wait) as api:
         asked = wait_for_surrogate(api, surrogate, wait).spec
         factory = _factory(env, read_spec(spec), asked)
-        with IsolatedEnvironment(factory, step_limit) as environment:
-            sampler = Sampler(api, surrogate, environment, settings, None if quiet else _tell)
+        with IsolatedEnvironment(factory, step_limit) as environment, _telling(api, surrogate, quiet=quiet) as tell:
+            sampler = Sampler(api, surrogate, environment, settings, tell)
             signal.signal(signal.SIGTERM, lambda *_: sampler.stop())
-            report = sampler.run()
+            with on_interrupt(lambda: _words_of_interruption(sampler.summary())):
+                report = sampler.run()
     give(asdict(report), lambda: _words(surrogate, report), as_json=as_json, quiet=quiet)
     if report.phase == "failed":
         raise typer.Exit(1)
@@ -103,6 +110,38 @@ def _factory(env: str | None, given: EnvironmentSpec | None, asked: EnvironmentS
     name = env or asked.environment
     own = ":" in name and given is None
     return partial(make, name) if own else partial(make, name, spec=given or asked)
+
+
+@contextmanager
+def _telling(api: Api, surrogate: str, *, quiet: bool) -> Iterator[Tell | None]:
+    """How queries are told of: a bar of the design on a terminal, a line each elsewhere."""
+    from surrogym_client.cli.output import progress
+
+    if quiet or not sys.stderr.isatty():
+        yield None if quiet else _tell
+        return
+    with progress("design") as update:
+
+        def tell(query: Query, outcome: Outcome, error: str) -> None:
+            if error:
+                _tell(query, outcome, error)
+            with suppress(SurrogymClientError):  # a server that is away for a moment is the sampler's business
+                view = api.surrogate(surrogate)
+                update(share_of_design(view), words_of_design(view))
+
+        from surrogym_client.errors import SurrogymClientError
+        from surrogym_client.waiting import share_of_design, words_of_design
+
+        view = api.surrogate(surrogate)
+        update(share_of_design(view), words_of_design(view))
+        yield tell
+
+
+def _words_of_interruption(report: SamplerReport) -> str:
+    return (
+        f"interrupted after {report.answered} queries answered with {report.steps} real steps; all of them are stored, "
+        "queries under way went back into the queue, and the same command goes on"
+    )
 
 
 def _tell(query: Query, outcome: Outcome, error: str) -> None:

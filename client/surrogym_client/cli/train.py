@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from surrogym_client.cli.output import Update
     from surrogym_client.train import TrainProgress, TrainResult, TrainSettings
     from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.wire import SurrogateView
 
     Record = Callable[[TrainProgress], None]
 
@@ -99,7 +101,8 @@ def command(
     Example: surrogym train pendulum --out policy.zip --seed 0
     """
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.cli.output import give, progress
+    from surrogym_client.cli.output import give
+    from surrogym_client.cli.train_words import words_of_result
     from surrogym_client.lifetime import exit_with_parent as watch_parent
 
     if exit_with_parent:
@@ -107,19 +110,19 @@ def command(
     if start_from is not None and not start_from.exists():
         raise CommandError(f"{start_from}: no such policy file")
     hyperparameters = _hyperparameters(chosen or [])
-    spec, url = _trainable(surrogate, server, token, wait)
+    session = _given(
+        variant=variant,
+        particles=particles,
+        propagation=propagation,
+        weighting=weighting,
+        spread=spread,
+        process_noise=process_noise or None,
+        trust=trust,
+        penalty=penalty,
+    )
+    spec, url = _trainable(surrogate, server, token, wait, quiet=quiet)
     from surrogym_client.train import TrainSettings  # torch; imported once there is something to train on
 
-    options = {
-        "variant": variant,
-        "particles": particles,
-        "propagation": propagation,
-        "weighting": weighting,
-        "spread": spread,
-        "process_noise": process_noise or None,
-        "trust": trust,
-        "penalty": penalty,
-    }
     settings = TrainSettings(
         algorithm=algorithm,
         total_steps=steps,
@@ -129,12 +132,14 @@ def command(
         start_from=start_from,
         tensorboard=tensorboard,
         hyperparameters=hyperparameters,
-        session={key: value for key, value in options.items() if value is not None},
+        session=session,
     )
-    with progress("train", quiet=quiet) as update, _recording(progress_file, update) as record:
-        rounds_of = None if improve == 0 else (improve, rounds)
-        result = _train(url, token, surrogate, out, settings, rounds_of, record)
-    summary = _write_card(result, surrogate, spec, url, seed)
+    card = partial(_write_card, surrogate=surrogate, spec=spec, url=url, seed=seed)
+    with _keeping(card, surrogate):
+        result = _train(
+            url, token, surrogate, out, settings, (improve, rounds) if improve else None, progress_file, quiet=quiet
+        )
+    summary = card(result)
     give(summary, lambda: words_of_result(result), as_json=as_json, quiet=quiet)
 
 
@@ -154,17 +159,56 @@ def _hyperparameters(chosen: list[str]) -> dict[str, Any]:
     return found
 
 
-def _trainable(surrogate: str, server: str | None, token: str | None, wait: float) -> tuple[EnvironmentSpec, str]:
+def _given(**options: Any) -> dict[str, Any]:
+    """The options that were given a value."""
+    return {name: value for name, value in options.items() if value is not None}
+
+
+@contextmanager
+def _keeping(write_card: Callable[[TrainResult], object], surrogate: str) -> Iterator[None]:
+    """Say after Ctrl-C what there is to go on with; a policy that was saved gets its card."""
+    from surrogym_client.cli.output import say
+    from surrogym_client.training import TrainingInterrupted
+
+    try:
+        yield
+    except TrainingInterrupted as interruption:
+        result = interruption.result
+        write_card(result)
+        say(
+            f"interrupted after {result.virtual_steps} virtual steps; the policy so far is in {result.path}; to go on: "
+            f"surrogym train {surrogate} --start-from {result.path} --out {result.path}"
+        )
+        raise
+    except KeyboardInterrupt:
+        say("interrupted before there was a policy; nothing was saved, and the same command begins anew")
+        raise
+
+
+def _trainable(
+    surrogate: str, server: str | None, token: str | None, wait: float, *, quiet: bool
+) -> tuple[EnvironmentSpec, str]:
     """Specification and server of a surrogate whose design is done; with ``wait``, torch is imported meanwhile."""
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.waiting import FINISHED, wait_for_design, wait_for_surrogate
+    from surrogym_client.cli.output import on_interrupt, progress
+    from surrogym_client.waiting import (
+        FINISHED,
+        share_of_design,
+        wait_for_design,
+        wait_for_surrogate,
+        words_of_design,
+    )
 
     with connect(server, token, wait) as api:
         view = wait_for_surrogate(api, surrogate, wait)
         if wait > 0:
             import surrogym_client.train  # noqa: F401
 
-            view = wait_for_design(api, surrogate, wait)
+            stays = "interrupted while the design goes on at the server; the same command waits again"
+            with on_interrupt(lambda: stays), progress("design", quiet=quiet) as update:
+                view = wait_for_design(
+                    api, surrogate, wait, lambda view: update(share_of_design(view), words_of_design(view))
+                )
         if view.model_version is None:
             raise CommandError(
                 f"{surrogate!r} has no model yet, its phase is {view.phase}: "
@@ -178,6 +222,8 @@ def _trainable(surrogate: str, server: str | None, token: str | None, wait: floa
 @contextmanager
 def _recording(path: Path | None, update: Update) -> Iterator[Record]:
     """Shows progress, and writes it to a file for those who watch from outside."""
+    from surrogym_client.cli.train_words import words_of
+
     started = time.monotonic()
     with path.open("a", encoding="utf-8") if path is not None else nullcontext() as file:
 
@@ -198,21 +244,36 @@ def _train(
     out: Path,
     settings: TrainSettings,
     rounds: tuple[int, int] | None,
-    record: Record,
+    progress_file: Path | None,
+    *,
+    quiet: bool,
 ) -> TrainResult:
     from surrogym_client.cli.errors import CommandError
+    from surrogym_client.cli.output import progress
     from surrogym_client.improve import ImproveSettings, train_and_improve
     from surrogym_client.train import train
     from surrogym_client.transport import Api, HttpSurrogate
 
-    with HttpSurrogate(url, surrogate, token) as port:
+    with (
+        HttpSurrogate(url, surrogate, token) as port,
+        progress("train", quiet=quiet) as update,
+        _recording(progress_file, update) as record,
+    ):
         try:
             if rounds is None:
                 return train(port, out, settings, record)
             with Api(url, token) as api:
-                return train_and_improve(api, surrogate, port, out, settings, ImproveSettings(*rounds), record)
+                improve = ImproveSettings(*rounds)
+                return train_and_improve(api, surrogate, port, out, settings, improve, record, _waiting(update))
         except ValueError as error:
             raise CommandError(str(error)) from error
+
+
+def _waiting(update: Update) -> Callable[[SurrogateView], None]:
+    """Shows a round's real steps while a sampler takes them; the bar stays where the training left it."""
+    from surrogym_client.waiting import words_of_design
+
+    return lambda view: update(None, f"waiting for a sampler: {words_of_design(view)}")
 
 
 def _write_card(result: TrainResult, surrogate: str, spec: EnvironmentSpec, url: str, seed: int) -> dict[str, Any]:
@@ -238,22 +299,3 @@ def _write_card(result: TrainResult, surrogate: str, spec: EnvironmentSpec, url:
         "lost_episodes": result.lost_episodes,
         **card.model_dump(mode="json", exclude={"spec"}),
     }
-
-
-def words_of_result(result: TrainResult) -> str:
-    lost = result.lost_episodes
-    cut = f"; {lost} episode{'s' * (lost > 1)} cut short, lost with the server's sessions" if lost else ""
-    return (
-        f"{result.path}: {result.virtual_steps} virtual steps in {result.seconds:.1f} s"
-        f"{_imagined(result.imagined_return)}{cut}; next: surrogym evaluate {result.path}"
-    )
-
-
-def words_of(now: dict[str, Any]) -> str:
-    """One look at the training, from the fields of ``TrainProgress``."""
-    penalty = f", penalty {now['episode_penalty']:.1f} an episode" if now["episode_penalty"] else ""
-    return f"{now['steps']} of {now['total_steps']} virtual steps{_imagined(now['imagined_return'])}{penalty}"
-
-
-def _imagined(value: float | None) -> str:
-    return "" if value is None else f", imagined return {value:.1f} (in the surrogate)"

@@ -15,14 +15,14 @@ from typing import Any
 
 from surrogym_client.api import Api
 from surrogym_client.cli.output import progress, say
-from surrogym_client.cli.train import words_of
+from surrogym_client.cli.train_words import words_of
 from surrogym_client.connection import Retries
 from surrogym_client.demo.judging import Judgement
 from surrogym_client.demo.processes import Child, Children, await_file
 from surrogym_client.demo.settings import DemoSettings
 from surrogym_client.demo.tasks import ROUNDS, queries_a_round
 from surrogym_client.policy_file import read_card
-from surrogym_client.waiting import FINISHED, wait_for_design
+from surrogym_client.waiting import share_of_design, wait_for_design, words_of_design
 from surrogym_shared.wire import SurrogateView
 
 PATIENCE_SECONDS = 3_600.0
@@ -123,8 +123,7 @@ class SurrogateRun:
 
             def look(view: SurrogateView) -> None:
                 self._children.check()
-                share = 1.0 if view.phase in FINISHED else view.samples / view.budget
-                update(min(1.0, share), _design_words(view))
+                update(share_of_design(view), words_of_design(view))
 
             view = wait_for_design(self._api, self._settings.task, PATIENCE_SECONDS, look)
             if not self._settings.way.closed_loop:
@@ -179,9 +178,3 @@ def _warm_up(pictures: bool) -> None:
     with suppress(ImportError):  # told by whoever needs it
         for module in ("stable_baselines3", *(["surrogym_client.demo.pictures"] if pictures else [])):
             import_module(module)
-
-
-def _design_words(view: SurrogateView) -> str:
-    ledger = view.ledger
-    fidelity = "" if view.fidelity is None else f", confidence index {view.fidelity.confidence_index:.4f}"
-    return f"{ledger.total} of {view.budget} real steps ({ledger.adaptive} adaptive){fidelity}"

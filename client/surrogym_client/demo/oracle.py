@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from surrogym_client.cli.output import progress
-from surrogym_client.cli.train import words_of
+from surrogym_client.cli.train_words import words_of
 from surrogym_client.demo.judging import Judgement, episodes_of
 from surrogym_client.demo.learning import Learned
 from surrogym_client.demo.settings import DemoSettings

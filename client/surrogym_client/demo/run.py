@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
 from surrogym_client.cli.errors import CommandError
-from surrogym_client.cli.output import say
+from surrogym_client.cli.output import on_interrupt
 from surrogym_client.demo.judging import Judgement, judge
 from surrogym_client.demo.learning import Learned, SurrogateRun
 from surrogym_client.demo.processes import Children
@@ -51,7 +51,7 @@ def run_demo(
     """
     started, code = time.monotonic(), commit()
     folder = _empty_folder(out or _new_folder(settings))
-    with terminations_as_interrupts(), _told_what_stays(folder), Children(folder) as children:
+    with terminations_as_interrupts(), on_interrupt(partial(_what_stays, folder)), Children(folder) as children:
         run = _run(settings, folder, children, quiet=quiet)
         learned = run.learn()
         judging = time.monotonic()
@@ -89,14 +89,9 @@ def _empty_folder(folder: Path) -> Path:
     return folder.resolve()
 
 
-@contextmanager
-def _told_what_stays(folder: Path) -> Iterator[None]:
-    """Say after an interruption what there is to go on with."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        database, policy = folder / "surrogym.db", folder / "policy.zip"
-        kept = [f"the real samples (surrogym serve --database {database})"] if database.exists() else []
-        kept += [f"the policy so far ({policy})"] if policy.exists() else []
-        say(f"interrupted; all processes have ended; kept in {folder}: {' and '.join(kept) or 'logs alone'}")
-        raise
+def _what_stays(folder: Path) -> str:
+    """What there is to go on with after an interruption."""
+    database, policy = folder / "surrogym.db", folder / "policy.zip"
+    kept = [f"the real samples (surrogym serve --database {database})"] if database.exists() else []
+    kept += [f"the policy so far ({policy})"] if policy.exists() else []
+    return f"interrupted; all processes have ended; kept in {folder}: {' and '.join(kept) or 'logs alone'}"

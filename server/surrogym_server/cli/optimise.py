@@ -55,6 +55,9 @@ def optimise(
         surrogate = LocalSurrogate.load(spec, model)
         found = climb(surrogate, settings, None if quiet else tell)
         found.policy.save(out)
+    except KeyboardInterrupt:
+        typer.echo("\ninterrupted; nothing was saved, and the same command begins anew", err=True)
+        raise
     except (SurrogymError, OSError, ValueError) as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(1) from None

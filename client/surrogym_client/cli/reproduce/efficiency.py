@@ -46,7 +46,7 @@ def command(
     Example: surrogym reproduce efficiency --tasks pendulum,acrobot --arms default,latin_hypercube --seeds 5
     """
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.cli.output import progress, say
+    from surrogym_client.cli.output import on_interrupt, progress, say
     from surrogym_client.cli.reproduce.table import present
     from surrogym_client.demo.arms import ARMS
     from surrogym_client.demo.tasks import TASKS
@@ -59,18 +59,15 @@ def command(
     rows = read_rows(out / "rows.csv")
     todo = wanted if again else [cell for cell in wanted if not done_already(cell, rows)]
     say(f"{len(wanted)} runs, {len(wanted) - len(todo)} of them done already", quiet=quiet)
-    try:
-        with terminations_as_interrupts(), progress("reproduce", quiet=quiet) as update:
+    stays = f"interrupted; what is done stays in {out / 'rows.csv'}, and the same command goes on from there"
+    with terminations_as_interrupts(), on_interrupt(lambda: stays), progress("reproduce", quiet=quiet) as update:
 
-            def tell(now: Progress) -> None:
-                update(now.done / now.of, _words(now))
-                if now.last is not None:
-                    say(_outcome(now.last), quiet=quiet)
+        def tell(now: Progress) -> None:
+            update(now.done / now.of, _words(now))
+            if now.last is not None:
+                say(_outcome(now.last), quiet=quiet)
 
-            rows = run_cells(todo, rows, out, jobs, tell) if todo else rows
-    except KeyboardInterrupt:
-        say(f"interrupted; what is done stays in {out / 'rows.csv'}, and the same command goes on from there")
-        raise
+        rows = run_cells(todo, rows, out, jobs, tell) if todo else rows
     present(rows, out, as_json=as_json, quiet=quiet)
     if bad := [row for row in rows if row.error and row.key in {cell.key for cell in wanted}]:
         raise CommandError(f"{len(bad)} runs ended badly, the first with {bad[0].error}; logs: {out / 'logs'}")

@@ -39,7 +39,7 @@ def command(
 
     from surrogym_client.cli.columns import columns
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.cli.output import give, progress
+    from surrogym_client.cli.output import give, on_interrupt, progress
     from surrogym_client.reproduce.paper import run_cells, tables
     from surrogym_client.reproduce.paper_cases import QUICK, TASKS, WHOLE, cells
 
@@ -48,7 +48,8 @@ def command(
         raise CommandError(f"unknown task {unknown[0]!r}: expected some of {', '.join(TASKS)}")
     scale = QUICK if quick else WHOLE
     scale = scale if steps is None else replace(scale, steps=steps)
-    with progress("reproduce", quiet=quiet) as update:
+    stays = f"interrupted; what is done stays in {out}, and the same command goes on from there"
+    with on_interrupt(lambda: stays), progress("reproduce", quiet=quiet) as update:
         rows = run_cells(list(cells(chosen, seeds, scale)), out, update)
         update(1.0, f"{len(rows)} cells")
     shown = tables(rows)

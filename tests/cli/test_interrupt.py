@@ -1,0 +1,69 @@
+"""Ctrl-C on a terminal: a command shows how far it is, ends at once, says what was saved, and leaves it in order."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from support.server import ServerProcess
+from support.terminal import Terminal, on_terminal
+from surrogym_client.api import Api
+from surrogym_client.evaluate import EvaluationInterrupted
+from surrogym_client.policy_file import load_policy
+
+INTERRUPTED = 130
+
+
+@pytest.fixture
+def surrogym_on_terminal(pendulum_server: ServerProcess, tmp_path: Path):
+    return lambda *arguments: on_terminal(*arguments, "--server", pendulum_server.url, width=140, folder=str(tmp_path))
+
+
+def said(terminal: Terminal) -> str:
+    """After Ctrl-C, as one line."""
+    assert "Traceback" not in terminal.shown
+    return " ".join(terminal.shown.split())
+
+
+def test_sampling_shows_the_design_and_keeps_every_real_step(surrogym, pendulum_server, surrogym_on_terminal, name):
+    register = ("register", "Pendulum-v1", "--name", name, "--budget", "6", "--initial", "4")
+    assert surrogym(*register, "--server", pendulum_server.url).code == 0
+    with surrogym_on_terminal("sample", name) as terminal:
+        terminal.await_text("6 of 6 real steps (2 adaptive), confidence index")
+        assert terminal.interrupt() == INTERRUPTED
+    assert "interrupted after 6 queries answered with 6 real steps; all of them are stored" in said(terminal)
+    with Api(pendulum_server.url) as api:
+        view = api.surrogate(name)
+    assert (view.ledger.total, view.queries.leased) == (6, 0)
+
+
+@pytest.mark.slow
+def test_training_saves_its_policy(pendulum_server: ServerProcess, surrogym_on_terminal, tmp_path: Path):
+    options = ("--steps", "900000", "--num-envs", "16", "--set", "n_steps=64", "--variant", "pathwise")
+    with surrogym_on_terminal("train", "pendulum", *options, "--out", "policy.zip") as terminal:
+        terminal.await_text("of 899072 virtual steps")
+        assert terminal.interrupt() == INTERRUPTED
+    assert "to go on: surrogym train pendulum --start-from policy.zip --out policy.zip" in said(terminal)
+    load_policy(tmp_path / "policy.zip")
+    card = json.loads((tmp_path / "policy.json").read_text())
+    assert 0 < card["virtual_steps"] < 899_072
+    assert card["spec"]["environment"] == "Pendulum-v1"
+
+
+def test_an_evaluation_that_is_interrupted_enters_its_real_steps(surrogym, pendulum_server, monkeypatch, tmp_path):
+    (tmp_path / "policy.zip").write_bytes(b"")
+    (tmp_path / "policy.json").write_text('{"surrogate": "pendulum"}')
+
+    def interrupted(*_):
+        raise EvaluationInterrupted(7)
+
+    monkeypatch.setattr("surrogym_client.policy_file.load_policy", lambda *_: None)
+    monkeypatch.setattr("surrogym_client.evaluate.evaluate", interrupted)
+    with Api(pendulum_server.url) as api:
+        before = api.surrogate("pendulum").ledger.evaluation
+        ended = surrogym("evaluate", "policy.zip", "--env", "Pendulum-v1", "--server", pendulum_server.url)
+        assert api.surrogate("pendulum").ledger.evaluation - before == 7
+    assert (ended.code, ended.out) == (INTERRUPTED, "")
+    assert "interrupted after 7 real steps" in ended.err
