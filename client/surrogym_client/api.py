@@ -11,8 +11,9 @@ from uuid import uuid4
 from pydantic import BaseModel, ValidationError
 
 from surrogym_client.connection import Connection, Retries, Timeouts
-from surrogym_client.errors import ProtocolMismatch, ServerUnreachable
+from surrogym_client.errors import NoModel, ProtocolMismatch, ServerUnreachable
 from surrogym_shared import wire
+from surrogym_shared.codes import STATUS, Code, Problem
 from surrogym_shared.spec import EnvironmentSpec
 
 R = TypeVar("R", bound=wire.Reply)
@@ -257,6 +258,14 @@ class Api:
 
     def models(self, name: str) -> list[wire.ModelView]:
         return self._get(wire.ModelList, f"{_surrogate(name)}/models").models
+
+    def model(self, name: str) -> wire.ModelView:
+        """The latest model's structure and fidelity. Raises ``NoModel`` before the first fit."""
+        view = self.surrogate(name)
+        if view.model_version is None:
+            detail = f"{name!r} has no model yet: let a sampler answer its first queries"
+            raise NoModel(Problem(title="No model", status=STATUS[Code.NO_MODEL], code=Code.NO_MODEL, detail=detail))
+        return self._get(wire.ModelView, f"{_surrogate(name)}/models/{view.model_version}")
 
     def export_model(self, name: str, version: int) -> bytes:
         """The model itself, complete, as a safetensors file."""

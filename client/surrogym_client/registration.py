@@ -1,10 +1,11 @@
-"""What makes ``gymnasium.make("surrogym/Remote-v0", url=..., surrogate=...)`` work, and the ids of the swing-up."""
+"""What makes ``gymnasium.make`` know this package's ids: a server's surrogates, those in files, and the swing-up."""
 
 from __future__ import annotations
 
 import gymnasium
 
 ENVIRONMENT_ID = "surrogym/Remote-v0"
+FILE_ID = "surrogym/File-v0"
 SWING_UP = "surrogym/CartPoleSwingUp-v0"
 SWING_UP_NARROW = "surrogym/CartPoleSwingUpNarrow-v0"
 SWING_UP_STEPS = 40  # of 0.1 s
@@ -12,12 +13,13 @@ SWING_UP_STEPS = 40  # of 0.1 s
 
 def register() -> None:
     """Enter this package's environments into Gymnasium's registry; doing it twice is harmless."""
-    if ENVIRONMENT_ID not in gymnasium.registry:
-        gymnasium.register(
-            ENVIRONMENT_ID,
-            entry_point="surrogym_client.remote:make_env",
-            vector_entry_point="surrogym_client.remote:make_vector_env",
-        )
+    for environment_id, module in ((ENVIRONMENT_ID, "remote"), (FILE_ID, "surrogate_file")):
+        if environment_id not in gymnasium.registry:
+            gymnasium.register(
+                environment_id,
+                entry_point=f"surrogym_client.{module}:make_env",
+                vector_entry_point=f"surrogym_client.{module}:make_vector_env",
+            )
     for environment_id, reward in ((SWING_UP, "smooth"), (SWING_UP_NARROW, "narrow")):
         if environment_id not in gymnasium.registry:
             gymnasium.register(

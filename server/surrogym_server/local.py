@@ -26,6 +26,7 @@ from surrogym_server.surrogate.codec import from_bytes
 from surrogym_server.surrogate.model import SurrogateModel
 from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult
 from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.surrogate_file import SurrogateFile
 from surrogym_shared.wire import OpenSession, SessionView
 
 VERSION = 1
@@ -59,6 +60,18 @@ class LocalSurrogate:
         """
         read = EnvironmentSpec.model_validate_json(Path(spec).read_bytes())
         return cls(read, from_bytes(definition_from_spec(read), Path(model).read_bytes()))
+
+    @classmethod
+    def from_file(cls, path: str | Path) -> Self:
+        """Read a whole surrogate from the one file that ``surrogym export`` writes.
+
+        Raises:
+            OSError: the file can't be read.
+            NotASurrogateFile: it is none.
+            InvalidInput: its model is none of its specification.
+        """
+        file = SurrogateFile.load(path)
+        return cls(file.spec, from_bytes(definition_from_spec(file.spec), file.model))
 
     def spec(self) -> EnvironmentSpec:
         return self._spec

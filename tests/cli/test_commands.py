@@ -99,6 +99,26 @@ def test_sample_answers_queries_which_status_and_export_show(on_server, pendulum
         assert all(len(arrays[key]) == 4 for key in arrays.files if arrays[key].ndim == 2)
 
 
+def test_a_surrogate_leaves_and_enters_as_one_file(surrogym, pendulum_server, name):
+    server = ("--server", pendulum_server.url)
+    assert surrogym("export", "pendulum", "--out", "pendulum.surrogate", *server).code == 0
+    entered = surrogym("import", "pendulum.surrogate", "--name", name, *server)
+    assert entered.out == (
+        f"{name}: Pendulum-v1, model 1 and 12 real samples, design paused; next: surrogym train {name}\n"
+    )
+    taken = surrogym("import", "pendulum.surrogate", *server)
+    assert (taken.code, taken.err) == (
+        1,
+        "error: expected a name that is free, got 'pendulum': give another by --name\n",
+    )
+
+
+def test_what_has_no_model_can_not_leave(on_server, pendulum):
+    said = on_server("export", pendulum, "--out", "pendulum.surrogate")
+    assert (said.code, said.out) == (1, "")
+    assert "has no model yet" in said.err
+
+
 def test_improve_asks_for_more(on_server, pendulum):
     assert on_server("improve", pendulum, "--queries", "3").code == 0
 

@@ -59,11 +59,13 @@ def test_an_address_that_is_none(surrogym):
             ("evaluate", "junk.zip", "--env", "Pendulum-v1", "--algorithm", "Magic"),
             "Stable-Baselines3 has no algorithm 'Magic'",
         ),
+        (("import", "missing.surrogate"), "missing.surrogate: No such file or directory"),
+        (("import", "junk.zip"), "junk.zip: expected a surrogate's file, got 19 bytes that are no safetensors"),
         (("demo", "pendulum", "--out", "."), "expected an empty run folder, got ., where there is something already"),
         (("demo", "pendulum", "--json", "no/such/m.json"), "expected an existing folder for --json, got no/such"),
         (
             ("export", "pendulum", "--out", "samples.txt"),
-            "expected a file ending in .csv, .npz, .safetensors or .json, got '.txt'",
+            "expected a file ending in .surrogate, .csv, .npz, .safetensors or .json, got '.txt'",
         ),
     ],
 )

@@ -46,6 +46,14 @@ def test_a_policy_of_another_algorithm_is_trained_and_its_states_are_known(
     assert view["budget"] == 7
 
 
+def test_a_surrogate_leaves_as_a_file_and_is_stepped_without_a_server(server: ServerProcess, tmp_path: Path) -> None:
+    on_server = ["--server", server.url]
+    run(tmp_path, "-m", "surrogym_client", "export", "pendulum", "--out", "pendulum.surrogate", *on_server)
+    run(tmp_path, "-m", "surrogym_client", "import", "pendulum.surrogate", "--name", "pendulum-2", *on_server)
+    for program in programs("files.md"):
+        run(tmp_path, "-c", program.replace("10_000", "512"))
+
+
 def test_the_cart_that_can_only_be_reset_is_registered_and_sampled(server: ServerProcess, tmp_path: Path) -> None:
     (program,) = programs("no-teleport.md")
     (tmp_path / "cart.py").write_text(program, encoding="utf-8")

@@ -20,6 +20,7 @@ COMMANDS = (
     "improve",
     "change",
     "export",
+    "import",
     "delete",
     "doctor",
     "conformance",

@@ -19,9 +19,10 @@ def sentence(error: Exception) -> str | None:
 
     from surrogym_client.errors import SurrogymClientError
     from surrogym_client.original.errors import OriginalError
+    from surrogym_shared.surrogate_file import NotASurrogateFile
 
     match error:
-        case CommandError() | SurrogymClientError() | OriginalError():
+        case CommandError() | SurrogymClientError() | OriginalError() | NotASurrogateFile():
             return str(error)
         case ModuleNotFoundError(name=str(name)):
             return _missing(name.partition(".")[0])

@@ -1,4 +1,4 @@
-"""``surrogym export``: the real samples, the latest model or the specification as a file."""
+"""``surrogym export``: a whole surrogate, its real samples, its latest model or its specification as a file."""
 
 from __future__ import annotations
 
@@ -21,14 +21,20 @@ def register(app: typer.Typer) -> None:
 def command(
     surrogate: Surrogate,
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="File to write; its ending says what: .csv, .npz, .safetensors, .json.")
+        Path,
+        typer.Option(
+            "--out", "-o", help="File to write; its ending says what: .surrogate, .csv, .npz, .safetensors, .json."
+        ),
     ],
     server: Server = None,
     token: Token = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write every real sample of a surrogate (.csv, .npz), its latest model (.safetensors) or its spec (.json).
+    """Write a whole surrogate into one file (.surrogate), which surrogym import takes; or of it every real sample
+    (.csv, .npz), the latest model (.safetensors) or the specification (.json) alone.
+
+    Example: surrogym export pendulum --out pendulum.surrogate
 
     Example: surrogym export pendulum --out samples.csv
     """
@@ -45,6 +51,10 @@ def _content(api: Api, surrogate: str, out: Path) -> bytes:
     from surrogym_client.cli.errors import CommandError
 
     match out.suffix.lower():
+        case ".surrogate":
+            from surrogym_client.surrogate_file import export_surrogate
+
+            return export_surrogate(api, surrogate).to_bytes()
         case ".csv":
             return api.export_samples(surrogate, "csv")
         case ".npz":
@@ -52,11 +62,8 @@ def _content(api: Api, surrogate: str, out: Path) -> bytes:
         case ".json":
             return api.surrogate(surrogate).spec.model_dump_json(indent=2).encode()
         case ".safetensors":
-            version = api.surrogate(surrogate).model_version
-            if version is None:
-                raise CommandError(f"{surrogate!r} has no model yet")
-            return api.export_model(surrogate, version)
+            return api.export_model(surrogate, api.model(surrogate).version)
         case other:
             raise CommandError(
-                f"expected a file ending in .csv, .npz, .safetensors or .json, got {other or 'no ending'!r}"
+                f"expected a file ending in .surrogate, .csv, .npz, .safetensors or .json, got {other or 'no ending'!r}"
             )

@@ -214,7 +214,7 @@ def _trainable(
                 f"{surrogate!r} has no model yet, its phase is {view.phase}: "
                 f"run surrogym sample {surrogate}, or give --wait SECONDS"
             )
-        if view.phase not in FINISHED:
+        if view.phase not in FINISHED and not view.paused:
             typer.echo(f"the design of {surrogate!r} goes on; training starts on model {view.model_version}", err=True)
         return view.spec, api.url
 

@@ -1,0 +1,44 @@
+"""``surrogym import``: a surrogate from its file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from surrogym_client.cli.options import AsJson, Quiet, Server, Token, connect
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("import")(command)
+
+
+def command(
+    file: Annotated[Path, typer.Argument(help="What surrogym export wrote with the ending .surrogate.")],
+    name: Annotated[str | None, typer.Option(help="Name of the surrogate. [default: as in the file]")] = None,
+    server: Server = None,
+    token: Token = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Make a surrogate of a file: it serves the same model at once, with its design paused.
+
+    Its real samples are stored as manual ones. surrogym change NAME --resume lets the design go on, with its initial
+    queries first.
+
+    Example: surrogym import pendulum.surrogate --name pendulum-2
+    """
+    from surrogym_client.cli.output import give
+    from surrogym_client.surrogate_file import import_surrogate
+    from surrogym_shared.surrogate_file import SurrogateFile
+
+    read = SurrogateFile.load(file)
+    with connect(server, token) as api:
+        view = import_surrogate(api, read, name)
+    words = (
+        f"{view.name}: {view.environment or 'own environment'}, model {view.model_version} and {view.samples} real "
+        f"samples, design paused; next: surrogym train {view.name}"
+    )
+    give(view.model_dump(mode="json"), lambda: words, as_json=as_json, quiet=quiet)

@@ -1,0 +1,121 @@
+"""A surrogate from a server into one file, and from a file into a server or into this process."""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surrogym_client.api import Api
+from surrogym_client.env import RemoteEnv
+from surrogym_client.errors import SurrogymClientError, UnknownSurrogate
+from surrogym_client.vector import RemoteVectorEnv
+from surrogym_shared.port import SurrogatePort
+from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
+from surrogym_shared.wire import NewSample, SurrogateView
+
+ENTRY_POINTS = "surrogym.ports"  # what steps a surrogate in this process, brought by the server's package
+BATCH = 1_024  # samples in a request
+
+
+class NotImportable(SurrogymClientError):
+    """The surrogate can't go where it should."""
+
+
+def export_surrogate(api: Api, name: str) -> SurrogateFile:
+    """A surrogate with its latest model and all its samples.
+
+    Raises:
+        NoModel: nothing has been fitted yet.
+        SurrogymClientError: as every request.
+    """
+    latest = api.model(name)
+    return SurrogateFile(name, api.surrogate(name).spec, api.export_model(name, latest.version), _samples(api, name))
+
+
+def import_surrogate(api: Api, file: SurrogateFile, name: str | None = None) -> SurrogateView:
+    """Make a surrogate of a file: it serves the same model at once. Its design is paused, and its samples count as
+    manual ones.
+
+    Args:
+        api: the server; needs the role admin.
+        file: the surrogate.
+        name: of the new surrogate; None takes the file's.
+
+    Raises:
+        NotImportable: there is a surrogate of this name.
+        InvalidInput: the model is none of the specification.
+        SurrogymClientError: as every request.
+    """
+    name = name or file.name
+    try:
+        api.surrogate(name)
+    except UnknownSurrogate:
+        api.create_surrogate(name, file.spec)
+    else:
+        raise NotImportable(f"expected a name that is free, got {name!r}: give another by --name")
+    api.patch_surrogate(name, paused=True)
+    try:
+        api.import_model(name, file.model)
+    except SurrogymClientError:
+        api.delete_surrogate(name)  # a model that is refused leaves nothing behind
+        raise
+    samples = [_sample(file.samples, i) for i in range(len(file.samples))]
+    for first in range(0, len(samples), BATCH):
+        api.add_samples(name, "import", samples[first : first + BATCH])
+    return api.surrogate(name)
+
+
+def open_file(path: str | Path) -> SurrogatePort:
+    """A surrogate stepped in this process, without a server; the same seeds give the same steps, bit for bit.
+
+    Raises:
+        ImportError: this needs the extra ``server``.
+        OSError: the file can't be read.
+        ValueError: it is no surrogate's file, or its model none of its specification.
+
+    Example:
+        >>> env = SurrogateVecEnv.from_port(open_file("pendulum.surrogate"), num_envs=16)
+    """
+    (entry,) = entry_points(group=ENTRY_POINTS, name="file")
+    try:
+        opened: SurrogatePort = entry.load()(path)
+    except ModuleNotFoundError as error:
+        raise ImportError(f"stepping a file needs {error.name}: pip install 'surrogym[server]'") from error
+    return opened
+
+
+def make_env(*, file: str | Path, **options: Any) -> RemoteEnv:
+    """One lane of a surrogate's file, for ``gymnasium.make("surrogym/File-v0", file=...)``; raises as ``open_file``."""
+    return RemoteEnv(open_file(file), **options)
+
+
+def make_vector_env(*, num_envs: int, file: str | Path, **options: Any) -> RemoteVectorEnv:
+    """Many lanes, for ``gymnasium.make_vec``; raises as ``open_file``."""
+    return RemoteVectorEnv(open_file(file), num_envs, **options)
+
+
+def _samples(api: Api, name: str) -> RealSamples:
+    spec, views = api.surrogate(name).spec, list(api.samples(name))
+    c, f = len(spec.coordinates), spec.action.size
+    return RealSamples(
+        coordinates=np.array([view.coordinates for view in views], dtype=np.float64).reshape(-1, c),
+        action=np.array([view.action for view in views], dtype=np.float64).reshape(-1, f),
+        next_coordinates=np.array([view.next_coordinates for view in views], dtype=np.float64).reshape(-1, c),
+        reward=np.array([view.reward for view in views], dtype=np.float64),
+        terminated=np.array([view.terminated for view in views], dtype=np.bool_),
+        truncated=np.array([view.truncated for view in views], dtype=np.bool_),
+    )
+
+
+def _sample(samples: RealSamples, i: int) -> NewSample:
+    return NewSample(
+        coordinates=samples.coordinates[i].tolist(),
+        action=samples.action[i].tolist(),
+        next_coordinates=samples.next_coordinates[i].tolist(),
+        reward=float(samples.reward[i]),
+        terminated=bool(samples.terminated[i]),
+        truncated=bool(samples.truncated[i]),
+    )
