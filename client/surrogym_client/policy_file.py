@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,11 @@ from surrogym_client.evaluate import Predict
 from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec
 
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
 DEFAULT_ALGORITHM = "PPO"
+ONNX = ".onnx"
 
 
 class UnusablePolicy(SurrogymClientError):
@@ -69,32 +73,46 @@ def read_card(policy: Path) -> PolicyCard:
 def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM) -> Predict:
     """The policy as a function of observations, its most probable action each.
 
-    A network of arrays is read as such. Any other file is unpickled: load only what you trust.
+    A network of arrays and ONNX are read as such. Any other file is unpickled: load only what you trust.
 
     Args:
-        path: what ``save`` of a Stable-Baselines3 algorithm wrote, or ``Network.save``.
-        algorithm: name of its class; a network of arrays needs none.
+        path: what ``save`` of a Stable-Baselines3 algorithm wrote, ``Network.save``, or ``surrogym export-policy``.
+        algorithm: name of its class; a network of arrays and ONNX need none.
 
     Raises:
         UnusablePolicy: no such algorithm, or the file is none of its policies.
     """
     if Network.is_at(path):
         return _network(path)
-    import stable_baselines3
+    if path.suffix.lower() == ONNX:
+        from surrogym_client.policy_export import from_onnx
 
-    kind = getattr(stable_baselines3, algorithm.upper(), None)
-    if kind is None or not hasattr(kind, "load"):
-        raise UnusablePolicy(f"Stable-Baselines3 has no algorithm {algorithm!r}: expected for instance PPO, SAC or DQN")
-    try:
-        model = kind.load(path, device="cpu")
-    except Exception as error:  # unpickling somebody's file can raise anything
-        raise UnusablePolicy(f"{path} is no policy of {algorithm}: {error}") from error
+        return from_onnx(path.read_bytes())
+    model = load_learner(path, algorithm)
 
     def predict(observations: NDArray[np.float32]) -> NDArray[Any]:
         actions: NDArray[Any] = model.predict(observations, deterministic=True)[0]
         return actions
 
     return predict
+
+
+def load_learner(path: Path, algorithm: str = DEFAULT_ALGORITHM) -> BaseAlgorithm:
+    """What ``save`` of a Stable-Baselines3 algorithm wrote. It is unpickled: load only what you trust.
+
+    Raises:
+        UnusablePolicy: no such algorithm, or the file is none of its policies.
+    """
+    import stable_baselines3
+
+    kind = getattr(stable_baselines3, algorithm.upper(), None)
+    if kind is None or not hasattr(kind, "load"):
+        raise UnusablePolicy(f"Stable-Baselines3 has no algorithm {algorithm!r}: expected for instance PPO, SAC or DQN")
+    try:
+        learner: BaseAlgorithm = kind.load(path, device="cpu")
+    except Exception as error:  # unpickling somebody's file can raise anything
+        raise UnusablePolicy(f"{path} is no policy of {algorithm}: {error}") from error
+    return learner
 
 
 def _network(path: Path) -> Predict:

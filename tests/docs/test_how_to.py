@@ -50,8 +50,18 @@ def test_a_surrogate_leaves_as_a_file_and_is_stepped_without_a_server(server: Se
     on_server = ["--server", server.url]
     run(tmp_path, "-m", "surrogym_client", "export", "pendulum", "--out", "pendulum.surrogate", *on_server)
     run(tmp_path, "-m", "surrogym_client", "import", "pendulum.surrogate", "--name", "pendulum-2", *on_server)
-    for program in programs("files.md"):
+    for program in programs("files.md")[:2]:
         run(tmp_path, "-c", program.replace("10_000", "512"))
+
+
+def test_a_policy_leaves_for_other_programs(server: ServerProcess, tmp_path: Path) -> None:
+    train = ["train", "pendulum", "--steps", "512", "--num-envs", "16", "--quiet", "--server", server.url]
+    run(tmp_path, "-m", "surrogym_client", *train)
+    for file, program in zip(("policy.onnx", "policy.pt2"), programs("files.md")[2:], strict=True):
+        run(tmp_path, "-m", "surrogym_client", "export-policy", "policy.zip", "--out", file)
+        run(tmp_path, "-c", program)
+    evaluate = ["evaluate", "policy.onnx", "--env", "Pendulum-v1", "--episodes", "2", "--json", "--server", server.url]
+    assert json.loads(run(tmp_path, "-m", "surrogym_client", *evaluate))["episodes"] == 2
 
 
 def test_the_cart_that_can_only_be_reset_is_registered_and_sampled(server: ServerProcess, tmp_path: Path) -> None:

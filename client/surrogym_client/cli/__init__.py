@@ -21,6 +21,7 @@ COMMANDS = (
     "change",
     "export",
     "import",
+    "export-policy",
     "delete",
     "doctor",
     "conformance",
@@ -56,7 +57,7 @@ def build() -> typer.Typer:
     )
     app.callback()(_version)
     for name in COMMANDS:
-        register: Callable[[typer.Typer], None] = import_module(f"{__name__}.{name}").register
+        register: Callable[[typer.Typer], None] = import_module(f"{__name__}.{name.replace('-', '_')}").register
         register(app)
     for entry in entry_points(group=ENTRY_POINTS):
         entry.load()(app)

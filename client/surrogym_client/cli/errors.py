@@ -5,6 +5,7 @@ from __future__ import annotations
 EXTRAS = {
     "server": ("alembic", "fastapi", "psycopg", "safetensors", "scipy", "sqlalchemy", "starlette", "uvicorn"),
     "train": ("matplotlib", "stable_baselines3", "tensorboard", "torch"),
+    "export": ("onnx", "onnxruntime", "onnxscript"),
     "mujoco": ("mujoco", "imageio"),
 }
 

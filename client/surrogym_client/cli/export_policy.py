@@ -1,0 +1,49 @@
+"""``surrogym export-policy``: a policy for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from surrogym_client.cli.options import AsJson, Quiet
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("export-policy")(command)
+
+
+def command(
+    policy: Annotated[Path, typer.Argument(help="Policy file that surrogym train, or Stable-Baselines3, wrote.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="File to write; its ending says what: .onnx, or .pt2 for torch.export.")
+    ],
+    algorithm: Annotated[
+        str | None, typer.Option(help="Stable-Baselines3 algorithm of the file. [default: as noted beside it, or PPO]")
+    ] = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write a policy's most probable action as ONNX (.onnx) or as a torch.export program (.pt2).
+
+    The file is checked to give the policy's actions on random observations. The policy itself is a zip that
+    Stable-Baselines3 loads.
+
+    Example: surrogym export-policy policy.zip --out policy.onnx
+    """
+    from surrogym_client.cli.output import give, progress
+    from surrogym_client.policy_file import read_card
+
+    card = read_card(policy)
+    with progress("export", quiet=quiet) as update:
+        update(0.0, "converting and checking")
+        from surrogym_client.policy_export import CHECKS, export_policy
+
+        largest = export_policy(policy, out, algorithm or card.algorithm)
+        update(1.0, "done")
+    size = out.stat().st_size
+    result = {"file": str(out), "bytes": size, "observations_checked": CHECKS, "largest_difference": largest}
+    words = f"{out}: {size} bytes; the same actions on {CHECKS} random observations, to {largest:.1g}"
+    give(result, lambda: words, as_json=as_json, quiet=quiet)
