@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import hypothesis
 import pytest
 import torch
 
@@ -11,6 +12,17 @@ from support.server import ServerProcess, running_server
 from support.teaching import teach
 from surrogym_client.api import Api
 from surrogym_client.original.classic import pendulum
+
+
+# The same examples in every run, on machines of any speed, and none kept in the checkout.
+hypothesis.settings.register_profile(
+    "surrogym",
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+)
+hypothesis.settings.load_profile("surrogym")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -65,7 +65,7 @@ def test_step_from_follows_the_environments_own_trajectory(environments, name):
 
 @pytest.mark.parametrize("name", IDS)
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_declared_observation_and_termination_are_the_environments_own(environments, name, seed):
     environment = environments[name]
     spec = environment.spec()

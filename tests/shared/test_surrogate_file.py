@@ -118,7 +118,7 @@ def test_sizes_are_bounded(monkeypatch, tmp_path):
         SurrogateFile.load(tmp_path / "large.surrogate")
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.lists(st.tuples(st.integers(0, len(DATA) - 1), st.integers(0, 255)), min_size=1, max_size=4))
 def test_random_changes_are_read_or_refused_and_nothing_else(changes):
     mutated = bytearray(DATA)

@@ -26,7 +26,7 @@ def draw(rng: np.random.Generator, n: int, lengths: list[float], noise: float) -
     return torch.from_numpy(x), torch.from_numpy(np.linalg.cholesky(k) @ rng.normal(size=n))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     linear=st.booleans(),
     quadratic=st.booleans(),

@@ -54,7 +54,7 @@ def assert_stratified(p: np.ndarray) -> None:
     assert np.all(ordered <= (np.arange(n) + 1) / n + 1e-9)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     distributions=st.lists(uniform | normal, min_size=1, max_size=3),
     action=actions,
