@@ -13,7 +13,6 @@ from support.teaching import teach
 from surrogym_client.api import Api
 from surrogym_client.original.classic import pendulum
 
-
 # The same examples in every run, on machines of any speed, and none kept in the checkout.
 hypothesis.settings.register_profile(
     "surrogym",
