@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.lanes import Lanes, session_request
+from surrogym_client.original.rendering import Picture
+from surrogym_client.pictures import RENDER_MODES, pictures_for
 from surrogym_client.spaces import space
 from surrogym_shared.port import SurrogatePort
 
@@ -30,11 +32,13 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
     Args:
         port: the surrogate.
         deviations: ask for the deviation of each model output.
-        render_mode: None; a surrogate has no picture.
+        render_mode: None, or rgb_array: the state is shown by the original environment's renderer, if it is installed.
+        original: ``package.module:factory`` of one's own environment, to render it.
         options: fields of ``OpenSession``: variant, seed, model, time_limit, penalty, ...
 
     Raises:
         ValueError: an option that does not exist or is out of range.
+        NotRenderable: no picture can be made.
         SurrogymClientError: the session can't be opened.
 
     Example:
@@ -42,7 +46,7 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
         >>> observation, info = env.reset(seed=0)
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  as gymnasium.Env declares it
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES}  # noqa: RUF012  as gymnasium.Env declares it
 
     def __init__(
         self,
@@ -50,10 +54,13 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
         *,
         deviations: bool = False,
         render_mode: str | None = None,
+        original: str | None = None,
         **options: Any,
     ) -> None:
-        require_no_rendering(render_mode)
-        self.render_mode = None
+        self.render_mode = render_mode
+        self._pictures = pictures_for(render_mode, port.spec, original)
+        if self._pictures is not None:
+            self.metadata = {**self.metadata, "render_fps": self._pictures.frames_per_second}
         self._lanes = Lanes(port, session_request(1, "disabled", options), deviations=deviations)
         self.observation_space = space(self._lanes.view.observation_space)
         self.action_space = space(self._lanes.view.action_space)
@@ -69,7 +76,8 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
         info: dict[str, Any] = {"model_version": int(start.model_version[0])}
         if start.lost is not None:
             info[LOST] = start.lost
-        return start.observation[0], info
+        self._shown = start.observation[0]
+        return self._shown, info
 
     def step(self, action: Any) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
         step = self._lanes.step(np.asarray(action)[None])
@@ -85,13 +93,14 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
         if step.lost is not None:
             info[LOST] = step.lost
         terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
-        return result.observation[0], float(result.reward[0]), terminated, truncated, info
+        self._shown = result.observation[0]
+        return self._shown, float(result.reward[0]), terminated, truncated, info
+
+    def render(self) -> Picture | None:
+        """The picture (height, width, 3) of the state that was last observed; None without a render mode."""
+        return None if self._pictures is None else self._pictures.of(self._shown)
 
     def close(self) -> None:
+        if self._pictures is not None:
+            self._pictures.close()
         self._lanes.close()
-
-
-def require_no_rendering(render_mode: str | None) -> None:
-    """Raises ``ValueError`` for any render mode but None."""
-    if render_mode is not None:
-        raise ValueError(f"a surrogate can't be rendered: expected render_mode None, got {render_mode!r}")

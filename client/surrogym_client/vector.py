@@ -10,8 +10,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from surrogym_client.env import LOST, Observation, require_no_rendering
+from surrogym_client.env import LOST, Observation
 from surrogym_client.lanes import Lanes, LaneStep, session_request
+from surrogym_client.original.rendering import Picture
+from surrogym_client.pictures import RENDER_MODES, pictures_for
 from surrogym_client.spaces import space
 from surrogym_shared import wire
 from surrogym_shared.port import Bools, SurrogatePort
@@ -36,11 +38,13 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         num_envs: N.
         autoreset_mode: Gymnasium's enum, or its value or name.
         deviations: ask for the deviation of each model output.
-        render_mode: None; a surrogate has no picture.
+        render_mode: None, or rgb_array: as in ``RemoteEnv``.
+        original: ``package.module:factory`` of one's own environment, to render it.
         options: fields of ``OpenSession``: variant, seed, model, time_limit, penalty, ...
 
     Raises:
         ValueError: an option that does not exist or is out of range.
+        NotRenderable: no picture can be made.
         SurrogymClientError: the session can't be opened.
 
     Example:
@@ -56,14 +60,16 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         deviations: bool = False,
         render_mode: str | None = None,
+        original: str | None = None,
         **options: Any,
     ) -> None:
-        require_no_rendering(render_mode)
         mode = _mode(autoreset_mode)
         self._lanes = Lanes(port, session_request(num_envs, WIRE_MODE[mode], options), deviations=deviations)
         self.num_envs = num_envs
-        self.metadata = {"render_modes": [], "autoreset_mode": mode}
-        self.render_mode = None
+        self.render_mode = render_mode
+        self._pictures = pictures_for(render_mode, port.spec, original)
+        fps = {} if self._pictures is None else {"render_fps": self._pictures.frames_per_second}
+        self.metadata = {"render_modes": RENDER_MODES, "autoreset_mode": mode, **fps}
         self.single_observation_space = space(self._lanes.view.observation_space)
         self.single_action_space = space(self._lanes.view.action_space)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -80,6 +86,7 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         infos = _entry("model_version", start.model_version, chosen)
         if start.lost is not None:
             infos |= _reason(start.lost, chosen)
+        self._shown = start.observation
         return start.observation, infos
 
     def step(
@@ -92,9 +99,16 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         infos = self._final_infos(step, final) if final.any() else {}
         infos |= _entry("model_version", result.model_version, np.ones(self.num_envs, dtype=bool))
         infos |= _step_infos(step, ~(final | step.began))
+        self._shown = result.observation
         return result.observation.copy(), result.reward, result.terminated, result.truncated, infos
 
+    def render(self) -> tuple[Picture, ...] | None:
+        """A picture (height, width, 3) of every lane; None without a render mode."""
+        return None if self._pictures is None else tuple(self._pictures.of(shown) for shown in self._shown)
+
     def close_extras(self, **_: Any) -> None:
+        if self._pictures is not None:
+            self._pictures.close()
         self._lanes.close()
 
     def _final_infos(self, step: LaneStep, final: Bools) -> dict[str, Any]:

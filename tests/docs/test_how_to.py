@@ -54,6 +54,13 @@ def test_a_surrogate_leaves_as_a_file_and_is_stepped_without_a_server(server: Se
         run(tmp_path, "-c", program.replace("10_000", "512"))
 
 
+def test_an_episode_is_filmed(server: ServerProcess, tmp_path: Path) -> None:
+    film, own = programs("pictures.md")
+    run(tmp_path, "-c", film.replace(PRINTED_URL, server.url))
+    assert [video.stat().st_size > 0 for video in (tmp_path / "videos").glob("*.mp4")] == [True]
+    run(tmp_path, "-c", f"{own}\nassert Cart().picture([0.5])[30, 140].tolist() == [200, 60, 20]")
+
+
 def test_a_policy_leaves_for_other_programs(server: ServerProcess, tmp_path: Path) -> None:
     train = ["train", "pendulum", "--steps", "512", "--num-envs", "16", "--quiet", "--server", server.url]
     run(tmp_path, "-m", "surrogym_client", *train)

@@ -16,6 +16,7 @@ import gymnasium
 import numpy as np
 
 from surrogym_client.errors import refused_here
+from surrogym_client.original.classic import pendulum
 from surrogym_shared.codes import Code
 from surrogym_shared.port import ResetResult, StepResult
 from surrogym_shared.spec import EnvironmentSpec
@@ -107,7 +108,7 @@ class ExactPendulum:
         self.sessions.clear()
 
     def spec(self) -> EnvironmentSpec:
-        raise NotImplementedError
+        return pendulum()
 
     def open(self, request: OpenSession) -> SessionView:
         self.opened.append(request)

@@ -6,6 +6,7 @@ EXTRAS = {
     "server": ("alembic", "fastapi", "psycopg", "safetensors", "scipy", "sqlalchemy", "starlette", "uvicorn"),
     "train": ("matplotlib", "stable_baselines3", "tensorboard", "torch"),
     "export": ("onnx", "onnxruntime", "onnxscript"),
+    "render": ("moviepy", "pygame"),
     "mujoco": ("mujoco", "imageio"),
 }
 

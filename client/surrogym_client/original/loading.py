@@ -16,7 +16,7 @@ from surrogym_shared.spec import BoxAction, EnvironmentSpec
 
 Preset = Literal["default", "paper"]
 Choose = Callable[[EnvironmentSpec], EnvironmentSpec]
-METHODS = ("step_from", "reset", "step", "coordinates", "begin", "act", "close")
+METHODS = ("step_from", "reset", "step", "coordinates", "begin", "act", "picture", "close")
 
 
 def make(

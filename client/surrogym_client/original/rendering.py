@@ -1,0 +1,127 @@
+"""The original environment's own renderer, shown a state it has not reached itself.
+
+Shapes: C coordinates; a picture is (height, width, 3) uint8.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.original.classic import TASKS
+from surrogym_client.original.errors import NotRenderable
+from surrogym_client.original.loading import is_known, load_factory
+from surrogym_client.original.mujoco import Joints
+from surrogym_client.original.protocol import Array, Native
+from surrogym_shared.spec import EnvironmentSpec
+
+Picture = NDArray[np.uint8]
+FRAMES_PER_SECOND = 30
+
+
+@runtime_checkable
+class Drawable(Protocol):
+    """What an environment of one's own needs to be shown: one method beside its others.
+
+    Example:
+        >>> def picture(self, coordinates):
+        ...     frame = np.full((100, 200, 3), 255, dtype=np.uint8)
+        ...     frame[45:55, int(100 + 80 * coordinates[0])] = 0
+        ...     return frame
+    """
+
+    def picture(self, coordinates: Array) -> Picture:
+        """The state at coordinates (C,)."""
+        ...
+
+
+class Renderer(Protocol):
+    """Draws states of one environment."""
+
+    frames_per_second: int
+
+    def draw(self, coordinates: Array) -> Picture:
+        """The state at coordinates (C,)."""
+        ...
+
+    def close(self) -> None:
+        """Release what the renderer holds."""
+        ...
+
+
+def renderer_of(spec: EnvironmentSpec, original: str | None = None) -> Renderer:
+    """The renderer of a specification's environment.
+
+    Args:
+        spec: the environment; its word is taken for ids with a built-in adapter alone, never for a module.
+        original: ``package.module:factory`` of one's own environment, which has a method ``picture``.
+
+    Raises:
+        NotRenderable: it has none, or what that needs is not installed.
+    """
+    if original is not None and ":" in original:
+        return _Own(original)
+    name = original or spec.environment
+    if not is_known(name):
+        raise NotRenderable(
+            f"expected original='package.module:factory' of the environment to show, got none (its name: {name!r})"
+        )
+    return _Native(name, spec)
+
+
+class _Own:
+    def __init__(self, name: str) -> None:
+        made = load_factory(name)()
+        if not isinstance(made, Drawable):
+            raise NotRenderable(f"expected {name} to have a method picture(coordinates), got a {type(made).__name__}")
+        self._environment = made
+        self.frames_per_second = int(getattr(made, "frames_per_second", FRAMES_PER_SECOND))
+
+    def draw(self, coordinates: Array) -> Picture:
+        picture = np.asarray(self._environment.picture(coordinates))
+        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
+            raise NotRenderable(f"expected a picture (h, w, 3) of uint8, got {picture.shape} of {picture.dtype}")
+        return picture
+
+    def close(self) -> None:
+        getattr(self._environment, "close", bool)()
+
+
+class _Native:
+    """A Gymnasium environment that is written to and asked for its picture; it is never stepped."""
+
+    def __init__(self, name: str, spec: EnvironmentSpec) -> None:
+        import gymnasium
+        from gymnasium.envs.registration import load_env_creator
+
+        self._name, self._spec = name, spec
+        try:
+            creator: Any = load_env_creator(str(gymnasium.spec(name).entry_point))
+            if "rgb_array" not in creator.metadata["render_modes"]:
+                raise NotRenderable(f"{name} has no picture of its own")
+            self._env: Native = gymnasium.make(name, render_mode="rgb_array").unwrapped
+            self._env.reset(seed=0)
+            self._joints = None if name in TASKS else Joints(self._env)
+        except (ImportError, gymnasium.error.Error) as error:
+            raise self._unavailable(error) from error
+        self.frames_per_second = int(self._env.metadata.get("render_fps", FRAMES_PER_SECOND))
+
+    def draw(self, coordinates: Array) -> Picture:
+        if self._joints is None:
+            TASKS[self._name].write(self._env, coordinates)
+        else:
+            self._joints.write(self._joints.columns(self._spec.coordinate_names), coordinates)
+        try:
+            frame: Any = self._env.render()
+        except Exception as error:  # a display, a driver or a library is missing: each says so by an error of its own
+            raise self._unavailable(error) from error
+        return np.asarray(frame, dtype=np.uint8)
+
+    def close(self) -> None:
+        self._env.close()
+
+    def _unavailable(self, error: Exception) -> NotRenderable:
+        extra = "render" if self._name in TASKS else "mujoco"
+        return NotRenderable(f"{self._name} can't be shown here: {error} (pip install 'surrogym[{extra}]')")

@@ -1,0 +1,104 @@
+"""Pictures of virtual states: an observation is turned back into coordinates, and the original's renderer draws them.
+
+Shapes: D observation entries, C coordinates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.original.errors import NotRenderable
+from surrogym_client.original.protocol import Array
+from surrogym_client.original.rendering import Picture, renderer_of
+from surrogym_shared.spec import EnvironmentSpec, Part
+
+Read = Callable[[Array], float]  # a coordinate from an observation (D,)
+RENDER_MODES = ["rgb_array"]
+
+
+class Pictures:
+    """Draws observations of one surrogate.
+
+    Args:
+        spec: the original environment.
+        original: ``package.module:factory`` of one's own environment; those with a built-in adapter need none.
+
+    Raises:
+        NotRenderable: it has no renderer, or observations don't tell the state.
+    """
+
+    def __init__(self, spec: EnvironmentSpec, original: str | None = None) -> None:
+        self._read = coordinates_from_observation(spec)
+        self._renderer = renderer_of(spec, original)
+        self.frames_per_second = self._renderer.frames_per_second
+
+    def of(self, observation: NDArray[Any]) -> Picture:
+        """The picture (height, width, 3) of an observation (D,)."""
+        return self._renderer.draw(self._read(np.asarray(observation, dtype=np.float64)))
+
+    def close(self) -> None:
+        """Release the renderer."""
+        self._renderer.close()
+
+
+def pictures_for(render_mode: str | None, spec: Callable[[], EnvironmentSpec], original: str | None) -> Pictures | None:
+    """What draws in this mode; None where nothing is to be drawn.
+
+    Raises:
+        ValueError: a mode there is none of.
+        NotRenderable: as ``Pictures``.
+    """
+    if render_mode is None:
+        return None
+    if render_mode not in RENDER_MODES:
+        raise ValueError(
+            f"a surrogate can't be rendered so: expected render_mode None or rgb_array, got {render_mode!r}"
+        )
+    return Pictures(spec(), original)
+
+
+def coordinates_from_observation(spec: EnvironmentSpec) -> Callable[[Array], Array]:
+    """The function from observations (D,) to coordinates (C,): entries that show a coordinate as it is, and angles from
+    their sine and cosine.
+
+    Raises:
+        NotRenderable: a coordinate can't be read off.
+    """
+    reads = [_read(spec, name) for name in spec.coordinate_names]
+    if missing := [name for name, read in zip(spec.coordinate_names, reads, strict=True) if read is None]:
+        raise NotRenderable(f"expected observations that tell every coordinate, got none that tells {missing[0]!r}")
+    known = [read for read in reads if read is not None]
+    return lambda observation: np.array([read(observation) for read in known])
+
+
+def _read(spec: EnvironmentSpec, name: str) -> Read | None:
+    found: dict[str, tuple[int, float, float]] = {}  # function: entry, factor, offset
+    for index, entry in enumerate(spec.observation):
+        parts = [part for part in entry.term.parts if part.function != "one"]
+        if len(parts) != 1 or not _of_alone(parts[0], name):
+            continue
+        part, offset = parts[0], sum(p.coefficient for p in entry.term.parts if p.function == "one")
+        weight = part.weights[name]
+        if part.function == "linear":
+            found["linear"] = (index, part.coefficient * weight, offset)
+        elif abs(weight) == 1:
+            found[part.function] = (index, part.coefficient * (weight if part.function == "sin" else 1.0), offset)
+    if "linear" in found:
+        return lambda o: _value(o, found["linear"])
+    if {"sin", "cos"} <= found.keys():
+        return lambda o: float(np.arctan2(_value(o, found["sin"]), _value(o, found["cos"])))
+    return None
+
+
+def _of_alone(part: Part, name: str) -> bool:
+    weights = {key for key, weight in part.weights.items() if weight != 0}
+    return weights == {name} and part.coefficient != 0
+
+
+def _value(observation: Array, place: tuple[int, float, float]) -> float:
+    index, factor, offset = place
+    return float((observation[index] - offset) / factor)

@@ -1,0 +1,139 @@
+"""Virtual states are shown by the original environment's renderer, and RecordVideo films them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import gymnasium
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+from gymnasium.wrappers import RecordVideo
+
+from support.exact_pendulum import ExactPendulum
+from surrogym_client.env import RemoteEnv
+from surrogym_client.original.classic import TASKS
+from surrogym_client.original.episodes import draw
+from surrogym_client.original.errors import NotRenderable
+from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
+from surrogym_client.original.terms import observe
+from surrogym_client.pictures import Pictures, coordinates_from_observation
+from surrogym_client.registration import SWING_UP
+from surrogym_client.vector import RemoteVectorEnv
+from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
+
+SPECS = {name: task.spec() for name, task in TASKS.items()} | {name: make() for name, make in SPECIFICATIONS.items()}
+SHOWN = ("Pendulum-v1", "CartPole-v1", "Acrobot-v1", "MountainCarContinuous-v0", "Reacher-v5", "InvertedPendulum-v5")
+LINE = EnvironmentSpec(
+    environment="line:Line",
+    coordinates=(Coordinate(name="x", sampling=Uniform(low=-1, high=1)),),
+    observation=(ObservationEntry(name="far", term=Term.linear(x=2) + Term.constant(1)),),
+    action=BoxAction(low=(-1,), high=(1,)),
+    start={"x": Uniform(low=-1, high=1)},
+)
+OWN = """
+import numpy as np
+
+class Line:
+    frames_per_second = 5
+
+    def picture(self, coordinates):
+        frame = np.zeros((4, 20, 3), dtype=np.uint8)
+        frame[:, int(10 + 9 * coordinates[0])] = 255
+        return frame
+
+class Blind:
+    pass
+"""
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "line.py").write_text(OWN)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "line", raising=False)
+
+
+@pytest.mark.parametrize("name", SPECS)
+def test_every_built_in_observation_tells_the_state(name: str) -> None:
+    spec, rng = SPECS[name], np.random.default_rng(0)
+    read = coordinates_from_observation(spec)
+    for _ in range(20):
+        coordinates = draw(spec, rng, wide=True)
+        np.testing.assert_allclose(read(observe(spec, coordinates[None])[0]), coordinates, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", SHOWN)
+def test_the_picture_is_the_originals_own(name: str) -> None:
+    env = gymnasium.make(name, render_mode="rgb_array")
+    pictures = Pictures(SPECS[name])
+    frames = []
+    for seed in (1, 2):
+        observation, _ = env.reset(seed=seed)
+        frames.append(pictures.of(observation))
+        off = np.abs(frames[-1].astype(int) - env.render())
+        assert off.mean() < 0.5, "but for the rounding of observations"
+    assert (frames[0] != frames[1]).any()
+    assert pictures.frames_per_second == env.metadata["render_fps"]
+    pictures.close()
+    env.close()
+
+
+def test_record_video_films_an_episode(tmp_path: Path) -> None:
+    videos = tmp_path / "videos"
+    virtual = RemoteEnv(ExactPendulum(), render_mode="rgb_array", time_limit=8)
+    with RecordVideo(virtual, str(videos), disable_logger=True) as env:
+        env.reset(seed=0)
+        over = False
+        while not over:
+            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            over = terminated or truncated
+    (video,) = videos.glob("*.mp4")
+    with imageio.get_reader(video) as film:
+        assert film.count_frames() == 9
+        assert film.get_data(0).std() > 5
+
+
+def test_each_lane_is_shown() -> None:
+    envs = RemoteVectorEnv(ExactPendulum(), 2, render_mode="rgb_array")
+    envs.reset(seed=0)
+    frames = envs.render()
+    assert len(frames) == 2
+    assert (frames[0] != frames[1]).any()
+    envs.step(np.zeros((2, 1), dtype=np.float32))
+    assert (envs.render()[0] != frames[0]).any()
+    envs.close()
+    assert RemoteVectorEnv(ExactPendulum(), 2).render() is None
+
+
+def test_an_environment_of_ones_own_draws_itself(own: None) -> None:
+    pictures = Pictures(LINE, "line:Line")
+    assert pictures.of(np.array([2.0]))[0, 14].tolist() == [255] * 3  # far = 2 x + 1, so x = 0.5
+    assert pictures.frames_per_second == 5
+
+
+@pytest.mark.parametrize(
+    ("spec", "original", "message"),
+    [
+        (LINE, None, r"expected original='package\.module:factory'"),
+        (LINE, "line:Blind", r"have a method picture\(coordinates\), got a Blind"),
+        (SPECS[SWING_UP], None, "no picture of its own"),
+        (
+            LINE.model_copy(update={"observation": (ObservationEntry(name="s", term=Term.sin(x=1)),)}),
+            "line:Line",
+            "got none that tells 'x'",
+        ),
+    ],
+)
+def test_what_can_not_be_shown_is_refused_in_words(own: None, spec, original, message) -> None:
+    with pytest.raises(NotRenderable, match=message):
+        Pictures(spec, original)
+
+
+def test_a_renderer_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    env = RemoteEnv(ExactPendulum(), render_mode="rgb_array")
+    env.reset(seed=0)
+    with pytest.raises(NotRenderable, match=r"Pendulum-v1 can't be shown here: .*surrogym\[render\]"):
+        env.render()
