@@ -50,10 +50,10 @@ def _decaying(remaining: float) -> float:
 
 PPO_BATCH = 1_024  # most of a training is the update, and its cost goes by the batch
 PPO_DEFAULTS: dict[str, Any] = {
-    "n_steps": 32,
+    "n_steps": 128,
     "n_epochs": 10,
     "learning_rate": _decaying,
-    "gae_lambda": 0.9,
+    "gae_lambda": 0.97,
 }
 
 
@@ -155,7 +155,7 @@ def even_batch(rollout: int) -> int:
 
 def suggested_lanes(algorithm: type[BaseAlgorithm]) -> int:
     """On-policy algorithms want many lanes, the others learn once for each step of all of them."""
-    return 256 if issubclass(algorithm, OnPolicyAlgorithm) else 4
+    return 128 if issubclass(algorithm, OnPolicyAlgorithm) else 4
 
 
 def imagined_return(port: SurrogatePort, learner: BaseAlgorithm, settings: TrainSettings) -> float:
