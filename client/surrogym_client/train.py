@@ -6,11 +6,11 @@ Settings follow from properties of the specification alone (kind of action, time
 from __future__ import annotations
 
 import inspect
+import itertools
 import json
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +18,16 @@ import numpy as np
 import stable_baselines3
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
+from surrogym_client.checks import Checks
 from surrogym_client.evolution import EVOLUTION, EVOLUTION_STEPS, evolve
 from surrogym_client.imagined import imagined_returns, observation_statistics
 from surrogym_client.policies import WIDER, PaperPolicy, Standardise
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.training import (
     CHECK_EPISODES,
-    CHECKS,
     TrainingInterrupted,
     TrainProgress,
     TrainResult,
@@ -41,6 +40,7 @@ MAX_STEPS = 1_000_000  # virtual steps of one training, the paper's cap
 ON_POLICY_STEPS = 600_000
 OFF_POLICY_STEPS = 50_000  # these learn from every step, and take far longer for each
 LEARNING_RATE = 3e-3
+ATTEMPT_SEED = 1_000_003  # between the seeds of one training's networks
 LAST_RATE = 0.02  # share of the learning rate that is left at the end
 
 
@@ -91,11 +91,18 @@ def train(
     started = time.perf_counter()
     try:
         statistics = observation_statistics(port, settings.seed)
-        learner = _learner(algorithm, wrapped, settings, spec, statistics, gamma)
+
+        def network(attempt: int = 0, start_from: Path | None = None) -> BaseAlgorithm:
+            asked = replace(settings, seed=settings.seed + ATTEMPT_SEED * attempt, start_from=start_from)
+            return _learner(algorithm, wrapped, asked, spec, statistics, gamma)
+
+        learner = network()
         total = _whole_rollouts(learner, total)
-        report = _Report(total, progress, lambda: imagined_return(port, learner, settings))
-        whole = _learned(learner, total, report)
-        report.restore_best()
+        checks = Checks(total, progress, lambda learner: imagined_return(port, learner, settings), learner)
+        if settings.start_from is not None and checks.worth_keeping(known := network(start_from=settings.start_from)):
+            learner = known
+        learner, whole = _learned(learner, network, checks)
+        checks.restore_best()
         out.parent.mkdir(parents=True, exist_ok=True)
         learner.save(out)
     finally:
@@ -103,11 +110,11 @@ def train(
     result = TrainResult(
         path=out,
         algorithm=algorithm.__name__,
-        virtual_steps=learner.num_timesteps,
+        virtual_steps=checks.steps,
         seconds=time.perf_counter() - started,
-        imagined_return=report.best,
-        episode_penalty=report.episode_penalty,
-        lost_episodes=report.lost,
+        imagined_return=checks.best,
+        episode_penalty=checks.episode_penalty,
+        lost_episodes=checks.lost,
         settings={**asdict(settings), "num_envs": num_envs, "total_steps": total, **effective(learner)},
     )
     out.with_suffix(".json").write_text(json.dumps(asdict(result), indent=2, default=str) + "\n")
@@ -116,13 +123,19 @@ def train(
     return result
 
 
-def _learned(learner: BaseAlgorithm, total: int, report: _Report) -> bool:
-    """Whether the training came to its end, and not to an interruption."""
-    try:
-        learner.learn(total, callback=report, reset_num_timesteps=True)
-    except KeyboardInterrupt:
-        return False
-    return True
+def _learned(
+    learner: BaseAlgorithm, another: Callable[[int], BaseAlgorithm], checks: Checks
+) -> tuple[BaseAlgorithm, bool]:
+    """The network that learned last, and whether the training came to its end, and not to an interruption."""
+    for attempt in itertools.count(1):
+        try:
+            learner.learn(_whole_rollouts(learner, checks.left), callback=checks, reset_num_timesteps=True)
+        except KeyboardInterrupt:
+            return learner, False
+        if not checks.given_up:
+            return learner, True
+        learner = another(attempt)
+    raise AssertionError("unreachable")
 
 
 def algorithm_by_name(name: str) -> type[BaseAlgorithm]:
@@ -220,66 +233,6 @@ def _whole_rollouts(learner: BaseAlgorithm, total: int) -> int:
     """The steps of as many whole rollouts as the total allows, at least one: Stable-Baselines3 would round up."""
     rollout = learner.n_envs * (learner.n_steps if isinstance(learner, OnPolicyAlgorithm) else 1)
     return max(total // rollout, 1) * rollout
-
-
-class _Report(BaseCallback):
-    """Remembers the policy with the best imagined return; reports progress, and what the penalty took of the reward."""
-
-    def __init__(
-        self, total: int, progress: Callable[[TrainProgress], None] | None, imagine: Callable[[], float]
-    ) -> None:
-        super().__init__()
-        self._total = total
-        self._progress = progress
-        self._imagine = imagine
-        self._penalty = self._size = 0.0
-        self._checked = 0  # checks made
-        self._latest: float | None = None
-        self._kept: dict[str, Any] = {}
-        self.best: float | None = None
-        self._penalties: deque[float] = deque(maxlen=100)  # of the last episodes
-        self.lost = 0
-
-    def restore_best(self) -> None:
-        """Give the learner the policy with the best imagined return of all checks; without any it keeps its own."""
-        if self._kept:
-            self.model.policy.load_state_dict(self._kept)
-
-    @property
-    def episode_penalty(self) -> float | None:
-        return float(np.mean(self._penalties)) if self._penalties else None
-
-    def _on_step(self) -> bool:
-        infos, env = self.locals["infos"], self.training_env
-        assert isinstance(env, VecNormalize)
-        reward = env.get_original_reward()
-        mean = np.array([info["reward_mean"] for info in infos])
-        self._penalty += float(np.abs(mean - reward).sum())
-        self._size += float(np.abs(mean).sum())
-        self._penalties.extend(info["penalty"] for info in infos if "penalty" in info)
-        self.lost += sum("surrogym_session_lost" in info for info in infos)
-        return True
-
-    def _on_rollout_end(self) -> None:
-        share = self._penalty / self._size if self._size else 0.0
-        self._penalty = self._size = 0.0
-        self.logger.record("surrogym/penalty_share", share)
-        if self.num_timesteps * CHECKS >= (self._checked + 1) * self._total:
-            self._check()
-        if self._progress is not None:
-            steps = min(self.num_timesteps, self._total)
-            self._progress(TrainProgress(steps, self._total, self._latest, share, self.episode_penalty))
-
-    def _on_training_end(self) -> None:
-        self._check()
-
-    def _check(self) -> None:
-        self._checked = int(self.num_timesteps * CHECKS / self._total)
-        self._latest = self._imagine()
-        self.logger.record("surrogym/imagined_return", self._latest)
-        if self.best is None or self._latest >= self.best:
-            self.best = self._latest
-            self._kept = {name: tensor.clone() for name, tensor in self.model.policy.state_dict().items()}
 
 
 __all__ = ["TrainProgress", "TrainResult", "TrainSettings", "TrainingInterrupted", "algorithm_by_name", "train"]

@@ -8,6 +8,7 @@ import pytest
 from stable_baselines3 import PPO, SAC
 
 from support.real_steps import random_steps
+from surrogym_client import train as training
 from surrogym_client.imagined import imagined_returns
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_client.original.loading import make
@@ -216,3 +217,37 @@ def test_statistics_are_of_the_sampling_range(surrogate):
     np.testing.assert_allclose(mean, [0, 0, 0], atol=0.5)
     np.testing.assert_allclose(deviation, [0.5**0.5, 0.5**0.5, 16 / 12**0.5], rtol=0.1)
     assert not surrogate._sessions
+
+
+IDLE = SMALL | {"learning_rate": 0.0, "n_steps": 4}  # learns nothing
+
+
+def test_a_network_that_learns_nothing_is_given_up_for_another(surrogate, tmp_path: Path, monkeypatch):
+    made, plain = [], training._learner
+
+    def seen(algorithm, env, settings, *rest):
+        made.append(settings.seed)
+        return plain(algorithm, env, settings, *rest)
+
+    monkeypatch.setattr(training, "_learner", seen)
+    session = {"time_limit": 4}
+    result = train(surrogate, tmp_path / "policy.zip", small(total_steps=2_000, hyperparameters=IDLE, session=session))
+    assert 2 <= len(made) == len(set(made)) <= 4, "at most one for each quarter of the steps"
+    assert 1_900 <= result.virtual_steps <= 2_000
+    kept = PPO.load(result.path, device="cpu")
+    again = imagined_return(surrogate, kept, small(session=session))
+    assert again == pytest.approx(result.imagined_return)
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [(0, 1), (1, 0)])
+def test_a_saved_policy_that_earns_no_more_than_an_untrained_one_is_not_gone_on_from(
+    surrogate, tmp_path: Path, ours, theirs
+):
+    saved, untrained = tmp_path / "saved.zip", tmp_path / "untrained.zip"
+    for path, seed in ((saved, theirs), (untrained, ours)):
+        train(surrogate, path, small(seed=seed, hyperparameters=IDLE, total_steps=32))
+    settings = small(seed=ours, hyperparameters=IDLE, total_steps=32, start_from=saved)
+    earned = [imagined_return(surrogate, PPO.load(p, device="cpu"), settings) for p in (saved, untrained)]
+    result = train(surrogate, tmp_path / "policy.zip", settings)
+    assert earned[0] != earned[1]
+    assert result.imagined_return == pytest.approx(max(earned))

@@ -1,0 +1,130 @@
+"""Checks of a training by imagined return: the best policy is kept, a network that learns nothing is given up."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecNormalize
+
+from surrogym_client.training import CHECKS, TrainProgress
+
+PATIENCE = 0.25  # of the steps, in which a network has to earn more than it did untrained
+PATIENT_ROLLOUTS = 8  # at least
+
+
+class Checks(BaseCallback):
+    """Measures the imagined return of what is learned, reports progress, and what the penalty took of the reward.
+
+    A network that earns no more than an untrained one after a quarter of the steps is given up, while there is as much
+    left for another: rewards that come at the end alone leave some networks without a first success, and they stop
+    exploring before they have one.
+
+    Args:
+        total: virtual steps of the training.
+        progress: called after every rollout.
+        imagine: a learner's imagined return.
+        untrained: a learner that has learned nothing yet.
+    """
+
+    def __init__(
+        self,
+        total: int,
+        progress: Callable[[TrainProgress], None] | None,
+        imagine: Callable[[BaseAlgorithm], float],
+        untrained: BaseAlgorithm,
+    ) -> None:
+        super().__init__()
+        self._total = total
+        self._progress = progress
+        self._imagine = imagine
+        self._floor = imagine(untrained)
+        self._spent = 0  # by the networks before
+        self._rollouts = 0  # of this one
+        self._checked = 0  # checks made
+        self._latest: float | None = None
+        self._kept: dict[str, Any] = {}
+        self._penalty = self._size = 0.0
+        self._penalties: deque[float] = deque(maxlen=100)  # of the last episodes
+        self.best: float | None = None
+        self.given_up = False
+        self.lost = 0
+
+    @property
+    def steps(self) -> int:
+        """Virtual steps taken, by all networks."""
+        return self._spent + self.num_timesteps
+
+    @property
+    def left(self) -> int:
+        return self._total - self.steps
+
+    @property
+    def episode_penalty(self) -> float | None:
+        return float(np.mean(self._penalties)) if self._penalties else None
+
+    def worth_keeping(self, known: BaseAlgorithm) -> bool:
+        """Whether a policy from before earns more than an untrained one; if so it is the best so far."""
+        earned = self._imagine(known)
+        if earned <= self._floor:
+            return False
+        self._keep(earned, known)
+        return True
+
+    def restore_best(self) -> None:
+        """Give the learner the policy with the best imagined return of all checks; without any it keeps its own."""
+        if self._kept:
+            self.model.policy.load_state_dict(self._kept)
+
+    def _on_training_start(self) -> None:
+        if self.given_up:
+            self.given_up, self._rollouts = False, 0
+
+    def _on_step(self) -> bool:
+        infos, env = self.locals["infos"], self.training_env
+        assert isinstance(env, VecNormalize)
+        reward = env.get_original_reward()
+        mean = np.array([info["reward_mean"] for info in infos])
+        self._penalty += float(np.abs(mean - reward).sum())
+        self._size += float(np.abs(mean).sum())
+        self._penalties.extend(info["penalty"] for info in infos if "penalty" in info)
+        self.lost += sum("surrogym_session_lost" in info for info in infos)
+        return not self.given_up
+
+    def _on_rollout_end(self) -> None:
+        share = self._penalty / self._size if self._size else 0.0
+        self._penalty = self._size = 0.0
+        self._rollouts += 1
+        self.logger.record("surrogym/penalty_share", share)
+        if self.steps * CHECKS >= (self._checked + 1) * self._total:
+            self._check()
+            self.given_up = self._hopeless()
+        if self._progress is not None:
+            steps = min(self.steps, self._total)
+            self._progress(TrainProgress(steps, self._total, self._latest, share, self.episode_penalty))
+
+    def _on_training_end(self) -> None:
+        if self.given_up:
+            self._spent, self.num_timesteps = self.steps, 0
+        else:
+            self._check()
+
+    def _check(self) -> None:
+        self._checked = int(self.steps * CHECKS / self._total)
+        self._latest = self._imagine(self.model)
+        self.logger.record("surrogym/imagined_return", self._latest)
+        if self.best is None or self._latest >= self.best:
+            self._keep(self._latest, self.model)
+
+    def _keep(self, earned: float, learner: BaseAlgorithm) -> None:
+        self.best = earned
+        self._kept = {name: tensor.clone() for name, tensor in learner.policy.state_dict().items()}
+
+    def _hopeless(self) -> bool:
+        assert self.best is not None
+        tried = self._rollouts >= PATIENT_ROLLOUTS and self.num_timesteps >= PATIENCE * self._total
+        return tried and self.best <= self._floor and self.left >= PATIENCE * self._total
