@@ -17,6 +17,7 @@ COMMANDS = (
     "train",
     "evaluate",
     "status",
+    "report",
     "improve",
     "change",
     "export",

@@ -6,20 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from surrogym_client.evaluate import Evaluation, Trace
-from surrogym_shared.spec import Coordinate, EnvironmentSpec, limits
+from surrogym_client.report.figures import WIDTH, draw_samples, with_unit
+from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import SampleView, SurrogateView
-
-COLOURS = {"initial": "#4c72b0", "adaptive": "#dd8452", "manual": "#55a868"}
-WIDTH = 6.0  # inches
 
 
 def draw_all(
@@ -34,26 +28,6 @@ def draw_all(
     _save(folder / "learning.png", draw_learning(curve))
     _save(folder / "returns.png", draw_returns(result))
     _save(folder / "rollout.png", draw_rollout(view.spec, result.trace))
-
-
-def draw_samples(view: SurrogateView, samples: Sequence[SampleView]) -> Figure:
-    """Where the real steps began, two coordinates a picture."""
-    coordinates = view.spec.coordinates
-    pairs = [(i, min(i + 1, len(coordinates) - 1)) for i in range(0, len(coordinates), 2)]
-    figure = Figure(figsize=(WIDTH, 0.8 * WIDTH * len(pairs)), layout="constrained")
-    for n, (i, j) in enumerate(pairs):
-        axes = figure.add_subplot(len(pairs), 1, n + 1)
-        for purpose, colour in COLOURS.items():
-            chosen = [s.coordinates for s in samples if s.purpose == purpose]
-            if chosen:
-                label = f"{purpose} ({len(chosen)})"
-                axes.scatter([q[i] for q in chosen], [q[j] for q in chosen], color=colour, label=label, clip_on=False)
-        axes.set(xlabel=_with_unit(coordinates[i]), ylabel=_with_unit(coordinates[j]))
-        axes.set(xlim=limits(coordinates[i].sampling), ylim=limits(coordinates[j].sampling))
-        if n == 0:
-            figure.legend(loc="outside upper right")
-    figure.suptitle(f"{view.name}: real steps of the design", x=0.02, ha="left")
-    return figure
 
 
 def draw_learning(curve: Sequence[dict[str, Any]]) -> Figure:
@@ -75,7 +49,7 @@ def draw_returns(result: Evaluation) -> Figure:
 def draw_rollout(spec: EnvironmentSpec, trace: Trace) -> Figure:
     """The first real episode: coordinates, and the action."""
     actions = trace.action.shape[1]
-    labels = [*map(_with_unit, spec.coordinates), *(f"action {i}" if actions > 1 else "action" for i in range(actions))]
+    labels = [*map(with_unit, spec.coordinates), *(f"action {i}" if actions > 1 else "action" for i in range(actions))]
     lines = [*trace.coordinates.T, *trace.action.T]
     figure = Figure(figsize=(1.5 * WIDTH, 1.4 * len(lines)), layout="constrained")
     grid = figure.subplots(len(lines), 1, sharex=True, squeeze=False)[:, 0]
@@ -86,10 +60,6 @@ def draw_rollout(spec: EnvironmentSpec, trace: Trace) -> Figure:
     figure.align_ylabels()
     figure.suptitle("the first real episode")
     return figure
-
-
-def _with_unit(coordinate: Coordinate) -> str:
-    return f"{coordinate.name} ({coordinate.unit})" if coordinate.unit else coordinate.name
 
 
 def _one(x: str, y: str, title: str) -> tuple[Figure, Axes]:

@@ -1,0 +1,39 @@
+"""``surrogym report``: one page about a surrogate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, connect
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("report")(command)
+
+
+def command(
+    surrogate: Surrogate,
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write.")] = Path("report.html"),
+    server: Server = None,
+    token: Token = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write one HTML page that needs nothing else: fidelity against samples, where they fell, the ledger, structure and
+    hyperparameters, and every model.
+
+    Example: surrogym report pendulum --out report.html
+    """
+    from surrogym_client.cli.output import give
+    from surrogym_client.report.page import page
+
+    with connect(server, token) as api:
+        at = f"{api.url}, surrogym {api.health().version}"
+        text = page(api.surrogate(surrogate), api.models(surrogate), list(api.samples(surrogate)), at)
+    size = out.write_text(text, encoding="utf-8")
+    words = f"{size} bytes written to {out}"
+    give({"file": str(out), "bytes": size}, lambda: words, as_json=as_json, quiet=quiet)

@@ -1,0 +1,1 @@
+"""What a server knows of a surrogate, as one page that needs nothing else."""

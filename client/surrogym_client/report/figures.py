@@ -1,0 +1,73 @@
+"""Figures of a surrogate: how sure each model was, and where the real steps began."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from io import StringIO
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from surrogym_shared.spec import Coordinate, limits
+from surrogym_shared.wire import ModelView, SampleView, SurrogateView
+
+COLOURS = {"initial": "#4c72b0", "adaptive": "#dd8452", "manual": "#55a868"}
+WIDTH = 6.0  # inches
+SMALLEST = 1e-9  # of what is drawn on a logarithmic axis
+
+
+def draw_fidelity(models: Sequence[ModelView], target: float) -> Figure:
+    """Confidence index of every output, and its leave-one-out error in tolerances, against the real samples."""
+    figure = Figure(figsize=(WIDTH, WIDTH), layout="constrained")
+    sure, wrong = figure.subplots(2, 1, sharex=True)
+    names = [output.name for output in models[-1].fidelity.outputs] if models else []
+    for name in names:
+        said = [(model.samples, o) for model in models for o in model.fidelity.outputs if o.name == name]
+        samples = [count for count, _ in said]
+        sure.plot(samples, [o.confidence_index for _, o in said], marker="o", label=name)
+        wrong.plot(samples, [max(o.leave_one_out_error / o.tolerance, SMALLEST) for _, o in said], marker="o")
+    sure.axhline(target, color="black", linestyle="--", linewidth=0.8, label=f"target {target:g}")
+    wrong.axhline(1.0, color="black", linestyle="--", linewidth=0.8)
+    sure.set(ylabel="confidence index")
+    wrong.set(ylabel="leave-one-out error / tolerance", xlabel="real samples", yscale="log")
+    wrong.xaxis.set_major_locator(MaxNLocator(integer=True))
+    figure.legend(loc="outside upper right", ncols=4)
+    return figure
+
+
+def draw_samples(view: SurrogateView, samples: Sequence[SampleView]) -> Figure:
+    """Where the real steps began, two coordinates a picture."""
+    coordinates = view.spec.coordinates
+    pairs = [(i, min(i + 1, len(coordinates) - 1)) for i in range(0, len(coordinates), 2)]
+    figure = Figure(figsize=(WIDTH, 0.8 * WIDTH * len(pairs)), layout="constrained")
+    for n, (i, j) in enumerate(pairs):
+        axes = figure.add_subplot(len(pairs), 1, n + 1)
+        for purpose, colour in COLOURS.items():
+            chosen = [s.coordinates for s in samples if s.purpose == purpose]
+            if chosen:
+                label = f"{purpose} ({len(chosen)})"
+                axes.scatter([q[i] for q in chosen], [q[j] for q in chosen], color=colour, label=label, clip_on=False)
+        axes.set(xlabel=with_unit(coordinates[i]), ylabel=with_unit(coordinates[j]))
+        axes.set(xlim=limits(coordinates[i].sampling), ylim=limits(coordinates[j].sampling))
+        if n == 0 and samples:
+            figure.legend(loc="outside upper right")
+    figure.suptitle(f"{view.name}: real steps of the design", x=0.02, ha="left")
+    return figure
+
+
+def with_unit(coordinate: Coordinate) -> str:
+    """The name of a coordinate's axis."""
+    return f"{coordinate.name} ({coordinate.unit})" if coordinate.unit else coordinate.name
+
+
+def svg(figure: Figure) -> str:
+    """The figure as an SVG element; the same figure gives the same text."""
+    text = StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": "surrogym", "svg.fonttype": "path"}):
+        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+    whole = text.getvalue()
+    return whole[whole.index("<svg") :]

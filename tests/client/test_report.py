@@ -1,0 +1,121 @@
+"""The report is one page that says everything and loads nothing."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+from html.parser import HTMLParser
+from xml.etree import ElementTree
+
+import pytest
+
+from support.server import ServerProcess
+from surrogym_client.api import Api
+from surrogym_client.report.figures import draw_fidelity, svg
+from surrogym_client.report.page import page
+from surrogym_shared.wire import ModelView, SampleView, SurrogateView
+
+SVG = "data:image/svg+xml;base64,"
+Known = tuple[SurrogateView, list[ModelView], list[SampleView]]
+
+
+class Page(HTMLParser):
+    """Tags with their attributes, and text, of a page that has to be well formed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: list[str] = []
+        self._open: list[str] = []
+        self.feed(text)
+        assert self._open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in ("meta", "img"):
+            self._open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self._open.pop() == tag
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+    def of(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+@pytest.fixture(scope="module")
+def known(pendulum_server: ServerProcess) -> Known:
+    with Api(pendulum_server.url) as api:
+        return api.surrogate("pendulum"), api.models("pendulum"), list(api.samples("pendulum"))
+
+
+def test_it_says_what_is_known(known: Known) -> None:
+    view, models, samples = known
+    read = Page(page(view, models, samples, "http://here, surrogym 0.1.0"))
+    titles = ["Ledger", "Fidelity", "Samples", "Structure and hyperparameters of model 1", "Models", "Specification"]
+    assert [text for text in read.texts if text in titles] == titles
+    for output in models[-1].fidelity.outputs:
+        assert read.texts.count(output.name) >= 2
+        assert f"{output.leave_one_out_error:.4g}" in read.texts
+    assert "lengthscale" in read.texts
+    assert models[0].data_hash[:12] in read.texts
+    assert f"{view.ledger.total} of {view.budget}" in read.texts
+
+
+def test_it_loads_nothing_and_its_policy_lets_nothing_load(known: Known) -> None:
+    text = page(*known, "here")
+    read = Page(text)
+    assert {tag for tag, _ in read.tags} & {"script", "link", "iframe", "object", "a"} == set()
+    for _, attributes in read.tags:
+        assert not {"style", "href"} & attributes.keys()
+        assert attributes.get("src", SVG).startswith(SVG)
+    (style,) = re.findall(r"<style>(.*?)</style>", text, re.DOTALL)
+    assert "url(" not in style
+    policy = next(meta["content"] for meta in read.of("meta") if "http-equiv" in meta)
+    digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
+    assert policy == f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'"
+
+
+def test_its_figures_are_whole_pictures_with_words_for_who_can_not_see_them(known: Known) -> None:
+    images = Page(page(*known, "here")).of("img")
+    assert len(images) == 2
+    for image in images:
+        assert image["alt"]
+        drawn = base64.b64decode(image["src"].removeprefix(SVG)).decode()
+        assert ElementTree.fromstring(drawn).tag == "{http://www.w3.org/2000/svg}svg"
+        assert re.findall(r"(?:href|src)=\"(?!#)", drawn) == []
+
+
+def test_the_same_figure_is_the_same_text(known: Known) -> None:
+    assert svg(draw_fidelity(known[1], 0.999)) == svg(draw_fidelity(known[1], 0.999))
+
+
+def test_what_strangers_wrote_stays_text(known: Known) -> None:
+    view, models, samples = known
+    hostile = "</td><script>alert(1)</script>"
+    model = models[0].model_copy(update={"description": {"outputs": [{"name": hostile, hostile: [hostile]}]}})
+    view = view.model_copy(update={"error": hostile, "environment": hostile})
+    text = page(view, [model], samples, hostile)
+    assert "<script" not in text
+    assert hostile in Page(text).texts
+
+
+def test_a_surrogate_without_samples_or_models_has_a_page(known: Known) -> None:
+    view = known[0].model_copy(update={"confidence_index": None, "model_version": None, "fidelity": None})
+    read = Page(page(view, [], [], "here"))
+    assert "no model yet, target 0.999" in read.texts
+    assert read.of("img") == []
+
+
+def test_the_command_writes_it(pendulum_server: ServerProcess, tmp_path, monkeypatch, capsys) -> None:
+    from surrogym_client.cli import main
+
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(["report", "pendulum", "--server", pendulum_server.url])
+    assert not ended.value.code
+    assert "bytes written to report.html" in capsys.readouterr().out
+    assert (tmp_path / "report.html").read_text(encoding="utf-8").startswith("<!doctype html>")
