@@ -38,6 +38,7 @@ from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_q
 from surrogym_server.engine.fits import Fits
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import MEBIBYTE, Limits, LiveSessions
+from surrogym_server.services.activity import Samplers
 from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import Designer
@@ -174,10 +175,11 @@ def _build_services(
         threads=settings.threads,
         look_seconds=settings.sweep_seconds,
     )
+    samplers = Samplers()
     services = Services(
-        surrogates=SurrogateService(storage, _define, design.plan, cache, engine.live, engine.notices),
-        queries=QueryService(storage, definitions, engine.notices),
-        samples=SampleService(storage, definitions, engine.notices),
+        surrogates=SurrogateService(storage, _define, design.plan, cache, engine.live, engine.notices, samplers),
+        queries=QueryService(storage, definitions, engine.notices, samplers),
+        samples=SampleService(storage, definitions, engine.notices, samplers),
         models=ModelService(storage, definitions, cache, engine.notices),
         sessions=SessionService(storage, definitions, cache, engine.live, settings.max_lanes, counts),
         designer=designer,

@@ -16,13 +16,30 @@ from surrogym_server.api.state import Use
 from surrogym_server.storage.records import EventRecord
 from surrogym_shared.codes import Code
 
-router = APIRouter(prefix="/v1/surrogates/{name}", tags=["events"])
+router = APIRouter(prefix="/v1", tags=["events"])
 
 STREAM = "text/event-stream"
+CONNECTED, SILENCE = ": connected\n\n", ": still here\n\n"
+
+
+HEADERS = {"cache-control": "no-store", "x-accel-buffering": "no"}
 
 
 @router.get(
     "/events",
+    summary="Follow whether anything happens",
+    response_class=StreamingResponse,
+    dependencies=[READ],
+    responses={200: {"content": {STREAM: {"example": "event: changed\ndata: {}\n\n"}}}},
+)
+async def changes(use: Use) -> StreamingResponse:
+    """An event ``changed`` after something happened to any surrogate, several in quick succession as one: the moment
+    to look at ``/v1/surrogates`` again."""
+    return StreamingResponse(_changes(use.events.changes()), media_type=STREAM, headers=HEADERS)
+
+
+@router.get(
+    "/surrogates/{name}/events",
     summary="Follow what happens",
     response_class=StreamingResponse,
     dependencies=[READ],
@@ -41,15 +58,20 @@ async def events(
     event; without either the stream begins with what happens from now on."""
     newest = await run_in_threadpool(use.events.newest, name)
     start = next((id for id in (last_event_id, after) if id is not None), newest)
-    headers = {"cache-control": "no-store", "x-accel-buffering": "no"}
-    return StreamingResponse(_lines(use.events.follow(name, start)), media_type=STREAM, headers=headers)
+    return StreamingResponse(_lines(use.events.follow(name, start)), media_type=STREAM, headers=HEADERS)
+
+
+async def _changes(changes: AsyncIterator[bool]) -> AsyncIterator[str]:
+    yield CONNECTED
+    async for changed in changes:
+        yield "event: changed\ndata: {}\n\n" if changed else SILENCE
 
 
 async def _lines(records: AsyncIterator[EventRecord | None]) -> AsyncIterator[str]:
-    yield ": connected\n\n"
+    yield CONNECTED
     async for record in records:
         if record is None:
-            yield ": still here\n\n"
+            yield SILENCE
         else:
             body = convert.event(record).model_dump_json()
             yield f"id: {record.id}\nevent: {record.kind}\ndata: {body}\n\n"

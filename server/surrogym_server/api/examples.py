@@ -65,6 +65,7 @@ ADD_SAMPLE: Example = {
 LEDGER: Example = {"steps": 20_000, "episodes": 100, "note": "ppo.zip", "idempotency_key": "evaluation-1"}
 IMPROVE: Example = {"queries": 5, "checkpoint": "after-100k-steps", "idempotency_key": "improve-1"}
 POINTS: Example = {"coordinates": [[0.1, 0.0]], "action": [[1.5]]}
+IMAGINE: Example = {"coordinates": [0.1, 0.0], "actions": [[1.5], [1.5]], "draws": 2, "seed": 0}
 OPEN: Example = {"num_envs": 2, "seed": 0, "autoreset_mode": "next_step", "idempotency_key": "run-7"}
 RESET: Example = {"seq": 1, "seed": 0}
 STEP: Example = {"seq": 2, "action": [[1.5], [-0.5]]}

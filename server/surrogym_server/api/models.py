@@ -15,7 +15,7 @@ from surrogym_server.api.body import example
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_shared.codes import Code
-from surrogym_shared.wire import ModelList, ModelView, Points, Prediction, Uncertainty
+from surrogym_shared.wire import Imagine, Imagined, ModelList, ModelView, Points, Prediction, Uncertainty
 
 router = APIRouter(prefix="/v1/surrogates/{name}", tags=["models"])
 
@@ -86,3 +86,11 @@ def predict(name: str, body: Annotated[Points, example(examples.POINTS)], use: U
     """One mean step from each point; no session is needed."""
     q, u = convert.numbers("coordinates", body.coordinates), convert.numbers("action", body.action)
     return convert.prediction(use.models.predict(name, q, u, body.model))
+
+
+@router.post("/imagine", summary="An episode from a given state", dependencies=[READ], responses=POINT_ERRORS)
+def imagine(name: str, body: Annotated[Imagine, example(examples.IMAGINE)], use: Use) -> Imagined:
+    """Without a session: the mean's episode, and those of functions drawn from the posterior, which part where the
+    model is not sure. An episode that terminates is shorter than ``actions``."""
+    q, u = convert.numbers("coordinates", body.coordinates), convert.numbers("actions", body.actions)
+    return convert.imagined(use.models.imagine(name, q, u, draws=body.draws, seed=body.seed, version=body.model))

@@ -9,13 +9,14 @@ from fastapi.responses import Response
 
 from surrogym_server import convert
 from surrogym_server.api import examples
-from surrogym_server.api.auth import TRAIN
+from surrogym_server.api.auth import READ, TRAIN
 from surrogym_server.api.body import example
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
     OpenSession,
+    SessionList,
     SessionView,
     SubmitOccupancy,
     SubmittedOccupancy,
@@ -45,6 +46,17 @@ async def open_session(name: str, body: Annotated[OpenSession, example(examples.
     """N lanes with a seed, a variant and an autoreset mode. The reply names the spaces and the seed."""
     session = await use.sessions.open(name, convert.opening(body))
     return convert.session_view(session, use.sessions.idle_seconds)
+
+
+@router.get(
+    "/surrogates/{name}/sessions",
+    summary="What the sessions do",
+    dependencies=[READ],
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
+)
+async def list_sessions(name: str, use: Use) -> SessionList:
+    """Those that are open: steps, imagined returns, and what the penalty took. Counted since this process started."""
+    return SessionList(sessions=[convert.session_activity(activity) for activity in await use.sessions.activity(name)])
 
 
 @router.get("/sessions/{id}", summary="One session", dependencies=[TRAIN], responses=documented(*SESSION_ERRORS))

@@ -24,6 +24,7 @@ from surrogym_server.storage.records import (
     SampleRecord,
 )
 from surrogym_server.surrogate.describe import PointPrediction
+from surrogym_server.virtual.imagined import Imagined, ImaginedEpisode
 from surrogym_shared import spec as wire
 from surrogym_shared import wire as replies
 
@@ -59,6 +60,8 @@ def _summary_fields(status: SurrogateStatus) -> dict[str, Any]:
         "budget": record.budget,
         "ledger": ledger(status.ledger),
         "queries": replies.QueryCounts(**asdict(status.queries)),
+        "samplers": list(status.samplers),
+        "sessions": status.sessions,
         "created_at": record.created_at,
     }
 
@@ -151,6 +154,21 @@ def prediction(said: Said[PointPrediction]) -> replies.Prediction:
         reward=result.reward.tolist(),
         reward_deviation=result.reward_deviation.tolist(),
         terminated=result.terminated.tolist(),
+    )
+
+
+def imagined(said: Said[Imagined]) -> replies.Imagined:
+    result = said.result
+    return replies.Imagined(
+        model_version=said.version,
+        mean=_episode(result.mean),
+        draws=[_episode(episode) for episode in result.draws],
+    )
+
+
+def _episode(episode: ImaginedEpisode) -> replies.ImaginedEpisode:
+    return replies.ImaginedEpisode(
+        coordinates=episode.coordinates.tolist(), reward=episode.reward.tolist(), terminated=episode.terminated
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_server.engine.session import Answer, Session
+from surrogym_server.services.activity import SessionActivity
 from surrogym_server.services.sessions import Opening
 from surrogym_server.surrogate import definition as core
 from surrogym_server.virtual import VirtualSettings
@@ -61,6 +62,24 @@ def session_view(session: Session, idle_seconds: float) -> replies.SessionView:
         action_space=_action_space(session.definition.action),
         outputs=list(session.definition.outputs),
         idle_seconds=idle_seconds,
+    )
+
+
+def session_activity(activity: SessionActivity) -> replies.SessionActivity:
+    session = activity.session
+    return replies.SessionActivity(
+        id=session.id,
+        num_envs=session.settings.num_envs,
+        variant=session.settings.variant,
+        model=session.model,
+        model_version=sorted(set(session.versions.tolist())),
+        steps=activity.steps,
+        steps_per_second=activity.steps_per_second,
+        idle_seconds=activity.idle_seconds,
+        penalty=session.settings.penalty,
+        episodes=activity.episodes,
+        returns=[episode.reward for episode in activity.recent],
+        penalties=[episode.penalty for episode in activity.recent],
     )
 
 

@@ -81,7 +81,7 @@ class LiveSessions:
         return len(self._live)
 
     def __iter__(self) -> Iterator[Session]:
-        return iter([live.session for live in self._live.values()])
+        return iter([live.session for live in list(self._live.values())])
 
     @property
     def requests(self) -> int:

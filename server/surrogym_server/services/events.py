@@ -12,6 +12,7 @@ from surrogym_server.storage.records import EventRecord
 
 POLL_SECONDS = 2.0
 SILENCE_SECONDS = 15.0
+CHANGE_SECONDS = 0.2  # at least, between two notices that something has changed
 PAGE = 1_000
 
 
@@ -26,6 +27,15 @@ class EventService:
         while page := self._storage.events.list(name, after, PAGE):
             after = page[-1].id
         return after
+
+    async def changes(self) -> AsyncIterator[bool]:
+        """True after something happened to any surrogate, False after a silence, until the server ends."""
+        with self._notices.listen() as listener:
+            while not self._notices.closing:
+                changed = await listener.wait(SILENCE_SECONDS)
+                if not self._notices.closing:
+                    yield changed
+                    await asyncio.sleep(CHANGE_SECONDS)
 
     async def follow(self, name: str, after: int) -> AsyncIterator[EventRecord | None]:
         """Events with an id above ``after``, until the surrogate or the server ends; None after a silence."""

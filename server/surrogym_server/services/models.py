@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 from surrogym_server.engine.fidelity import fidelity_of
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.sampling.uncertainty import UncertaintyResult, query_uncertainty
-from surrogym_server.services.definitions import Definitions, check_points
+from surrogym_server.services.definitions import Definitions, check_coordinates, check_points
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import ModelRecord, NewModel
+from surrogym_server.surrogate.actions import model_actions
 from surrogym_server.surrogate.codec import from_bytes
 from surrogym_server.surrogate.describe import PointPrediction, predict_points
 from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.virtual.imagined import Imagined, imagine
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -98,6 +100,13 @@ class ModelService:
         occupancy = self._storage.occupancy.latest(name)
         states = None if occupancy is None else occupancy.states
         return Said(version, model.definition.outputs, query_uncertainty(model, q, u, tolerances, states))
+
+    def imagine(self, name: str, q: Array, u: Array, *, draws: int, seed: int, version: int | None) -> Said[Imagined]:
+        """Episodes from q (C,) under u (T, F); raises as ``predict``."""
+        version, model = self._model(name, version)
+        start = check_coordinates(model.definition, "coordinates", q[None])[0]
+        actions = model_actions(model.definition.action, u)
+        return Said(version, model.definition.outputs, imagine(model, start, actions, draws=draws, seed=seed))
 
     def _model(self, name: str, version: int | None) -> tuple[int, SurrogateModel]:
         self._storage.surrogates.get(name)

@@ -18,12 +18,14 @@ class Listener:
     def wake(self) -> None:
         self._event.set()
 
-    async def wait(self, seconds: float) -> None:
-        """Until the next notice since the last wait, but no longer than ``seconds``."""
+    async def wait(self, seconds: float) -> bool:
+        """Until the next notice since the last wait, but no longer than ``seconds``; whether there was one."""
         with suppress(TimeoutError):
             async with asyncio.timeout(seconds):  # wait_for of Python 3.11 can swallow a cancellation
                 await self._event.wait()
+        noticed = self._event.is_set()
         self._event.clear()
+        return noticed
 
 
 class Notices:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_server.errors import InvalidInput
+from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions, check_points, check_rollouts, check_settable
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
@@ -31,10 +32,13 @@ class Claim:
 
 
 class QueryService:
-    def __init__(self, storage: Storage, definitions: Definitions, notices: Notices) -> None:
+    def __init__(
+        self, storage: Storage, definitions: Definitions, notices: Notices, samplers: Samplers | None = None
+    ) -> None:
         self._storage = storage
         self._definitions = definitions
         self._notices = notices
+        self._samplers = samplers or Samplers()
 
     async def claim(self, name: str, sampler: str, limit: int, lease_seconds: float, wait_seconds: float) -> Claim:
         """Lease up to ``limit`` queries; while there are none, wait for some, or for the design to finish.
@@ -56,6 +60,8 @@ class QueryService:
     def renew(self, name: str, query_id: int, token: str, lease_seconds: float) -> None:
         """The sampler's heartbeat. Raises ``UnknownQuery``, ``ForeignLease`` or ``LeaseExpired``."""
         self._storage.queries.renew(name, query_id, token, lease_seconds)
+        if sampler := self._storage.queries.get(name, query_id).sampler:
+            self._samplers.heard(name, sampler)
 
     def fail(self, name: str, query_id: int, token: str, error: str) -> QueryRecord:
         """Give a query back with an error. Raises ``UnknownQuery``, ``ForeignLease`` or ``LeaseExpired``."""
@@ -95,6 +101,7 @@ class QueryService:
         def claim() -> Claim:
             queries = self._storage.queries.claim(name, sampler, limit, lease_seconds)
             record = self._storage.surrogates.get(name)
+            self._samplers.heard(name, sampler)
             return Claim(queries, record.phase, record.paused)
 
         return await asyncio.to_thread(claim)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from surrogym_server.errors import InvalidInput
+from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions, check_coordinates
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
@@ -26,10 +27,13 @@ class Added:
 
 
 class SampleService:
-    def __init__(self, storage: Storage, definitions: Definitions, notices: Notices) -> None:
+    def __init__(
+        self, storage: Storage, definitions: Definitions, notices: Notices, samplers: Samplers | None = None
+    ) -> None:
         self._storage = storage
         self._definitions = definitions
         self._notices = notices
+        self._samplers = samplers or Samplers()
 
     def add(self, name: str, sampler: str, samples: Sequence[NewSample], key: str | None) -> Added:
         """Store real steps, all or nothing; committed when it returns.
@@ -44,6 +48,7 @@ class SampleService:
         if key is None and any(sample.query_id is None for sample in checked):
             raise InvalidInput("samples without a query_id: expected an idempotency_key, got none")
         added = self._storage.samples.add(name, sampler, checked, key=key)
+        self._samplers.heard(name, sampler)
         self._notices.post(name)
         return Added(added.ids, added.duplicates, self._storage.ledger.read(name))
 

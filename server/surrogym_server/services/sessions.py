@@ -27,6 +27,7 @@ from surrogym_server.engine.session import (
 )
 from surrogym_server.engine.sessions import LiveSessions, Work
 from surrogym_server.errors import InvalidInput, NotReset, SurrogymError, TooLarge
+from surrogym_server.services.activity import SessionActivity, Tallies
 from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.storage.port import Storage
@@ -72,6 +73,7 @@ class SessionService:
         self._live = live
         self._max_lanes = max_lanes
         self._counts = counts
+        self._tallies = Tallies()
         self._opening = asyncio.Lock()
         self._deadline: float | None = None
 
@@ -101,6 +103,7 @@ class SessionService:
                 return known
             needed = await asyncio.to_thread(self._expected_bytes, surrogate, opening)
             self._live.check_room(needed)
+            self._tallies.forget_all_but(self._live)
             return self._live.add(await asyncio.to_thread(self._open, surrogate, opening, digest), needed)
 
     def get(self, id: str) -> Session:
@@ -122,7 +125,9 @@ class SessionService:
         def work(session: Session) -> tuple[Session, Outcome]:
             return reset_session(session, seed, mask, self._latest(session))
 
-        return await self._live.advance(id, seq, digest_of("reset", seed, mask), work, deadline=self._deadline)
+        answer = await self._live.advance(id, seq, digest_of("reset", seed, mask), work, deadline=self._deadline)
+        self._tallies.of(id).reset(mask)
+        return answer
 
     async def step(self, id: str, seq: int | None, action: Array, mask: Bools | None, deviations: bool) -> Answer:
         """One step of the lanes of the mask (N,) with a policy's actions (N, F) or (N,).
@@ -177,6 +182,11 @@ class SessionService:
         """How many sessions are open, and how many lanes they have."""
         return len(self._live), sum(session.settings.num_envs for session in self._live)
 
+    async def activity(self, surrogate: str) -> list[SessionActivity]:
+        """What the open sessions of a surrogate are doing, oldest first. Raises ``UnknownSurrogate``."""
+        await asyncio.to_thread(self._storage.surrogates.get, surrogate)
+        return self._tallies.read(session for session in self._live if session.surrogate == surrogate)
+
     @property
     def requests(self) -> int:
         """How many requests that advance a session are at work or waiting."""
@@ -204,6 +214,7 @@ class SessionService:
         started = time.perf_counter()
         answer = await self._live.advance(id, seq, digest, work, steps, self._deadline)
         self._counts.steps.observe(time.perf_counter() - started)
+        self._tallies.of(id).stepped(answer)
         self._counts.lane_steps += steps * self._live.get(id).settings.num_envs
         return answer
 

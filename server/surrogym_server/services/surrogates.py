@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import LiveSessions
 from surrogym_server.errors import InvalidInput, NoModel
+from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Define
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
@@ -39,6 +40,8 @@ class SurrogateStatus:
     ledger: LedgerRecord
     queries: QueryCounts
     samples: int
+    samplers: tuple[str, ...]  # heard of within the last minute
+    sessions: int  # open
 
 
 class SurrogateService:
@@ -50,6 +53,7 @@ class SurrogateService:
         models: ModelCache,
         live: LiveSessions,
         notices: Notices,
+        samplers: Samplers,
     ) -> None:
         """``plan`` gives the first queries under a budget: (state, coordinates (m, C), action (m, F),
         rollouts (T, F) each)."""
@@ -59,6 +63,7 @@ class SurrogateService:
         self._models = models
         self._live = live
         self._notices = notices
+        self._samplers = samplers
 
     def create(self, name: str, spec: dict[str, Any], budget: int, target: float) -> SurrogateStatus:
         """Create a surrogate with its initial queries; the same name and spec again changes nothing.
@@ -133,4 +138,6 @@ class SurrogateService:
             ledger=self._storage.ledger.read(name),
             queries=self._storage.queries.counts(name),
             samples=self._storage.samples.count(name),
+            samplers=tuple(self._samplers.alive(name)),
+            sessions=sum(session.surrogate == name for session in self._live),
         )

@@ -8,6 +8,8 @@ from __future__ import annotations
 from surrogym_shared.wire.base import (
     MAX_BATCH,
     MAX_CLAIM,
+    MAX_DRAWS,
+    MAX_IMAGINED,
     MAX_LANES,
     MAX_MEASURED,
     MAX_PARTICLES,
@@ -30,7 +32,16 @@ from surrogym_shared.wire.base import (
     Variant,
     Vector,
 )
-from surrogym_shared.wire.models import ModelList, ModelView, Points, Prediction, Uncertainty
+from surrogym_shared.wire.models import (
+    Imagine,
+    Imagined,
+    ImaginedEpisode,
+    ModelList,
+    ModelView,
+    Points,
+    Prediction,
+    Uncertainty,
+)
 from surrogym_shared.wire.queries import (
     AddedSamples,
     AddSamples,
@@ -64,6 +75,8 @@ from surrogym_shared.wire.sessions import (
     ResetSession,
     RolloutReply,
     RolloutSession,
+    SessionActivity,
+    SessionList,
     SessionView,
     StepReply,
     StepSession,
@@ -85,6 +98,8 @@ from surrogym_shared.wire.surrogates import (
 __all__ = [
     "MAX_BATCH",
     "MAX_CLAIM",
+    "MAX_DRAWS",
+    "MAX_IMAGINED",
     "MAX_LANES",
     "MAX_MEASURED",
     "MAX_PARTICLES",
@@ -107,6 +122,9 @@ __all__ = [
     "FailQuery",
     "Fidelity",
     "Health",
+    "Imagine",
+    "Imagined",
+    "ImaginedEpisode",
     "Improve",
     "Key",
     "LeasedQuery",
@@ -145,6 +163,8 @@ __all__ = [
     "SampleView",
     "Seed",
     "Seq",
+    "SessionActivity",
+    "SessionList",
     "SessionView",
     "StepQuery",
     "StepReply",

@@ -14,6 +14,8 @@ MAX_PARTICLES = 1_000_000
 MAX_CLAIM = 256
 MAX_BATCH = 65_536
 MAX_ROLLOUT = 100_000
+MAX_IMAGINED = 500  # steps of an imagined episode
+MAX_DRAWS = 64
 MAX_MEASURED = 1e30  # beyond it variances overflow, and one such sample would leave no model to serve
 
 Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "failed"]

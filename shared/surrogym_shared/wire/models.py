@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from surrogym_shared.wire.base import Matrix, Reply, Request
+from surrogym_shared.wire.base import MAX_DRAWS, MAX_IMAGINED, Matrix, Reply, Request, Seed, Vector
 from surrogym_shared.wire.surrogates import Fidelity
 
 
@@ -36,6 +36,29 @@ class Prediction(Reply):
     reward: list[float] = Field(description="posterior mean, without the penalty")
     reward_deviation: list[float]
     terminated: list[bool]
+
+
+class Imagine(Request):
+    """An episode from ``coordinates`` under ``actions``: the mean's, and those of ``draws`` functions drawn
+    from its posterior."""
+
+    coordinates: Vector
+    actions: Annotated[list[Vector], Field(min_length=1, max_length=MAX_IMAGINED)] = Field(description="(T, F)")
+    draws: Annotated[int, Field(ge=0, le=MAX_DRAWS)] = 0
+    seed: Seed = 0
+    model: Annotated[int, Field(ge=1)] | None = Field(default=None, description="version; None is the latest")
+
+
+class ImaginedEpisode(Reply):
+    coordinates: list[list[float]] = Field(description="(t + 1, C), the start included; t is below T where it ended")
+    reward: list[float] = Field(description="(t,)")
+    terminated: bool
+
+
+class Imagined(Reply):
+    model_version: int
+    mean: ImaginedEpisode
+    draws: list[ImaginedEpisode]
 
 
 class ModelView(Reply):

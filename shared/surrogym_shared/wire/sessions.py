@@ -96,6 +96,27 @@ class SessionView(Reply):
     idle_seconds: float = Field(description="the session expires when unused for so long")
 
 
+class SessionActivity(Reply):
+    """What a session did since this process knows it."""
+
+    id: str
+    num_envs: int
+    variant: Variant
+    model: Literal["latest"] | int
+    model_version: list[int] = Field(description="versions its lanes are under now, without repetition")
+    steps: int = Field(description="of all lanes")
+    steps_per_second: float = Field(description="of all lanes, over about the last ten seconds")
+    idle_seconds: float = Field(description="since its last step")
+    penalty: float = Field(description="k of eq. 14")
+    episodes: int = Field(description="that ended")
+    returns: list[float] = Field(description="imagined, of the last episodes that ended, oldest first")
+    penalties: list[float] = Field(description="what was taken off each of them for its deviations")
+
+
+class SessionList(Reply):
+    sessions: list[SessionActivity]
+
+
 class ResetSession(Request):
     seq: Seq | None = None
     seed: Seed | Annotated[list[Seed], Field(max_length=MAX_LANES)] | None = None

@@ -88,6 +88,8 @@ class SurrogateSummary(Reply):
     budget: int = Field(description="real steps the design may take")
     ledger: Ledger
     queries: QueryCounts
+    samplers: list[str] = Field(default=[], description="names of those that were heard of within the last minute")
+    sessions: int = Field(default=0, description="open ones")
     created_at: float = Field(description="seconds since 1970, the server's clock")
 
 

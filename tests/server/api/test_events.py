@@ -48,3 +48,13 @@ def test_the_stream_of_a_deleted_surrogate_ends(client: httpx.Client, fresh: str
         next(lines)
         client.delete(f"/v1/surrogates/{fresh}").raise_for_status()
         assert not [line for line in lines if line.startswith("data: ")]
+
+
+def test_one_stream_tells_of_changes_to_any_surrogate(client: httpx.Client, fresh: str):
+    with client.stream("GET", "/v1/events") as stream:
+        lines = stream.iter_lines()
+        assert next(lines).startswith(":")
+        body = {"steps": 5, "idempotency_key": "any"}
+        client.post(f"/v1/surrogates/{fresh}/ledger", json=body).raise_for_status()
+        client.patch(f"/v1/surrogates/{fresh}", json={"budget": 20}).raise_for_status()
+        assert next(line for line in lines if line) == "event: changed"

@@ -22,6 +22,7 @@ EXAMPLES = {
     "LEDGER": wire.ReportSteps,
     "IMPROVE": wire.Improve,
     "POINTS": wire.Points,
+    "IMAGINE": wire.Imagine,
     "OPEN": wire.OpenSession,
     "RESET": wire.ResetSession,
     "STEP": wire.StepSession,

@@ -151,3 +151,23 @@ def test_a_lane_keeps_its_model_to_the_end_of_its_episode(client: httpx.Client, 
     fixed = [send(client, opened[1], "step", action=ACTIONS).json()["model_version"] for _ in range(4)]
     assert fixed == [[1, 1]] * 4
     client.delete(f"/v1/surrogates/{name}")
+
+
+def test_the_list_of_sessions_counts_steps_once_and_ended_episodes(client: httpx.Client, open_session: Open):
+    session = open_session(num_envs=2, time_limit=3, autoreset_mode="same_step", penalty=1.0)["id"]
+    send(client, session, "reset", seq=1)
+    body = {"seq": 2, "actions": [ACTIONS] * 4}
+    steps, _ = (send(client, session, "rollout", **body).json()["steps"] for _ in range(2))
+    listed = client.get(f"/v1/surrogates/{pendulum_name(client, session)}/sessions").raise_for_status()
+    (found,) = [s for s in wire.SessionList.model_validate_json(listed.content).sessions if s.id == session]
+    assert (found.steps, found.episodes, found.num_envs) == (8, 2, 2)
+    assert found.steps_per_second > 0
+    for lane in range(2):
+        assert found.returns[lane] == pytest.approx(sum(step["reward"][lane] for step in steps[:3]))
+        mean = sum(step["reward_mean"][lane] for step in steps[:3])
+        assert found.penalties[lane] == pytest.approx(mean - found.returns[lane])
+        assert found.penalties[lane] > 0
+
+
+def pendulum_name(client: httpx.Client, session: str) -> str:
+    return str(client.get(f"/v1/sessions/{session}").json()["surrogate"])

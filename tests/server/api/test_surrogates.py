@@ -215,3 +215,15 @@ def test_deleting_takes_everything_along(client: httpx.Client, name: str):
     assert client.post(f"/v1/sessions/{session}/reset", json={}).status_code == 404
     client.post("/v1/surrogates", json={"name": name, "spec": pendulum.spec()}).raise_for_status()
     assert view(client, name).model_version is None
+
+
+def test_a_surrogate_names_its_samplers_and_counts_its_sessions(client: httpx.Client, fresh: str):
+    before = view(client, fresh)
+    query = pendulum.claim(client, fresh, max_queries=1)["queries"][0]
+    pendulum.add(client, fresh, [pendulum.answer(query)]).raise_for_status()
+    assert (before.samplers, len(view(client, fresh).samplers)) == ([], 1)
+    assert before.sessions == 0
+
+
+def test_an_open_session_is_counted(client: httpx.Client, taught: str, session: str):
+    assert view(client, taught).sessions >= 1

@@ -1,0 +1,69 @@
+"""Episodes from a given state under given actions: the mean's, and those of functions drawn from the posterior.
+
+Shapes: C coordinates, F action entries, T actions, K draws.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.virtual.environment import VirtualSettings, create, step
+from surrogym_server.virtual.lanes import RUNNING
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ImaginedEpisode:
+    coordinates: Array  # (t + 1, C), the start included; t < T where it terminated
+    reward: NDArray[np.floating[Any]]  # (t,)
+    terminated: bool
+
+
+@dataclass(frozen=True)
+class Imagined:
+    mean: ImaginedEpisode
+    draws: tuple[ImaginedEpisode, ...]
+
+
+def imagine(model: SurrogateModel, q: Array, u: Array, *, draws: int, seed: int) -> Imagined:
+    """Episodes from q (C,) under u (T, F), the model's actions. The same seed draws the same functions."""
+    mean = _episodes(model, VirtualSettings(1, autoreset_mode="disabled"), q, u, seed)[0]
+    if not draws:
+        return Imagined(mean, ())
+    settings = VirtualSettings(draws, variant="pathwise", autoreset_mode="disabled")
+    return Imagined(mean, _episodes(model, settings, q, u, seed))
+
+
+def _episodes(
+    model: SurrogateModel, settings: VirtualSettings, q: Array, u: Array, seed: int
+) -> tuple[ImaginedEpisode, ...]:
+    count = settings.num_envs
+    lanes = create(model.definition, settings, seed)
+    lanes = replace(
+        lanes,
+        q=torch.from_numpy(q).repeat(count, 1),
+        phase=torch.full_like(lanes.phase, RUNNING),
+        episode=torch.zeros_like(lanes.episode),
+    )
+    states, rewards, running = [lanes.q.numpy()], [], np.ones(count, dtype=bool)
+    length = np.zeros(count, dtype=np.int64)
+    for action in u:
+        if not running.any():
+            break
+        lanes, moved = step(model, settings, lanes, np.tile(action, (count, 1)), running)
+        length += running
+        running = running & ~moved.terminated
+        states.append(lanes.q.numpy())
+        rewards.append(moved.reward)
+    path, reward = np.stack(states, 1), np.stack(rewards, 1)
+    return tuple(
+        ImaginedEpisode(path[lane, : length[lane] + 1], reward[lane, : length[lane]], bool(not running[lane]))
+        for lane in range(count)
+    )
