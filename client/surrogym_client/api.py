@@ -51,6 +51,7 @@ class Api:
 
     @property
     def url(self) -> str:
+        """Where the server is."""
         return self.connection.url
 
     def __enter__(self) -> Self:
@@ -60,6 +61,7 @@ class Api:
         self.close()
 
     def close(self) -> None:
+        """Close the sockets; a later call connects anew."""
         self.connection.close()
 
     # Service
@@ -107,9 +109,15 @@ class Api:
         return self._post(wire.SurrogateView, "/v1/surrogates", wire.CreateSurrogate(name=name, spec=spec))
 
     def surrogates(self) -> list[wire.SurrogateSummary]:
+        """All of them, oldest first, with phase, what was spent, and confidence."""
         return self._get(wire.SurrogateList, "/v1/surrogates").surrogates
 
     def surrogate(self, name: str) -> wire.SurrogateView:
+        """One, with its specification, the fidelity of every output, its ledger and counts of queries.
+
+        Raises:
+            UnknownSurrogate: there is none of this name.
+        """
         return self._get(wire.SurrogateView, _surrogate(name))
 
     def patch_surrogate(
@@ -126,6 +134,11 @@ class Api:
         return self._post(wire.SurrogateView, _surrogate(name), body, method="PATCH")
 
     def delete_surrogate(self, name: str) -> None:
+        """Remove it with its samples, models and sessions; there is no way back.
+
+        Raises:
+            UnknownSurrogate: there is none of this name.
+        """
         self.connection.send("DELETE", _surrogate(name))
 
     # Queries
@@ -188,6 +201,7 @@ class Api:
         return self._post(wire.QueryList, f"{_surrogate(name)}/queries", body).queries
 
     def queries(self, name: str) -> list[wire.QueryView]:
+        """Every query ever asked, with its state, attempts and last error."""
         return self._get(wire.QueryList, f"{_surrogate(name)}/queries").queries
 
     # Samples and the ledger
@@ -257,6 +271,7 @@ class Api:
         return self._post(wire.Prediction, f"{_surrogate(name)}/predict", _points(coordinates, action, model))
 
     def models(self, name: str) -> list[wire.ModelView]:
+        """Every fit with its structure, hyperparameters and fidelity, oldest first."""
         return self._get(wire.ModelList, f"{_surrogate(name)}/models").models
 
     def model(self, name: str) -> wire.ModelView:

@@ -247,8 +247,8 @@ def _termination_kind(value: object) -> str:
 
 
 Termination = Annotated[
-    Annotated[Literal["learned"], Tag("learned")]
-    | Annotated[tuple[AllOf, ...], Field(max_length=MAX_INEQUALITIES), Tag("declared")],
+    Annotated[tuple[AllOf, ...], Field(max_length=MAX_INEQUALITIES), Tag("declared")]
+    | Annotated[Literal["learned"], Tag("learned")],
     Discriminator(_termination_kind),
     Field(description="ends when any of these all-of groups holds at q'; or 'learned' from samples that ended"),
 ]

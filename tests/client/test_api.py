@@ -1,5 +1,6 @@
 """Api: keys that make repeats harmless, pages, and events that survive a broken stream. Over real sockets."""
 
+import inspect
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -120,3 +121,11 @@ def test_a_server_on_its_way_up_is_waited_for():
     ready = said(wire.Ready(status="ready", storage="ok"))
     with api_of(problem(Code.UNAVAILABLE), ready, said(wire.Health(version="1"))) as (api, _):
         assert api.wait_until_ready(5.0).version == "1"
+
+
+def test_every_method_is_typed_and_explains_itself():
+    methods = {name: member for name, member in vars(Api).items() if callable(member) and not name.startswith("_")}
+    assert len(methods) > 20
+    for name, method in methods.items():
+        assert method.__doc__, name
+        assert inspect.signature(method).return_annotation is not inspect.Signature.empty, name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from fastapi import APIRouter, FastAPI, Request
@@ -59,5 +60,27 @@ def describe(app: FastAPI) -> dict[str, Any]:
         parts = schema["components"]["schemas"]
         parts.update(problem.pop("$defs", {}))
         parts["Problem"] = problem
+        _drop_object_defaults(parts)
+        _name_operations(schema["paths"])
         app.openapi_schema = schema
     return app.openapi_schema
+
+
+def _name_operations(paths: dict[str, Any]) -> None:
+    """Short names, such as ``surrogates_create``: generated clients call their functions so."""
+    for path, methods in paths.items():
+        for method, operation in methods.items():
+            behind = re.sub(r"\W", "_", path) + f"_{method}"
+            operation["operationId"] = f"{operation['tags'][0]}_{operation['operationId'].removesuffix(behind)}"
+
+
+def _drop_object_defaults(node: Any) -> None:
+    """Leave out defaults that are objects: their own fields say theirs, and generators of clients refuse them."""
+    if isinstance(node, dict):
+        if isinstance(node.get("default"), dict):
+            del node["default"]
+        for value in node.values():
+            _drop_object_defaults(value)
+    elif isinstance(node, list):
+        for value in node:
+            _drop_object_defaults(value)

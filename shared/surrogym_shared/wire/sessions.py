@@ -29,7 +29,7 @@ class OpenSession(Request):
     variant: Variant = "deterministic"
     seed: Seed | None = Field(default=None, description="None draws one; the reply says which")
     autoreset_mode: AutoresetMode = "next_step"
-    model: Literal["latest"] | Annotated[int, Field(ge=1)] = "latest"
+    model: Annotated[int, Field(ge=1)] | Literal["latest"] = "latest"
     time_limit: Annotated[int, Field(ge=1, le=10_000_000)] | None = Field(default=None, description="None: the spec's")
     penalty: Annotated[float, Field(ge=0, le=100)] | None = Field(default=None, description="k of eq. 14")
     start_box: Annotated[float, Field(ge=0, le=1)] = Field(
@@ -85,7 +85,7 @@ class SessionView(Reply):
     variant: Variant
     seed: int
     autoreset_mode: AutoresetMode
-    model: Literal["latest"] | int
+    model: int | Literal["latest"]
     model_version: list[int] = Field(description="(N,) the version each lane's episode runs under")
     seq: int = Field(description="the last seq answered; the next request carries seq + 1")
     time_limit: int | None
