@@ -66,6 +66,7 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         mode = _mode(autoreset_mode)
         self._lanes = Lanes(port, session_request(num_envs, WIRE_MODE[mode], options), deviations=deviations)
         self.num_envs = num_envs
+        self.autoreset_mode = mode  # as SyncVectorEnv has it; TorchRL reads it here
         self.render_mode = render_mode
         self._pictures = pictures_for(render_mode, port.spec, original)
         fps = {} if self._pictures is None else {"render_fps": self._pictures.frames_per_second}

@@ -1,0 +1,50 @@
+"""The environments of examples/ run in short: registered, sampled, and where it says so trained on and evaluated."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from support.examples import EXAMPLES, cells, run, surrogym
+from support.server import ServerProcess
+from surrogym_client.api import Api
+
+ENVIRONMENT_LINES = 60  # of one's own environment, without blank ones
+
+
+def test_the_drone_is_learned_trained_on_and_evaluated(server: ServerProcess, tmp_path: Path) -> None:
+    surrogym(server, tmp_path, "register", "drone:Drone", "--name", "drone", "--budget", "10", "--initial", "10")
+    report = surrogym(server, tmp_path, "sample", "drone", "--env", "drone:Drone", "--until-done", "--json")
+    assert json.loads(report)["steps"] == 10
+    surrogym(server, tmp_path, "train", "drone", "--steps", "2048", "--num-envs", "16", "--out", "drone.zip")
+    evaluated = surrogym(server, tmp_path, "evaluate", "drone.zip", "--env", "drone:Drone", "--episodes", "2", "--json")
+    assert json.loads(evaluated)["episodes"] == 2
+
+
+def test_the_drone_is_as_short_as_the_docs_say() -> None:
+    lines = (EXAMPLES / "drone.py").read_text(encoding="utf-8").splitlines()
+    assert sum(bool(line) for line in lines) <= ENVIRONMENT_LINES
+
+
+def test_four_samplers_share_the_queries_of_a_slow_simulator(server: ServerProcess, tmp_path: Path) -> None:
+    surrogym(
+        server, tmp_path, "register", "slow_simulator:SlowPendulum", "--name", "slow", "--budget", "8", "--initial", "8"
+    )
+    said = run(server, tmp_path, str(EXAMPLES / "slow_simulator.py"), "slow", SIMULATOR_SECONDS="0.5")
+    assert said.splitlines()[-1].startswith("4 samplers, 0 failed")
+    with Api(server.url) as api:
+        workers = [sample.sampler for sample in api.samples("slow")]
+    assert len(workers) == 8
+    assert len(set(workers)) >= 2
+
+
+def test_the_robot_that_can_be_set_to_no_state_is_sampled(server: ServerProcess, tmp_path: Path) -> None:
+    surrogym(server, tmp_path, "register", "robot:Joint", "--name", "joint", "--budget", "14")
+    report = surrogym(
+        server, tmp_path, "sample", "joint", "--env", "robot:Joint", "--until-done", "--json", ROBOT_PERIOD="0"
+    )
+    assert 12 <= json.loads(report)["steps"] <= 14
+
+
+def test_the_notebook_runs_from_its_first_cell_to_its_last(server: ServerProcess, tmp_path: Path) -> None:
+    run(server, tmp_path, "-W", "error", "-c", cells(EXAMPLES / "first_steps.ipynb"))

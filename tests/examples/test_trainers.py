@@ -1,0 +1,44 @@
+"""Trainers of others against a live server: those of the base install here, the rest where their packages are."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from support.examples import EXAMPLES, ROOT, run
+from support.server import ServerProcess
+
+EXTRAS = Path(os.environ.get("SURROGYM_TEST_EXTRAS", ROOT / ".venv-extras")) / "bin" / "python"
+needs_extras = pytest.mark.skipif(not EXTRAS.exists(), reason="no .venv-extras here: make test-all makes it")
+
+
+def program(name: str) -> str:
+    return str(EXAMPLES / name)
+
+
+def test_stable_baselines3(server: ServerProcess, tmp_path: Path) -> None:
+    said = run(server, tmp_path, program("train_sb3.py"), "pendulum", "--steps", "2048")
+    assert "imagined return: -" in said
+    assert (tmp_path / "sb3.zip").exists()
+    assert list((tmp_path / "runs" / "sb3").rglob("events.out.tfevents.*"))
+
+
+def test_a_plain_loop(server: ServerProcess, tmp_path: Path) -> None:
+    said = run(server, tmp_path, program("train_cleanrl.py"), "pendulum", "--steps", str(7 * 2048))
+    assert said.startswith("14336 steps, imagined return -")
+    assert (tmp_path / "cleanrl.pt").exists()
+
+
+@needs_extras
+def test_torchrl(server: ServerProcess, tmp_path: Path) -> None:
+    said = run(server, tmp_path, program("train_torchrl.py"), "pendulum", "--steps", str(7 * 1024), python=str(EXTRAS))
+    assert "imagined return -" in said
+    assert (tmp_path / "torchrl.pt").exists()
+
+
+@needs_extras
+def test_rllib(server: ServerProcess, tmp_path: Path) -> None:
+    said = run(server, tmp_path, program("train_rllib.py"), "pendulum", "--iterations", "2", python=str(EXTRAS))
+    assert "iteration 2: imagined return -" in said
