@@ -14,7 +14,7 @@ import numpy as np
 
 from surrogym_client.answers import sample_of
 from surrogym_client.api import Api
-from surrogym_client.cli.errors import EXTRAS
+from surrogym_client.cli.errors import EXTRAS, GIVE_TOKEN, START_SERVER
 from surrogym_client.errors import ProblemError, ProtocolMismatch, Refused, ServerUnreachable, SurrogymClientError
 from surrogym_client.original.episodes import draw
 from surrogym_client.original.errors import OriginalError, StepFailed
@@ -25,7 +25,6 @@ from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.wire import PROTOCOL, StepQuery
 
 ROUND_TRIPS = 20
-START_SERVER = "start one with surrogym serve, or name another by --server or SURROGYM_URL"
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,7 @@ def _access(api: Api) -> Finding:
     try:
         access = api.access()
     except Refused as error:
-        return Finding("token", str(error), "give a token of this server by --token or SURROGYM_TOKEN")
+        return Finding("token", str(error), GIVE_TOKEN)
     except SurrogymClientError as error:
         return Finding("token", str(error), "bring server and client to the same version")
     return Finding("token", f"role {access.role}" if access.tokens else "none needed: everybody is admin here")

@@ -2,6 +2,9 @@
 
 import pytest
 
+from support.scripted_server import problem, reply, scripted_server
+from surrogym_shared.codes import Code
+
 NOBODY = ("--server", "http://127.0.0.1:9")
 
 
@@ -32,7 +35,9 @@ def refused(said, code=1):
     ],
 )
 def test_a_server_that_is_not_there(surrogym, quickly, arguments):
-    assert "no Surrogym server answers at http://127.0.0.1:9" in refused(surrogym(*arguments, *NOBODY))
+    said = refused(surrogym(*arguments, *NOBODY))
+    assert "no Surrogym server answers at http://127.0.0.1:9" in said
+    assert "start one with surrogym serve" in said
 
 
 def test_an_address_that_is_none(surrogym):
@@ -89,6 +94,22 @@ def test_wrong_usage(surrogym, arguments):
     assert said.err
 
 
-@pytest.mark.parametrize("command", ["sample", "train", "status", "improve"])
+@pytest.mark.parametrize("command", ["sample", "train", "status", "improve", "report"])
 def test_an_unknown_surrogate(on_server, command):
-    assert "nobody" in refused(on_server(command, "nobody"))
+    said = refused(on_server(command, "nobody"))
+    assert "nobody" in said
+    assert said.endswith("; surrogym status lists those there are\n")
+
+
+@pytest.mark.parametrize(
+    ("answer", "way_out"),
+    [
+        (problem(Code.UNAUTHENTICATED), "; give a token of this server by --token or SURROGYM_TOKEN"),
+        (problem(Code.FORBIDDEN), "; surrogym doctor says what this token may do"),
+        (reply("<html>"), "; surrogym doctor says more"),
+    ],
+    ids=["no token", "a token of another role", "another program"],
+)
+def test_the_way_out_stands_beside_what_is_wrong(surrogym, answer, way_out):
+    with scripted_server(answer) as server:
+        assert refused(surrogym("status", "--server", server.url)).endswith(f"{way_out}\n")

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from surrogym_client.errors import SurrogymClientError
+
 EXTRAS = {
     "server": ("alembic", "fastapi", "psycopg", "safetensors", "scipy", "sqlalchemy", "starlette", "uvicorn"),
     "train": ("matplotlib", "stable_baselines3", "tensorboard", "torch"),
@@ -9,6 +14,8 @@ EXTRAS = {
     "render": ("moviepy", "pygame"),
     "mujoco": ("mujoco", "imageio"),
 }
+START_SERVER = "start one with surrogym serve, or name another by --server or SURROGYM_URL"
+GIVE_TOKEN = "give a token of this server by --token or SURROGYM_TOKEN"
 
 
 class CommandError(Exception):
@@ -24,7 +31,9 @@ def sentence(error: Exception) -> str | None:
     from surrogym_shared.surrogate_file import NotASurrogateFile
 
     match error:
-        case CommandError() | SurrogymClientError() | OriginalError() | NotASurrogateFile():
+        case SurrogymClientError():
+            return f"{error}{_way_out(error)}"
+        case CommandError() | OriginalError() | NotASurrogateFile():
             return str(error)
         case ModuleNotFoundError(name=str(name)):
             return _missing(name.partition(".")[0])
@@ -34,6 +43,27 @@ def sentence(error: Exception) -> str | None:
             return f"{path}: {reason}"
         case _:
             return None
+
+
+def _way_out(error: SurrogymClientError) -> str:
+    """What to do about what a server, or none, has said."""
+    from surrogym_client import errors
+
+    match error:
+        case errors.RequestTimeout():
+            return "; surrogym doctor says how far away it is"
+        case errors.ServerUnreachable():
+            return f"; {START_SERVER}"
+        case errors.ProtocolMismatch():
+            return "; surrogym doctor says more"
+        case errors.Unauthenticated():
+            return f"; {GIVE_TOKEN}"
+        case errors.Forbidden():
+            return "; surrogym doctor says what this token may do"
+        case errors.UnknownSurrogate():
+            return "; surrogym status lists those there are"
+        case _:
+            return ""
 
 
 def invalid(error: Exception) -> str:
