@@ -11,7 +11,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint
 PINS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: demo test format-check lint types imports unit chaos bench acquisition format postgresql clean help
+.PHONY: demo test test-all docs docs-serve format-check lint types imports unit chaos bench acquisition format postgresql clean help
 
 demo: .venv/all  ## Solve Pendulum with server, sampler and trainer on this machine (ARGS="--seed 1")
 	@exec $(BIN)/surrogym demo pendulum $(ARGS)
@@ -32,6 +32,15 @@ imports: .venv/dev  ## Check which room imports which
 
 unit: .venv/dev postgresql  ## The tests alone (ARGS="-k pendulum")
 	$(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
+
+test-all: test .venv-extras  ## make test, every command of the docs, and trainers and trackers with packages of their own
+	DOCS=full $(BIN)/pytest --durations 0 tests/docs tests/examples
+
+docs: .venv/dev  ## Build the site into build/docs; warnings are errors
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
+docs-serve: .venv/dev  ## Show the site while its pages are written
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve
 
 chaos: .venv/dev postgresql  ## Faults and attacks in full length; make test has a short form (ARGS="-k killed")
 	CHAOS=full $(BIN)/pytest --durations 0 tests/chaos tests/security $(ARGS)
@@ -57,7 +66,7 @@ postgresql:
 	fi
 
 clean:  ## Remove the virtual environment, caches and builds; run folders stay
-	rm -rf .venv build dist .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-extras build dist .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
 	find client server shared tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:  ## This list
@@ -71,6 +80,13 @@ help:  ## This list
 .venv/all: $(PINS) | .venv/bin/python
 	@echo "installing into .venv; this takes some minutes the first time"
 	@$(PIP) --editable ".[all]"
+	@touch $@
+
+.venv-extras: pyproject.toml constraints-extras.txt | .venv/bin/python
+	@echo "installing RLlib, TorchRL, MLflow and Weights & Biases into .venv-extras"
+	@$(PYTHON) -m venv .venv-extras
+	@.venv-extras/bin/python -m pip install -qq --disable-pip-version-check --constraint constraints-extras.txt \
+	    --editable ".[train,torchrl,rllib,trackers]"
 	@touch $@
 
 .venv/dev: $(PINS) | .venv/bin/python

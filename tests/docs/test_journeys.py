@@ -1,0 +1,122 @@
+"""Pages are followed from top to bottom as a reader would: programs are saved or run, commands typed, in their order.
+
+Long work is made short (``SHORTER``), and what another test runs, or what belongs to another machine, is left out
+(``ELSEWHERE``). Two pages are followed here, all of them with DOCS=full, which is in ``make test-all``.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from support.examples import EXAMPLES, ROOT, run
+from support.server import ServerProcess, running_server
+from support.teaching import teach
+from surrogym_client.api import Api
+from surrogym_client.original.classic import pendulum
+
+PRINTED_URL = "http://127.0.0.1:8000"
+PAGES = ["docs/tutorial.md"]
+ALL_PAGES = [
+    "docs/how-to/files.md",
+    "docs/how-to/no-teleport.md",
+    "docs/how-to/own-environment.md",
+    "docs/how-to/pictures.md",
+    "docs/how-to/policy-search.md",
+    "docs/how-to/remote-gymnasium.md",
+    "docs/how-to/rewards-and-terminations.md",
+    "docs/how-to/stable-baselines3.md",
+    "docs/how-to/trainers.md",
+]
+SHORTER = {
+    "register": ["--budget", "12"],
+    "train": ["--steps", "512", "--num-envs", "16"],
+    "evaluate": ["--episodes", "1"],
+    "optimise": ["--iterations", "1"],
+}
+ELSEWHERE = {
+    "make": "tests/demo and the Makefile itself",
+    "docker": "tests/docker",
+    "export": "a setting of the shell",
+    ".": "a setting of the shell",
+    "pip": "tests/packaging",
+    "surrogym serve": "a server of this test runs already",
+    "surrogym demo": "tests/demo",
+    "surrogym reproduce": "tests/cli/test_reproduce.py",
+}
+BLOCK = re.compile(
+    r"^(?P<before>[^\n]*)\n\n^```(?P<language>python|console)\n(?P<code>.*?)^```", re.DOTALL | re.MULTILINE
+)
+SAVED = re.compile(r"[Ss]ave (?:this|it) as `(\S+\.py)`")
+
+
+@pytest.mark.parametrize("page", PAGES + (ALL_PAGES if os.environ.get("DOCS") == "full" else []))
+def test_a_page_is_followed_from_top_to_bottom(page: str, tmp_path: Path) -> None:
+    server_folder, folder = tmp_path / "server", tmp_path / "reader"
+    server_folder.mkdir()
+    folder.mkdir()
+    (folder / "examples").symlink_to(EXAMPLES)
+    with running_server(server_folder) as server:
+        for kind, content in steps((ROOT / page).read_text(encoding="utf-8")):
+            follow(server, folder, kind, content)
+
+
+def steps(text: str) -> Iterator[tuple[Literal["file", "program", "command"], str]]:
+    """What a page has its reader do, in order; a file begins with the line of its name."""
+    first_command = re.search(r"surrogym register \S+ --name pendulum", text)
+    if first_command is None and "pendulum" in text:
+        yield "file", "pendulum"
+    for block in BLOCK.finditer(text):
+        saved = SAVED.search(block["before"])
+        if block["language"] == "console":
+            yield from (("command", line) for line in block["code"].replace("\\\n", " ").splitlines() if line.strip())
+        elif saved is not None:
+            yield "file", f"{saved[1]}\n{block['code']}"
+        else:
+            yield "program", block["code"]
+
+
+def follow(server: ServerProcess, folder: Path, kind: str, content: str) -> None:
+    if kind == "file" and content == "pendulum":  # the page supposes that it is there
+        with Api(server.url) as api:
+            teach(api, "pendulum", pendulum(), queries=6)
+    elif kind == "file":
+        name, _, code = content.partition("\n")
+        (folder / name).write_text(code, encoding="utf-8")
+    elif kind == "program":
+        run(server, folder, "-c", content.replace(PRINTED_URL, server.url).replace("0_000", "00"))
+    elif (words := shortened(shlex.split(content, comments=True))) is not None:
+        run(server, folder, *words)
+
+
+def shortened(words: list[str]) -> list[str] | None:
+    """The arguments of Python that a line of a shell comes to, made short; None where it is run elsewhere."""
+    if not words or words[0] in ELSEWHERE or " ".join(words[:2]) in ELSEWHERE or "--watch" in words:
+        return None
+    if words[0] == "python":
+        return [*words[1:], *(["--steps", "4096"] if words[1].startswith("train") else [])]
+    assert words[0] == "surrogym", f"a page has people type {words[0]!r}, which nothing runs"
+    more = SHORTER.get(words[1], []) if "--help" not in words else []
+    return ["-m", "surrogym_client", *words[1:], *more]
+
+
+def test_each_page_with_commands_is_followed_or_known_to_be_run_elsewhere() -> None:
+    followed = {*PAGES, *ALL_PAGES}
+    others = {  # by test_http_api, test_pages alone (no server), tests/docker and tests/cli
+        "README.md",
+        "docs/http-api.md",
+        "docs/how-to/containers.md",
+        "docs/how-to/terminal.md",
+        "docs/performance.md",
+        "docs/results.md",
+    }
+    pages = [
+        path for path in (ROOT / "docs").rglob("*.md") if re.search(r"^```(python|console)$", path.read_text(), re.M)
+    ]
+    assert {str(path.relative_to(ROOT)) for path in pages} <= followed | others
