@@ -172,7 +172,7 @@ def acrobot() -> EnvironmentSpec:
             *(
                 Coordinate(
                     name=name,
-                    sampling=Normal(mean=0, std=std, low=-top, high=top),
+                    sampling=Normal(mean=0, std=std),
                     bounds=Bounds(low=-top, high=top),
                     unit="rad/s",
                 )

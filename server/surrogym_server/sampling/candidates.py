@@ -33,8 +33,10 @@ def candidates_of(model: SurrogateModel, points: Points, states: Tensor | None, 
     """Candidates from the Monte Carlo set ``points`` (m) and, as many again, visited states (v, C) under random
     actions: few points of a set spread over the whole range lie where a policy goes.
 
-    The reference is the Monte Carlo set, mixed with the visited states where there are any.
+    The reference is the Monte Carlo set, mixed with the visited states where there are any. Visited states outside the
+    sampling range are left out: a wrong model lets policies run away, and no real system should be set to where.
     """
+    states = None if states is None else states[model.definition.in_range(states)]
     points = points[:MAX_CANDIDATES]
     reference, weights = points[:REFERENCE], points.q.new_ones(min(len(points), REFERENCE))
     if states is not None and len(states) and model.definition.design.preset == "default":

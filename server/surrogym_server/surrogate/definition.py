@@ -153,6 +153,12 @@ class EnvironmentDefinition:
         room = REACH * (ends[:, 1] - ends[:, 0])
         return torch.maximum(low, ends[:, 0] - room), torch.minimum(high, ends[:, 1] + room)
 
+    def in_range(self, q: Tensor) -> Tensor:
+        """Whether states q (n, C) lie in the sampling range, (n,) bool."""
+        low, high = torch.tensor([(c.sampling.low, c.sampling.high) for c in self.coordinates], dtype=torch.float64).T
+        inside: Tensor = ((q >= low) & (q <= high)).all(-1)
+        return inside
+
     @cached_property
     def angles(self) -> tuple[int, ...]:
         return tuple(i for i, c in enumerate(self.coordinates) if c.kind == "angle")

@@ -48,6 +48,16 @@ def test_without_visited_states_a_query_should_be_good_anywhere(model, points, r
     torch.testing.assert_close(made.weights, torch.full((60,), 1 / 60, dtype=torch.float64))
 
 
+def test_visited_states_outside_the_sampling_range_are_never_asked_for(model, points, unseen, rng):
+    visited, away = unseen.q[:7], torch.tensor([[0.0, 8.5], [3.0, -400.0]], dtype=torch.float64)
+    made = candidates_of(model, Points(*points), torch.cat([away, visited]), rng)
+    assert float(made.points.q[:, 1].abs().max()) <= 8
+    assert float(made.reference.q[:, 1].abs().max()) <= 8
+    none = candidates_of(model, Points(*points), away, rng)
+    assert torch.equal(none.points.q, points[0])
+    assert torch.equal(none.weights, torch.full_like(none.weights, 1 / len(none.weights)))
+
+
 def test_visited_states_are_candidates_and_have_their_share_of_the_reference(model, points, unseen, rng):
     visited = unseen.q[:7]
     made = candidates_of(model, Points(*points), visited, rng)
