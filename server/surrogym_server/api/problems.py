@@ -41,6 +41,7 @@ CODES: dict[type[errors.SurrogymError], Code] = {
 }
 
 HTTP_CODES = {
+    400: Code.INVALID_REQUEST,  # FastAPI could not parse the body
     401: Code.UNAUTHENTICATED,
     403: Code.FORBIDDEN,
     404: Code.NOT_FOUND,
@@ -183,12 +184,13 @@ async def _request_invalid(_: Request, error: Exception) -> Response:
 
 async def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    code = HTTP_CODES.get(error.status_code, Code.INVALID_REQUEST)
+    code = HTTP_CODES[error.status_code]
     detail = {
         Code.NOT_FOUND: f"no route {request.url.path!r}: see /docs",
         Code.METHOD_NOT_ALLOWED: f"{request.method} is not allowed on {request.url.path!r}",
+        Code.INVALID_REQUEST: "the body: expected JSON in UTF-8, got bytes that are none",
     }.get(code, str(error.detail))
-    return problem_response(code, detail, status=error.status_code, headers=error.headers)
+    return problem_response(code, detail, headers=error.headers)
 
 
 async def _gone(_: Request, error: Exception) -> Response:

@@ -33,6 +33,7 @@ ERRORS = documented(
     Code.UNSUPPORTED_MEDIA_TYPE,
     Code.TOO_MANY_REQUESTS,
     Code.DEADLINE_EXCEEDED,
+    Code.UNAVAILABLE,
 )
 
 

@@ -364,3 +364,9 @@ def test_an_oversized_body_in_chunks_that_do_not_say_how_many(client: httpx.Clie
     headers = {"content-type": "application/json"}
     for path in (f"/v1/sessions/{session}/step", "/v1/surrogates"):
         refused(client.post(path, content=chunks(), headers=headers), Code.TOO_LARGE, "at most")
+
+
+def test_bytes_that_are_no_text(client: httpx.Client):
+    reply = client.post("/v1/surrogates", content=b"\xff\xfe{", headers={"content-type": "application/json"})
+    refused(reply, Code.INVALID_REQUEST, "expected JSON in UTF-8")
+    assert reply.status_code == 422

@@ -73,7 +73,19 @@ def test_every_refusal_is_a_problem(openapi: dict[str, Any]):
     for operation, said in operations(openapi):
         for status, reply in said["responses"].items():
             if status >= "400":
-                assert list(reply["content"]) == [PROBLEM_MEDIA_TYPE], (operation, status)
+                assert list(resolved(openapi, reply)["content"]) == [PROBLEM_MEDIA_TYPE], (operation, status)
+
+
+def resolved(openapi: dict[str, Any], reply: dict[str, Any]) -> dict[str, Any]:
+    name = reply.get("$ref", "").rpartition("/")[2]
+    response: dict[str, Any] = openapi["components"]["responses"][name] if name else reply
+    return response
+
+
+def test_guards_and_limits_are_described_wherever_they_stand(openapi: dict[str, Any]):
+    for operation, said in operations(openapi):
+        guards = {"404", "405", "408", "413", "422", "429", "503"} | ({"401", "403"} if "security" in said else set())
+        assert guards <= said["responses"].keys(), operation
 
 
 def test_no_reference_dangles(openapi: dict[str, Any]):
@@ -83,7 +95,7 @@ def test_no_reference_dangles(openapi: dict[str, Any]):
             return below | ({node["$ref"]} if isinstance(node.get("$ref"), str) else set())
         return set().union(*(references(value) for value in node)) if isinstance(node, list) and node else set()
 
-    known = {f"#/components/schemas/{name}" for name in openapi["components"]["schemas"]}
+    known = {f"#/components/{kind}/{name}" for kind, parts in openapi["components"].items() for name in parts}
     assert references(openapi) <= known
 
 

@@ -1,0 +1,73 @@
+"""OpenAPI of the app: what FastAPI knows of the routes, and the refusals that come from no route of their own."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from surrogym_server.api.problems import documented
+from surrogym_shared.codes import Code, Problem
+
+SCHEMAS = "#/components/schemas/{model}"
+RESPONSES = "#/components/responses/{name}"
+
+ANY_REQUEST = documented(
+    Code.NOT_FOUND,
+    Code.METHOD_NOT_ALLOWED,
+    Code.REQUEST_TIMEOUT,
+    Code.TOO_LARGE,
+    Code.INVALID_REQUEST,
+    Code.TOO_MANY_REQUESTS,
+    Code.UNAVAILABLE,
+)
+WITH_TOKEN = documented(Code.UNAUTHENTICATED, Code.FORBIDDEN)
+
+
+def describe(app: FastAPI) -> dict[str, Any]:
+    """OpenAPI of the app, complete; built once.
+
+    A guard, a limit or a token refuses on every route that it stands before, so its reply is described once, under
+    ``components/responses``, and named by each of them.
+    """
+    if app.openapi_schema is None:
+        schema = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+        problem = Problem.model_json_schema(ref_template=SCHEMAS)
+        components = schema["components"]
+        components["schemas"].update(problem.pop("$defs", {}), Problem=problem)
+        components["responses"] = {str(status): reply for status, reply in {**ANY_REQUEST, **WITH_TOKEN}.items()}
+        _drop_object_defaults(components["schemas"])
+        _name_operations(schema["paths"])
+        for methods in schema["paths"].values():
+            for operation in methods.values():
+                _add_refusals(operation)
+        app.openapi_schema = schema
+    return app.openapi_schema
+
+
+def _add_refusals(operation: dict[str, Any]) -> None:
+    """Those that the route has not described itself, because it has causes of its own."""
+    for status in (*ANY_REQUEST, *(WITH_TOKEN if "security" in operation else ())):
+        operation["responses"].setdefault(str(status), {"$ref": RESPONSES.format(name=status)})
+
+
+def _name_operations(paths: dict[str, Any]) -> None:
+    """Short names, such as ``surrogates_create``: generated clients call their functions so."""
+    for path, methods in paths.items():
+        for method, operation in methods.items():
+            behind = re.sub(r"\W", "_", path) + f"_{method}"
+            operation["operationId"] = f"{operation['tags'][0]}_{operation['operationId'].removesuffix(behind)}"
+
+
+def _drop_object_defaults(node: Any) -> None:
+    """Leave out defaults that are objects: their own fields say theirs, and generators of clients refuse them."""
+    if isinstance(node, dict):
+        if isinstance(node.get("default"), dict):
+            del node["default"]
+        for value in node.values():
+            _drop_object_defaults(value)
+    elif isinstance(node, list):
+        for value in node:
+            _drop_object_defaults(value)
