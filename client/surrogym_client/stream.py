@@ -1,14 +1,15 @@
 """A stream of binary messages to the server: WebSocket without threads, one message there and one back.
 
 The protocol is websockets' own; this is the blocking socket around it. A background thread, as a chat program
-needs, would add two switches between threads to every step.
+needs, would add two switches between threads to every step. Once hands are shaken, whole binary messages are written
+and read here, and every other frame is left to the protocol.
 """
 
 from __future__ import annotations
 
+import secrets
 import socket
 from threading import Lock
-from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
@@ -22,6 +23,7 @@ from websockets.uri import parse_uri
 
 from surrogym_client.errors import error_from_problem, refused_here
 from surrogym_shared.codes import Code, Problem
+from surrogym_shared.messages import KEY_BYTES, MASKED, WHOLE_BINARY, FrameSplitter, apply_mask, header
 
 CHUNK_BYTES = 262_144
 NO_SUCH_ROUTE = (Code.NOT_FOUND, Code.METHOD_NOT_ALLOWED)
@@ -53,6 +55,7 @@ class Stream:
         self._connect_seconds = connect_seconds
         self._socket: socket.socket | None = None
         self._protocol: ClientProtocol
+        self._frames: FrameSplitter
         self._turn = Lock()
 
     def __reduce__(self) -> tuple[type[Stream], tuple[str, str | None, float]]:
@@ -72,8 +75,8 @@ class Stream:
                 connected = self._socket or self._connect()
                 if seconds != connected.gettimeout():  # setting it is a call of the system
                     connected.settimeout(seconds)
-                self._protocol.send_binary(message)
-                self._flush(connected)
+                key = secrets.token_bytes(KEY_BYTES)
+                connected.sendall(b"".join((header(len(message), MASKED), key, apply_mask(message, key))))
                 return self._receive(connected)
             except (WebSocketException, ConnectionError) as error:
                 self.close()
@@ -110,22 +113,43 @@ class Stream:
         if self._protocol.handshake_exc is not None:
             raise self._protocol.handshake_exc
         self._protocol.events_received()  # the response itself
+        self._frames = FrameSplitter()
 
     def _receive(self, connected: socket.socket) -> bytes:
-        parts: list[Any] = []
+        parts: list[bytes] = []
         while True:
-            for event in self._protocol.events_received():
-                assert isinstance(event, Frame)
-                if event.opcode is Opcode.CLOSE:
-                    raise self._closed()
-                if event.opcode in (Opcode.BINARY, Opcode.CONT):
-                    parts.append(event.data)
-                    if event.fin:
-                        return bytes(parts[0]) if len(parts) == 1 else b"".join(parts)
-            self._feed(connected)
+            whole = self._frames.split(self._read(connected))
+            if len(whole) == 1 and not parts and whole[0][0][0] == WHOLE_BINARY:
+                frame, extent = whole[0]
+                assert extent is not None
+                return frame[extent.payload :]
+            for frame, _ in whole:
+                self._protocol.receive_data(frame)
+            self._flush(connected)  # pongs
+            if (message := self._gathered(parts)) is not None:
+                return message
+
+    def _gathered(self, parts: list[bytes]) -> bytes | None:
+        """The message that the protocol's events complete, after the parts that came before."""
+        for event in self._protocol.events_received():
+            assert isinstance(event, Frame)
+            if event.opcode is Opcode.CLOSE:
+                raise self._closed()
+            if event.opcode in (Opcode.BINARY, Opcode.CONT):
+                parts.append(bytes(event.data))
+                if event.fin:
+                    return b"".join(parts)
+        return None
+
+    def _read(self, connected: socket.socket) -> bytes:
+        if chunk := connected.recv(CHUNK_BYTES):
+            return chunk
+        self._protocol.receive_eof()
+        self._flush(connected)
+        raise self._closed()
 
     def _feed(self, connected: socket.socket) -> None:
-        """Hand what arrives to the protocol, and send what it answers: pongs, and the end of a handshake."""
+        """Hand an answer to the handshake to the protocol."""
         if chunk := connected.recv(CHUNK_BYTES):
             self._protocol.receive_data(chunk)
         else:

@@ -34,6 +34,7 @@ _UPGRADE_PAUSE_SECONDS = 60.0  # until a stream is asked for again where HTTP al
 class _Live:
     """What is known of a session; ``seq`` is the last one answered."""
 
+    route: str
     shape: Shape
     seq: int
     stream: Stream
@@ -177,7 +178,7 @@ class HttpSurrogate:
         """Send a request that changes the session under its next seq; an error leaves the seq as it was."""
         live = self._live.get(session) or self._look_up(session)
         content = write(live.seq + 1, live.shape)
-        attempt = self._attempt(live, f"{_session(session)}/{what}", content, timeout)
+        attempt = self._attempt(live, what, content, timeout)
         try:
             seq, result = self.connection.persist(lambda: read(attempt(), live.shape))
         except SessionLost:
@@ -185,18 +186,20 @@ class HttpSurrogate:
             raise
         except UNREADABLE as error:
             live.stream.close()
-            raise ProtocolMismatch(f"unexpected answer of {_session(session)}/{what}: {error}") from error
+            raise ProtocolMismatch(f"unexpected answer of {live.route}/{what}: {error}") from error
         if seq != live.seq + 1:
             live.stream.close()
             raise ProtocolMismatch(f"expected the answer to seq {live.seq + 1} of {session}, got {seq}")
         live.seq = seq
         return result
 
-    def _attempt(self, live: _Live, route: str, content: bytes, timeout: float) -> Callable[[], bytes]:
+    def _attempt(self, live: _Live, what: str, content: bytes, timeout: float) -> Callable[[], bytes]:
         """One try to get a request answered, to be called again after a failure."""
         if self.transport == "stream":
             return lambda: live.stream.exchange(content, timeout)
-        by_http = self.connection.attempt("POST", route, content, timeout=timeout, media_type=self._form.media_type)
+        by_http = self.connection.attempt(
+            "POST", f"{live.route}/{what}", content, timeout=timeout, media_type=self._form.media_type
+        )
         if self.transport != "auto" or time.monotonic() < self._upgrade_after:
             return by_http
         first = True
@@ -222,8 +225,9 @@ class HttpSurrogate:
         return self._know(parse(wire.SessionView, self.connection.send("GET", route), route))
 
     def _know(self, view: wire.SessionView) -> _Live:
-        stream = self.connection.stream_to(f"{_session(view.id)}/stream")
-        self._live[view.id] = _Live(Shape.of(view), view.seq, stream)
+        route = _session(view.id)
+        stream = self.connection.stream_to(f"{route}/stream")
+        self._live[view.id] = _Live(route, Shape.of(view), view.seq, stream)
         return self._live[view.id]
 
     def _forget(self, session: str) -> None:

@@ -108,6 +108,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     app.state.notices = None
     app.state.counts = Counts()
     problems.install(app)
+    app.add_middleware(steps.StepDoor)
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, max_together=settings.max_bodies_bytes)
     if settings.loopback and not settings.tokens:
         app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", settings.host}))

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_shared.codes import Code
-from surrogym_shared.port import ResetResult, StepResult
+from surrogym_shared.port import ResetResult, StepResult, quick
 from surrogym_shared.wire import (
     MAX_ROLLOUT,
     ActionSpace,
@@ -193,7 +193,7 @@ def seed_of(request: ResetRequest, shape: Shape) -> int | list[int] | None:
 
 def mask_of(request: ResetRequest | StepRequest, shape: Shape) -> Bools | None:
     """The mask (N,). Raises ``FrameError``."""
-    return None if request.mask is None else _flags("mask", request.mask, shape.lanes)
+    return None if request.mask is None else _array("mask", _checked("mask", request.mask), BOOL, (shape.lanes,))
 
 
 def action_of(request: StepRequest, shape: Shape) -> NDArray[np.float64]:
@@ -229,29 +229,32 @@ def reset_result(reply: ResetReply, shape: Shape) -> ResetResult:
     """Arrays of their own: aligned and writable, as a caller expects them. Raises ``FrameError``."""
     lanes = shape.lanes
     return ResetResult(
-        observation=_array("observation", reply.observation, FLOAT32, (lanes, shape.observation)).copy(),
-        model_version=_array("model_version", reply.model_version, INT64, (lanes,)).copy(),
+        observation=_own("observation", reply.observation, FLOAT32, (lanes, shape.observation)),
+        model_version=_own("model_version", reply.model_version, INT64, (lanes,)),
     )
 
 
 def step_result(step: Step, shape: Shape) -> StepResult:
     """Arrays of their own: aligned and writable, as a caller expects them. Raises ``FrameError``."""
-    lanes = shape.lanes
+    each = (shape.lanes,)
     final_lanes, final_observation = _final(step, shape)
     deviation = None
     if step.deviation is not None:
-        deviation = _array("deviation", step.deviation, FLOAT64, (lanes, shape.outputs)).copy()
-    return StepResult(
-        observation=_array("observation", step.observation, FLOAT32, (lanes, shape.observation)).copy(),
-        reward=_array("reward", step.reward, FLOAT64, (lanes,)).copy(),
-        terminated=_flags("terminated", step.terminated, lanes).copy(),
-        truncated=_flags("truncated", step.truncated, lanes).copy(),
+        deviation = _own("deviation", step.deviation, FLOAT64, (shape.lanes, shape.outputs))
+    return quick(
+        StepResult,
+        observation=_own("observation", step.observation, FLOAT32, (shape.lanes, shape.observation)),
+        reward=_own("reward", step.reward, FLOAT64, each),
+        terminated=_own("terminated", _checked("terminated", step.terminated), BOOL, each),
+        truncated=_own("truncated", _checked("truncated", step.truncated), BOOL, each),
         final_lanes=final_lanes,
         final_observation=final_observation,
-        model_version=_array("model_version", step.model_version, INT64, (lanes,)).copy(),
-        reward_mean=_array("reward_mean", step.reward_mean, FLOAT64, (lanes,)).copy(),
+        model_version=_own("model_version", step.model_version, INT64, each),
+        reward_mean=_own("reward_mean", step.reward_mean, FLOAT64, each),
         deviation=deviation,
-        untrusted=None if step.untrusted is None else _flags("untrusted", step.untrusted, lanes).copy(),
+        untrusted=None
+        if step.untrusted is None
+        else _own("untrusted", _checked("untrusted", step.untrusted), BOOL, each),
     )
 
 
@@ -278,11 +281,10 @@ def _final(step: Step, shape: Shape) -> tuple[Array, Array]:
             raise FrameError("expected final_lanes and final_observation together, got one of them")
         return np.zeros(0, dtype=INT64), np.zeros((0, shape.observation), dtype=FLOAT32)
     count = step.final_lanes.nbytes // INT64.itemsize
-    lanes = _array("final_lanes", step.final_lanes, INT64, (count,))
+    lanes = _own("final_lanes", step.final_lanes, INT64, (count,))
     if count == 0 or lanes.min() < 0 or lanes.max() >= shape.lanes:
         raise FrameError(f"final_lanes: expected some of 0..{shape.lanes - 1}, got {lanes[:8].tolist()}")
-    observation = _array("final_observation", step.final_observation, FLOAT32, (count, shape.observation))
-    return lanes.copy(), observation.copy()
+    return lanes, _own("final_observation", step.final_observation, FLOAT32, (count, shape.observation))
 
 
 # Arrays
@@ -304,17 +306,27 @@ def _flat(array: Array, dtype: np.dtype[Any]) -> memoryview:
 
 
 def _array(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
-    expected = math.prod(shape) * dtype.itemsize
-    if view.nbytes != expected:
-        raise FrameError(f"{name}: expected {expected} bytes, shape {shape} of {dtype.name}, got {view.nbytes} bytes")
+    """A view of the frame."""
+    _require_size(name, view, dtype, shape)
     return np.ndarray(shape, dtype, view)
 
 
-def _flags(name: str, view: memoryview, lanes: int) -> Bools:
-    flags: Bools = _array(name, view, BOOL, (lanes,))
+def _own(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
+    """An array with memory of its own."""
+    _require_size(name, view, dtype, shape)
+    return np.ndarray(shape, dtype, bytearray(view))
+
+
+def _require_size(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+    expected = math.prod(shape) * dtype.itemsize
+    if view.nbytes != expected:
+        raise FrameError(f"{name}: expected {expected} bytes, shape {shape} of {dtype.name}, got {view.nbytes} bytes")
+
+
+def _checked(name: str, view: memoryview) -> memoryview:
     if bytes(view).strip(b"\x00\x01"):  # what is left begins with a byte that is neither
         raise FrameError(f"{name}: expected bytes 0 and 1, got others")
-    return flags
+    return view
 
 
 def _seeds(seed: int | Sequence[int]) -> memoryview:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from surrogym_shared.wire import OpenSession, SessionView
 Floats = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.integer[Any]]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,13 @@ class StepResult:
     reward_mean: Floats  # (N,), before the penalty
     deviation: Floats | None  # (N, O) when asked for
     untrusted: Bools | None = None  # (N,) lanes truncated for leaving the trusted range; None in a session without one
+
+
+def quick(kind: type[T], **fields: Any) -> T:
+    """A frozen dataclass of all its fields, at half the cost of its constructor, which every step pays twice."""
+    made = object.__new__(kind)
+    made.__dict__.update(fields)
+    return made
 
 
 @runtime_checkable

@@ -6,6 +6,7 @@ Run as ``servers.py echo PORT`` or ``servers.py surrogym OPTIONS``, the options 
 from __future__ import annotations
 
 import sys
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -53,14 +54,17 @@ def serve_surrogym(options: list[str]) -> None:
 
     true_step = sessions.step_session
 
+    @cache
+    def nothing_done(lanes: int, size: int) -> StepResult:
+        zeros, flags = np.zeros(lanes), np.zeros(lanes, dtype=bool)
+        nobody = np.zeros(0, dtype=np.int64), np.zeros((0, size), dtype=np.float32)
+        shown, versions = np.zeros((lanes, size), dtype=np.float32), np.ones(lanes, dtype=np.int64)
+        return StepResult(shown, zeros, flags, flags, *nobody, versions, zeros, None)
+
     def step_session(session: Any, *arguments: Any) -> Any:
         if session.surrogate != TRIVIAL:
             return true_step(session, *arguments)
-        zeros, flags = np.zeros(len(session.versions)), np.zeros(len(session.versions), dtype=bool)
-        size = len(session.definition.observation_names)
-        nothing = np.zeros(0, dtype=np.int64), np.zeros((0, size), dtype=np.float32)
-        shown = np.zeros((len(zeros), size), dtype=np.float32)
-        return session, StepResult(shown, zeros, flags, flags, *nothing, session.versions, zeros, None)
+        return session, nothing_done(len(session.versions), len(session.definition.observation_names))
 
     sessions.step_session = step_session
     sys.argv = ["surrogym", "serve", *options]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from surrogym_server.api.headers import raw_header
 from surrogym_server.api.problems import RETRY_AFTER_SECONDS, problem_response
 from surrogym_shared.codes import Code
 
@@ -23,9 +23,9 @@ class BodyLimit:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        announced = Headers(scope=scope).get("content-length", "0")
+        announced = raw_header(scope, b"content-length")
         if announced.isdigit() and int(announced) > self._max_bytes:
-            response = problem_response(Code.TOO_LARGE, self._detail(f"{announced} bytes"))
+            response = problem_response(Code.TOO_LARGE, self._detail(f"{announced.decode()} bytes"))
             await response(scope, receive, send)
             return
         received = 0
@@ -68,7 +68,7 @@ class KnownHosts:
 
 
 def _host(scope: Scope) -> str:
-    header = Headers(scope=scope).get("host", "").lower()
+    header = raw_header(scope, b"host").decode("latin-1").lower()
     if header.startswith("["):
         return header[1:].partition("]")[0]
     return header.partition(":")[0]

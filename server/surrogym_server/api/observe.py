@@ -6,10 +6,11 @@ import logging
 import re
 import secrets
 import time
+from itertools import count
 
-from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from surrogym_server.api.headers import raw_header
 from surrogym_server.api.problems import REQUEST_HEADER
 from surrogym_server.logs import REQUEST_ID
 from surrogym_server.services.counts import Counts, Durations
@@ -21,6 +22,8 @@ METHODS = frozenset({"GET", "POST", "PUT", "PATCH", "DELETE", "HEAD", "OPTIONS"}
 FAILED = 500  # a request that ended before its reply began
 
 _GIVEN = re.compile(r"[A-Za-z0-9._-]{1,64}")
+_HEADER = REQUEST_HEADER.encode()
+_PROCESS, _NUMBERS = secrets.token_hex(4), count(1)  # drawing each id is a call of the system
 
 
 class Observed:
@@ -37,7 +40,7 @@ class Observed:
         id = _id_of(scope)
         REQUEST_ID.set(id)  # for good: the task is this request's own, and the handler of the unexpected is outside
         started, status = time.perf_counter(), FAILED
-        header = (REQUEST_HEADER.encode(), id.encode())
+        header = (_HEADER, id.encode())
 
         async def identified(message: Message) -> None:
             nonlocal status
@@ -67,5 +70,5 @@ class Observed:
 
 def _id_of(scope: Scope) -> str:
     """The caller's own id of a request where it is usable, else a new one."""
-    given = Headers(scope=scope).get(REQUEST_HEADER)
-    return given if given is not None and _GIVEN.fullmatch(given) else secrets.token_hex(6)
+    given = raw_header(scope, _HEADER).decode("latin-1")
+    return given if given and _GIVEN.fullmatch(given) else f"{_PROCESS}{next(_NUMBERS):06x}"

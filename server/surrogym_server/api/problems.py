@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -61,12 +61,17 @@ SHOWN_CHARACTERS = 120
 
 def install(app: FastAPI) -> None:
     """Make every error reply of the app a problem body."""
-    app.add_exception_handler(errors.SurrogymError, _refused)
-    app.add_exception_handler(FrameError, _refused)
-    app.add_exception_handler(RequestValidationError, _request_invalid)
-    app.add_exception_handler(HTTPException, _http_error)
-    app.add_exception_handler(ClientDisconnect, _gone)
+    for kind, answer in _ANSWERS.items():
+        app.add_exception_handler(kind, answer)
     app.add_exception_handler(Exception, _unexpected)
+
+
+async def answer_to(request: Request, error: Exception) -> Response:
+    """The reply to a request that ended in an error. Raises the error itself where it is an unexpected one."""
+    for kind, answer in _ANSWERS.items():
+        if isinstance(error, kind):
+            return await answer(request, error)
+    raise error
 
 
 def code_of(error: errors.SurrogymError) -> Code:
@@ -204,3 +209,12 @@ async def _unexpected(_: Request, error: Exception) -> Response:
     assert not isinstance(error, errors.SurrogymError)
     problem = problem_of(error)
     return response_of(problem, {REQUEST_HEADER: problem.request or ""})
+
+
+_ANSWERS: dict[type[Exception], Callable[[Request, Exception], Awaitable[Response]]] = {
+    errors.SurrogymError: _refused,
+    FrameError: _refused,
+    RequestValidationError: _request_invalid,
+    HTTPException: _http_error,
+    ClientDisconnect: _gone,
+}

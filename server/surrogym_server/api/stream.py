@@ -2,12 +2,17 @@
 
 Plain ASGI: a step over it costs little more than two messages. One request is carried out at a time, and answered
 before the next is read; the connection may be dropped at any moment, for the session is an id.
+
+A server that offers ``EXTENSION`` may hand over a message where it arrives, without waking a task: what needs no
+waiting is answered there. Anything else takes the way of ASGI.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Callable
+from contextvars import copy_context
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
@@ -23,6 +28,9 @@ from surrogym_server.services.sessions import SessionService
 from surrogym_shared import frames
 
 logger = logging.getLogger(__name__)
+
+EXTENSION = "surrogym.prompt"  # of the scope: called with a Prompt once the connection is accepted
+Prompt = Callable[[bytes], bytes | None]  # from a message to its reply, None to have it come by ASGI
 
 
 class StepStream:
@@ -40,6 +48,9 @@ class StepStream:
             await response_of(problem_of(error))(scope, receive, send)
             return
         await send({"type": "websocket.accept"})
+        if (offered := scope.get("extensions", {}).get(EXTENSION)) is not None:
+            within = copy_context()  # log lines carry the id of the connection's request
+            offered(lambda content: within.run(_at_once, sessions, limit, id, shape, content))
         while (message := await receive())["type"] == "websocket.receive":
             reply = await _reply(sessions.within(limit), id, shape, message.get("bytes"))
             await send({"type": "websocket.send", "bytes": reply})
@@ -56,19 +67,46 @@ def _admit(scope: Scope) -> None:
     gate.check(bearer_token(headers), ("train",))
 
 
+def _at_once(
+    sessions: SessionService, limit: float | None, id: str, shape: frames.Shape, content: bytes
+) -> bytes | None:
+    """The reply to one message where it needs no waiting, else None and nothing is done."""
+    if not sessions.prompt(id):
+        return None
+    try:
+        request = frames.read_request(content)
+    except frames.FrameError:
+        return None
+    if isinstance(request, frames.RolloutRequest):
+        return None
+    carried = _carried(sessions.within(limit), id, shape, request)
+    try:
+        carried.send(None)
+    except StopIteration as done:
+        reply: bytes = done.value
+        return reply
+    carried.close()
+    raise AssertionError("a request that was to be answered at once waited")
+
+
 async def _reply(sessions: SessionService, id: str, shape: frames.Shape, content: bytes | None) -> bytes:
     """The reply to one message, as a frame; never raises but when it is cancelled."""
-    seq = None
     try:
         if content is None:
             raise frames.FrameError("expected a binary message, got text")
         request = frames.read_request(content)
-        seq = request.seq
+    except frames.FrameError as error:
+        return _refusal(error, None)
+    return await _carried(sessions, id, shape, request)
+
+
+async def _carried(sessions: SessionService, id: str, shape: frames.Shape, request: frames.Request) -> bytes:
+    try:
         return await carry_out(sessions, id, shape, request)
     except Exception as error:
         if not isinstance(error, SurrogymError | frames.FrameError):
             logger.exception("a request of the stream failed")
-        return _refusal(error, seq)
+        return _refusal(error, request.seq)
 
 
 def _refusal(error: Exception, seq: int | None) -> bytes:

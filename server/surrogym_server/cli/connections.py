@@ -1,14 +1,18 @@
-"""Connections that bring no request, or bring it too slowly, or are too many."""
+"""Connections that bring no request, or too slowly, or are too many; and messages answered where they arrive."""
 
 from __future__ import annotations
 
 import asyncio
 import resource
+from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from surrogym_server.api.problems import problem_response
+from surrogym_server.api.stream import EXTENSION, Prompt
 from surrogym_shared.codes import Code
+from surrogym_shared.messages import MASKED, WHOLE_BINARY, Extent, FrameSplitter, apply_mask, header
 
 SPARE_FILES = 128  # for the database, pipes and whatever else is open beside connections
 
@@ -71,3 +75,59 @@ def patient(seconds: float, most: int) -> type[HttpToolsProtocol]:
             self.transport.close()
 
     return Patient
+
+
+class PromptMessages(WebSocketsSansIOProtocol):
+    """uvicorn's WebSocket, which offers the app to answer a message where it arrives.
+
+    The way of ASGI wakes a task through a queue, and back, for each message. That takes as long as all else a small
+    step needs. What is no whole binary message, and what the app does not answer at once, goes that way all the same;
+    so does everything while the app is busy, and so the order of messages is kept.
+    """
+
+    _answer: Prompt | None = None
+    _chunks = 0  # before the app took the offer; more than the handshake may have left half a frame with the library
+    _waiting = False  # the app has asked for the next message
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self._frames = FrameSplitter(self.config.ws_max_size)
+
+    def handle_connect(self, event: Any) -> None:
+        super().handle_connect(event)
+        if hasattr(self, "scope"):
+            offers: dict[str, Any] = self.scope["extensions"]
+            offers[EXTENSION] = self._take
+
+    def data_received(self, data: bytes) -> None:
+        if self._answer is None:
+            self._chunks += 1
+            super().data_received(data)
+            return
+        whole = self._frames.split(data)
+        for frame, extent in whole:
+            if extent is None:
+                self._answer = None
+            if len(whole) > 1 or extent is None or not self._answered(self._answer, frame, extent):
+                super().data_received(frame)
+
+    async def receive(self) -> Any:
+        self._waiting = True
+        try:
+            return await super().receive()
+        finally:
+            self._waiting = False
+
+    def _take(self, answer: Prompt) -> None:
+        if self._chunks == 1:
+            self._answer = answer
+
+    def _answered(self, answer: Prompt | None, frame: bytes, extent: Extent) -> bool:
+        free = self._waiting and self.queue.empty() and not self.frames and self.writable.is_set()
+        if answer is None or not free or frame[0] != WHOLE_BINARY or not frame[1] & MASKED:
+            return False
+        message = apply_mask(frame[extent.payload :], frame[extent.key : extent.payload])
+        if self.close_sent or (reply := answer(message)) is None:
+            return False
+        self.transport.write(b"".join((header(len(reply)), reply)))
+        return True

@@ -16,7 +16,7 @@ from fastapi import FastAPI
 
 from surrogym_server import logs
 from surrogym_server.app import create_app, say_goodbye
-from surrogym_server.cli.connections import connections_within, patient
+from surrogym_server.cli.connections import PromptMessages, connections_within, patient
 from surrogym_server.errors import InvalidInput
 from surrogym_server.settings import Settings
 
@@ -32,6 +32,7 @@ class Runner(uvicorn.Server):
         config = uvicorn.Config(
             app,
             http=patient(settings.request_seconds, connections_within(settings.max_connections)),
+            ws=PromptMessages,
             log_config=None,
             access_log=False,  # ours names the request
             server_header=False,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_server.engine.occupancy import Reservoir
-from surrogym_server.engine.session import Answer, Outcome, Session
+from surrogym_server.engine.session import Answer, Fingerprint, Outcome, Session
 from surrogym_server.errors import InvalidInput
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.virtual import LaneState, VirtualSettings
@@ -36,7 +36,7 @@ def session_to_bytes(session: Session) -> bytes:
     }
     arrays: Arrays = {"versions": session.versions, **_prefixed("lanes", session.lanes.to_arrays())}
     if session.answer is not None:
-        header["answer"] = {"seq": session.answer.seq, "digest": session.answer.digest}
+        header["answer"] = {"seq": session.answer.seq, "digest": session.answer.request.digest}
         arrays |= _outcome_arrays(session.answer.outcome)
     if session.visited is not None:
         header["visited"] = {"seed": session.visited.seed, "seen": session.visited.seen}
@@ -81,7 +81,7 @@ def _answer(header: dict[str, Any], arrays: Arrays) -> Answer | None:
         return None
     reset = _unprefixed("reset", arrays)
     outcome = ResetResult(**reset) if reset else _steps(_unprefixed("steps", arrays))
-    return Answer(kept["seq"], kept["digest"], outcome)
+    return Answer(kept["seq"], Fingerprint(digest=kept["digest"]), outcome)
 
 
 def _visited(header: dict[str, Any], arrays: Arrays) -> Reservoir | None:

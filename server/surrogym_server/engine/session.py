@@ -18,7 +18,7 @@ from surrogym_server.errors import IdempotencyConflict, InvalidInput, SeqConflic
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.model import SurrogateModel
 from surrogym_server.virtual import LaneState, Transition, VirtualSettings, create, reset, step
-from surrogym_shared.port import ResetResult, StepResult
+from surrogym_shared.port import ResetResult, StepResult, quick
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
@@ -29,7 +29,34 @@ Seeds = int | Sequence[int] | None
 Outcome = ResetResult | tuple[StepResult, ...]
 
 RESULT_BYTES = 2_048  # of one step's arrays, beside the numbers in them
-LANE_BYTES = 48  # of one lane in them, beside its observations
+LANE_BYTES = 48  # of one lane in them, beside its observation and its action
+
+
+class Fingerprint:
+    """What tells requests apart, whatever carried them: a digest of their parts, taken when it is first asked for.
+
+    Most requests are never repeated, and a digest costs as much as the rest of a small step's way.
+    """
+
+    __slots__ = ("_digest", "_parts")
+
+    def __init__(self, *parts: object, digest: str | None = None) -> None:
+        """Parts as in ``digest_of``; arrays among them must not change. With a digest none are needed."""
+        self._parts = parts
+        self._digest = digest
+
+    @property
+    def digest(self) -> str:
+        if self._digest is None:
+            operation, *parts = self._parts
+            self._digest = digest_of(str(operation), *parts)
+        return self._digest
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Fingerprint) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
 
 
 @dataclass(frozen=True)
@@ -37,7 +64,7 @@ class Answer:
     """The last reply, kept so that a repeat of its request gets it again."""
 
     seq: int
-    digest: str
+    request: Fingerprint
     outcome: Outcome
 
 
@@ -65,7 +92,7 @@ class Session:
 
     def answer_bytes(self, steps: int) -> int:
         """Bytes that the answer to so many steps takes while it is kept, roughly."""
-        lane = 8 * len(self.definition.observation_names) + LANE_BYTES
+        lane = 8 * (len(self.definition.observation_names) + self.definition.action.size) + LANE_BYTES
         return steps * (RESULT_BYTES + self.settings.num_envs * lane)
 
     @property
@@ -101,7 +128,7 @@ def open_session(
     )
 
 
-def replay(session: Session, seq: int | None, digest: str) -> Answer | None:
+def replay(session: Session, seq: int | None, request: Fingerprint) -> Answer | None:
     """The kept answer when the request repeats the last one; None when it is the next one.
 
     Raises:
@@ -110,15 +137,15 @@ def replay(session: Session, seq: int | None, digest: str) -> Answer | None:
     if seq is None or seq == session.seq + 1:
         return None
     answer = session.answer
-    if answer is not None and seq == answer.seq and digest == answer.digest:
+    if answer is not None and seq == answer.seq and request == answer.request:
         return answer
     repeated = " with another body" if answer is not None and seq == answer.seq else ""
     raise SeqConflict(f"expected seq {session.seq + 1}, got {seq}{repeated}", expected=session.seq + 1)
 
 
-def answered(session: Session, digest: str, outcome: Outcome) -> tuple[Session, Answer]:
+def answered(session: Session, request: Fingerprint, outcome: Outcome) -> tuple[Session, Answer]:
     """The session with the outcome kept as its last answer."""
-    answer = Answer(session.seq + 1, digest, outcome)
+    answer = quick(Answer, seq=session.seq + 1, request=request, outcome=outcome)
     return _with(session, answer=answer), answer
 
 
@@ -201,7 +228,8 @@ def _join(parts: Sequence[tuple[NDArray[np.intp], Transition]]) -> Transition:
 
 
 def _result(transition: Transition, versions: Versions) -> StepResult:
-    return StepResult(
+    return quick(
+        StepResult,
         observation=transition.observation,
         reward=transition.reward,
         terminated=transition.terminated,

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 
-from surrogym_server.engine.session import Answer, Outcome, Session, answered, check_opening, replay
+from surrogym_server.engine.session import Answer, Fingerprint, Outcome, Session, answered, check_opening, replay
 from surrogym_server.errors import DeadlineExceeded, Overloaded, SessionExpired, TooLarge, UnknownSession
 
 # Work below this is done in the event loop: a hop to a thread and back costs about 70 us idle and several times
@@ -32,6 +32,7 @@ class _Live:
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     reserved: int = 0  # bytes its lanes are expected to take
     seconds_per_step: float = float("inf")  # measured, so unknown before the first
+    requests: int = 0  # of it that are at work or waiting
 
     @property
     def nbytes(self) -> int:
@@ -120,18 +121,23 @@ class LiveSessions:
                 return check_opening(session, digest)
         return None
 
+    def prompt(self, id: str) -> bool:
+        """Whether ``advance`` would now take one step of a session without waiting for anything."""
+        live = self._live.get(id)
+        return live is not None and not live.requests and live.seconds_per_step < INLINE_SECONDS
+
     async def advance(
-        self, id: str, seq: int | None, digest: str, work: Work, steps: int = 1, deadline: float | None = None
+        self, id: str, seq: int | None, request: Fingerprint, work: Work, steps: int = 1, deadline: float | None = None
     ) -> Answer:
         """Do the work of a request once, and keep its outcome as the session's last answer.
 
-        The same seq with the same digest gets the kept answer, also when it comes while the first is being
+        The same seq with the same fingerprint gets the kept answer, also when it comes while the first is being
         computed. Work that raises changes nothing.
 
         Args:
             id: of the session.
             seq: the session's next one, or None to give up replay.
-            digest: fingerprint of the request.
+            request: its fingerprint.
             work: from the session to the new session and the outcome; pure.
             steps: how many virtual steps it takes, to predict how long.
             deadline: by the clock; work that would end later is not begun.
@@ -146,19 +152,21 @@ class LiveSessions:
         if self._requests >= self._limits.requests:
             raise Overloaded(f"expected at most {self._limits.requests} requests of sessions at once: try again later")
         self._requests += 1
+        live.requests += 1
         try:
             async with live.lock:
                 self._get(id).used = self.clock()
-                if kept := replay(live.session, seq, digest):
+                if kept := replay(live.session, seq, request):
                     return kept
                 if steps > 1:
                     self._check_memory(live.session.answer_bytes(steps))
                 session, outcome = await self._do(live, work, steps, deadline)
-                live.session, answer = answered(session, digest, outcome)
+                live.session, answer = answered(session, request, outcome)
                 live.used = self.clock()
                 return answer
         finally:
             self._requests -= 1
+            live.requests -= 1
 
     def close(self, id: str) -> None:
         """End a session; harmless when it has ended."""

@@ -17,6 +17,7 @@ from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.saved import session_from_bytes, session_to_bytes
 from surrogym_server.engine.session import (
     Answer,
+    Fingerprint,
     ModelChoice,
     Outcome,
     Session,
@@ -110,6 +111,10 @@ class SessionService:
         """Raises ``UnknownSession`` or ``SessionExpired``."""
         return self._live.get(id)
 
+    def prompt(self, id: str) -> bool:
+        """Whether a reset or step of the session would now be carried out without waiting for anything."""
+        return self._live.prompt(id)
+
     def close(self, id: str) -> None:
         """End a session; harmless when it has ended."""
         self._live.close(id)
@@ -125,7 +130,7 @@ class SessionService:
         def work(session: Session) -> tuple[Session, Outcome]:
             return reset_session(session, seed, mask, self._latest(session))
 
-        answer = await self._live.advance(id, seq, digest_of("reset", seed, mask), work, deadline=self._deadline)
+        answer = await self._live.advance(id, seq, Fingerprint("reset", seed, mask), work, deadline=self._deadline)
         self._tallies.of(id).reset(mask)
         return answer
 
@@ -143,8 +148,8 @@ class SessionService:
             stepped, result = self._step(session, u, mask, deviations)
             return stepped, (result,)
 
-        digest = digest_of("step", _columns(action, 2), mask, deviations)
-        return await self._counted(id, seq, digest, work, steps=1)
+        request = Fingerprint("step", _columns(action, 2), mask, deviations)
+        return await self._counted(id, seq, request, work, steps=1)
 
     async def rollout(self, id: str, seq: int | None, actions: Array) -> Answer:
         """T steps with a policy's actions (T, N, F) or (T, N), all or none. Raises as ``step``."""
@@ -159,8 +164,8 @@ class SessionService:
                 results.append(result)
             return session, tuple(results)
 
-        digest = digest_of("rollout", _columns(actions, 3))
-        return await self._counted(id, seq, digest, work, steps=len(actions))
+        request = Fingerprint("rollout", _columns(actions, 3))
+        return await self._counted(id, seq, request, work, steps=len(actions))
 
     async def submit_occupancy(self, id: str, checkpoint: str) -> int:
         """Store the states that a session visited under a name; returns how many.
@@ -210,9 +215,9 @@ class SessionService:
             restored += 1
         return restored
 
-    async def _counted(self, id: str, seq: int | None, digest: str, work: Work, steps: int) -> Answer:
+    async def _counted(self, id: str, seq: int | None, request: Fingerprint, work: Work, steps: int) -> Answer:
         started = time.perf_counter()
-        answer = await self._live.advance(id, seq, digest, work, steps, self._deadline)
+        answer = await self._live.advance(id, seq, request, work, steps, self._deadline)
         self._counts.steps.observe(time.perf_counter() - started)
         self._tallies.of(id).stepped(answer)
         self._counts.lane_steps += steps * self._live.get(id).settings.num_envs

@@ -21,8 +21,8 @@ def policy_actions(action: ActionDefinition, raw: NDArray[Any], lanes: int) -> A
         InvalidInput: wrong shape, not finite, not an integer, or out of bounds.
     """
     rows = _rows(raw, (lanes, action.size))
-    if action.policy_counts:
-        _require_counts(rows, action.policy_counts)
+    if counts := action.policy_counts:
+        _require_counts(rows, counts)
         return decode_bins(action, rows) if action.bins else rows
     return _in_box(action, rows)
 
@@ -48,7 +48,7 @@ def decode_bins(action: ActionDefinition, rows: Array) -> Array:
 
 
 def _rows(raw: NDArray[Any], expected: tuple[int, int]) -> Array:
-    rows = np.asarray(raw, dtype=np.float64)
+    rows = np.array(raw, dtype=np.float64)  # a frame's array is a view, neither aligned nor writable
     if rows.ndim == 1 and expected[1] == 1:
         rows = rows[:, None]
     if rows.shape != expected:
@@ -71,6 +71,8 @@ def _require_counts(rows: Array, counts: tuple[int, ...]) -> None:
 
 def _in_box(action: ActionDefinition, rows: Array) -> Array:
     low, high = action.limits
+    if ((rows >= low) & (rows <= high)).all():
+        return rows
     slack = FLOAT32_SLACK * (high - low)  # a policy's float32 bound may round to just outside
     bad = (rows < low - slack) | (rows > high + slack)
     if bad.any():

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import signal
+import socket
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from urllib.parse import urlsplit
 
 import httpx
 import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.frames import Frame, Opcode
 from websockets.sync.client import ClientConnection, connect
 
 from support import pendulum
@@ -22,6 +25,7 @@ from surrogym_server.api.auth import Gate
 from surrogym_server.api.stream import StepStream
 from surrogym_shared import frames, wire
 from surrogym_shared.codes import Code, Problem
+from surrogym_shared.messages import MASKED, WHOLE_BINARY, FrameSplitter, header
 
 SHAPE = frames.Shape(lanes=2, observation=3, action=1, outputs=3)
 ACTION = np.array([[0.5], [-1.5]])
@@ -272,3 +276,58 @@ def test_a_deadline_of_the_handshake_holds_for_each_message(
     with pytest.raises(InvalidStatus) as refusal:
         connect(address(server_process.url, session), additional_headers={"x-deadline-ms": "0"})
     assert refusal.value.response.status_code == 422
+
+
+@pytest.fixture
+def bare(server_process: ServerProcess, session: str) -> Iterator[socket.socket]:
+    """A stream whose bytes are written by hand."""
+    parts = urlsplit(server_process.url)
+    with socket.create_connection((parts.hostname, parts.port), 30) as connected:
+        lines = [f"GET /v1/sessions/{session}/stream HTTP/1.1", f"Host: {parts.netloc}", "Upgrade: websocket"]
+        lines += ["Connection: Upgrade", "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA=="]
+        connected.sendall("\r\n".join([*lines, "", ""]).encode())
+        answer = b""
+        while b"\r\n\r\n" not in answer:
+            answer += connected.recv(4_096)
+        assert b" 101 " in answer
+        yield connected
+
+
+def written(request: frames.Request) -> bytes:
+    return Frame(Opcode.BINARY, frames.encode(request)).serialize(mask=True, extensions=[])
+
+
+def replies(connected: socket.socket, count: int) -> list[Any]:
+    splitter, found = FrameSplitter(), []
+    while len(found) < count:
+        found += splitter.split(connected.recv(65_536))
+    return [frames.read_reply(frame[extent.payload :]) for frame, extent in found if frame[0] == WHOLE_BINARY]
+
+
+def test_messages_in_any_pieces_are_answered_in_order(bare: socket.socket):
+    """Alone, byte by byte, several in one piece with a ping between, and as fragments."""
+    bare.sendall(written(frames.reset_request(1, 0, None)))
+    (first,) = replies(bare, 1)
+    for byte in written(frames.step_request(2, ACTION, None, False)):
+        bare.sendall(bytes([byte]))
+    (second,) = replies(bare, 1)
+    third, fourth = (written(frames.step_request(seq, ACTION, None, False)) for seq in (3, 4))
+    bare.sendall(third + Frame(Opcode.PING, b"?").serialize(mask=True, extensions=[]) + fourth)
+    ahead = replies(bare, 3)
+    content = frames.encode(frames.step_request(5, ACTION, None, False))
+    begin = Frame(Opcode.BINARY, content[:9], fin=False).serialize(mask=True, extensions=[])
+    bare.sendall(begin + Frame(Opcode.CONT, content[9:]).serialize(mask=True, extensions=[]))
+    (fifth,) = replies(bare, 1)
+    bare.sendall(written(frames.step_request(6, ACTION, None, False)))
+    (sixth,) = replies(bare, 1)
+    assert [r.seq for r in (first, second, *ahead, fifth, sixth)] == [1, 2, 3, 4, 5, 6]
+
+
+def test_an_announced_message_beyond_the_limit_ends_the_stream(bare: socket.socket):
+    bare.sendall(written(frames.reset_request(1, 0, None)))
+    replies(bare, 1)
+    bare.sendall(header(2**40, MASKED) + b"key!" + b"some")
+    answer = b""
+    while piece := bare.recv(4_096):
+        answer += piece
+    assert answer[2:4] == (1009).to_bytes(2, "big")

@@ -11,7 +11,15 @@ import numpy as np
 import pytest
 
 from surrogym_server.engine.saved import session_from_bytes, session_to_bytes
-from surrogym_server.engine.session import Session, answered, digest_of, replay, reset_session, step_session
+from surrogym_server.engine.session import (
+    Fingerprint,
+    Session,
+    answered,
+    digest_of,
+    replay,
+    reset_session,
+    step_session,
+)
 from surrogym_server.errors import InvalidInput, SeqConflict
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.model import SurrogateModel
@@ -84,10 +92,10 @@ def test_what_was_saved_goes_on_bit_for_bit(
     for _ in range(2):
         session, result = stepped(fitted, session)
         results.append(result)
-    session, answer = answered(session, "digest", tuple(results))
+    session, answer = answered(session, Fingerprint("digest"), tuple(results))
     back = session_from_bytes(definition, session_to_bytes(session))
     assert (back.id, back.seed, back.settings, back.seq, back.model) == ("s", 3, session.settings, 1, "latest")
-    for ours, theirs in zip(replay(back, 1, "digest").outcome, answer.outcome, strict=True):
+    for ours, theirs in zip(replay(back, 1, Fingerprint("digest")).outcome, answer.outcome, strict=True):
         for name in ARRAYS:
             np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), strict=True)
     for _ in range(4):
@@ -129,21 +137,25 @@ def test_pathwise_lanes_of_two_versions_step_side_by_side(opened: Open, fitted: 
 
 def test_the_answer_of_a_reset_is_saved_too(opened: Open, definition: EnvironmentDefinition):
     session, result = reset_session(opened(), 5, None, 1)
-    session, _ = answered(session, "digest", result)
+    session, _ = answered(session, Fingerprint("digest"), result)
     back = session_from_bytes(definition, session_to_bytes(session))
-    np.testing.assert_array_equal(replay(back, 1, "digest").outcome.observation, result.observation, strict=True)
+    np.testing.assert_array_equal(
+        replay(back, 1, Fingerprint("digest")).outcome.observation, result.observation, strict=True
+    )
 
 
 def test_only_the_next_seq_and_a_repeat_of_the_last_are_taken(opened: Open):
     session, result = reset_session(opened(), None, None, 1)
-    assert replay(session, 1, "a") is None
-    session, answer = answered(session, "a", result)
-    assert replay(session, None, "a") is None
-    assert replay(session, 2, "b") is None
-    assert replay(session, 1, "a") is answer
-    for seq, digest in ((1, "b"), (3, "a"), (9, "a")):
+    a, b = Fingerprint("step", "a"), Fingerprint("step", "b")
+    assert replay(session, 1, a) is None
+    session, answer = answered(session, a, result)
+    assert replay(session, None, a) is None
+    assert replay(session, 2, b) is None
+    assert replay(session, 1, Fingerprint("step", "a")) is answer
+    assert replay(session, 1, Fingerprint(digest=a.digest)) is answer
+    for seq, request in ((1, b), (3, a), (9, a)):
         with pytest.raises(SeqConflict) as refusal:
-            replay(session, seq, digest)
+            replay(session, seq, request)
         assert refusal.value.expected == 2
 
 

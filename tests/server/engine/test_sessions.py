@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from surrogym_server.engine.session import Outcome, Session, reset_session
+from surrogym_server.engine.session import Fingerprint, Outcome, Session, reset_session
 from surrogym_server.engine.sessions import MEBIBYTE, Limits, LiveSessions
 from surrogym_server.errors import (
     DeadlineExceeded,
@@ -65,7 +65,7 @@ def test_a_repeat_while_the_first_runs_waits_for_its_answer(live: LiveSessions, 
     live.add(opened())
 
     async def twice() -> list[object]:
-        both = [asyncio.create_task(live.advance("s", 1, "same", slow)) for _ in range(2)]
+        both = [asyncio.create_task(live.advance("s", 1, Fingerprint("same"), slow)) for _ in range(2)]
         while not slow.begun:
             await asyncio.sleep(0.001)
         slow.go.set()
@@ -82,8 +82,8 @@ def test_another_session_and_the_loop_go_on_meanwhile(live: LiveSessions, opened
     live.add(opened("quick"))
 
     async def both() -> None:
-        waiting = asyncio.create_task(live.advance("slow", 1, "d", slow))
-        await live.advance("quick", 1, "d", work)
+        waiting = asyncio.create_task(live.advance("slow", 1, Fingerprint("d"), slow))
+        await live.advance("quick", 1, Fingerprint("d"), work)
         assert not waiting.done()
         slow.go.set()
         await waiting
@@ -100,11 +100,11 @@ def test_work_that_fails_changes_nothing(live: LiveSessions, opened: Open):
     async def run() -> None:
         before = live.get("s")
         with pytest.raises(ValueError, match="bad action"):
-            await live.advance("s", 1, "d", fail)
+            await live.advance("s", 1, Fingerprint("d"), fail)
         assert live.get("s") is before
-        assert (await live.advance("s", 1, "d", work)).seq == 1
+        assert (await live.advance("s", 1, Fingerprint("d"), work)).seq == 1
         with pytest.raises(SeqConflict, match="expected seq 2, got 7"):
-            await live.advance("s", 7, "d", work)
+            await live.advance("s", 7, Fingerprint("d"), work)
 
     asyncio.run(run())
 
@@ -119,7 +119,7 @@ def test_quick_work_is_done_without_a_thread_once_it_is_known(live: LiveSessions
 
     async def run() -> None:
         for _ in range(20):
-            await live.advance("s", None, "d", note)
+            await live.advance("s", None, Fingerprint("d"), note)
 
     asyncio.run(run())
     assert threads[0] != threading.current_thread().name, "how long it takes is not known yet"
@@ -130,7 +130,7 @@ def test_an_idle_session_expires_with_an_error_of_its_own(live: LiveSessions, op
     live.add(opened("idle"))
     live.add(opened("used"))
     clock.now = 9
-    asyncio.run(live.advance("used", 1, "d", work))
+    asyncio.run(live.advance("used", 1, Fingerprint("d"), work))
     clock.now = 11
     assert live.sweep() == ["idle"]
     with pytest.raises(SessionExpired, match="idle for more than 10 s"):
@@ -145,7 +145,7 @@ def test_a_session_at_work_is_not_idle(live: LiveSessions, opened: Open, clock: 
     live.add(opened())
 
     async def run() -> None:
-        waiting = asyncio.create_task(live.advance("s", 1, "d", slow))
+        waiting = asyncio.create_task(live.advance("s", 1, Fingerprint("d"), slow))
         while not slow.begun:
             await asyncio.sleep(0.001)
         clock.now = 1_000
@@ -177,10 +177,10 @@ def test_all_sessions_together_have_a_limit_of_memory(live: LiveSessions, opened
         live.add(opened("c"), reserved=int(1.1 * MEBIBYTE))
     live.add(opened("small"))
     with pytest.raises(Overloaded, match="all sessions to take at most"):
-        asyncio.run(live.advance("small", 1, "d", work, steps=200))
+        asyncio.run(live.advance("small", 1, Fingerprint("d"), work, steps=200))
     with pytest.raises(TooLarge, match="lanes and answers"):
-        asyncio.run(live.advance("small", 1, "d", work, steps=10_000))
-    asyncio.run(live.advance("small", 1, "d", work, steps=10))
+        asyncio.run(live.advance("small", 1, Fingerprint("d"), work, steps=10_000))
+    asyncio.run(live.advance("small", 1, Fingerprint("d"), work, steps=10))
     assert {session.id for session in live} == {"a", "small"}
 
 
@@ -189,13 +189,13 @@ def test_requests_beyond_the_queue_are_refused(live: LiveSessions, opened: Open)
     live.add(opened())
 
     async def run() -> None:
-        queue = [asyncio.create_task(live.advance("s", 1, "d", slow)) for _ in range(LIMITS.requests)]
+        queue = [asyncio.create_task(live.advance("s", 1, Fingerprint("d"), slow)) for _ in range(LIMITS.requests)]
         await asyncio.sleep(0.01)
         with pytest.raises(Overloaded, match="at most 3 requests"):
-            await live.advance("s", 1, "d", slow)
+            await live.advance("s", 1, Fingerprint("d"), slow)
         slow.go.set()
         await asyncio.gather(*queue)
-        await live.advance("s", 2, "d", work)
+        await live.advance("s", 2, Fingerprint("d"), work)
 
     asyncio.run(run())
 
@@ -212,12 +212,12 @@ def test_what_would_be_late_is_refused_before_it_is_computed(live: LiveSessions,
         return session, ()
 
     async def run() -> None:
-        await live.advance("known", None, "d", lasting)
+        await live.advance("known", None, Fingerprint("d"), lasting)
         with pytest.raises(DeadlineExceeded, match=r"within 20 ms, but it would take [5-9]"):
-            await live.advance("known", None, "d", lasting, deadline=clock.now + 0.02)
-        await live.advance("known", None, "d", lasting, deadline=clock.now + 60)
-        before = asyncio.create_task(live.advance("waiting", 1, "d", slow))
-        late = asyncio.create_task(live.advance("waiting", 2, "e", lasting, deadline=clock.now + 1))
+            await live.advance("known", None, Fingerprint("d"), lasting, deadline=clock.now + 0.02)
+        await live.advance("known", None, Fingerprint("d"), lasting, deadline=clock.now + 60)
+        before = asyncio.create_task(live.advance("waiting", 1, Fingerprint("d"), slow))
+        late = asyncio.create_task(live.advance("waiting", 2, Fingerprint("e"), lasting, deadline=clock.now + 1))
         while not slow.begun:
             await asyncio.sleep(0.001)
         clock.now += 2
@@ -225,7 +225,7 @@ def test_what_would_be_late_is_refused_before_it_is_computed(live: LiveSessions,
         with pytest.raises(DeadlineExceeded, match="within 0 ms"):
             await late
         assert (await before).seq == 1, "a kept answer has no deadline"
-        assert (await live.advance("waiting", 1, "d", slow, deadline=clock.now)).seq == 1
+        assert (await live.advance("waiting", 1, Fingerprint("d"), slow, deadline=clock.now)).seq == 1
 
     asyncio.run(run())
     assert begun == ["known", "known"]

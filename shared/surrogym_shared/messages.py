@@ -1,0 +1,92 @@
+"""Where one WebSocket frame ends and the next begins (RFC 6455, section 5.2), for the one message that is all traffic.
+
+A step is one whole, uncompressed binary message each way. Both sides take such a message apart themselves, and leave
+every other frame, whole, to the library that speaks the protocol.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+try:
+    from websockets.speedups import apply_mask
+except ImportError:  # a platform without compiled parts
+    from websockets.utils import apply_mask
+
+__all__ = ["KEY_BYTES", "MASKED", "WHOLE_BINARY", "Extent", "FrameSplitter", "apply_mask", "extent_of", "header"]
+
+WHOLE_BINARY = 0x82  # the last fragment, no extension, opcode 2
+MASKED = 0x80
+_TWO_BYTES, _EIGHT_BYTES = 126, 127
+_SHORT, _LONG = struct.Struct("!H"), struct.Struct("!Q")
+KEY_BYTES = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """Where a frame's key and payload begin, and where it ends, from its first byte on."""
+
+    key: int  # of the mask; equal to ``payload`` where there is none
+    payload: int
+    end: int
+
+
+def extent_of(content: bytes | bytearray) -> Extent | None:
+    """Extent of the frame that the content begins with; None while its header is not all there."""
+    if len(content) < 2:
+        return None
+    size, key = content[1] & 0x7F, 2
+    if size == _TWO_BYTES:
+        if len(content) < 4:
+            return None
+        (size,), key = _SHORT.unpack_from(content, 2), 4
+    elif size == _EIGHT_BYTES:
+        if len(content) < 10:
+            return None
+        (size,), key = _LONG.unpack_from(content, 2), 10
+    payload = key + KEY_BYTES if content[1] & MASKED else key
+    return Extent(key, payload, payload + size)
+
+
+def header(size: int, masked: int = 0) -> bytes:
+    """Header of a whole binary message of so many bytes; ``masked`` is 0 or ``MASKED``, and then a key follows."""
+    if size < _TWO_BYTES:
+        return bytes((WHOLE_BINARY, masked | size))
+    if size < 65_536:
+        return bytes((WHOLE_BINARY, masked | _TWO_BYTES)) + _SHORT.pack(size)
+    return bytes((WHOLE_BINARY, masked | _EIGHT_BYTES)) + _LONG.pack(size)
+
+
+class FrameSplitter:
+    """Gathers chunks, as they come, into whole frames.
+
+    ``max_bytes`` is the longest payload worth gathering: beyond it the chunks so far are given back as they are, for
+    the library to refuse.
+    """
+
+    def __init__(self, max_bytes: float = float("inf")) -> None:
+        self._max_bytes = max_bytes
+        self._held = bytearray()
+        self._due = 0  # nothing is whole before so many bytes are held
+
+    def split(self, chunk: bytes) -> list[tuple[bytes, Extent | None]]:
+        """The frames that are whole with this chunk, in order, each with its extent; None marks what is too long."""
+        if self._held:
+            self._held += chunk
+            if len(self._held) < self._due:
+                return []
+            chunk = bytes(self._held)
+            self._held.clear()
+        found: list[tuple[bytes, Extent | None]] = []
+        while chunk:
+            extent = extent_of(chunk)
+            if extent is not None and extent.end - extent.payload > self._max_bytes:
+                return [*found, (chunk, None)]
+            if extent is None or extent.end > len(chunk):
+                self._held += chunk
+                self._due = 0 if extent is None else extent.end
+                break
+            found.append((chunk[: extent.end], extent))  # the whole chunk is not copied by this
+            chunk = chunk[extent.end :]
+        return found
