@@ -50,6 +50,7 @@ MICROSECONDS = 1e6  # of a second
 JSON_REPLY_BYTES = {1: 190, 16: 1_600, 256: 22_500, 1024: 89_000}  # about, of a Pendulum step
 
 Call = Callable[[], Any]
+process_ids: dict[str, int] = {}  # of the servers that run, by their first argument
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ class Figures:
 def process(*arguments: str, ready: Callable[[], bool]) -> Iterator[None]:
     """A child process for the time of the context, once it is ready."""
     child = subprocess.Popen([sys.executable, SERVERS, *arguments], stdout=subprocess.DEVNULL)
+    process_ids[arguments[0]] = child.pid
     try:
         while not ready():
             if child.poll() is not None:

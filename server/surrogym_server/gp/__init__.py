@@ -19,8 +19,9 @@ from surrogym_server.gp.fit import FitOptions, Fitted, fit
 from surrogym_server.gp.joint import Joint
 from surrogym_server.gp.kernel import Hyperparameters
 from surrogym_server.gp.pathwise import Pathwise
-from surrogym_server.gp.posterior import Posterior, condition
+from surrogym_server.gp.posterior import Posterior, Sparse, condition
 from surrogym_server.gp.serving import Output, Serving
+from surrogym_server.gp.sparse import condition_sparse, spread
 
 __all__ = [
     "FitOptions",
@@ -31,7 +32,10 @@ __all__ = [
     "Pathwise",
     "Posterior",
     "Serving",
+    "Sparse",
     "condition",
+    "condition_sparse",
     "fit",
     "in_blocks",
+    "spread",
 ]

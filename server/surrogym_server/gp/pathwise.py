@@ -42,14 +42,29 @@ class Pathwise:
         """Weights (N, size) of the residuals that standard normal ``noise`` (N, size) stands for."""
         posterior = self.posterior
         prior, measured = noise[:, : self._features], noise[:, self._features :]
-        deviation = math.sqrt(posterior.hyper.noise_variance + posterior.jitter)
-        at_points = prior @ self._prior(posterior.x).T + deviation * measured
+        at_points = prior @ self._prior(posterior.x).T + self._noise(measured)
         return torch.cat([prior, -torch.cholesky_solve(at_points.T, posterior.factor).T], 1)
 
     def residual(self, x: Tensor, weights: Tensor) -> Tensor:
         """How far draw i, ``weights`` (N, size), is from the posterior's mean at input i of x (N, d): (N,)."""
         k = covariance(self.posterior.hyper, x, self.posterior.x)
         return (torch.cat([self._prior(x), k], 1) * weights).sum(1)
+
+    def _noise(self, measured: Tensor) -> Tensor:
+        """Noise of the n points that standard normal ``measured`` (N, n) stands for, (N, n)."""
+        posterior = self.posterior
+        if posterior.sparse is not None:
+            return measured @ self._sparse_noise
+        return math.sqrt(posterior.hyper.noise_variance + posterior.jitter) * measured
+
+    @cached_property
+    def _sparse_noise(self) -> Tensor:
+        """Square root (n, n) of the noise that is left at inducing points, F F^T - k(Z, Z)."""
+        posterior = self.posterior
+        left = posterior.factor @ posterior.factor.T - covariance(posterior.hyper, posterior.x, posterior.x)
+        values, vectors = torch.linalg.eigh(left)
+        root: Tensor = (vectors * values.clamp_min(0).sqrt()) @ vectors.T
+        return root
 
     @cached_property
     def _features(self) -> int:

@@ -7,7 +7,7 @@ Reference: Rasmussen and Williams (2006), algorithm 2.1.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -20,6 +20,14 @@ BLOCK = 16_384  # rows predicted at once: bounds memory at any batch size
 
 
 @dataclass(frozen=True)
+class Sparse:
+    """What a process through inducing points stands for, and what it costs."""
+
+    points: int  # that were learned from
+    unexplained: float  # deviation left at them, prior deviations, root mean square: 0 where nothing is lost
+
+
+@dataclass(frozen=True)
 class Posterior:
     """A process conditioned on n points, with all that prediction needs: nothing is recomputed on loading."""
 
@@ -29,6 +37,7 @@ class Posterior:
     factor: Tensor  # (n, n) lower Cholesky factor of K + (sigma_n^2 + jitter) I
     weights: Tensor  # (n,)
     jitter: float  # added to the diagonal to factor it, 0 as a rule
+    sparse: Sparse | None = None  # None where the n points are all there are; see ``gp.sparse``
 
     def mean(self, x: Tensor) -> Tensor:
         """Posterior mean at x (m, d), shape (m,)."""
@@ -67,7 +76,8 @@ class Posterior:
         factor = torch.zeros(n + 1, n + 1, dtype=self.factor.dtype, device=self.factor.device)
         factor[:n, :n], factor[n, :n], factor[n, n] = self.factor, row[0], pivot[0]
         y = torch.cat([self.y, y.reshape(1)])
-        return Posterior(self.hyper, torch.cat([self.x, x[None]]), y, factor, _weights(factor, y), self.jitter)
+        x = torch.cat([self.x, x[None]])
+        return replace(self, x=x, y=y, factor=factor, weights=_weights(factor, y))
 
 
 def condition(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from surrogym_server.errors import InvalidInput
-from surrogym_server.gp import Hyperparameters, Posterior
+from surrogym_server.gp import Hyperparameters, Posterior, Sparse
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.features import Encoding, FeatureMap, State, encode
 from surrogym_server.surrogate.model import OutputModel
@@ -60,6 +60,8 @@ def output_header(output: OutputModel) -> dict[str, Any]:
             "noise_variance": hyper.noise_variance,
             "jitter": posterior.jitter,
         }
+        if posterior.sparse is not None:
+            entry["posterior"]["sparse"] = asdict(posterior.sparse)
     return entry
 
 
@@ -75,15 +77,19 @@ def read_output(entry: dict[str, Any], tensors: Mapping[str, Tensor], prefix: st
             float(stored["quadratic_variance"]),
             float(stored["noise_variance"]),
         )
-        posterior = Posterior(
-            hyper, arrays["x"], arrays["y"], arrays["factor"], arrays["weights"], float(stored["jitter"])
-        )
+        x, y, factor, weights = (arrays[name] for name in ("x", "y", "factor", "weights"))
+        jitter, sparse = float(stored["jitter"]), _sparse(stored.get("sparse"))
+        posterior = Posterior(hyper, x, y, factor, weights, jitter, sparse)
     scores = tuple((name, score) for name, score in entry["scores"])
     feature_map = _feature_map(entry["feature_map"])
     if replace(feature_map, drift=()) not in KNOWN_MAPS:
         raise ValueError(f"unknown feature map {feature_map}")
     centre, scale = float(entry["centre"]), float(entry["scale"])
     return OutputModel(str(entry["name"]), feature_map, posterior, centre, scale, int(entry["left_out"]), scores)
+
+
+def _sparse(entry: dict[str, Any] | None) -> Sparse | None:
+    return None if entry is None else Sparse(int(entry["points"]), float(entry["unexplained"]))
 
 
 def _feature_map(entry: dict[str, Any]) -> FeatureMap:
@@ -108,6 +114,8 @@ def _require_numbers(output: OutputModel) -> None:
         positive += [hyper.signal_variance, hyper.noise_variance, *hyper.lengthscale.tolist()]
         positive += posterior.factor.diagonal().tolist()
         least_zero += [hyper.linear_variance, hyper.quadratic_variance, posterior.jitter]
+        if posterior.sparse is not None:
+            least_zero += [posterior.sparse.points - len(posterior.y), posterior.sparse.unexplained]
     if not (
         all(math.isfinite(v) for v in (*finite, *positive, *least_zero))
         and min(positive) > 0

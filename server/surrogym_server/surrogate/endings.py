@@ -43,6 +43,10 @@ def _classifier(learner: Learner, name: str, q: Tensor, inside: Tensor) -> tuple
     process = learner.output(name, 2 * inside.double() - 1, inputs, everything, everything)
     if process.posterior is None:
         return Classifier(definition, process), 0.0
-    mean, variance = process.posterior.leave_one_out()
+    if process.posterior.sparse is None:
+        mean, variance = process.posterior.leave_one_out()
+    else:  # one point of thousands hardly counts
+        mean, latent = process.posterior.mean_and_variance(inputs[process.feature_map])
+        variance = latent + process.posterior.hyper.noise_variance
     probability = likely(process.centre + process.scale * mean, process.scale * variance.sqrt())
     return Classifier(definition, process), log_probability(probability, inside) - HANDICAP

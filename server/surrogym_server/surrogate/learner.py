@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from surrogym_server.gp import FitOptions, Fitted, fit
+from surrogym_server.gp import FitOptions, Fitted, condition_sparse, fit, spread
 from surrogym_server.surrogate.definition import REWARD, EnvironmentDefinition
 from surrogym_server.surrogate.features import FeatureMap
 from surrogym_server.surrogate.model import OutputModel
@@ -45,13 +45,17 @@ class Learner:
             used = keep_lead
             chosen = self._fit(f"{name}|{best}|all", inputs[best][used], y[used])
         scores = tuple((str(m), f.score) for m, f in fits.items())
-        return OutputModel(name, best, chosen.posterior, centre, scale, int((~used).sum()), scores)
+        posterior = chosen.posterior
+        if len(posterior.y) < int(used.sum()):
+            posterior = condition_sparse(posterior.hyper, inputs[best][used], y[used])
+        return OutputModel(name, best, posterior, centre, scale, int((~used).sum()), scores)
 
     def _fit(self, key: str, x: Tensor, y: Tensor) -> Fitted:
-        options = self._options(key)
-        fitted = fit(x, y, options, self.warm.get(key))
+        """Fit to all points; of very many, to some of them, and score as if all were alike."""
+        options, rows = self._options(key), spread(len(y))
+        fitted = fit(x[rows], y[rows], options, self.warm.get(key))
         self.thetas[key] = fitted.theta
-        return fitted
+        return replace(fitted, score=fitted.score * len(y) / len(rows))
 
     def _options(self, key: str) -> FitOptions:
         """Dynamics tend to be near linear, costs to be quadratic; the paper has the squared exponential alone."""

@@ -6,6 +6,7 @@ Preset ``paper`` moves the observation instead, o' = o + f(o, u), and reads the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -280,4 +281,11 @@ def _describe(output: OutputModel) -> dict[str, Any]:
             "noise_variance": hyper.noise_variance,
             "jitter": output.posterior.jitter,
         }
+        if (sparse := output.posterior.sparse) is not None:
+            prior = hyper.signal_variance + hyper.linear_variance
+            described |= {
+                "points": sparse.points,
+                "inducing_points": len(output.posterior.y),
+                "unexplained_deviation": output.scale * math.sqrt(prior) * sparse.unexplained,
+            }
     return described

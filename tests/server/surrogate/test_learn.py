@@ -9,6 +9,8 @@ from support.real_steps import answer, join, random_steps
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
+from surrogym_server.gp import sparse
+from surrogym_server.surrogate.codec import from_bytes, to_bytes
 from surrogym_server.surrogate.learn import learn
 from surrogym_server.surrogate.model import paid
 from surrogym_server.surrogate.samples import Samples
@@ -117,3 +119,24 @@ def test_learning_the_same_samples_gives_the_same_model(pendulum_definition, pen
     again = learn(pendulum_definition, pendulum_samples).model
     assert again.digest == pendulum_model.digest == pendulum_samples.digest
     assert again.description == pendulum_model.description
+
+
+@pytest.mark.parametrize(("points", "through"), [(40, False), (41, True)])
+def test_beyond_a_number_of_samples_a_model_is_sparse_and_says_so(
+    pendulum_definition, points: int, through: bool, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sparse, "MAX_EXACT", 40)
+    monkeypatch.setattr(sparse, "FITTED", 30)
+    monkeypatch.setattr(sparse, "INDUCING", 25)
+    steps, later = random_steps(pendulum(), points, seed=0), random_steps(pendulum(), 100, seed=1)
+    model = learn(pendulum_definition, steps).model
+    reward = model.description["outputs"][-1]  # learned from all; transitions leave saturated samples out
+    assert ("inducing_points" in reward) == through
+    if through:
+        assert (reward["points"], reward["inducing_points"] <= 25) == (points, True)
+        assert 0 <= reward["unexplained_deviation"] < 0.05
+        again = from_bytes(pendulum_definition, to_bytes(model))
+        assert again.description == model.description
+    inside = later.q_next[:, 1].abs() < 8
+    error = (model.transition(later.q, later.u).q_next - later.q_next)[inside, 1]
+    assert float(error.abs().max()) < 0.05

@@ -1,0 +1,73 @@
+"""Processes of many points: a few inducing points stand for all, and nothing else changes.
+
+m of the n points are chosen, Z, by pivoted Cholesky: each is the one the others explain least. With V = L^-1 k(Z, X),
+L L^T = k(Z, Z), and C = V V^T, the projected process (R&W (2006), section 8.3.4) predicts
+
+    mean(x) = k(x, Z) L^-T (C + sigma_n^2 I)^-1 V y,
+    var(x) = k(x, x) - k(x, Z) (F F^T)^-1 k(Z, x),  F = L chol(I + sigma_n^2 C^-1).
+
+So it is an exact process of the m points with the factor F, whose noise sigma_n^2 L C^-1 L^T is what is left of the
+noise where n points speak for m, and with the values y_Z = F F^T weights. It is served, stored, extended and drawn
+from as any other. Its variance goes back to the prior's away from Z.
+Reference: Fine and Scheinberg (2001) for the choice of Z; Seeger, Williams, Lawrence (2003) for the projected process.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from surrogym_server.gp.kernel import Hyperparameters, covariance, variance
+from surrogym_server.gp.posterior import Posterior, Sparse, factorise
+
+MAX_EXACT = 2_000  # points; beyond, a fit is sparse
+INDUCING = 1_000
+FITTED = 1_000  # points that hyperparameters of a sparse process are fitted to
+EXPLAINED, BELOW_NOISE = 1e-10, 1e-3  # of the prior's and the noise variance: a point known so well is not chosen
+
+
+def spread(points: int) -> Tensor:
+    """Which of n points, in the order they came, hyperparameters are fitted to: all up to ``MAX_EXACT``, else
+    ``FITTED`` of them at equal distances, (m,)."""
+    if points <= MAX_EXACT:
+        return torch.arange(points)
+    return torch.linspace(0, points - 1, FITTED, dtype=torch.float64).round().long()
+
+
+def condition_sparse(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
+    """Condition a process on x (n, d) and y (n,) through inducing points, in O(n m^2).
+
+    Raises:
+        NumericalFailure: as ``condition``.
+    """
+    chosen, known, left = _pivots(hyper, x)  # (m,), V (m, n), (n,)
+    inducing = x[chosen]
+    lower = known[:, chosen].T.tril()
+    noise = hyper.noise_variance
+    gram = known @ known.T
+    solid, _ = factorise(gram + noise * torch.eye(len(gram), dtype=x.dtype, device=x.device))
+    whitened = torch.cholesky_solve((known @ y)[:, None], solid)
+    weights = torch.linalg.solve_triangular(lower.T, whitened, upper=True)[:, 0]
+    inverse = torch.cholesky_inverse(factorise(gram)[0])
+    inner, _ = factorise(torch.eye(len(gram), dtype=x.dtype, device=x.device) + noise * 0.5 * (inverse + inverse.T))
+    factor = lower @ inner
+    values = factor @ (factor.T @ weights)
+    sparse = Sparse(len(y), float((left.mean() / variance(hyper, x).mean()).sqrt()))
+    return Posterior(hyper, inducing, values, factor, weights, 0.0, sparse)
+
+
+def _pivots(hyper: Hyperparameters, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Points in the order of their choice (m,), the rows V (m, n), and the variance that they leave at each (n,)."""
+    left, prior = variance(hyper, x), float(variance(hyper, x).mean())
+    enough = max(BELOW_NOISE * hyper.noise_variance, EXPLAINED * prior)
+    rows, chosen = x.new_empty(min(INDUCING, len(x)), len(x)), []
+    for count in range(len(rows)):
+        pivot = int(left.argmax())
+        if count and float(left[pivot]) <= enough:
+            break
+        row = covariance(hyper, x[pivot : pivot + 1], x)[0] - rows[:count, pivot] @ rows[:count]
+        rows[count] = row / left[pivot].sqrt()
+        left = (left - rows[count].square()).clamp_min_(0)
+        left[pivot] = 0.0
+        chosen.append(pivot)
+    return torch.tensor(chosen), rows[: len(chosen)], left

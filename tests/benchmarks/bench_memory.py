@@ -1,0 +1,80 @@
+"""Resident memory of a server that steps 64 sessions of 256 lanes each for ten minutes: flat, or it leaks.
+
+Run by ``make bench-memory`` (ARGS="--minutes 1" for a look). Sessions take turns over their streams from one process,
+with a pause between rounds so that the rest of the machine goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import numpy as np
+from bench_step import machine, process_ids, surrogym_server
+
+from surrogym_client.transport import HttpSurrogate
+from surrogym_shared.wire import OpenSession
+
+SESSIONS, LANES = 64, 256
+WARM_UP_SHARE = 0.1  # of the time: pools and caches fill
+READINGS = 60
+PAUSE_SECONDS = 0.1
+FLAT = 0.05  # share by which the mean of the last quarter may exceed that of the first after the warm-up
+
+
+def resident_mib(pid: int) -> float:
+    status = Path(f"/proc/{pid}/status").read_text()
+    return float(status.partition("VmRSS:")[2].split()[0]) / 1024
+
+
+def run(url: str, pid: int, minutes: float) -> tuple[list[tuple[float, float]], int]:
+    """(seconds, MiB) of readings spread over the time, and how many steps of all lanes were made."""
+    rng, readings, steps = np.random.default_rng(0), [], 0
+    with ExitStack() as stack:
+        port = stack.enter_context(HttpSurrogate(url, "pendulum", transport="stream"))
+        ids = [port.open(OpenSession(num_envs=LANES, seed=seed)).id for seed in range(SESSIONS)]
+        for id in ids:
+            port.reset(id)
+        start = time.monotonic()
+        while (elapsed := time.monotonic() - start) < 60 * minutes:
+            action = rng.uniform(-2, 2, (LANES, 1))
+            for id in ids:
+                port.step(id, action)
+            steps += SESSIONS * LANES
+            if elapsed >= len(readings) * 60 * minutes / READINGS:
+                readings.append((elapsed, resident_mib(pid)))
+            time.sleep(PAUSE_SECONDS)
+        for id in ids:
+            port.close(id)
+    return readings, steps
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("build/benchmarks"), help="folder of the JSON file")
+    parser.add_argument("--minutes", type=float, default=10.0)
+    options = parser.parse_args()
+    with surrogym_server() as url:
+        readings, steps = run(url, process_ids["surrogym"], options.minutes)
+    mib = np.array([m for _, m in readings])[int(WARM_UP_SHARE * len(readings)) :]
+    quarter = max(1, len(mib) // 4)
+    growth = float(mib[-quarter:].mean() / mib[:quarter].mean() - 1)
+    report: dict[str, Any] = {"machine": machine(), "steps": steps, "growth": growth, "readings": readings}
+    print(f"{SESSIONS} sessions of {LANES} lanes, {options.minutes:g} minutes, {steps:,} environment steps")
+    print(
+        f"resident: {mib.min():.1f} to {mib.max():.1f} MiB after the warm-up, last quarter {growth:+.2%} of the first"
+    )
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "memory.json").write_text(json.dumps(report, indent=1))
+    sys.exit(growth > FLAT)
+
+
+if __name__ == "__main__":
+    main()
