@@ -42,7 +42,7 @@ def require_output(definition: EnvironmentDefinition, output: OutputModel) -> No
 
 def output_header(output: OutputModel) -> dict[str, Any]:
     """All of an output but its arrays, as JSON."""
-    entry = {
+    entry: dict[str, Any] = {
         "name": output.name,
         "feature_map": asdict(output.feature_map),
         "centre": output.centre,
