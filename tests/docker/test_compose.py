@@ -15,6 +15,8 @@ ROOT = Path(__file__).parents[2]
 COMPOSE = ROOT / "docker" / "compose.yaml"
 DOCKERFILE = (ROOT / "docker" / "Dockerfile").read_text(encoding="utf-8")
 SERVICES: dict[str, dict[str, Any]] = yaml.safe_load(COMPOSE.read_text(encoding="utf-8"))["services"]
+BUILT = {name: service for name, service in SERVICES.items() if "build" in service}
+TEAM = {name: service for name, service in SERVICES.items() if "build" not in service}
 DEFAULT = re.compile(r"\$\{\w+:-([^}]*)\}")
 
 
@@ -71,14 +73,14 @@ def test_whatever_is_copied_is_there_and_not_ignored() -> None:
         assert f"!{source}" in ignored
 
 
-@pytest.mark.parametrize("name", SERVICES)
+@pytest.mark.parametrize("name", BUILT)
 def test_a_service_is_built_from_a_target_of_the_dockerfile(name: str) -> None:
     build = SERVICES[name]["build"]
     assert (COMPOSE.parent / build["context"] / build["dockerfile"]).samefile(ROOT / "docker" / "Dockerfile")
     assert build["target"] in stages()
 
 
-@pytest.mark.parametrize("name", SERVICES)
+@pytest.mark.parametrize("name", BUILT)
 def test_no_service_starts_without_a_token_of_ones_own(name: str) -> None:
     assert SERVICES[name]["environment"]["SURROGYM_TOKEN"].startswith("${SURROGYM_TOKEN:?expected ")
 
@@ -98,9 +100,25 @@ def test_database_and_policy_lie_in_the_volume() -> None:
     assert "SURROGYM_DATABASE=/data/" in last("server", "ENV")
     trainer = SERVICES["trainer"]
     policy = parse([DEFAULT.sub(r"\1", word) for word in trainer["command"]])["out"]
-    assert policy.parent == Path("/data")
+    assert Path(policy).parent == Path("/data")
     assert SERVICES["server"]["volumes"] == trainer["volumes"] == ["data:/data"]
 
 
 def test_samplers_can_be_scaled() -> None:
     assert not {"container_name", "ports"} & SERVICES["sampler"].keys()
+
+
+def test_what_is_not_built_here_waits_for_its_profile_and_has_a_version() -> None:
+    assert set(TEAM) == {"postgresql", "prometheus", "grafana"}
+    for service in TEAM.values():
+        assert service["profiles"] == ["team"]
+        assert re.search(r":v?\d+[\d.]*}$", service["image"])
+        assert all(port.startswith("127.0.0.1:") for port in service.get("ports", []))
+    assert not [name for name, service in BUILT.items() if "profiles" in service]
+
+
+def test_what_is_mounted_is_there() -> None:
+    mounts = [volume.split(":")[0] for service in TEAM.values() for volume in service["volumes"]]
+    files = [mount for mount in mounts if mount.startswith("./")]
+    assert len(files) == 3
+    assert all((COMPOSE.parent / file).exists() for file in files)
