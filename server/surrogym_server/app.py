@@ -21,6 +21,7 @@ from surrogym_server.api import (
     events,
     metrics,
     models,
+    openapi,
     problems,
     queries,
     samples,
@@ -108,6 +109,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     app.state.notices = None
     app.state.counts = Counts()
     problems.install(app)
+    openapi.install(app)
     app.add_middleware(steps.StepDoor)
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, max_together=settings.max_bodies_bytes)
     if settings.loopback and not settings.tokens:

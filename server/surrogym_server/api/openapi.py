@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
 from fastapi.openapi.utils import get_openapi
+from fastapi.responses import Response
+from starlette.routing import compile_path
 
-from surrogym_server.api.problems import documented
+from surrogym_server.api.problems import documented, problem_response
 from surrogym_shared.codes import Code, Problem
 
 SCHEMAS = "#/components/schemas/{model}"
@@ -24,6 +26,19 @@ ANY_REQUEST = documented(
     Code.UNAVAILABLE,
 )
 WITH_TOKEN = documented(Code.UNAUTHENTICATED, Code.FORBIDDEN)
+
+
+def install(app: FastAPI) -> None:
+    """Let a refused method be told all methods of its path, which several routes may serve."""
+    app.add_exception_handler(405, _method_not_allowed)
+
+
+async def _method_not_allowed(request: Request, _: Exception) -> Response:
+    path = request.url.path
+    paths = describe(request.app)["paths"].items()
+    allowed = {method.upper() for known, said in paths if compile_path(known)[0].match(path) for method in said}
+    detail = f"{request.method} is not allowed on {path!r}"
+    return problem_response(Code.METHOD_NOT_ALLOWED, detail, headers={"allow": ", ".join(sorted(allowed or {"GET"}))})
 
 
 def describe(app: FastAPI) -> dict[str, Any]:

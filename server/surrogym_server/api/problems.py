@@ -45,7 +45,6 @@ HTTP_CODES = {
     401: Code.UNAUTHENTICATED,
     403: Code.FORBIDDEN,
     404: Code.NOT_FOUND,
-    405: Code.METHOD_NOT_ALLOWED,
     408: Code.REQUEST_TIMEOUT,
     413: Code.TOO_LARGE,
     415: Code.UNSUPPORTED_MEDIA_TYPE,
@@ -192,7 +191,6 @@ async def _http_error(request: Request, error: Exception) -> Response:
     code = HTTP_CODES[error.status_code]
     detail = {
         Code.NOT_FOUND: f"no route {request.url.path!r}: see /docs",
-        Code.METHOD_NOT_ALLOWED: f"{request.method} is not allowed on {request.url.path!r}",
         Code.INVALID_REQUEST: "the body: expected JSON in UTF-8, got bytes that are none",
     }.get(code, str(error.detail))
     return problem_response(code, detail, headers=error.headers)

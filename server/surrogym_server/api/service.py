@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from fastapi import APIRouter, Request
-from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.responses import HTMLResponse, JSONResponse
 
+from surrogym_server.api import reference
 from surrogym_server.api.auth import READ, Gate, bearer_token
 from surrogym_server.api.openapi import describe
 from surrogym_server.api.problems import documented
@@ -44,4 +44,4 @@ async def openapi(request: Request) -> JSONResponse:
 
 @router.get("/docs", include_in_schema=False, dependencies=[READ])
 async def docs(request: Request) -> HTMLResponse:
-    return get_swagger_ui_html(openapi_url="/openapi.json", title=request.app.title)
+    return HTMLResponse(reference.page(describe(request.app)), headers=reference.HEADERS)

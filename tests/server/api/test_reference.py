@@ -1,0 +1,47 @@
+"""The page at /docs: all of the OpenAPI, without a script and without another host."""
+
+from __future__ import annotations
+
+import re
+from html import unescape
+
+import httpx
+import pytest
+
+from surrogym_server.api.reference import page
+
+
+@pytest.fixture(scope="module")
+def docs(client: httpx.Client) -> httpx.Response:
+    return client.get("/docs").raise_for_status()
+
+
+def test_it_names_every_operation_and_schema(client: httpx.Client, docs: httpx.Response):
+    openapi, text = client.get("/openapi.json").json(), unescape(docs.text)
+    for path, methods in openapi["paths"].items():
+        for method, operation in methods.items():
+            assert f"<code>{method.upper()} {path}</code> {operation['summary']}" in text
+    linked = set(re.findall(r'href="#([^"]+)"', docs.text))
+    assert linked <= set(re.findall(r'id="([^"]+)"', docs.text)) == openapi["components"]["schemas"].keys()
+
+
+def test_it_loads_nothing_and_may_not(docs: httpx.Response):
+    assert not re.search(r"<script|<link|<img|<iframe|src=|https?://", docs.text)
+    policy = docs.headers["content-security-policy"]
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    assert docs.headers["x-content-type-options"] == "nosniff"
+
+
+def test_what_a_description_says_is_text():
+    hostile = "<script>alert(1)</script>"
+    operation = {"tags": [hostile], "summary": hostile, "description": hostile, "responses": {}}
+    info = {"title": hostile, "version": "0", "description": hostile}
+    schemas = {hostile: {"description": hostile, "properties": {hostile: {"enum": [hostile]}}}}
+    openapi = {"info": info, "paths": {f"/{hostile}": {"get": operation}}, "components": {"schemas": schemas}}
+    assert "<script" not in page(openapi)
+
+
+def test_a_refused_method_is_told_all_methods_of_its_path(client: httpx.Client):
+    assert client.put("/v1/surrogates/any").headers["allow"] == "DELETE, GET, PATCH"
+    assert client.post("/").headers["allow"] == "GET"
