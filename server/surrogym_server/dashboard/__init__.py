@@ -1,4 +1,7 @@
-"""The page people look at: static files that read the API with a token kept in the browser tab alone."""
+"""The page people look at: static files that read the API with a token kept in the browser tab alone.
+
+No build step: what lies here is what a browser gets. ``uplot`` is a copy of uPlot 1.6.32 with its licence.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +9,26 @@ from importlib.resources import files
 
 HEADERS = {
     "content-security-policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; "
         "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     ),
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
+    "cache-control": "no-cache",
 }
-FILES = {
-    "/": ("index.html", "text/html"),
-    "/dashboard.js": ("dashboard.js", "text/javascript"),
-    "/dashboard.css": ("dashboard.css", "text/css"),
-}
+TYPES = {"css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
+
+
+def _parts() -> dict[str, tuple[str, str]]:
+    names = [
+        f"{folder}{entry.name}" for folder in ("", "uplot/") for entry in files(__name__).joinpath(folder).iterdir()
+    ]
+    return {
+        f"/page/{name}": (name, TYPES[kind]) for name in sorted(names) if (kind := name.rpartition(".")[2]) in TYPES
+    }
+
+
+FILES = {"/": ("index.html", "text/html"), **_parts()}
 
 
 def read(name: str) -> bytes:

@@ -11,10 +11,11 @@ from websockets.sync.client import connect
 
 from support import pendulum
 from support.server import running_server
+from surrogym_server import dashboard
 
 ROLES = ("read", "train", "sample", "admin")
 TOKENS = {role: f"the-token-to-{role}" for role in ROLES}
-PUBLIC = {"/healthz", "/readyz", "/", "/dashboard.js", "/dashboard.css"}
+PUBLIC = {"/healthz", "/readyz", *dashboard.FILES}
 BODIES = {
     "claim": ("POST", "/v1/surrogates/p/queries:claim", {"sampler": "s"}),
     "create": ("POST", "/v1/surrogates", {"name": "p", "spec": pendulum.spec()}),

@@ -1,0 +1,67 @@
+// The first ten seconds: how sure, where not, and what it cost.
+
+import { call, surrogate } from "/page/api.js";
+import { h } from "/page/dom.js";
+import { count, MEANING, number, percent, plural } from "/page/format.js";
+import { confidenceMeter, costBar } from "/page/parts.js";
+import { told } from "/page/point.js";
+
+const LOOKS = 768;
+
+const card = (title, ...children) => h("div", { class: "card fact" }, h("h2", {}, title), children);
+
+/** The same points for everybody: a Halton sequence over the box of states and actions. */
+function points(entries) {
+  const bases = [2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53];
+  const share = (index, base) => {
+    let [value, weight] = [0, 1];
+    for (let rest = index; rest > 0; rest = Math.floor(rest / base)) value += (weight /= base) * (rest % base);
+    return value;
+  };
+  return Array.from({ length: LOOKS }, (_, index) =>
+    entries.map(({ low, high, n }, at) => {
+      const part = at < bases.length ? share(index + 1, bases[at]) : Math.random();
+      return n ? Math.floor(part * n) : low + part * (high - low);
+    }));
+}
+
+/** Where the model is least sure, in tolerances: {output, times, within, coordinates, action}. */
+export async function leastSure(name, fidelity, { ranges, entries }) {
+  const rows = points([...ranges, ...entries]);
+  const [coordinates, action] = [rows.map((row) => row.slice(0, ranges.length)), rows.map((row) => row.slice(ranges.length))];
+  const said = await call("POST", `${surrogate(name)}/query_uncertainty`, { coordinates, action });
+  const worst = said.deviation.map((row) => row.map((value, at) => value / fidelity.outputs[at].tolerance));
+  let [at, output] = [0, 0];
+  worst.forEach((row, index) => row.forEach((value, which) => { if (value > worst[at][output]) [at, output] = [index, which]; }));
+  const within = worst.filter((row) => Math.max(...row) <= 1).length / worst.length;
+  return { output: said.outputs[output], times: worst[at][output], within, coordinates: coordinates[at], action: action[at] };
+}
+
+export function sure({ confidence_index: index, target, fidelity, phase, error }) {
+  if (index === null) return card("How sure", h("p", { class: "big" }, "no model yet"), h("p", { class: "note" }, error ?? MEANING[phase]));
+  const least = fidelity.outputs.reduce((a, b) => (b.confidence_index < a.confidence_index ? b : a));
+  return card("How sure",
+    h("p", { class: index >= target ? "big good" : "big" }, percent(index)), confidenceMeter(index, target),
+    h("p", { class: "note" }, `${index >= target ? "Above" : "Below"} its target of ${percent(target)}; least sure of ${least.name}.`),
+    h("p", { class: error ? "bad" : "note" }, error ?? `${MEANING[phase][0].toUpperCase()}${MEANING[phase].slice(1)}.`));
+}
+
+export function where(found, names, onshow) {
+  if (!found) return card("Where not", h("p", { class: "big" }, "everywhere"), h("p", { class: "note" }, "Nothing is known before the first model."));
+  const { times, within, output, coordinates, action } = found;
+  const place = `${told(names, coordinates)}, action ${action.map((value) => number(value, 2)).join(", ")}`;
+  return card("Where not",
+    h("p", { class: times <= 1 ? "big good" : "big" }, times <= 1 ? "nowhere" : percent(1 - within)),
+    h("p", { class: "note" }, times <= 1
+      ? `Every one of ${LOOKS} points looked at is within tolerance; ${output} comes closest, with ${number(times, 2)} of it.`
+      : `of states and actions are beyond tolerance. Worst: ${output}, ${number(times, 2)} tolerances.`),
+    h("p", { class: "note" }, `Least sure near ${place}. `, h("button", { type: "button", class: "link", onclick: () => onshow(coordinates, action) }, "Show it")));
+}
+
+export function cost({ ledger, budget, queries }) {
+  const open = queries.pending + queries.leased;
+  return card("What it cost",
+    h("p", { class: "big" }, plural(ledger.total, "real step")), costBar(ledger, budget),
+    h("p", { class: "note" }, `${count(ledger.initial)} initial, ${count(ledger.adaptive)} adaptive${ledger.manual ? `, ${count(ledger.manual)} by hand` : ""}; the budget is ${count(budget)}${open ? `, ${count(open)} asked now` : ""}.`),
+    h("p", { class: "note" }, `${ledger.unresolved ? `At most ${count(ledger.unresolved)} more that were never answered. ` : ""}Evaluation, apart: ${count(ledger.evaluation)}.`));
+}

@@ -1,0 +1,41 @@
+// All surrogates: how sure each is, and what it cost.
+
+import { call } from "/page/api.js";
+import { h, keyed } from "/page/dom.js";
+import { count, percent } from "/page/format.js";
+import { alive, confidenceMeter, costBar, phaseBadge } from "/page/parts.js";
+
+const EMPTY = () => h("div", { class: "card welcome" },
+  h("h2", {}, "No surrogate yet"),
+  h("p", {}, "Register an environment, and let a sampler answer the questions about it. This page follows by itself."),
+  h("pre", {}, "surrogym register Pendulum-v1 --name pendulum\nsurrogym sample pendulum"));
+
+function row(surrogate) {
+  const { name, environment, confidence_index: index, target, ledger, budget } = surrogate;
+  return h("li", {}, h("a", { class: "card row", href: `#/s/${encodeURIComponent(name)}` },
+    h("span", { class: "who" }, h("strong", {}, name), h("span", { class: "note" }, environment)),
+    phaseBadge(surrogate),
+    h("span", { class: "cell" }, h("span", { class: "note" }, "how sure"), confidenceMeter(index, target),
+      h("span", { class: "value" }, index === null ? "no model yet" : `${percent(index)} of ${percent(target)}`)),
+    h("span", { class: "cell" }, h("span", { class: "note" }, "what it cost"), costBar(ledger, budget),
+      h("span", { class: "value" }, `${count(ledger.total)} of ${count(budget)} real steps`)),
+    h("span", { class: "alive note" }, alive(surrogate))));
+}
+
+export function listView(main) {
+  const list = h("ul", { class: "list" });
+  const place = h("div", {}, h("div", { class: "card loading", "aria-busy": "true" }, "Asking the server…"));
+  const rows = keyed(list, row);
+  main.replaceChildren(h("h1", {}, "Surrogates"), place);
+  return {
+    async refresh() {
+      const { surrogates } = await call("GET", "/v1/surrogates");
+      rows(surrogates.map(({ created_at, queries, round, ...rest }) => rest), (surrogate) => surrogate.name);
+      const wanted = surrogates.length ? list : place.querySelector(".welcome") ?? EMPTY();
+      if (place.firstChild !== wanted) place.replaceChildren(wanted);
+    },
+    fail: (error) => place.replaceChildren(h("div", { class: "card bad", role: "alert" }, error.message)),
+    repaint() {},
+    close() {},
+  };
+}

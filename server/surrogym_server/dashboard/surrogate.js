@@ -1,0 +1,128 @@
+// One surrogate: what is known of it, and everything one can look at.
+
+import { actions } from "/page/actions.js";
+import { call, Problem, surrogate as path } from "/page/api.js";
+import { learningCurves } from "/page/charts.js";
+import { h, shown } from "/page/dom.js";
+import { cost, leastSure, sure, where } from "/page/hero.js";
+import { maps } from "/page/maps.js";
+import { alive, phaseBadge, section } from "/page/parts.js";
+import { pointControls } from "/page/point.js";
+import { probe } from "/page/probe.js";
+import { ledgerTable, modelTable, queueTable, sessionTable } from "/page/tables.js";
+
+const PAGE = 10_000;
+const LINKS = [["learning", "Learning"], ["maps", "Maps"], ["probe", "Probe"], ["sessions", "Sessions"], ["queue", "Queue"], ["ledger", "Ledger"], ["models", "Models"], ["actions", "Steer"]];
+
+export function surrogateView(main, name, context) {
+  const url = path(name);
+  let parts = null;
+  let samples = [];
+  let models = [];
+  let version = null;
+  let closed = false;
+  main.replaceChildren(h("h1", {}, name), h("div", { class: "card loading", "aria-busy": "true" }, "Asking the server…"));
+
+  async function allSamples() {
+    for (;;) {
+      const { samples: page } = await call("GET", `${url}/samples?after=${samples.at(-1)?.id ?? 0}&limit=${PAGE}`);
+      samples = [...samples, ...page];
+      if (page.length < PAGE) return;
+    }
+  }
+
+  async function refresh() {
+    const now = await call("GET", url);
+    const newSamples = samples.length !== now.samples && allSamples();
+    const newModels = version !== now.model_version && call("GET", `${url}/models`).then((reply) => { models = reply.models; });
+    const [queries, sessions] = await Promise.all([call("GET", `${url}/queries`), call("GET", `${url}/sessions`), newSamples, newModels]);
+    if (closed) return;
+    parts ??= build(main, name, now.spec, context);
+    parts.show({ now, samples, models: newModels && models, queries: queries.queries, sessions: sessions.sessions });
+    version = now.model_version;
+  }
+
+  function fail(error) {
+    const missing = error instanceof Problem && error.status === 404;
+    parts?.close();
+    parts = null;
+    [samples, models, version] = [[], [], null];
+    main.replaceChildren(h("h1", {}, name), h("div", { class: "card bad", role: "alert" },
+      missing ? "There is no surrogate of this name, or it was deleted." : error.message, " ", h("a", { href: "#/" }, "All surrogates")));
+  }
+
+  return {
+    refresh,
+    fail,
+    repaint: () => parts?.repaint(),
+    close: () => { closed = true; parts?.close(); },
+  };
+}
+
+function build(main, name, spec, context) {
+  const title = h("div", { class: "title" });
+  const facts = h("div", { class: "facts" });
+  const curves = learningCurves();
+  const waiting = h("p", { class: "empty" }, "The first model follows the initial queries.");
+  const plots = h("div", { hidden: true }, curves.parts);
+  const controls = pointControls(spec, () => { map.moved(); probing.moved(); });
+  const map = maps(name, spec, controls);
+  const steer = actions(name, context);
+  const settable = spec.max_rollout === undefined || spec.max_rollout === null;
+  const probing = probe(name, spec, controls, { onepisodes: map.paths, ask: settable && ((point) => steer.ask(point)) });
+  const [queue, ledger, versions, sessions] = [queueTable(), ledgerTable(), modelTable(), sessionTable()];
+  const names = controls.ranges.map((range) => range.name);
+  const showPoint = (coordinates, action) => {
+    controls.move(coordinates, action);
+    document.getElementById("maps").scrollIntoView({ behavior: "smooth" });
+  };
+  const render = {
+    title: shown(title, (now) => [h("a", { class: "back", href: "#/" }, "All surrogates"), h("h1", {}, name), phaseBadge(now), h("span", { class: "note" }, `${now.environment} · ${alive(now)}`)]),
+    facts: shown(facts, ({ now, found }) => [sure(now), where(found, names, showPoint), cost(now)]),
+  };
+  const jump = (id) => (event) => {
+    event.preventDefault();
+    document.getElementById(id).scrollIntoView({ behavior: "smooth" });
+    document.getElementById(`${id}-title`).parentElement.parentElement.focus?.();
+  };
+  main.replaceChildren(title, facts,
+    h("nav", { class: "jumps", "aria-label": "Parts of this page" }, LINKS.map(([id, text]) => h("a", { href: `#${id}`, onclick: jump(id) }, text))),
+    section("learning", "Learning", "How sure the model was after so many real steps, and how wrong it was where it left each of them out.", waiting, plots),
+    section("maps", "Maps", "Two coordinates at a time; the sliders set the others. Click a map, or move with the arrow keys.",
+      h("div", { class: "cut" }, controls.form, h("div", {}, map.parts))),
+    section("probe", "Probe", "What the model says of one step from the point above, with its standard deviations.", probing.parts),
+    sessions.element, queue.element, h("div", { class: "two" }, ledger.element, steer.element), versions.element);
+
+  let found = null;
+  let looked = null;
+  async function look(now) {
+    if (!now.fidelity || looked === now.model_version) return;
+    looked = now.model_version;
+    found = await leastSure(name, now.fidelity, controls).catch(() => null);
+    render.facts({ now, found });
+  }
+
+  return {
+    show({ now, samples, models, queries, sessions: open }) {
+      const { created_at, spec: _, ...rest } = now;
+      render.title(rest);
+      render.facts({ now: rest, found });
+      if (models && models.length) {
+        plots.hidden = false;
+        waiting.hidden = true;
+        curves.show(models);
+      }
+      if (models) versions.show(models);
+      const point = { samples, fidelity: now.fidelity, version: now.model_version };
+      map.show(point);
+      probing.show(point);
+      queue.show(queries);
+      ledger.show(now.ledger);
+      sessions.show(open);
+      steer.show(now);
+      look(rest);
+    },
+    repaint: () => [curves, map, probing].forEach((part) => part.repaint()),
+    close: () => [curves, map, probing].forEach((part) => part.close()),
+  };
+}

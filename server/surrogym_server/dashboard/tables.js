@@ -1,0 +1,83 @@
+// Queue, ledger, models and sessions.
+
+import { h, keyed, shown } from "/page/dom.js";
+import { count, moment, number, percent, plural, seconds, vector } from "/page/format.js";
+import { section, sparkline, table } from "/page/parts.js";
+
+const ROWS = 200;
+const FILTERS = { all: () => true, open: (query) => ["pending", "leased"].includes(query.status), "with errors": (query) => query.error !== null };
+const STATUS = { set_aside: "set aside" };
+
+export function queueTable() {
+  const filter = h("select", { "aria-label": "queries to show" }, Object.keys(FILTERS).map((name) => h("option", {}, name)));
+  const place = h("div");
+  let queries = [];
+  const render = shown(place, (rows) => table("Queue of queries",
+    [["id", "num"], ["purpose", ""], ["status", ""], ["state", ""], ["action", ""], ["leases", "num"], ["sampler", ""], ["error", "wide"]],
+    rows.map((query) => [query.id, h("span", { class: `mark ${query.purpose}` }, query.purpose),
+      h("span", { class: `badge ${query.status}` }, STATUS[query.status] ?? query.status),
+      vector(query.coordinates), query.actions.length > 1 ? `${query.actions.length} actions` : vector(query.actions[0]),
+      query.attempts, query.sampler ?? "–", query.error ? h("span", { class: "bad" }, query.error) : ""]),
+    filter.value === "all" ? "No query was asked yet." : "None."));
+  const draw = () => render(queries.filter(FILTERS[filter.value]).slice(0, ROWS));
+  filter.addEventListener("change", draw);
+  return {
+    element: section("queue", "Queue", "Queries to samplers, the newest first. A lease is one attempt; a query that keeps failing is set aside.", h("div", { class: "picks" }, h("label", { class: "pick" }, "show", filter)), place),
+    show(given) { queries = given.toReversed(); draw(); },
+  };
+}
+
+export function ledgerTable() {
+  const place = h("div");
+  const render = shown(place, (ledger) => table("Ledger", [["real steps", ""], ["", "num"], ["", "wide"]], [
+    ["initial", count(ledger.initial), "a Latin hypercube, before anything is known"],
+    ["adaptive", count(ledger.adaptive), "chosen where the model was not sure"],
+    ["manual", count(ledger.manual), "asked for, or handed in, by a person"],
+    [h("strong", {}, "total"), h("strong", {}, count(ledger.total)), "what the design cost"],
+    ["unresolved", count(ledger.unresolved), "leased and never answered: at most so many more were taken"],
+    ["evaluation", count(ledger.evaluation), "to judge policies; not seen by the model"],
+  ], ""));
+  return { element: section("ledger", "Ledger", "Every real step, by purpose.", place), show: render };
+}
+
+const HYPER = ["inputs", "kernel", "lengthscale", "signal_variance", "linear_variance", "quadratic_variance", "noise_variance", "jitter", "scale", "points", "left_out"];
+
+function model(record) {
+  const { fidelity } = record;
+  const head = h("summary", {}, h("strong", {}, `version ${record.version}`), h("span", { class: "note" },
+    ` ${plural(record.samples, "sample")}, confidence ${percent(fidelity.confidence_index)}, fitted in ${seconds(record.fit_seconds)}, ${moment(record.created_at)}`));
+  const rows = fidelity.outputs.map((output) => [output.name, output.structure, percent(output.confidence_index), percent(output.coverage), number(output.leave_one_out_error), number(output.tolerance)]);
+  const parts = (record.description.outputs ?? []).map((output) => h("div", {}, h("h4", {}, output.name), h("dl", { class: "hyper" },
+    HYPER.filter((name) => output[name] !== undefined).flatMap((name) => [h("dt", {}, name.replaceAll("_", " ")),
+      h("dd", {}, Array.isArray(output[name]) ? vector(output[name]) : typeof output[name] === "number" ? number(output[name]) : String(output[name]))]))));
+  return h("details", { class: "model" }, head,
+    table(`Outputs of version ${record.version}`, [["output", ""], ["structure", ""], ["confidence", "num"], ["coverage", "num"], ["leave-one-out", "num"], ["tolerance", "num"]], rows, ""), h("div", { class: "outputs" }, parts));
+}
+
+export function modelTable() {
+  const list = h("div", { class: "models" });
+  const rows = keyed(list, model);
+  const empty = h("p", { class: "empty" }, "No model yet: the first fit follows the initial queries.");
+  return {
+    element: section("models", "Model versions", "Open one for its structure and hyperparameters.", empty, list),
+    show(models) { empty.hidden = models.length > 0; rows(models.toReversed(), (record) => record.version); },
+  };
+}
+
+export function sessionTable() {
+  const place = h("div");
+  const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
+  const render = shown(place, (sessions) => table("Sessions",
+    [["session", ""], ["lanes", "num"], ["variant", ""], ["model", ""], ["steps", "num"], ["steps / s", "num"], ["episodes", "num"], ["imagined return", "num"], ["", ""], ["penalty's share", "num"]],
+    sessions.map((session) => {
+      const taken = session.penalties.reduce((sum, value) => sum + value, 0);
+      const before = session.returns.reduce((sum, value, at) => sum + Math.abs(value + session.penalties[at]), 0);
+      return [h("code", {}, session.id.slice(0, 8)), count(session.num_envs), session.variant, `${session.model_version.join(", ")}${session.model === "latest" ? ", latest" : ""}`,
+        count(session.steps), count(session.steps_per_second), count(session.episodes),
+        session.returns.length ? number(mean(session.returns), 4) : "–", sparkline(session.returns), session.returns.length && before ? percent(taken / before) : "–"];
+    }), "No session is open. A trainer opens one: surrogym train"));
+  return {
+    element: section("sessions", "Sessions", "Virtual environments in use. Returns are means of the last hundred episodes, and imagined: no sign of success in the original environment.", place),
+    show: render,
+  };
+}
