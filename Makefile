@@ -11,7 +11,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint
 PINS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: demo test test-all docs docs-serve format-check lint types imports unit chaos bench acquisition format postgresql clean help
+.PHONY: demo test test-all docs docs-serve format-check lint types imports unit chaos bench acquisition format postgresql chromium screenshots clean help
 
 demo: .venv/all  ## Solve Pendulum with server, sampler and trainer on this machine (ARGS="--seed 1")
 	@exec $(BIN)/surrogym demo pendulum $(ARGS)
@@ -30,7 +30,7 @@ types: .venv/dev  ## Check the types
 imports: .venv/dev  ## Check which room imports which
 	$(BIN)/lint-imports
 
-unit: .venv/dev postgresql  ## The tests alone (ARGS="-k pendulum")
+unit: .venv/dev postgresql chromium  ## The tests alone (ARGS="-k pendulum")
 	$(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
 
 test-all: test .venv-extras  ## make test, every command of the docs, and trainers and trackers with packages of their own
@@ -64,6 +64,18 @@ postgresql:
 	else \
 	    echo "PostgreSQL is not on this machine, so its tests are skipped. To run them: apt-get install postgresql"; \
 	fi
+
+chromium:
+	@if command -v chromium chromium-browser google-chrome >/dev/null; then \
+	    :; \
+	elif [ -n "$$CI" ] && [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq chromium >/dev/null; \
+	else \
+	    echo "Chromium is not on this machine, so the tests of the page are skipped. To run them: apt-get install chromium"; \
+	fi
+
+screenshots: .venv/dev chromium  ## Pictures of the page for the docs, from a live Pendulum
+	$(BIN)/python tests/dashboard/screenshots.py
 
 clean:  ## Remove the virtual environment, caches and builds; run folders stay
 	rm -rf .venv .venv-extras build dist .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache

@@ -42,6 +42,7 @@ async function refresh() {
   page.busy = true;
   try {
     await page.view.refresh();
+    if (page.state === "gone") say("live");
   } catch (error) {
     if (error.name !== "AbortError") failed(error);
   } finally {
@@ -152,5 +153,5 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => page
 addEventListener("hashchange", route);
 theme();
 route();
-setInterval(() => document.visibilityState === "visible" && page.state === "live" && refresh(), LOOK_MS);
+setInterval(() => document.visibilityState === "visible" && ["live", "gone"].includes(page.state) && refresh(), LOOK_MS);
 follow();

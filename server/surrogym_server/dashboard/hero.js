@@ -46,7 +46,8 @@ export function sure({ confidence_index: index, target, fidelity, phase, error }
     h("p", { class: error ? "bad" : "note" }, error ?? `${MEANING[phase][0].toUpperCase()}${MEANING[phase].slice(1)}.`));
 }
 
-export function where(found, names, onshow) {
+export function where(found, names, onshow, model) {
+  if (!found && model) return card("Where not", h("p", { class: "big" }, "looking…"), h("p", { class: "note" }, `Asking the model about ${LOOKS} points.`));
   if (!found) return card("Where not", h("p", { class: "big" }, "everywhere"), h("p", { class: "note" }, "Nothing is known before the first model."));
   const { times, within, output, coordinates, action } = found;
   const place = `${told(names, coordinates)}, action ${action.map((value) => number(value, 2)).join(", ")}`;

@@ -65,7 +65,7 @@ export function maps(name, spec, controls) {
     const show = (kind, values, [low, high], [lowText, highText], remark) =>
       kinds[kind].show({ ...base, values, low, high, lowText, highText, remark });
     if (!state.said) {
-      for (const kind of Object.keys(kinds)) show(kind, null, [0, 1], ["", ""], "No model yet.");
+      for (const kind of Object.keys(kinds)) show(kind, null, [0, 1], ["", ""], state.version === null ? "No model yet." : "Asking the model…");
       return;
     }
     const { deviation, input_probability: occupancy, log_uncertainty_index: index } = state.said;

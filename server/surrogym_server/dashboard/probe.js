@@ -1,6 +1,6 @@
 // The probe: what the model says of one step from the point, and of episodes from there.
 
-import { call, surrogate } from "/page/api.js";
+import { call, Problem, surrogate } from "/page/api.js";
 import { episodeCharts } from "/page/charts.js";
 import { debounced, h, newest, shown } from "/page/dom.js";
 import { number } from "/page/format.js";
@@ -15,6 +15,7 @@ export function probe(name, spec, controls, { onepisodes, ask }) {
   const steps = h("input", { type: "number", min: 1, max: 500, value: Math.min(60, spec.time_limit ?? 60), "aria-label": "steps of the episode" });
   const how = h("select", { "aria-label": "actions of the episode" }, h("option", { value: "hold" }, "this action held"), h("option", { value: "random" }, "random actions"));
   const episode = h("p", { class: "note" });
+  const trouble = h("p", { class: "bad", role: "alert" });
   let ready = false;
 
   const render = shown(answer, ({ now, said, doubt, tolerances }) => {
@@ -51,16 +52,20 @@ export function probe(name, spec, controls, { onepisodes, ask }) {
     episode.textContent = `Imagined return of the mean over ${imagined.mean.reward.length} steps: ${number(total, 4)}${imagined.mean.terminated ? ", then it ends" : ""}. Thin lines: ${DRAWS} functions the data allow.`;
   });
 
-  const refused = (error) => answer.replaceChildren(h("p", { class: "bad", role: "alert" }, error.message));
+  const refused = (error) => {
+    if (!(error instanceof Problem)) return; // a server that is away has a banner of its own
+    trouble.textContent = error.message;
+  };
   const askStep = debounced(80, (tolerances) => step(tolerances).catch(refused));
   const askRoll = debounced(350, () => roll().catch(refused));
   let tolerances = [];
-  const run = () => { if (ready) { askStep(tolerances); askRoll(); } };
+  const run = () => { trouble.textContent = ""; if (ready) { askStep(tolerances); askRoll(); } };
   steps.addEventListener("input", run);
   how.addEventListener("change", run);
 
   return {
     parts: [
+      trouble,
       h("div", { class: "probe" }, answer,
         ask && h("button", { type: "button", class: "main", onclick: () => ask(point) }, "Ask for this real step")),
       h("h3", {}, "An episode from there"),
@@ -71,6 +76,7 @@ export function probe(name, spec, controls, { onepisodes, ask }) {
     show({ fidelity, version }) {
       if (!fidelity || version === ready) return;
       tolerances = fidelity.outputs.map((output) => output.tolerance);
+      if (!ready) answer.firstChild.textContent = "Asking the model…";
       ready = version;
       run();
     },

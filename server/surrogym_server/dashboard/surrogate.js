@@ -78,7 +78,7 @@ function build(main, name, spec, context) {
   };
   const render = {
     title: shown(title, (now) => [h("a", { class: "back", href: "#/" }, "All surrogates"), h("h1", {}, name), phaseBadge(now), h("span", { class: "note" }, `${now.environment} · ${alive(now)}`)]),
-    facts: shown(facts, ({ now, found }) => [sure(now), where(found, names, showPoint), cost(now)]),
+    facts: shown(facts, ({ now, found }) => [sure(now), where(found, names, showPoint, now.model_version), cost(now)]),
   };
   const jump = (id) => (event) => {
     event.preventDefault();

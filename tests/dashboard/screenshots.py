@@ -1,0 +1,82 @@
+"""Pictures of the page for docs/images: a real server, a Pendulum learned from real steps, and a policy in training."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "tests"))
+
+from playwright.sync_api import Browser, Page, expect  # noqa: E402
+
+from support.browser import launched  # noqa: E402
+from support.server import running_server  # noqa: E402
+
+IMAGES = ROOT / "docs" / "images"
+QUEUED = "CartPole-v1"
+
+
+def surrogym(url: str, *words: str) -> None:
+    subprocess.run([sys.executable, "-m", "surrogym_client", *words, "--server", url, "--quiet"], check=True)
+
+
+def populate(url: str) -> None:
+    """A finished Pendulum with an occupancy, and a CartPole that waits for a sampler."""
+    surrogym(url, "register", "Pendulum-v1", "--name", "pendulum")
+    surrogym(url, "register", QUEUED, "--name", "cartpole")
+    surrogym(url, "sample", "pendulum", "--until-done")
+
+
+def take(browser: Browser, url: str, name: str, path: str, scheme: str, width: int, height: int) -> None:
+    context = browser.new_context(
+        viewport={"width": width, "height": height}, color_scheme="dark" if scheme == "dark" else "light"
+    )
+    page = context.new_page()
+    page.goto(f"{url}/{path}")
+    settle(page, path)
+    page.screenshot(path=IMAGES / f"{name}.png", full_page=path != "#/")
+    context.close()
+
+
+def settle(page: Page, path: str) -> None:
+    expect.set_options(timeout=30_000)
+    expect(page.locator("#connection")).to_have_text("live")
+    if path != "#/":
+        expect(page.locator(".episodes canvas")).to_have_count(3)
+        expect(page.locator("#maps")).to_contain_text("of the tolerance on this cut")
+        expect(page.locator(".facts")).to_contain_text("Least sure near")
+        expect(page.locator("#sessions tbody")).to_be_visible()
+    page.wait_for_timeout(600)  # transitions
+
+
+def main() -> None:
+    IMAGES.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder, running_server(Path(folder)) as server, launched() as browser:
+        populate(server.url)
+        command = ["train", "pendulum", "--steps", "1000000", "--penalty", "1", "--out", f"{folder}/policy.zip"]
+        training = subprocess.Popen(
+            [sys.executable, "-m", "surrogym_client", *command, "--server", server.url, "--quiet"]
+        )
+        try:
+            wait_for_episodes(browser, server.url)
+            take(browser, server.url, "page-list", "#/", "light", 1100, 420)
+            take(browser, server.url, "page-light", "#/s/pendulum", "light", 1280, 900)
+            take(browser, server.url, "page-dark", "#/s/pendulum", "dark", 1280, 900)
+            take(browser, server.url, "page-phone", "#/s/pendulum", "light", 390, 844)
+        finally:
+            training.terminate()
+            training.wait()
+
+
+def wait_for_episodes(browser: Browser, url: str) -> None:
+    page = browser.new_page()
+    page.goto(f"{url}/#/s/pendulum")
+    page.locator("#sessions .spark").wait_for(timeout=180_000)
+    page.close()
+
+
+if __name__ == "__main__":
+    main()

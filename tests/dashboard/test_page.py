@@ -1,0 +1,125 @@
+"""The page in a real browser: complete, without a complaint, by keyboard, on a phone, and behind its content policy."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import httpx
+import pytest
+from playwright.sync_api import Page, expect
+
+from support.server import ServerProcess
+from surrogym_client.api import Api
+from surrogym_client.original.classic import pendulum
+
+Open = Callable[..., Page]
+PARTS = ("Learning", "Maps", "Probe", "Sessions", "Queue", "Ledger", "Steer", "Model versions")
+
+
+@pytest.fixture
+def url(pendulum_server: ServerProcess) -> str:
+    expect.set_options(timeout=30_000)
+    return pendulum_server.url
+
+
+def opened(page: Page) -> Page:
+    """The page once all that it asks for has come."""
+    expect(page.locator(".episodes canvas")).to_have_count(3)
+    expect(page.locator("#maps")).to_contain_text("of the tolerance on this cut")
+    expect(page.locator(".facts")).to_contain_text("Least sure near")
+    return page
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_surrogate_is_shown_whole_and_without_a_complaint(
+    url: str, open_page: Open, complaints: list[str], scheme: str
+):
+    requested: list[str] = []
+    page = open_page("about:blank", scheme=scheme)
+    page.on("request", lambda request: requested.append(request.url))
+    page.goto(f"{url}/#/s/pendulum")
+    opened(page)
+    headings = page.locator("section h2").all_text_contents()
+    assert set(headings) == set(PARTS)
+    expect(page.locator(".facts")).to_contain_text("12 real steps")
+    assert page.locator("#learning canvas").count() == 2
+    expect(page.locator("#queue tbody tr")).to_have_count(12)
+    page.locator(".model summary").first.click()
+    expect(page.locator(".model").first).to_contain_text("lengthscale")
+    assert {re.match(r"https?://[^/]+", address)[0] for address in requested} == {url}
+    assert complaints == []
+
+
+def test_the_content_policy_lets_nothing_in(url: str):
+    reply = httpx.get(url)
+    policy = reply.headers["content-security-policy"]
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    assert not re.search(r"<script(?![^>]*src=)|style=|\son\w+=", reply.text)
+
+
+def test_a_click_on_a_map_moves_the_probe(url: str, open_page: Open):
+    page = opened(open_page(f"{url}/#/s/pendulum"))
+    canvas = page.locator(".heat canvas").first
+    box = canvas.bounding_box()
+    assert box is not None
+    canvas.click(position={"x": box["width"] * 0.8, "y": box["height"] * 0.3})
+    shown = [float(page.get_by_label(f"{name}, as a number").input_value()) for name in ("theta", "speed")]
+    assert shown[0] > 1
+    assert shown[1] > 1
+    with Api(url) as api:
+        said = api.predict("pendulum", [shown], [[0.0]])
+    row = page.locator("#probe tbody tr").nth(1).locator("td").nth(2)
+    expect(row).to_have_text(re.compile(f"^{said.next_coordinates[0][1]:.1f}"))
+
+
+def test_the_keyboard_reaches_a_surrogate_and_moves_its_point(url: str, open_page: Open):
+    page = open_page(url)
+    row = page.get_by_role("link", name=re.compile("^pendulum"))
+    expect(row).to_be_visible()
+    for _ in range(30):
+        page.keyboard.press("Tab")
+        if row.evaluate("element => element === document.activeElement"):
+            break
+    page.keyboard.press("Enter")
+    opened(page)
+    canvas = page.locator(".heat canvas").first
+    canvas.focus()
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("Shift+ArrowUp")
+    assert float(page.get_by_label("theta, as a number").input_value()) > 0
+    assert float(page.get_by_label("speed, as a number").input_value()) > 0
+    assert "Arrow keys" in (canvas.get_attribute("aria-label") or "")
+
+
+@pytest.mark.parametrize("width", [320, 390])
+def test_a_phone_needs_no_sideways_scrolling(url: str, open_page: Open, width: int):
+    page = open_page(url, width=width, height=800)
+    expect(page.get_by_role("link", name=re.compile("^pendulum"))).to_be_visible()
+    overflow = "document.documentElement.scrollWidth - innerWidth"
+    assert page.evaluate(overflow) <= 0
+    page.goto(f"{url}/#/s/pendulum")
+    assert opened(page).evaluate(overflow) <= 0
+
+
+def test_an_admin_pauses_asks_adds_and_deletes(url: str, open_page: Open, complaints: list[str]):
+    with Api(url) as api:
+        api.create_surrogate("steered", pendulum())
+        page = open_page(f"{url}/#/s/steered")
+        page.get_by_role("button", name="Pause").click()
+        expect(page.locator(".title")).to_contain_text("paused")
+        before = api.surrogate("steered")
+        assert before.paused
+        page.get_by_role("button", name="Add to the budget").click()
+        expect(page.locator("#actions")).to_contain_text(f"The budget is now {before.budget + 10}")
+        page.get_by_role("button", name="Ask for this real step").click()
+        expect(page.locator("#queue tbody tr").first).to_contain_text("manual")
+        page.get_by_role("button", name="Delete…").click()
+        confirm = page.get_by_role("dialog").get_by_role("button", name="Delete")
+        expect(confirm).to_be_disabled()
+        page.get_by_label("Type its name").fill("steered")
+        confirm.click()
+        expect(page.get_by_role("heading", name="Surrogates")).to_be_visible()
+        assert "steered" not in [surrogate.name for surrogate in api.surrogates()]
+    assert complaints == []
