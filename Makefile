@@ -45,9 +45,13 @@ docs-serve: .venv/dev  ## Show the site while its pages are written
 chaos: .venv/dev postgresql  ## Faults and attacks in full length; make test has a short form (ARGS="-k killed")
 	CHAOS=full $(BIN)/pytest --durations 0 tests/chaos tests/security $(ARGS)
 
-bench: .venv/dev  ## What a step costs on this machine, beside bare echoes (ARGS="--lanes 1 16")
-	$(BIN)/python tests/benchmarks/bench_step.py $(ARGS)
-	$(BIN)/python tests/benchmarks/bench_predict.py
+bench: .venv/dev  ## What steps, predictions and trainings cost on this machine, beside echoes, libraries and other systems
+	@for part in step peers train growth predict; do \
+	    echo; echo "== $$part"; $(BIN)/python tests/benchmarks/bench_$$part.py $(ARGS) || exit 1; \
+	done
+
+bench-memory: .venv/dev  ## Resident memory of a server with 64 sessions of 256 lanes, 10 minutes (ARGS="--minutes 1")
+	$(BIN)/python tests/benchmarks/bench_memory.py $(ARGS)
 
 acquisition: .venv/dev  ## Adaptive queries beside a Latin hypercube, by model error (ARGS="--tasks pendulum --seeds 10")
 	$(BIN)/python tests/benchmarks/acquisition.py $(ARGS)

@@ -44,7 +44,7 @@ POINTS, OUTPUTS, INPUTS = 125, 4, 4
 BATCHES = (1, 1_024, 8_192)
 LANES = (1, 4, 16, 64, 256, 1_024, 4_096)
 SIZES = (10, 30, 100, 300, 1_000, 2_000)
-PARTICLE_LANES, PARTICLES, SAMPLES = 64, 1_000, 50
+PARTICLE_LANES, PARTICLES, SAMPLES = 64, (10, 100, 1_000, 4_000), 50
 LENGTHSCALE, NOISE = 1.5, 1e-4
 COMPARISON, TURN = 5.0, 0.05  # seconds
 
@@ -190,16 +190,16 @@ def steps(model: SurrogateModel, lanes: int) -> Row:
     return {"N": lanes, **made, "AUR-D, us a lane": 1e3 * made["AUR-D"] / lanes}
 
 
-def particles(model: SurrogateModel) -> Row:
-    shape = {"variant": "probabilistic", "particles": PARTICLES, "penalty": 3.0}
+def particles(model: SurrogateModel, count: int) -> Row:
+    shape = {"variant": "probabilistic", "particles": count, "penalty": 3.0}
     stages = [stage.serving for stage in model._stages if stage is not None]
-    bare = [products(s, PARTICLE_LANES * PARTICLES, list(s.processes)) for s in stages]
+    bare = [products(s, PARTICLE_LANES * count, list(s.processes)) for s in stages]
     subjects = {
         "AUR-P": stepping(model, PARTICLE_LANES, **shape),
         "products": lambda: [call() for call in bare],
     }
     made = measure(subjects)
-    return {"lanes x particles": f"{PARTICLE_LANES} x {PARTICLES}", **made, "steps a second": 1e3 / made["AUR-P"]}
+    return {"lanes x particles": f"{PARTICLE_LANES} x {count}", **made, "steps a second": 1e3 / made["AUR-P"]}
 
 
 def table(title: str, rows: Sequence[Row]) -> None:
@@ -230,7 +230,7 @@ def main() -> None:
     model, report = pendulum_model(), {"machine": machine(), "threads": options.threads}
     for title, rows in {
         f"mean and variance, n={POINTS}, {OUTPUTS} outputs": (predictions(batch) for batch in BATCHES),
-        f"AUR-P step, Pendulum, n={SAMPLES}": (particles(model) for _ in range(1)),
+        f"AUR-P step, Pendulum, n={SAMPLES}": (particles(model, count) for count in PARTICLES),
         f"AUR-D step, Pendulum, n={SAMPLES}": (steps(model, lanes) for lanes in LANES),
         f"1,024 predictions of {OUTPUTS} outputs": (growth(points) for points in SIZES),
     }.items():

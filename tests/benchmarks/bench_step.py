@@ -77,11 +77,15 @@ def process(*arguments: str, ready: Callable[[], bool]) -> Iterator[None]:
         child.wait(30)
 
 
-@contextmanager
-def echo_server() -> Iterator[str]:
+def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def echo_server() -> Iterator[str]:
+    port = free_port()
 
     def listening() -> bool:
         with socket.socket() as caller:
