@@ -18,6 +18,7 @@ import numpy as np
 import stable_baselines3
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
@@ -26,6 +27,7 @@ from surrogym_client.evolution import EVOLUTION, EVOLUTION_STEPS, evolve
 from surrogym_client.imagined import imagined_returns, observation_statistics
 from surrogym_client.policies import WIDER, PaperPolicy, Standardise
 from surrogym_client.sb3 import SurrogateVecEnv
+from surrogym_client.tracking import tracking, with_folder
 from surrogym_client.training import (
     CHECK_EPISODES,
     TrainingInterrupted,
@@ -78,8 +80,11 @@ def train(
     """
     settings = settings or TrainSettings()
     if settings.algorithm.upper() == EVOLUTION:
+        if settings.tracker in ("wandb", "mlflow"):
+            raise ValueError(f"{EVOLUTION} logs to no tracker: expected none, got {settings.tracker}")
         return evolve(port, out, settings, planned_steps(settings), progress)
     torch.set_num_threads(settings.threads)
+    settings = with_folder(settings, out)
     spec, algorithm = port.spec(), algorithm_by_name(settings.algorithm)
     total = planned_steps(settings)
     num_envs = settings.num_envs or suggested_lanes(algorithm)
@@ -101,7 +106,8 @@ def train(
         checks = Checks(total, progress, lambda learner: imagined_return(port, learner, settings), learner)
         if settings.start_from is not None and checks.worth_keeping(known := network(start_from=settings.start_from)):
             learner = known
-        learner, whole = _learned(learner, network, checks)
+        with tracking(settings, out) as callbacks:
+            learner, whole = _learned(learner, network, checks, callbacks)
         checks.restore_best()
         out.parent.mkdir(parents=True, exist_ok=True)
         learner.save(out)
@@ -124,12 +130,14 @@ def train(
 
 
 def _learned(
-    learner: BaseAlgorithm, another: Callable[[int], BaseAlgorithm], checks: Checks
+    learner: BaseAlgorithm, another: Callable[[int], BaseAlgorithm], checks: Checks, callbacks: Sequence[BaseCallback]
 ) -> tuple[BaseAlgorithm, bool]:
     """The network that learned last, and whether the training came to its end, and not to an interruption."""
     for attempt in itertools.count(1):
         try:
-            learner.learn(_whole_rollouts(learner, checks.left), callback=checks, reset_num_timesteps=True)
+            learner.learn(
+                _whole_rollouts(learner, checks.left), callback=[checks, *callbacks], reset_num_timesteps=True
+            )
         except KeyboardInterrupt:
             return learner, False
         if not checks.given_up:
@@ -189,7 +197,9 @@ def _learner(
     gamma: float,
 ) -> BaseAlgorithm:
     if settings.start_from is not None:
-        return algorithm.load(settings.start_from, env=env, device="cpu", seed=settings.seed)
+        learner = algorithm.load(settings.start_from, env=env, device="cpu", seed=settings.seed)
+        learner.tensorboard_log = None if settings.tensorboard is None else str(settings.tensorboard)
+        return learner
     extractor = {"mean": statistics[0], "deviation": statistics[1]}
     defaults: dict[str, Any] = {"gamma": gamma}
     policy_kwargs: dict[str, Any] = {"features_extractor_class": Standardise, "features_extractor_kwargs": extractor}

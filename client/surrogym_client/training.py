@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 CHECKS = 12  # of the imagined return in one training; the best policy is kept
 CHECK_EPISODES = 64
+
+Tracker = Literal["tensorboard", "wandb", "mlflow"]
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,10 @@ class TrainSettings:
     start_box: float = 0.5
     start_from: Path | None = None  # go on from a saved policy
     threads: int = 1
-    tensorboard: Path | None = None
+    tracker: Tracker | None = None  # of Stable-Baselines3's algorithms; CMA-ES has none
+    tensorboard: Path | None = (
+        None  # folder of TensorBoard's files; None: beside the policy, where the tracker has some
+    )
     session: dict[str, Any] = field(default_factory=dict)
     hyperparameters: dict[str, Any] = field(default_factory=dict)
 

@@ -46,6 +46,7 @@ ELSEWHERE = {
     "export": "a setting of the shell",
     ".": "a setting of the shell",
     "pip": "tests/packaging",
+    "tensorboard": "a page that stays open",
     "surrogym serve": "a server of this test runs already",
     "surrogym demo": "tests/demo",
     "surrogym reproduce": "tests/cli/test_reproduce.py",
@@ -113,6 +114,7 @@ def test_each_page_with_commands_is_followed_or_known_to_be_run_elsewhere() -> N
         "docs/http-api.md",
         "docs/how-to/containers.md",
         "docs/how-to/terminal.md",
+        "docs/how-to/tracking.md",
         "docs/performance.md",
         "docs/results.md",
     }

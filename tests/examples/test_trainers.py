@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
-import pytest
-
-from support.examples import EXAMPLES, ROOT, run
+from support.examples import EXAMPLES, EXTRAS, needs_extras, run
 from support.server import ServerProcess
-
-EXTRAS = Path(os.environ.get("SURROGYM_TEST_EXTRAS", ROOT / ".venv-extras")) / "bin" / "python"
-needs_extras = pytest.mark.skipif(not EXTRAS.exists(), reason="no .venv-extras here: make test-all makes it")
 
 
 def program(name: str) -> str:

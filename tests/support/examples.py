@@ -8,10 +8,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from support.server import ServerProcess
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
+EXTRAS = Path(os.environ.get("SURROGYM_TEST_EXTRAS", ROOT / ".venv-extras")) / "bin" / "python"
+needs_extras = pytest.mark.skipif(not EXTRAS.exists(), reason="no .venv-extras here: make test-all makes it")
 
 
 def run(server: ServerProcess, folder: Path, *arguments: str, python: str = sys.executable, **environment: str) -> str:

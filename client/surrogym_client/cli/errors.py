@@ -12,6 +12,7 @@ EXTRAS = {
     "train": ("matplotlib", "stable_baselines3", "tensorboard", "torch"),
     "export": ("onnx", "onnxruntime", "onnxscript"),
     "render": ("moviepy", "pygame"),
+    "trackers": ("mlflow", "wandb"),
     "mujoco": ("mujoco", "imageio"),
 }
 START_SERVER = "start one with surrogym serve, or name another by --server or SURROGYM_URL"

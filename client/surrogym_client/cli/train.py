@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 Variant = Literal["deterministic", "probabilistic", "pathwise"]
 Propagation = Literal["mean", "sample"]
 Weighting = Literal["inverse_variance", "uniform"]
+Log = Literal["tensorboard", "wandb", "mlflow", "none"]
 
 
 def register(app: typer.Typer) -> None:
@@ -85,7 +86,10 @@ def command(
         typer.Option(min=0, help="More real queries in each round, where the policy goes, until the design is ready."),
     ] = 0,
     rounds: Annotated[int, typer.Option(min=1, help="Rounds of --improve, at most.")] = 3,
-    tensorboard: Annotated[Path | None, typer.Option(help="Folder for TensorBoard.")] = None,
+    log: Annotated[Log, typer.Option(help="Where the curves of the training go.")] = "tensorboard",
+    tensorboard: Annotated[
+        Path | None, typer.Option(help="Folder for TensorBoard. [default: tensorboard beside the policy]")
+    ] = None,
     wait: Wait = 0.0,
     progress_file: Annotated[Path | None, typer.Option(hidden=True, help="Write progress as JSON lines.")] = None,
     exit_with_parent: ExitWithParent = False,
@@ -130,6 +134,7 @@ def command(
         seed=seed,
         start_box=start_box,
         start_from=start_from,
+        tracker=None if log == "none" else log,
         tensorboard=tensorboard,
         hyperparameters=hyperparameters,
         session=session,

@@ -14,7 +14,14 @@ from surrogym_client.policy_file import PolicyCard, read_card
 from surrogym_client.versions import machine, versions
 from surrogym_client.waiting import IN_WORDS
 
-BY_RUN = ("seed", "start_from", "tensorboard", "tensorboard_log", "total_steps")  # differ between runs of one kind
+BY_RUN = (
+    "seed",
+    "start_from",
+    "tensorboard",
+    "tensorboard_log",
+    "total_steps",
+    "tracker",
+)  # differ between runs of one kind
 
 
 def metrics_of(
