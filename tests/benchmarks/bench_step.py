@@ -214,6 +214,7 @@ def throughput(url: str, lanes: int) -> dict[str, Figures]:
         return measure(subjects)
 
 
+READY = "echo, WebSocket library"
 BESIDE = {"stream": "echo, WebSocket", "binary": "echo, HTTP", "json": "echo, HTTP JSON"}
 
 
@@ -221,7 +222,8 @@ def show_trips(lanes: int, figures: dict[str, Figures]) -> None:
     for name, found in figures.items():
         echo = figures[BESIDE.get(name.partition(", ")[2], name)]
         ratio = f"{found.p50 / echo.p50:8.2f}" if echo is not found else " " * 8
-        print(f"{lanes:6} {name:26}{found.p50:10.0f}{found.p99:10.0f}{ratio}")
+        ready = f"{found.p50 / figures[READY].p50:12.2f}" if name.endswith("stream") else ""
+        print(f"{lanes:6} {name:26}{found.p50:10.0f}{found.p99:10.0f}{ratio}{ready}")
 
 
 def show_throughput(lanes: int, figures: dict[str, Figures]) -> None:
@@ -250,7 +252,7 @@ def main() -> None:
     report: dict[str, Any] = {"machine": machine(), "round_trip_us": {}, "step_us": {}}
     print(", ".join(f"{name} {value}" for name, value in report["machine"].items()))
     with echo_server() as echo, surrogym_server() as url:
-        print(f"{'N':>6} {'round trip':26}{'p50 us':>10}{'p99 us':>10}{'to echo':>8}")
+        print(f"{'N':>6} {'round trip':26}{'p50 us':>10}{'p99 us':>10}{'to echo':>8}{'to library':>12}")
         for lanes in options.lanes:
             figures = round_trips(url, echo, lanes)
             show_trips(lanes, figures)
