@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-PATIENCE = 60.0
+PATIENCE = 120.0
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
@@ -37,8 +37,9 @@ class Terminal:
     def interrupt(self) -> int:
         """Press Ctrl-C; the exit status, once everything it said is read."""
         self.process.send_signal(signal.SIGINT)
+        deadline = time.monotonic() + PATIENCE
         while self._read(0.2) or self.process.poll() is None:
-            pass
+            assert time.monotonic() < deadline, self.shown[-2_000:]
         return self.process.wait()
 
     def _read(self, seconds: float) -> bool:
@@ -52,6 +53,11 @@ class Terminal:
         return bool(said)
 
 
+def _heed_interrupts() -> None:
+    """A shell that starts the tests in the background has them, and their children, ignore Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @contextmanager
 def on_terminal(*arguments: str, width: int = 80, folder: str | None = None) -> Iterator[Terminal]:
     """``surrogym ARGUMENTS`` on a terminal of ``width`` characters; killed at the end if it still runs."""
@@ -60,7 +66,9 @@ def on_terminal(*arguments: str, width: int = 80, folder: str | None = None) -> 
     command = [sys.executable, "-m", "surrogym_client", *arguments]
     kept = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")}
     environment = kept | {"TERM": "xterm", "COLUMNS": str(width)}
-    process = subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs, env=environment, cwd=folder)
+    process = subprocess.Popen(
+        command, stdin=theirs, stdout=theirs, stderr=theirs, env=environment, cwd=folder, preexec_fn=_heed_interrupts
+    )
     os.close(theirs)
     try:
         yield Terminal(process, ours)
