@@ -127,6 +127,7 @@ function locked(error) {
 function keys(access) {
   const button = document.getElementById("role");
   button.hidden = !access.tokens;
+  document.getElementById("docs").hidden = access.tokens; // a link carries no token
   button.textContent = `Role: ${access.role}, leave`;
 }
 

@@ -95,7 +95,7 @@ export function episodeCharts(coordinates) {
           legend: { show: false },
           cursor: { show: false },
           scales: { x: { time: false } },
-          axes: [axis({ size: 26, space: 45 }), axis({ size: 52 })],
+          axes: [axis({ size: 26, space: 45 }), axis({ size: 52, space: 22 })],
           series: [{}, ...rows.map((_, at) => at === rows.length - 1
             ? { stroke: css("--accent"), width: 2.5, points: { show: false } }
             : { stroke: css("--draw"), width: 1, points: { show: false } })],

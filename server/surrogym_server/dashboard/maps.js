@@ -52,7 +52,14 @@ export function maps(name, spec, controls) {
     state.said = await call("POST", `${surrogate(name)}/query_uncertainty`, { coordinates, action }, signal);
     draw();
   });
-  const ask = debounced(120, () => state.version !== null && fetchMap().catch(() => {}));
+  const ask = debounced(120, async () => {
+    if (state.version === null) return;
+    try {
+      await fetchMap();
+    } catch {
+      state.version = null; // the next look asks again
+    }
+  });
 
   function draw() {
     const [across, up, which] = [x.select, y.select, output].map((select) => Number(select.value));

@@ -53,8 +53,8 @@ export function probe(name, spec, controls, { onepisodes, ask }) {
   });
 
   const refused = (error) => {
-    if (!(error instanceof Problem)) return; // a server that is away has a banner of its own
-    trouble.textContent = error.message;
+    if (error instanceof Problem) trouble.textContent = error.message;
+    else ready = false; // the server is away, which has a banner of its own; the next look asks again
   };
   const askStep = debounced(80, (tolerances) => step(tolerances).catch(refused));
   const askRoll = debounced(350, () => roll().catch(refused));
@@ -76,7 +76,6 @@ export function probe(name, spec, controls, { onepisodes, ask }) {
     show({ fidelity, version }) {
       if (!fidelity || version === ready) return;
       tolerances = fidelity.outputs.map((output) => output.tolerance);
-      if (!ready) answer.firstChild.textContent = "Asking the model…";
       ready = version;
       run();
     },

@@ -98,8 +98,12 @@ function build(main, name, spec, context) {
   async function look(now) {
     if (!now.fidelity || looked === now.model_version) return;
     looked = now.model_version;
-    found = await leastSure(name, now.fidelity, controls).catch(() => null);
-    render.facts({ now, found });
+    try {
+      found = await leastSure(name, now.fidelity, controls);
+      render.facts({ now, found });
+    } catch {
+      looked = null; // the next look asks again
+    }
   }
 
   return {
