@@ -11,12 +11,12 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint
 PINS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: demo test test-all docs docs-serve format-check lint types imports unit chaos bench acquisition format postgresql chromium screenshots clean help
+.PHONY: demo test audit test-all docs docs-serve format-check lint types imports unit chaos bench acquisition format postgresql chromium screenshots clean help
 
 demo: .venv/all  ## Solve Pendulum with server, sampler and trainer on this machine (ARGS="--seed 1")
 	@exec $(BIN)/surrogym demo pendulum $(ARGS)
 
-test: format-check lint types imports unit  ## Everything that guards the project
+test: format-check lint types imports audit unit  ## Everything that guards the project
 
 format-check: .venv/dev
 	$(BIN)/ruff format --check
@@ -41,6 +41,9 @@ docs: .venv/dev  ## Build the site into build/docs; warnings are errors
 
 docs-serve: .venv/dev  ## Show the site while its pages are written
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve
+
+audit: .venv/dev  ## Ask for known holes of the pinned packages, where that can be asked
+	@$(BIN)/python tests/audit.py
 
 chaos: .venv/dev postgresql  ## Faults and attacks in full length; make test has a short form (ARGS="-k killed")
 	CHAOS=full $(BIN)/pytest --durations 0 tests/chaos tests/security $(ARGS)

@@ -131,7 +131,7 @@ def _parse_token(entry: str) -> tuple[str, Role]:
     for known in ROLES:
         if role == known:
             return token, known
-    raise InvalidInput(f"unknown role of a token: expected one of {', '.join(ROLES)}, got {role!r}")
+    raise InvalidInput(f"a token's role: expected one of {', '.join(ROLES)} before its colon, got another word")
 
 
 def _one_sentence(error: ValidationError) -> str:

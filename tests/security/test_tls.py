@@ -9,14 +9,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
-from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from support.server import ServerProcess, running_server
+from support.teaching import teach
 from surrogym_client.api import Api
+from surrogym_client.original.classic import pendulum
 from surrogym_server.errors import InvalidInput
 from surrogym_server.settings import read_settings
+from surrogym_shared import frames
 
 pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificate")
 
@@ -51,13 +54,20 @@ def test_a_client_that_does_not_trust_it_goes_no_further(server: ServerProcess):
         httpx.get(f"{server.url}/healthz", trust_env=False)
 
 
-def test_the_stream_runs_over_the_same_certificate(server: ServerProcess, certificate: Path):
-    """404 comes from the application: the handshake went through TLS, and there is no such session."""
+def test_the_stream_steps_over_the_same_certificate(
+    server: ServerProcess, certificate: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+    with Api(server.url) as api:
+        teach(api, "pendulum", pendulum(), queries=12)
     trusting = ssl.create_default_context(cafile=certificate)
-    url = f"{server.url.replace('https', 'wss', 1)}/v1/sessions/none/stream"
-    with pytest.raises(InvalidStatus) as refused, connect(url, ssl=trusting):
-        pass
-    assert refused.value.response.status_code == 404
+    opened = httpx.post(f"{server.url}/v1/surrogates/pendulum/sessions", json={"seed": 0}, verify=trusting, timeout=60)
+    url = f"{server.url.replace('https', 'wss', 1)}/v1/sessions/{opened.json()['id']}/stream"
+    requests = [frames.reset_request(1, None, None), frames.step_request(2, np.array([[0.5]]), None, False)]
+    with connect(url, ssl=trusting, compression=None, open_timeout=60) as stream:
+        for request, reply in zip(requests, (frames.ResetReply, frames.StepReply), strict=True):
+            stream.send(frames.encode(request))
+            assert isinstance(frames.read_reply(bytes(stream.recv(timeout=60))), reply)
 
 
 def test_plain_http_is_not_answered(server: ServerProcess):

@@ -55,7 +55,7 @@ def test_tokens_come_with_roles(tmp_path: Path):
         ({"SURROGYM_PORT": "many"}, "setting port: .*integer"),
         ({"SURROGYM_PORT": "70000"}, "setting port: .*65535"),
         ({"SURROGYM_TOKEN": "short"}, "at least 8 characters, got 5"),
-        ({"SURROGYM_TOKENS": "king:some-long-token"}, "one of read, train, sample, admin, got 'king'"),
+        ({"SURROGYM_TOKENS": "king:some-long-token"}, "one of read, train, sample, admin before its colon"),
         ({"SURROGYM_TOKEN_FILE": "/no/such/file"}, "'/no/such/file' can't be read"),
         ({"SURROGYM_LOG_LEVEL": "loud"}, "setting log_level: .*'info'"),
     ],
@@ -69,3 +69,9 @@ def test_a_refusal_does_not_print_the_token():
     with pytest.raises(InvalidInput) as refusal:
         read_settings({"SURROGYM_TOKEN": "secret", "SURROGYM_PORT": "-1"})
     assert "secret" not in str(refusal.value)
+
+
+def test_a_token_with_a_colon_that_is_taken_for_a_role_is_not_printed():
+    with pytest.raises(InvalidInput) as refusal:
+        read_settings({"SURROGYM_TOKENS": "secret-half:other-half"})
+    assert "half" not in str(refusal.value)

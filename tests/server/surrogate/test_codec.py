@@ -152,3 +152,34 @@ def test_numbers_that_no_model_has_are_refused(pendulum_definition, pendulum_mod
 def test_a_header_without_end_is_refused(pendulum_definition):
     with pytest.raises(InvalidInput):
         from_bytes(pendulum_definition, (200_000).to_bytes(8, "little") + b"[" * 200_000)
+
+
+def with_head(data: bytes, change) -> bytes:
+    """The file with its safetensors header changed by a function of it."""
+    length = int.from_bytes(data[:8], "little")
+    head = json.loads(data[8 : 8 + length])
+    change(head)
+    text = json.dumps(head).encode()
+    return len(text).to_bytes(8, "little") + text + data[8 + length :]
+
+
+def overlapping(head: dict) -> None:
+    first, second = (entry for name, entry in list(head.items())[:3] if name != "__metadata__")
+    second["data_offsets"] = first["data_offsets"]
+
+
+def beyond_the_end(head: dict) -> None:
+    entry = next(entry for name, entry in head.items() if name != "__metadata__")
+    entry["data_offsets"], entry["shape"] = [0, 2**60], [2**57]
+
+
+@pytest.mark.parametrize("change", [overlapping, beyond_the_end])
+def test_arrays_that_overlap_or_reach_beyond_the_file_are_refused(pendulum_definition, data, change):
+    with pytest.raises(InvalidInput, match="expected a Surrogym model"):
+        from_bytes(pendulum_definition, with_head(data, change))
+
+
+@pytest.mark.parametrize("length", [2**32, 2**63 - 1, 2**64 - 1])
+def test_a_header_that_claims_to_be_huge_is_refused(pendulum_definition, data, length):
+    with pytest.raises(InvalidInput, match="expected a Surrogym model"):
+        from_bytes(pendulum_definition, length.to_bytes(8, "little") + data[8:])
