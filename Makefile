@@ -37,7 +37,7 @@ test-all: test .venv-extras  ## make test, every command of the docs, and traine
 	DOCS=full $(BIN)/pytest --durations 0 tests/docs tests/examples
 
 docs: .venv/dev  ## Build the site into build/docs; warnings are errors
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 docs-serve: .venv/dev  ## Show the site while its pages are written
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve

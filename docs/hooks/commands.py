@@ -1,9 +1,11 @@
-"""Makes the page of all commands while the site is built, from the source of ``surrogym COMMAND --help``."""
+"""Makes the page of all commands while the site is built, from the source of ``surrogym COMMAND --help``, and puts
+every decision into the navigation."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import click
@@ -14,6 +16,15 @@ from mkdocs.structure.files import File, Files
 from surrogym_client.cli import build
 
 PAGE = "reference/commands.md"
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Adds the pages of decisions behind their index, the last entry of the last section."""
+    (section,) = config.nav[-1].values()
+    assert section[-1] == "decisions/README.md"
+    pages = sorted(Path(config.docs_dir, "decisions").glob("[0-9]*.md"))
+    section.extend(f"decisions/{path.name}" for path in pages)
+    return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
