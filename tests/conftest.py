@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+
+if "DISPLAY" not in os.environ:
+    os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported, so before everything else
+
 from collections.abc import Iterator
 
 import hypothesis
