@@ -83,7 +83,8 @@ def trained(server: RestartingServer, out: Path, sig: int | None = None) -> Trai
         with Faults(server, sig) as faults:
             result = train(port, out, settings, faults.note)
     assert len(faults.after) == FAULTS, "the training was under way"
-    assert result.virtual_steps == STEPS, "it ended"
+    rollout = LANES * SMALL["n_steps"]  # less than one is left over where a network was given up for another
+    assert STEPS - rollout < result.virtual_steps <= STEPS, "it ended"
     return result
 
 

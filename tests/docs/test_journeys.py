@@ -109,10 +109,11 @@ def shortened(words: list[str]) -> list[str] | None:
 
 def test_each_page_with_commands_is_followed_or_known_to_be_run_elsewhere() -> None:
     followed = {*PAGES, *ALL_PAGES}
-    others = {  # by test_http_api, test_pages alone (no server), tests/docker and tests/cli
+    others = {  # by test_http_api, test_pages alone (no server), tests/docker, tests/cli and tests/dashboard
         "README.md",
         "docs/http-api.md",
         "docs/how-to/containers.md",
+        "docs/how-to/page.md",
         "docs/how-to/terminal.md",
         "docs/how-to/tracking.md",
         "docs/performance.md",

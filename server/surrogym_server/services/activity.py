@@ -21,7 +21,8 @@ Clock = Callable[[], float]
 
 RATE_SECONDS = 10.0  # steps per second are an exponential average over about so long
 KEPT_EPISODES = 100
-FOLD_LANE_STEPS = 16_384  # rewards of so many are gathered before they are summed: the path of a step is short
+FOLD_STEPS = 32  # as many are gathered before they are summed: the path of a step is short
+FOLD_LANE_STEPS = 16_384  # or as many of all lanes
 ALIVE_SECONDS = 60.0  # a sampler that was not heard of for so long is taken for gone
 
 
@@ -70,7 +71,7 @@ class Tally:
         self._decayed = self._decayed * math.exp((self._last - now) / RATE_SECONDS) + steps
         self._last = now
         self._pending.extend(answer.outcome)
-        if len(self._pending) * lanes >= FOLD_LANE_STEPS:
+        if len(self._pending) >= FOLD_STEPS or len(self._pending) * lanes >= FOLD_LANE_STEPS:
             self._fold()
 
     def reset(self, mask: NDArray[np.bool_] | None) -> None:
