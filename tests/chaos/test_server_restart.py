@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
+import httpx
 import numpy as np
 import pytest
 
@@ -42,6 +43,13 @@ def vec_env(restarting: RestartingServer) -> SurrogateVecEnv:
     return SurrogateVecEnv(restarting.url, "pendulum", LANES, seed=0, time_limit=6, retries=PATIENT)
 
 
+def await_rollout(url: str) -> None:
+    """Wait until a session has a request at work."""
+    deadline = time.monotonic() + 60
+    while "surrogym_session_requests 1.0" not in httpx.get(f"{url}/metrics").text:
+        assert time.monotonic() < deadline
+
+
 def test_a_clean_restart_goes_unnoticed(restarting: RestartingServer):
     touched, undisturbed = vec_env(restarting), vec_env(restarting)
     expected = [undisturbed.reset(), *(undisturbed.step(action) for action in actions(10))]
@@ -71,7 +79,7 @@ def test_a_stop_lets_long_polls_end_and_running_steps_finish(restarting: Restart
         port.reset(session)
         poll = pool.submit(api.claim, "leased", "second", max_queries=1, wait_seconds=50.0)
         rollout = pool.submit(port.rollout, session, actions(2_000))
-        time.sleep(0.2)  # both are under way
+        await_rollout(restarting.url)  # both are under way
         stopping = time.monotonic()
         assert restarting.stop() == 0
         assert time.monotonic() - stopping < 30

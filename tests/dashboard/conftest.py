@@ -12,8 +12,9 @@ from support.browser import find_chromium, launched
 Open = Callable[..., Page]
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
+    """One for a file: while Playwright lives, its event loop runs in this thread and ``asyncio.run`` refuses."""
     if find_chromium() is None:
         pytest.skip("Chromium is not on this machine, so the page is not tested. To test it: apt-get install chromium")
     with launched() as found:

@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 PATIENCE = 120.0
+UPWARDS = re.compile(r"\x1b\[\d*A")  # what follows is drawn on a line of its own
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
@@ -25,7 +26,12 @@ CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 class Terminal:
     process: subprocess.Popen[bytes]
     descriptor: int
-    shown: str = ""  # without control sequences
+    _said: bytes = b""  # kept as it came: a read may end within a character or a control sequence
+
+    @property
+    def shown(self) -> str:
+        """All that was shown since the start, without control sequences."""
+        return CONTROL.sub("", UPWARDS.sub("\n", self._said.decode(errors="replace")))
 
     def await_text(self, text: str) -> None:
         """Read until ``text`` has been shown since the start."""
@@ -49,7 +55,7 @@ class Terminal:
             said = os.read(self.descriptor, 65_536)
         except OSError:  # the other end is closed
             return False
-        self.shown += CONTROL.sub("", said.decode(errors="replace"))
+        self._said += said
         return bool(said)
 
 
