@@ -116,7 +116,8 @@ def _detail(view: SurrogateView) -> str:
     lines = [
         f"{view.name}: {view.environment or 'own environment'}, {'paused, ' if view.paused else ''}{view.phase}",
         f"real steps: {ledger.initial} initial, {ledger.adaptive} adaptive, {ledger.manual} manual, "
-        f"{ledger.total} of {view.budget} in all; {ledger.evaluation} in evaluation, {ledger.unresolved} unresolved",
+        f"{ledger.total} of {view.budget} in all; {ledger.evaluation} in evaluation, {ledger.unresolved} unresolved "
+        f"({ledger.failed} failed)",
         f"queries: {view.queries.pending} pending, {view.queries.leased} leased, {view.queries.set_aside} set aside",
     ]
     if view.error:

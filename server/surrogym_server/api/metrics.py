@@ -89,7 +89,9 @@ def _of_surrogates(statuses: Iterable[SurrogateStatus]) -> list[Metric]:
         "surrogym_real_steps", "Acknowledged real steps by purpose.", labels=("surrogate", "purpose")
     )
     unresolved = GaugeMetricFamily(
-        "surrogym_unresolved_attempts", "Leases that began and never answered.", labels=BY_SURROGATE
+        "surrogym_unresolved_steps",
+        "Real steps that leases which ended without an answer may have taken.",
+        labels=("surrogate", "outcome"),
     )
     queries = GaugeMetricFamily("surrogym_queries", "Queries by status.", labels=("surrogate", "status"))
     phase = GaugeMetricFamily("surrogym_phase", "1 for the phase of a surrogate.", labels=("surrogate", "phase"))
@@ -101,7 +103,8 @@ def _of_surrogates(statuses: Iterable[SurrogateStatus]) -> list[Metric]:
         name, ledger = status.record.name, status.ledger
         for purpose in ("initial", "adaptive", "manual", "evaluation"):
             samples.add_metric([name, purpose], getattr(ledger, purpose))
-        unresolved.add_metric([name], ledger.unresolved)
+        unresolved.add_metric([name, "failed"], ledger.failed)
+        unresolved.add_metric([name, "expired"], ledger.unresolved - ledger.failed)
         for kind in ("pending", "leased", "answered", "set_aside"):
             queries.add_metric([name, kind], getattr(status.queries, kind))
         phase.add_metric([name, status.record.phase], 1)

@@ -34,7 +34,7 @@ export function ledgerTable() {
     ["adaptive", count(ledger.adaptive), "chosen where the model was not sure"],
     ["manual", count(ledger.manual), "asked for, or handed in, by a person"],
     [h("strong", {}, "total"), h("strong", {}, count(ledger.total)), "what the design cost"],
-    ["unresolved", count(ledger.unresolved), "leased and never answered: at most so many more were taken"],
+    ["unresolved", count(ledger.unresolved), `leases that ran out, or failed (${count(ledger.failed)}): at most so many more were taken`],
     ["evaluation", count(ledger.evaluation), "to judge policies; not seen by the model"],
   ], ""));
   return { element: section("ledger", "Ledger", "Every real step, by purpose.", place), show: render };

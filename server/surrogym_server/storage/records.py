@@ -224,14 +224,15 @@ class SampleArrays:
 
 @dataclass(frozen=True)
 class LedgerRecord:
-    """Acknowledged real steps by purpose; ``unresolved`` counts the steps that leases which expired, never answered or
-    failed, may have taken."""
+    """Acknowledged real steps by purpose. ``unresolved`` counts the steps that leases which ended without an answer may
+    have taken; ``failed`` of them were under leases that a sampler gave back with an error, the rest expired."""
 
     initial: int = 0
     adaptive: int = 0
     manual: int = 0
     evaluation: int = 0
     unresolved: int = 0
+    failed: int = 0
 
     @property
     def total(self) -> int:

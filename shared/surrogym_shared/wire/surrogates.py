@@ -57,8 +57,9 @@ class Fidelity(Reply):
 
 class Ledger(Reply):
     """Acknowledged real steps by purpose. ``total`` is what the design cost: initial + adaptive + manual; evaluation is
-    apart, and ``unresolved`` counts the steps that leases which began and were never answered may have taken, so the
-    true number of real steps lies between total and total + unresolved."""
+    apart, and ``unresolved`` counts the steps that leases which ended without an answer may have taken, so the true
+    number of real steps lies between total and total + unresolved. ``failed`` of the unresolved ones were under leases
+    that a sampler gave back with an error; the rest ran out."""
 
     initial: int = 0
     adaptive: int = 0
@@ -66,6 +67,7 @@ class Ledger(Reply):
     total: int = 0
     evaluation: int = 0
     unresolved: int = 0
+    failed: int = 0
 
 
 class QueryCounts(Reply):

@@ -9,7 +9,7 @@ import pytest
 
 from surrogym_server.errors import ForeignLease, IdempotencyConflict, InvalidInput, LeaseExpired, UnknownQuery
 from surrogym_server.storage.port import MAX_ATTEMPTS, Storage
-from surrogym_server.storage.records import NewSample, QueryCounts
+from surrogym_server.storage.records import LedgerRecord, NewSample, QueryCounts
 
 LONG = 60.0
 SHORT = 0.02
@@ -104,7 +104,7 @@ def test_a_query_that_keeps_failing_is_set_aside_with_its_error(storage: Storage
     assert [event.body for event in storage.events.list(name) if event.kind == "set_aside"] == [
         {"query_id": leased.id, "error": "fell over 3"}
     ]
-    assert storage.ledger.read(name).unresolved == 0, "a failure is reported, so it is resolved"
+    assert storage.ledger.read(name) == LedgerRecord(unresolved=3, failed=3), "each may have moved the robot"
 
 
 def test_a_query_whose_leases_all_run_out_is_set_aside(
@@ -120,7 +120,18 @@ def test_a_query_whose_leases_all_run_out_is_set_aside(
     [query] = storage.queries.list(name, ["set_aside"])
     assert query.attempts == MAX_ATTEMPTS
     assert query.error is not None
-    assert storage.ledger.read(name).unresolved == MAX_ATTEMPTS
+    assert storage.ledger.read(name) == LedgerRecord(unresolved=MAX_ATTEMPTS, failed=0)
+
+
+def test_an_answer_after_a_failure_resolves_it(
+    storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
+) -> None:
+    name = make(queries=1)
+    [leased] = storage.queries.claim(name, "a", 1, LONG)
+    storage.queries.fail(name, leased.id, leased.token, "the gripper slipped")
+    assert storage.ledger.read(name) == LedgerRecord(unresolved=1, failed=1)
+    storage.samples.add(name, "a", [answer(leased)])
+    assert storage.ledger.read(name) == LedgerRecord(initial=1)
 
 
 def test_failing_twice_under_one_lease_counts_once(storage: Storage, make: Callable[..., str]) -> None:

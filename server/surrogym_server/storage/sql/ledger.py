@@ -41,17 +41,26 @@ def _read(connection: Connection, surrogate_id: int) -> LedgerRecord:
     evaluation = sa.select(sa.func.coalesce(sa.func.sum(evaluations.c.steps), 0)).where(
         evaluations.c.surrogate_id == surrogate_id
     )
-    unswept = (leases.c.outcome == "open") & (leases.c.expires <= clock(connection))
-    unresolved = (
-        sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0))
-        .select_from(leases.join(queries, queries.c.id == leases.c.query_id))
-        .where(leases.c.surrogate_id == surrogate_id, (leases.c.outcome == "expired") | unswept)
+    failed = leases.c.outcome == "failed"
+    expired = (leases.c.outcome == "expired") | (
+        (leases.c.outcome == "open") & (leases.c.expires <= clock(connection))  # not swept yet
     )
     row = connection.execute(
         sa.select(
             *counts,
             evaluation.scalar_subquery().label("evaluation"),
-            unresolved.scalar_subquery().label("unresolved"),
+            _steps_asked(surrogate_id, expired | failed).label("unresolved"),
+            _steps_asked(surrogate_id, failed).label("failed"),
         ).where(samples.c.surrogate_id == surrogate_id)
     ).one()
     return LedgerRecord(**{field: int(value) for field, value in row._mapping.items()})
+
+
+def _steps_asked(surrogate_id: int, of_leases: sa.ColumnElement[bool]) -> sa.ScalarSelect[int]:
+    """Steps that such leases of a surrogate were given out for."""
+    return (
+        sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0))
+        .select_from(leases.join(queries, queries.c.id == leases.c.query_id))
+        .where(leases.c.surrogate_id == surrogate_id, of_leases)
+        .scalar_subquery()
+    )
