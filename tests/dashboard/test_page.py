@@ -43,7 +43,8 @@ def test_a_surrogate_is_shown_whole_and_without_a_complaint(
     headings = page.locator("section h2").all_text_contents()
     assert set(headings) == set(PARTS)
     expect(page.locator(".facts")).to_contain_text("12 real steps")
-    assert page.locator("#learning canvas").count() == 2
+    assert page.locator("#learning canvas").count() == 1  # both on one axis of samples
+    expect(page.locator("#learning")).to_contain_text("speed, error")
     expect(page.locator("#queue tbody tr")).to_have_count(12)
     page.locator(".model summary").first.click()
     expect(page.locator(".model").first).to_contain_text("lengthscale")
@@ -91,6 +92,38 @@ def test_the_keyboard_reaches_a_surrogate_and_moves_its_point(url: str, open_pag
     assert float(page.get_by_label("theta, as a number").input_value()) > 0
     assert float(page.get_by_label("speed, as a number").input_value()) > 0
     assert "Arrow keys" in (canvas.get_attribute("aria-label") or "")
+
+
+FOCUSABLE = """() => [...document.querySelectorAll("a[href], button, input, select, summary, [tabindex='0']")]
+    .filter((element) => !element.disabled && element.checkVisibility())"""
+
+
+def test_tab_reaches_everything_that_can_be_operated_and_jumps_land_in_their_part(url: str, open_page: Open):
+    page = opened(open_page(f"{url}/#/s/pendulum"))
+    page.evaluate(f"window.wanted = new Set(({FOCUSABLE})())")
+    for _ in range(page.evaluate("wanted.size") + 1):
+        page.keyboard.press("Tab")
+        page.evaluate("wanted.delete(document.activeElement)")
+    missed = "[...wanted].filter((element) => element.isConnected).map((element) => element.outerHTML)"
+    assert page.evaluate(missed) == []
+    page.get_by_role("navigation").get_by_role("link", name="Queue").press("Enter")
+    page.keyboard.press("Tab")
+    expect(page.get_by_label("queries to show")).to_be_focused()
+
+
+def test_the_queue_says_who_holds_a_query_and_for_how_long(url: str, open_page: Open):
+    with Api(url) as api:
+        api.create_surrogate("leased", pendulum())
+        held, failed = api.claim("leased", "arm-7", max_queries=2, lease_seconds=600).queries
+        api.fail("leased", failed.id, failed.lease_token, "the arm is stuck")
+        page = open_page(f"{url}/#/s/leased")
+        rows = page.locator("#queue tbody tr")
+        row = rows.filter(has_text="arm-7").filter(has_text="leased")
+        expect(row).to_have_text(re.compile(r"(600|59\d) s"))
+        expect(rows.filter(has_text="the arm is stuck")).to_contain_text("pending")
+        page.get_by_label("queries to show").select_option("with errors")
+        expect(rows).to_have_count(1)
+        api.delete_surrogate("leased")
 
 
 @pytest.mark.parametrize("width", [320, 390])

@@ -104,6 +104,7 @@ def query_view(record: QueryRecord) -> replies.QueryView:
         attempts=record.attempts,
         sampler=record.sampler,
         error=record.error,
+        lease_seconds_left=record.lease_seconds_left,
     )
 
 

@@ -5,6 +5,8 @@ import { nines, number, percent } from "/page/format.js";
 
 const uPlot = window.uPlot;
 const HEIGHT = 190;
+const LEARNING_HEIGHT = 280;
+const ALL = "every output";
 const LEGEND = { markers: { fill: (plot, at) => plot.series[at].stroke(plot, at) } };
 const LEAST_ERROR = 1e-6;
 const SURE = [0, 0.9, 0.99, 0.999, 0.9999, 0.99999, 0.999999, 0.9999999, 0.99999999, 0.999999999];
@@ -28,50 +30,69 @@ function chart(label) {
   return { place, draw, repaint: () => last && draw(...last), close: () => watcher.disconnect() };
 }
 
+/** Heights of the two scales, so that the target of the one and the tolerance of the other are the same line. */
+function heights(target, errors) {
+  const top = Math.max(4, Math.ceil(nines(target)) + 2);
+  const line = nines(target) / top;
+  const span = Math.max(2, -Math.min(0, ...errors) / line, Math.max(0, ...errors) / (1 - line));
+  return { top, error: [-line * span, (1 - line) * span] };
+}
+
 /** Confidence and leave-one-out error of each output against samples; the newest model of each number of samples. */
 export function learningCurves() {
-  const sure = chart("Confidence index of each output against samples");
-  const error = chart("Leave-one-out error of each output against samples, in tolerances");
-  const cursor = { sync: { key: "samples" }, drag: { x: false, y: false } };
-  const samplesAxis = () => axis({ label: "real steps the model has seen", labelSize: 22, size: 34, labelFont: "12px system-ui", space: 40, incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000] });
+  const both = chart("Confidence index and leave-one-out error of each output against samples");
+  const which = h("select", {}, h("option", {}, ALL));
+  const text = { font: "12px system-ui", labelFont: "12px system-ui", labelSize: 20 };
+  const power = (value) => (Math.abs(value) < 4 ? String(10 ** value) : `1e${value}`.replace("-", "−"));
+  let latest = [];
+
+  function draw() {
+    const { fidelity } = latest.at(-1);
+    const names = fidelity.outputs.map((output) => output.name).filter((name) => [ALL, name].includes(which.value));
+    const colour = (name) => fidelity.outputs.findIndex((output) => output.name === name);
+    const of = (what) => names.map((name) => latest.map((model) => {
+      const output = model.fidelity.outputs.find((candidate) => candidate.name === name);
+      return output ? what(output) : null;
+    }));
+    const index = of((output) => output.confidence_index);
+    const errors = of((output) => Math.log10(Math.max(LEAST_ERROR, output.leave_one_out_error / output.tolerance)));
+    const { top, error } = heights(fidelity.target, errors.flat());
+    const x = latest.map((model) => model.samples);
+    both.draw(() => ({
+      height: LEARNING_HEIGHT,
+      cursor: { drag: { x: false, y: false } },
+      scales: { x: { time: false, range: (_, low, high) => (low === high ? [low - 1, high + 1] : [low, high]) }, y: { range: [0, top] }, error: { range: error } },
+      axes: [
+        axis({ ...text, label: "real steps the model has seen", size: 34, space: 40, incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000] }),
+        axis({ ...text, label: "confidence index", size: 60, splits: () => [...SURE.keys()].slice(0, top + 1), values: (_, at) => at.map((k) => (k ? `${100 * SURE[k]} %`.replace(/(\.\d*?9)0+\d* %/, "$1 %") : "0")) }),
+        axis({ ...text, scale: "error", side: 1, label: "error / tolerance", size: 48, grid: { show: false }, incrs: [1, 2, 3], values: (_, at) => at.map(power) }),
+      ],
+      series: [
+        { label: "samples" },
+        ...names.map((name, at) => line(name, colour(name), { value: (plot, shown, series, place) => (place === null ? "–" : percent(index[at][place])) })),
+        { ...dashed("target"), value: (plot, shown, series, place) => (place === null ? "–" : percent(latest[place].fidelity.target)) },
+        ...names.map((name) => line(`${name}, error`, colour(name), { scale: "error", dash: [2, 4], points: { show: true, size: 3 }, value: (_, value) => (value === null ? "–" : number(10 ** value)) })),
+      ],
+    }), [x, ...index.map((shares) => shares.map((share) => share && Math.min(top, nines(share)))), latest.map((model) => nines(model.fidelity.target)), ...errors]);
+  }
+  which.addEventListener("change", draw);
+
   return {
     parts: [
-      h("h3", {}, "Confidence index, by output"), sure.place,
-      h("h3", {}, "Leave-one-out error, in tolerances"), error.place,
+      h("div", { class: "picks" }, h("label", { class: "pick" }, "of", which)),
+      h("p", { class: "note" }, "Solid, left: confidence index. Dotted, right: leave-one-out error in tolerances. Dashed: the target of the one and a whole tolerance of the other."),
+      both.place,
     ],
     show(models) {
-      const latest = [...new Map(models.map((model) => [model.samples, model])).values()].sort((a, b) => a.samples - b.samples);
-      const names = latest.at(-1).fidelity.outputs.map((output) => output.name);
-      const x = latest.map((model) => model.samples);
-      const of = (what) => names.map((name) => latest.map((model) => {
-        const output = model.fidelity.outputs.find((candidate) => candidate.name === name);
-        return output ? what(output) : null;
-      }));
-      const top = Math.min(9, Math.max(4, Math.ceil(nines(latest.at(-1).fidelity.target)) + 2));
-      const xScale = { time: false, range: (_, low, high) => (low === high ? [low - 1, high + 1] : [low, high]) };
-      sure.draw(() => ({
-        cursor,
-        scales: { x: xScale, y: { range: [0, top] } },
-        axes: [samplesAxis(), axis({ size: 74, splits: () => SURE.keys().toArray?.().slice(0, top + 1) ?? [...SURE.keys()].slice(0, top + 1), values: (_, at) => at.map((k) => (k ? `${100 * SURE[k]} %`.replace(/(\.\d*?9)0+\d* %/, "$1 %") : "0")) })],
-        series: [
-          { label: "samples" },
-          ...names.map((name, at) => line(name, at, { value: (plot, shown, series, index) => (index === null ? "–" : percent(of((output) => output.confidence_index)[at][index])) })),
-          { ...dashed("target"), value: (plot, shown, series, index) => (index === null ? "–" : percent(latest[index].fidelity.target)) },
-        ],
-      }), [x, ...of((output) => Math.min(top, nines(output.confidence_index))), latest.map((model) => nines(model.fidelity.target))]);
-      error.draw(() => ({
-        cursor,
-        scales: { x: xScale, y: { range: (_, low, high) => [Math.floor(Math.min(low, -1)), Math.ceil(Math.max(high, 1))] } },
-        axes: [samplesAxis(), axis({ size: 74, incrs: [1, 2, 3], values: (_, at) => at.map((power) => (Math.abs(power) < 4 ? String(10 ** power) : `1e${power}`.replace("-", "−"))) })],
-        series: [
-          { label: "samples" },
-          ...names.map((name, at) => line(name, at, { value: (_, value) => (value === null ? "–" : number(10 ** value)) })),
-          { ...dashed("tolerance"), value: () => "1" },
-        ],
-      }), [x, ...of((output) => Math.log10(Math.max(LEAST_ERROR, output.leave_one_out_error / output.tolerance))), x.map(() => 0)]);
+      latest = [...new Map(models.map((model) => [model.samples, model])).values()].sort((a, b) => a.samples - b.samples);
+      const names = [ALL, ...latest.at(-1).fidelity.outputs.map((output) => output.name)];
+      const kept = which.value;
+      which.replaceChildren(...names.map((name) => h("option", {}, name)));
+      which.value = names.includes(kept) ? kept : ALL;
+      draw();
     },
-    repaint: () => [sure, error].forEach((part) => part.repaint()),
-    close: () => [sure, error].forEach((part) => part.close()),
+    repaint: both.repaint,
+    close: both.close,
   };
 }
 

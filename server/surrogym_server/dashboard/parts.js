@@ -36,7 +36,7 @@ export const alive = (surrogate) =>
   `${plural(surrogate.samplers.length, "sampler")}, ${plural(surrogate.sessions, "session")}`;
 
 export const section = (id, title, note, ...children) =>
-  h("section", { class: "card", id, "aria-labelledby": `${id}-title` },
+  h("section", { class: "card", id, tabindex: "-1", "aria-labelledby": `${id}-title` },
     h("header", { class: "head" }, h("h2", { id: `${id}-title` }, title), note && h("p", { class: "note" }, note)), children);
 
 /** A table that scrolls within itself where the window is narrow. `columns` are [title, class]. */

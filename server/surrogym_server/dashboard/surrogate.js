@@ -82,8 +82,9 @@ function build(main, name, spec, context) {
   };
   const jump = (id) => (event) => {
     event.preventDefault();
-    document.getElementById(id).scrollIntoView({ behavior: "smooth" });
-    document.getElementById(`${id}-title`).parentElement.parentElement.focus?.();
+    const part = document.getElementById(id);
+    part.scrollIntoView({ behavior: "smooth" });
+    part.focus({ preventScroll: true }); // Tab goes on from there
   };
   main.replaceChildren(title, facts,
     h("nav", { class: "jumps", "aria-label": "Parts of this page" }, LINKS.map(([id, text]) => h("a", { href: `#${id}`, onclick: jump(id) }, text))),

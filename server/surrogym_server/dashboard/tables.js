@@ -8,21 +8,27 @@ const ROWS = 200;
 const FILTERS = { all: () => true, open: (query) => ["pending", "leased"].includes(query.status), "with errors": (query) => query.error !== null };
 const STATUS = { set_aside: "set aside" };
 
+/** What is left of the lease a sampler holds, by the server's clock. */
+function lease({ lease_seconds_left: left }) {
+  if (left === null) return "–";
+  return left > 0 ? `${Math.ceil(left)} s` : "ran out";
+}
+
 export function queueTable() {
   const filter = h("select", { "aria-label": "queries to show" }, Object.keys(FILTERS).map((name) => h("option", {}, name)));
   const place = h("div");
   let queries = [];
   const render = shown(place, (rows) => table("Queue of queries",
-    [["id", "num"], ["purpose", ""], ["status", ""], ["state", ""], ["action", ""], ["leases", "num"], ["sampler", ""], ["error", "wide"]],
+    [["id", "num"], ["purpose", ""], ["status", ""], ["state", ""], ["action", ""], ["leases", "num"], ["lease ends in", "num"], ["sampler", ""], ["error", "wide"]],
     rows.map((query) => [query.id, h("span", { class: `mark ${query.purpose}` }, query.purpose),
       h("span", { class: `badge ${query.status}` }, STATUS[query.status] ?? query.status),
       vector(query.coordinates), query.actions.length > 1 ? `${query.actions.length} actions` : vector(query.actions[0]),
-      query.attempts, query.sampler ?? "–", query.error ? h("span", { class: "bad" }, query.error) : ""]),
+      query.attempts, lease(query), query.sampler ?? "–", query.error ? h("span", { class: "bad" }, query.error) : ""]),
     filter.value === "all" ? "No query was asked yet." : "None."));
   const draw = () => render(queries.filter(FILTERS[filter.value]).slice(0, ROWS));
   filter.addEventListener("change", draw);
   return {
-    element: section("queue", "Queue", "Queries to samplers, the newest first. A lease is one attempt; a query that keeps failing is set aside.", h("div", { class: "picks" }, h("label", { class: "pick" }, "show", filter)), place),
+    element: section("queue", "Queue", "Queries to samplers, the newest first. A lease is one attempt, and a sampler at work renews it; a query that keeps failing is set aside.", h("div", { class: "picks" }, h("label", { class: "pick" }, "show", filter)), place),
     show(given) { queries = given.toReversed(); draw(); },
   };
 }

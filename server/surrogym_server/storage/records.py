@@ -138,6 +138,7 @@ class QueryRecord(Asked):
     attempts: int  # leases given out so far
     sampler: str | None  # the last one to claim it
     error: str | None  # of the last attempt that failed
+    lease_seconds_left: float | None = None  # of the lease that is open, by the database's clock; below 0 it ran out
 
 
 @dataclass(frozen=True)

@@ -88,6 +88,9 @@ class QueryView(Reply):
     attempts: int
     sampler: str | None
     error: str | None
+    lease_seconds_left: float | None = Field(
+        default=None, description="of the lease that a sampler holds, by the server's clock; below 0 it has run out"
+    )
 
 
 class QueryList(Reply):

@@ -34,6 +34,17 @@ def test_a_query_says_who_has_it(storage: Storage, make: Callable[..., str]) -> 
     assert (query.status, query.sampler, query.attempts) == ("leased", "arm-7", 1)
 
 
+def test_a_query_says_how_long_its_lease_lasts(storage: Storage, make: Callable[..., str]) -> None:
+    name = make(queries=2)
+    [failed] = storage.queries.claim(name, "a", 1, LONG)
+    storage.queries.fail(name, failed.id, failed.token, "dropped")
+    [leased] = storage.queries.claim(name, "b", 1, LONG)
+    left = {query.id: query.lease_seconds_left for query in storage.queries.list(name)}
+    assert left.keys() == {failed.id, failed.id + 1}
+    assert LONG - 5 < left[leased.id] <= LONG
+    assert [seconds for id, seconds in left.items() if id != leased.id] == [None]
+
+
 def test_coordinates_come_back_bit_for_bit(storage: Storage, make: Callable[..., str]) -> None:
     name = make(queries=0)
     odd = np.array([[0.1 + 0.2, -0.0], [5e-324, 1.7976931348623157e308]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
@@ -101,7 +102,7 @@ class SqlQueries(port.Queries):
 
     def list(self, name: str, statuses: Sequence[QueryStatus] = (), limit: int = 10_000) -> list[QueryRecord]:
         with self._database.read() as connection:
-            wanted = sa.select(*COLUMNS).where(queries.c.surrogate_id == find(connection, name))
+            wanted = _records(connection).where(queries.c.surrogate_id == find(connection, name))
             if statuses:
                 wanted = wanted.where(queries.c.status.in_(statuses))
             rows = connection.execute(wanted.order_by(queries.c.id).limit(limit))
@@ -136,8 +137,15 @@ def _ended(query_id: int) -> LeaseExpired:
     return LeaseExpired(f"the lease of query {query_id} has ended; claim again")
 
 
+def _records(connection: Connection) -> sa.Select[Any]:
+    """Queries with what is left of their open lease, of which each has one at most."""
+    left = (leases.c.expires - clock(connection)).label("lease_seconds_left")
+    is_open = (leases.c.query_id == queries.c.id) & (leases.c.outcome == "open")
+    return sa.select(*COLUMNS, left).outerjoin(leases, is_open)
+
+
 def _read(connection: Connection, surrogate_id: int, query_id: int) -> QueryRecord:
-    wanted = sa.select(*COLUMNS).where(queries.c.surrogate_id == surrogate_id, queries.c.id == query_id)
+    wanted = _records(connection).where(queries.c.surrogate_id == surrogate_id, queries.c.id == query_id)
     row = connection.execute(wanted).one_or_none()
     if row is None:
         raise leasing.unknown_query(query_id)
