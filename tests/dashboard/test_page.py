@@ -114,7 +114,7 @@ def test_tab_reaches_everything_that_can_be_operated_and_jumps_land_in_their_par
 def test_the_queue_says_who_holds_a_query_and_for_how_long(url: str, open_page: Open):
     with Api(url) as api:
         api.create_surrogate("leased", pendulum())
-        held, failed = api.claim("leased", "arm-7", max_queries=2, lease_seconds=600).queries
+        _, failed = api.claim("leased", "arm-7", max_queries=2, lease_seconds=600).queries
         api.fail("leased", failed.id, failed.lease_token, "the arm is stuck")
         page = open_page(f"{url}/#/s/leased")
         rows = page.locator("#queue tbody tr")
