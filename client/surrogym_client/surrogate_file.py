@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -35,14 +36,17 @@ def export_surrogate(api: Api, name: str) -> SurrogateFile:
     return SurrogateFile(name, api.surrogate(name).spec, api.export_model(name, latest.version), _samples(api, name))
 
 
-def import_surrogate(api: Api, file: SurrogateFile, name: str | None = None) -> SurrogateView:
+def import_surrogate(
+    api: Api, file: SurrogateFile, name: str | None = None, progress: Callable[[float], None] = lambda _: None
+) -> SurrogateView:
     """Make a surrogate of a file: it serves the same model at once. Its design is paused, and its samples count as
-    manual ones.
+    manual ones. Where anything fails, or Ctrl-C is pressed, nothing of it stays.
 
     Args:
         api: the server; needs the role admin.
         file: the surrogate.
         name: of the new surrogate; None takes the file's.
+        progress: called with the share of the samples that has been taken, in [0, 1].
 
     Raises:
         NotImportable: there is a surrogate of this name.
@@ -56,16 +60,18 @@ def import_surrogate(api: Api, file: SurrogateFile, name: str | None = None) -> 
         api.create_surrogate(name, file.spec)
     else:
         raise NotImportable(f"expected a name that is free, got {name!r}: give another by --name")
-    api.patch_surrogate(name, paused=True)
     try:
+        api.patch_surrogate(name, paused=True)
         api.import_model(name, file.model)
-    except SurrogymClientError:
-        api.delete_surrogate(name)  # a model that is refused leaves nothing behind
+        samples = [_sample(file.samples, i) for i in range(len(file.samples))]
+        for first in range(0, len(samples), BATCH):
+            progress(first / len(samples))
+            api.add_samples(name, "import", samples[first : first + BATCH])
+        progress(1.0)
+        return api.surrogate(name)
+    except BaseException:
+        api.delete_surrogate(name)
         raise
-    samples = [_sample(file.samples, i) for i in range(len(file.samples))]
-    for first in range(0, len(samples), BATCH):
-        api.add_samples(name, "import", samples[first : first + BATCH])
-    return api.surrogate(name)
 
 
 def open_file(path: str | Path) -> SurrogatePort:

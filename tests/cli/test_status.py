@@ -26,7 +26,7 @@ def looks(monkeypatch):
             if next(left, None) is None:
                 raise KeyboardInterrupt
 
-        monkeypatch.setattr("surrogym_client.cli.output.time.sleep", sleep)
+        monkeypatch.setattr("surrogym_shared.terminal.time.sleep", sleep)
 
     return press_after
 

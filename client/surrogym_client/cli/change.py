@@ -29,7 +29,7 @@ def command(
 
     Example: surrogym change pendulum --tolerance theta=0.01 --budget 30
     """
-    from surrogym_client.cli.output import give
+    from surrogym_shared.terminal import give
 
     tolerances = read_tolerances(tolerance) if tolerance else None
     with connect(server, token) as api:

@@ -28,8 +28,8 @@ def command(
 
     Example: surrogym conformance --server http://127.0.0.1:8000
     """
-    from surrogym_client.cli.output import give, on_interrupt
     from surrogym_client.conformance import conformance
+    from surrogym_shared.terminal import give, on_interrupt
 
     outcomes = []
     with on_interrupt(lambda: f"interrupted; nothing stays of {surrogate!r}"):

@@ -26,7 +26,7 @@ def command(
 
     Example: surrogym delete pendulum --yes
     """
-    from surrogym_client.cli.output import give
+    from surrogym_shared.terminal import give
 
     with connect(server, token) as api:
         view = api.surrogate(surrogate)

@@ -46,11 +46,11 @@ def command(
     Example: surrogym demo pendulum --seed 0 --json metrics.json
     """
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.cli.output import give
     from surrogym_client.demo.report import table
     from surrogym_client.demo.run import run_demo
     from surrogym_client.demo.settings import DemoSettings
     from surrogym_client.lifetime import exit_with_parent as watch_parent
+    from surrogym_shared.terminal import give
 
     if exit_with_parent:
         watch_parent()

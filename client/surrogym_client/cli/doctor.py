@@ -37,8 +37,8 @@ def command(
     """
     from dataclasses import asdict
 
-    from surrogym_client.cli.output import give
     from surrogym_client.doctor import environment, installation, service
+    from surrogym_shared.terminal import give
 
     def findings() -> Iterator[Finding]:
         given = read_spec(spec)

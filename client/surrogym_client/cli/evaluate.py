@@ -55,19 +55,20 @@ def command(
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 100
     """
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.cli.output import give, progress, say
     from surrogym_client.evaluate import EvaluationInterrupted, EvaluationSettings, evaluate
     from surrogym_client.policy_file import load_policy, read_card
+    from surrogym_shared.terminal import give, progress, say
 
     card = read_card(policy)
     if wide and start_scale != 1:
         raise CommandError("expected --wide or --start-scale, got both")
     settings = EvaluationSettings(episodes, first_seed, wide, start_scale, perturb)
     opener = _opener(env, read_spec(spec), card)
-    predict = load_policy(policy, algorithm or card.algorithm)
     enter = partial(_enter, surrogate or card.surrogate, server or card.server, token, quiet=quiet)
     try:
         with progress("evaluate", quiet=quiet) as update:
+            update(0.0, f"reading {policy}")
+            predict = load_policy(policy, algorithm or card.algorithm)
             result = _checked(
                 lambda: evaluate(
                     predict,
@@ -123,8 +124,8 @@ def _enter(
 ) -> None:
     """Enter the real steps into the ledger; a server that is gone does not spoil the result."""
     from surrogym_client.cli.options import connect
-    from surrogym_client.cli.output import say
     from surrogym_client.errors import SurrogymClientError
+    from surrogym_shared.terminal import say
 
     if surrogate is None or steps == 0:
         return

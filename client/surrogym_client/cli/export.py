@@ -38,11 +38,14 @@ def command(
 
     Example: surrogym export pendulum --out samples.csv
     """
-    from surrogym_client.cli.output import give
+    from surrogym_shared.terminal import give, on_interrupt, progress
 
-    with connect(server, token) as api:
+    stays = "interrupted; nothing was written, and the same command begins anew"
+    with on_interrupt(lambda: stays), progress("export", quiet=quiet) as update, connect(server, token) as api:
+        update(0.0, f"reading {surrogate}")
         content = _content(api, surrogate, out)
-    out.write_bytes(content)
+        out.write_bytes(content)
+        update(1.0, "done")
     words = f"{len(content)} bytes written to {out}"
     give({"file": str(out), "bytes": len(content)}, lambda: words, as_json=as_json, quiet=quiet)
 

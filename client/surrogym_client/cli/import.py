@@ -30,13 +30,15 @@ def command(
 
     Example: surrogym import pendulum.surrogate --name pendulum-2
     """
-    from surrogym_client.cli.output import give
     from surrogym_client.surrogate_file import import_surrogate
     from surrogym_shared.surrogate_file import SurrogateFile
+    from surrogym_shared.terminal import give, on_interrupt, progress
 
-    read = SurrogateFile.load(file)
-    with connect(server, token) as api:
-        view = import_surrogate(api, read, name)
+    stays = "interrupted; nothing stays of it at the server, and the same command begins anew"
+    with on_interrupt(lambda: stays), progress("import", quiet=quiet) as update, connect(server, token) as api:
+        update(0.0, f"reading {file}")
+        read = SurrogateFile.load(file)
+        view = import_surrogate(api, read, name, lambda share: update(share, f"{len(read.samples)} real samples"))
     words = (
         f"{view.name}: {view.environment or 'own environment'}, model {view.model_version} and {view.samples} real "
         f"samples, design paused; next: surrogym train {view.name}"

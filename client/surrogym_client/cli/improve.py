@@ -29,7 +29,7 @@ def command(
 
     Example: surrogym improve pendulum --queries 10
     """
-    from surrogym_client.cli.output import give
+    from surrogym_shared.terminal import give
 
     with connect(server, token) as api:
         view = api.improve(surrogate, queries, checkpoint=checkpoint)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -10,6 +12,7 @@ import typer
 if TYPE_CHECKING:
     from surrogym_client.api import Api
     from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.wire import SurrogateView
 
 QUICK = 1.0  # seconds a person waits for a server that is not there
 
@@ -51,19 +54,51 @@ StepLimit = Annotated[float, typer.Option(min=0.001, help="Seconds one real step
 Preset = Literal["default", "paper"]
 
 
-def connect(server: str | None, token: str | None, wait: float = 0.0) -> Api:
-    """The server, which must answer within ``wait`` seconds.
+def connect(server: str | None, token: str | None, wait: float = 0.0, *, quiet: bool = False) -> Api:
+    """The server, which must answer within ``wait`` seconds; a person sees what is waited for.
 
     Raises:
         SurrogymClientError: it does not, or it is none.
     """
     from surrogym_client.api import Api
     from surrogym_client.connection import Retries
+    from surrogym_client.errors import ServerUnreachable
 
     api = Api(server, token, retries=Retries(seconds=QUICK))
     if wait > 0:
-        api.wait_until_ready(wait)
+        try:
+            api.wait_until_ready(QUICK)
+        except ServerUnreachable:
+            with _waiting(f"for a server at {api.url}", quiet=quiet):
+                api.wait_until_ready(wait)
     return api
+
+
+def awaited_surrogate(api: Api, name: str, wait: float, *, quiet: bool) -> SurrogateView:
+    """The surrogate, which must be registered within ``wait`` seconds; a person sees what is waited for.
+
+    Raises:
+        UnknownSurrogate: it is not.
+    """
+    from surrogym_client.errors import UnknownSurrogate
+    from surrogym_client.waiting import wait_for_surrogate
+
+    try:
+        return api.surrogate(name)
+    except UnknownSurrogate:
+        if wait == 0:
+            raise
+    with _waiting(f"for {name!r} to be registered", quiet=quiet):
+        return wait_for_surrogate(api, name, wait)
+
+
+@contextmanager
+def _waiting(words: str, *, quiet: bool) -> Iterator[None]:
+    from surrogym_shared.terminal import on_interrupt, progress
+
+    with on_interrupt(lambda: "interrupted; the same command waits again"), progress("wait", quiet=quiet) as update:
+        update(None, words)
+        yield
 
 
 def read_spec(path: Path | None) -> EnvironmentSpec | None:

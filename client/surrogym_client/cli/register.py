@@ -63,7 +63,7 @@ def command(
 
     Example: surrogym register Pendulum-v1 --name pendulum --budget 30
     """
-    from surrogym_client.cli.output import give
+    from surrogym_shared.terminal import give
 
     chosen = _specification(
         environment,
@@ -82,7 +82,7 @@ def command(
     if print_spec:
         typer.echo(chosen.model_dump_json(indent=2))
         return
-    with connect(server, token, wait) as api:
+    with connect(server, token, wait, quiet=quiet) as api:
         view = api.create_surrogate(name or default_name(chosen.environment or environment or ""), chosen)
     give(view.model_dump(mode="json"), lambda: _words(view, environment or ""), as_json=as_json, quiet=quiet)
 

@@ -28,12 +28,17 @@ def command(
 
     Example: surrogym report pendulum --out report.html
     """
-    from surrogym_client.cli.output import give
-    from surrogym_client.report.page import page
+    from surrogym_shared.terminal import give, on_interrupt, progress
 
-    with connect(server, token) as api:
-        at = f"{api.url}, surrogym {api.health().version}"
-        text = page(api.surrogate(surrogate), api.models(surrogate), list(api.samples(surrogate)), at)
-    size = out.write_text(text, encoding="utf-8")
+    stays = "interrupted; nothing was written, and the same command begins anew"
+    with on_interrupt(lambda: stays), progress("report", quiet=quiet) as update, connect(server, token) as api:
+        update(0.0, f"reading {surrogate}")
+        view, models, samples = api.surrogate(surrogate), api.models(surrogate), list(api.samples(surrogate))
+        update(0.3, "drawing")
+        from surrogym_client.report.page import page
+
+        text = page(view, models, samples, f"{api.url}, surrogym {api.health().version}")
+        size = out.write_text(text, encoding="utf-8")
+        update(1.0, "done")
     words = f"{size} bytes written to {out}"
     give({"file": str(out), "bytes": size}, lambda: words, as_json=as_json, quiet=quiet)

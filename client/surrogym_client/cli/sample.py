@@ -22,6 +22,7 @@ from surrogym_client.cli.options import (
     Surrogate,
     Token,
     Wait,
+    awaited_surrogate,
     connect,
     read_spec,
 )
@@ -68,11 +69,10 @@ def command(
 
     Example: surrogym sample pendulum --until-done
     """
-    from surrogym_client.cli.output import give, on_interrupt
     from surrogym_client.lifetime import exit_with_parent as watch_parent
     from surrogym_client.original.isolated import IsolatedEnvironment
     from surrogym_client.sampler import Sampler, SamplerSettings, worker_name
-    from surrogym_client.waiting import wait_for_surrogate
+    from surrogym_shared.terminal import give, on_interrupt
 
     if exit_with_parent:
         watch_parent()
@@ -84,8 +84,8 @@ def command(
         max_queries=max_queries,
         time_limit=time_limit,
     )
-    with connect(server, token, wait) as api:
-        asked = wait_for_surrogate(api, surrogate, wait).spec
+    with connect(server, token, wait, quiet=quiet) as api:
+        asked = awaited_surrogate(api, surrogate, wait, quiet=quiet).spec
         factory = _factory(env, read_spec(spec), asked)
         with IsolatedEnvironment(factory, step_limit) as environment, _telling(api, surrogate, quiet=quiet) as tell:
             sampler = Sampler(api, surrogate, environment, settings, tell)
@@ -115,7 +115,7 @@ def _factory(env: str | None, given: EnvironmentSpec | None, asked: EnvironmentS
 @contextmanager
 def _telling(api: Api, surrogate: str, *, quiet: bool) -> Iterator[Tell | None]:
     """How queries are told of: a bar of the design on a terminal, a line each elsewhere."""
-    from surrogym_client.cli.output import progress
+    from surrogym_shared.terminal import progress
 
     if quiet or not sys.stderr.isatty():
         yield None if quiet else _tell
@@ -145,7 +145,7 @@ def _words_of_interruption(report: SamplerReport) -> str:
 
 
 def _tell(query: Query, outcome: Outcome, error: str) -> None:
-    from surrogym_client.cli.output import say
+    from surrogym_shared.terminal import say
 
     asked = f", {len(query.actions)} steps" if query.kind == "rollout" else ""
     say(f"query {query.id} ({query.purpose}{asked}) {outcome}{': ' if error else ''}{error}")

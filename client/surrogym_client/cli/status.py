@@ -45,7 +45,7 @@ def command(
 
     Example: surrogym status pendulum --watch
     """
-    from surrogym_client.cli.output import watch
+    from surrogym_shared.terminal import watch
 
     form: Form = "json" if as_json else "short" if quiet else "words"
     with connect(server, token) as api:

@@ -13,12 +13,22 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from surrogym_client.cli.options import AsJson, ExitWithParent, Quiet, Server, Surrogate, Token, Wait, connect
+from surrogym_client.cli.options import (
+    AsJson,
+    ExitWithParent,
+    Quiet,
+    Server,
+    Surrogate,
+    Token,
+    Wait,
+    awaited_surrogate,
+    connect,
+)
 
 if TYPE_CHECKING:
-    from surrogym_client.cli.output import Update
     from surrogym_client.train import TrainProgress, TrainResult, TrainSettings
     from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.terminal import Update
     from surrogym_shared.wire import SurrogateView
 
     Record = Callable[[TrainProgress], None]
@@ -105,9 +115,9 @@ def command(
     Example: surrogym train pendulum --out policy.zip --seed 0
     """
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.cli.output import give
     from surrogym_client.cli.train_words import words_of_result
     from surrogym_client.lifetime import exit_with_parent as watch_parent
+    from surrogym_shared.terminal import give, progress
 
     if exit_with_parent:
         watch_parent()
@@ -125,7 +135,9 @@ def command(
         penalty=penalty,
     )
     spec, url = _trainable(surrogate, server, token, wait, quiet=quiet)
-    from surrogym_client.train import TrainSettings  # torch; imported once there is something to train on
+    with progress("prepare", quiet=quiet) as update:
+        update(None, "importing Stable-Baselines3")
+        from surrogym_client.train import TrainSettings  # torch; imported once there is something to train on
 
     settings = TrainSettings(
         algorithm=algorithm,
@@ -172,8 +184,8 @@ def _given(**options: Any) -> dict[str, Any]:
 @contextmanager
 def _keeping(write_card: Callable[[TrainResult], object], surrogate: str) -> Iterator[None]:
     """Say after Ctrl-C what there is to go on with; a policy that was saved gets its card."""
-    from surrogym_client.cli.output import say
     from surrogym_client.training import TrainingInterrupted
+    from surrogym_shared.terminal import say
 
     try:
         yield
@@ -195,17 +207,16 @@ def _trainable(
 ) -> tuple[EnvironmentSpec, str]:
     """Specification and server of a surrogate whose design is done; with ``wait``, torch is imported meanwhile."""
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.cli.output import on_interrupt, progress
     from surrogym_client.waiting import (
         FINISHED,
         share_of_design,
         wait_for_design,
-        wait_for_surrogate,
         words_of_design,
     )
+    from surrogym_shared.terminal import on_interrupt, progress
 
-    with connect(server, token, wait) as api:
-        view = wait_for_surrogate(api, surrogate, wait)
+    with connect(server, token, wait, quiet=quiet) as api:
+        view = awaited_surrogate(api, surrogate, wait, quiet=quiet)
         if wait > 0:
             import surrogym_client.train  # noqa: F401
 
@@ -254,10 +265,10 @@ def _train(
     quiet: bool,
 ) -> TrainResult:
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.cli.output import progress
     from surrogym_client.improve import ImproveSettings, train_and_improve
     from surrogym_client.train import train
     from surrogym_client.transport import Api, HttpSurrogate
+    from surrogym_shared.terminal import progress
 
     with (
         HttpSurrogate(url, surrogate, token) as port,

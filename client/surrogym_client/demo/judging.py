@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from surrogym_client.cli.output import progress
 from surrogym_client.demo.settings import DemoSettings
 from surrogym_client.demo.tasks import Outcome
 from surrogym_client.evaluate import Evaluation, EvaluationSettings, evaluate
 from surrogym_client.original import make
 from surrogym_client.original.episodes import Episode, open_episode
 from surrogym_client.policy_file import load_policy, read_card
+from surrogym_shared.terminal import progress
 
 
 @dataclass(frozen=True)

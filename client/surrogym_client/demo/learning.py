@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from surrogym_client.api import Api
-from surrogym_client.cli.output import progress, say
 from surrogym_client.cli.train_words import words_of
 from surrogym_client.connection import Retries
 from surrogym_client.demo.judging import Judgement
@@ -23,6 +22,7 @@ from surrogym_client.demo.settings import DemoSettings
 from surrogym_client.demo.tasks import ROUNDS, queries_a_round
 from surrogym_client.policy_file import read_card
 from surrogym_client.waiting import share_of_design, wait_for_design, words_of_design
+from surrogym_shared.terminal import progress, say
 from surrogym_shared.wire import SurrogateView
 
 PATIENCE_SECONDS = 3_600.0

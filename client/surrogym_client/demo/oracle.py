@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 
-from surrogym_client.cli.output import progress
 from surrogym_client.cli.train_words import words_of
 from surrogym_client.demo.judging import Judgement, episodes_of
 from surrogym_client.demo.learning import Learned
@@ -13,6 +12,7 @@ from surrogym_client.demo.settings import DemoSettings
 from surrogym_client.original.port import OriginalPort
 from surrogym_client.policy_file import PolicyCard, write_card
 from surrogym_client.train import TrainProgress, TrainSettings, train
+from surrogym_shared.terminal import progress
 
 
 class OriginalRun:

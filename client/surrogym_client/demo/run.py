@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from surrogym_client.cli.errors import CommandError
-from surrogym_client.cli.output import on_interrupt
 from surrogym_client.demo.judging import Judgement, judge
 from surrogym_client.demo.learning import Learned, SurrogateRun
 from surrogym_client.demo.processes import Children
@@ -18,6 +17,7 @@ from surrogym_client.demo.report import metrics_of
 from surrogym_client.demo.settings import DemoSettings
 from surrogym_client.lifetime import terminations_as_interrupts
 from surrogym_client.versions import commit
+from surrogym_shared.terminal import on_interrupt
 
 
 class Run(Protocol):

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from surrogym_server.errors import SurrogymError
+from surrogym_shared.terminal import give, on_interrupt, progress
 
 
 def register(app: typer.Typer) -> None:
@@ -36,31 +37,31 @@ def optimise(
 
     Example: surrogym optimise --spec spec.json --model model.safetensors --out policy.zip
     """
-    import torch
+    stays = "interrupted; nothing was saved, and the same command begins anew"
+    with on_interrupt(lambda: stays), progress("optimise", quiet=quiet) as update:
+        update(0.0, "importing torch")
+        import torch
 
-    from surrogym_server.gradients import GradientSettings, Update
-    from surrogym_server.gradients import optimise as climb
-    from surrogym_server.local import LocalSurrogate
+        from surrogym_server.gradients import GradientSettings, Update
+        from surrogym_server.gradients import optimise as climb
+        from surrogym_server.local import LocalSurrogate
 
-    torch.set_num_threads(1)  # many small products: threads cost more than they give
-    chosen = GradientSettings(seed=seed, horizon=horizon)
-    settings = chosen if updates is None else GradientSettings(seed=seed, horizon=horizon, updates=updates)
+        torch.set_num_threads(1)  # many small products: threads cost more than they give
+        chosen = GradientSettings(seed=seed, horizon=horizon)
+        settings = chosen if updates is None else GradientSettings(seed=seed, horizon=horizon, updates=updates)
 
-    def tell(now: Update) -> None:
-        imagined = "" if now.imagined_return is None else f", imagined return {now.imagined_return:.1f} (in the model)"
-        typer.echo(f"\r{now.number} of {settings.updates} updates{imagined}   ", nl=False, err=True)
+        def tell(now: Update) -> None:
+            imagined = "" if now.imagined_return is None else f", imagined return {now.imagined_return:.1f}"
+            update(now.number / settings.updates, f"{now.number} of {settings.updates} updates{imagined}")
 
-    started = time.perf_counter()
-    try:
-        surrogate = LocalSurrogate.load(spec, model)
-        found = climb(surrogate, settings, None if quiet else tell)
-        found.policy.save(out)
-    except KeyboardInterrupt:
-        typer.echo("\ninterrupted; nothing was saved, and the same command begins anew", err=True)
-        raise
-    except (SurrogymError, OSError, ValueError) as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(1) from None
+        started = time.perf_counter()
+        try:
+            surrogate = LocalSurrogate.load(spec, model)
+            found = climb(surrogate, settings, tell)
+            found.policy.save(out)
+        except (SurrogymError, OSError, ValueError) as error:
+            typer.echo(f"error: {error}", err=True)
+            raise typer.Exit(1) from None
     seconds = time.perf_counter() - started
     card = {
         "algorithm": "gradient",
@@ -72,12 +73,9 @@ def optimise(
         "settings": asdict(settings),
     }
     out.with_suffix(".json").write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
-    if not quiet:
-        typer.echo("", err=True)
-    if as_json:
-        typer.echo(json.dumps({"policy": str(out), **{name: card[name] for name in card if name != "spec"}}, indent=2))
-    elif not quiet:
-        typer.echo(
-            f"{out}: {found.virtual_steps} virtual steps in {seconds:.1f} s, imagined return "
-            f"{found.imagined_return:.1f} (in the model); next: surrogym evaluate {out}"
-        )
+    result = {"policy": str(out), **{name: card[name] for name in card if name != "spec"}}
+    words = (
+        f"{out}: {found.virtual_steps} virtual steps in {seconds:.1f} s, imagined return "
+        f"{found.imagined_return:.1f} (in the model); next: surrogym evaluate {out}"
+    )
+    give(result, lambda: words, as_json=as_json, quiet=quiet)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import signal
 import socket
-import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
@@ -22,13 +22,15 @@ from surrogym_server.settings import Settings
 
 GRACE_SECONDS = 5
 PARENT_LOOK_SECONDS = 0.5
+Tell = Callable[[str], None]
+
 ANY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 
 
 class Runner(uvicorn.Server):
     """Announces its address, ends long polls at shutdown, and takes a signal as a wish, not as a failure."""
 
-    def __init__(self, app: FastAPI, settings: Settings, url: str, ready_file: Path | None) -> None:
+    def __init__(self, app: FastAPI, settings: Settings, url: str, ready_file: Path | None, tell: Tell) -> None:
         config = uvicorn.Config(
             app,
             http=patient(settings.request_seconds, connections_within(settings.max_connections)),
@@ -47,13 +49,13 @@ class Runner(uvicorn.Server):
         self._app = app
         self._url = url
         self._ready_file = ready_file
+        self._tell = tell
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
         if self._ready_file is not None:
             _write_at_once(self._ready_file, self._url)
-        sys.stdout.write(f"Surrogym listens on {self._url}\n")
-        sys.stdout.flush()
+        self._tell(self._url)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         say_goodbye(self._app)
@@ -64,8 +66,8 @@ class Runner(uvicorn.Server):
         self.should_exit = True
 
 
-def run(settings: Settings, ready_file: Path | None, exit_with_parent: bool) -> None:
-    """Serve until a signal comes, or the parent ends.
+def run(settings: Settings, ready_file: Path | None, exit_with_parent: bool, tell: Tell) -> None:
+    """Serve until a signal comes, or the parent ends; ``tell`` is called with the address once requests are accepted.
 
     Raises:
         InvalidInput: the address can't be listened on.
@@ -73,7 +75,7 @@ def run(settings: Settings, ready_file: Path | None, exit_with_parent: bool) -> 
     """
     logs.configure(settings.log_level, settings.log_format)
     with _listen(settings.host, settings.port) as listener:
-        runner = Runner(create_app(settings), settings, _url(listener, settings), ready_file)
+        runner = Runner(create_app(settings), settings, _url(listener, settings), ready_file, tell)
         if exit_with_parent:
             threading.Thread(target=_end_with_parent, args=(runner, os.getppid()), daemon=True).start()
         runner.run(sockets=[listener])

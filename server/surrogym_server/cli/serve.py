@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import sys
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from surrogym_server.errors import InvalidInput, SurrogymError
+from surrogym_shared.terminal import give, progress
 
 WORKERS_VARIABLE = "WEB_CONCURRENCY"
 
@@ -46,6 +49,10 @@ def serve(
     exit_with_parent: Annotated[
         bool, typer.Option("--exit-with-parent", help="End when the process that started this one ends.")
     ] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print address and version as JSON, once the server accepts requests.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No remarks; the log is what --log-level says.")] = False,
 ) -> None:
     """Run the server until Ctrl-C.
 
@@ -71,9 +78,16 @@ def serve(
             log_level=log_level,
             log_format=log_format,
         )
-        from surrogym_server.cli import runner  # imports torch, which neither --help nor a refusal should wait for
+        with progress("serve", quiet=quiet or not sys.stderr.isatty()) as update:
+            update(None, "importing torch")
+            from surrogym_server.cli import runner  # neither --help nor a refusal should wait for it
 
-        runner.run(settings, ready_file, exit_with_parent)
+        def tell(url: str) -> None:
+            about = {"url": url, "version": version("surrogym")}
+            give(about, lambda: f"Surrogym listens on {url}", as_json=as_json, quiet=quiet)
+            sys.stdout.flush()
+
+        runner.run(settings, ready_file, exit_with_parent, tell)
     except SurrogymError as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(1) from None

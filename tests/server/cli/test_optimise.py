@@ -31,6 +31,7 @@ def test_a_policy_and_its_card_are_written(tmp_path: Path):
     export(tmp_path, pendulum())
     said = optimise(tmp_path, "--updates", "2", "--horizon", "3", "--seed", "4")
     assert said.returncode == 0, said.stderr
+    assert "optimise: 2 of 2 updates" in said.stderr
     assert "next: surrogym evaluate policy.zip" in said.stdout
     policy = tmp_path / "policy.zip"
     assert Network.is_at(policy)
@@ -45,6 +46,7 @@ def test_what_can_not_be_optimised_is_one_sentence(tmp_path: Path, missing: bool
         export(tmp_path, cartpole())
     said = optimise(tmp_path)
     assert said.returncode == 1
-    assert said.stderr.startswith("error: ")
-    assert ("spec.json" if missing else "expected continuous actions") in said.stderr
+    error = said.stderr.splitlines()[-1]
+    assert error.startswith("error: ")
+    assert ("spec.json" if missing else "expected continuous actions") in error
     assert not (tmp_path / "policy.zip").exists()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -106,9 +108,10 @@ def test_killed_in_a_fit_leaves_no_process_behind(tmp_path: Path):
         time.sleep(0.05)
 
 
-def test_it_ends_with_its_parent(tmp_path: Path):
+def test_it_says_where_it_listens_as_json_and_ends_with_its_parent(tmp_path: Path):
     ready = tmp_path / "ready"
-    options = ["--port", "0", "--database", str(tmp_path / "p.db"), "--ready-file", str(ready), "--exit-with-parent"]
+    options = ["--port", "0", "--database", str(tmp_path / "p.db"), "--ready-file", str(ready), "--json"]
+    options.append("--exit-with-parent")
     parent = "import subprocess, sys; print(subprocess.Popen(sys.argv[1:]).pid, flush=True); input()"
     with subprocess.Popen(
         [sys.executable, "-c", parent, *SERVE, *options],
@@ -127,6 +130,7 @@ def test_it_ends_with_its_parent(tmp_path: Path):
         while _alive(server):
             assert time.monotonic() < deadline + PATIENCE
             time.sleep(0.05)
+        assert json.loads(process.stdout.read()) == {"url": ready.read_text(), "version": version("surrogym")}
 
 
 def _wait_for_children(pid: int) -> list[int]:

@@ -46,13 +46,13 @@ def command(
     Example: surrogym reproduce efficiency --tasks pendulum,acrobot --arms default,latin_hypercube --seeds 5
     """
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.cli.output import on_interrupt, progress, say
     from surrogym_client.cli.reproduce.table import present
     from surrogym_client.demo.arms import ARMS
     from surrogym_client.demo.tasks import TASKS
     from surrogym_client.lifetime import terminations_as_interrupts
     from surrogym_client.reproduce.cells import cells, done_already, run_cells
     from surrogym_client.reproduce.rows import read_rows
+    from surrogym_shared.terminal import on_interrupt, progress, say
 
     chosen = _chosen("task", tasks, TASKS), _chosen("arm", arms, ARMS), range(first_seed, first_seed + seeds)
     wanted = list(cells(*chosen, shares=_shares(shares), steps=steps, episodes=episodes))

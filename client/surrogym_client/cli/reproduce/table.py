@@ -37,6 +37,7 @@ def command(
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.reproduce.page import update
     from surrogym_client.reproduce.rows import merge, read_rows, write_rows
+    from surrogym_shared.terminal import give
 
     if missing := [path for path in rows if not path.exists()]:
         raise CommandError(f"{missing[0]}: no such file")
@@ -46,16 +47,22 @@ def command(
         present(merged, out, as_json=as_json, quiet=quiet)
     else:
         update(page, merged, out)
+        words = f"{page} shows {len(merged)} rows"
+        give({"page": str(page), "rows": len(merged)}, lambda: words, as_json=as_json, quiet=quiet)
 
 
 def present(rows: Sequence[Row], out: Path, *, as_json: bool, quiet: bool) -> None:
     """Write table and pictures of rows, and show the table."""
-    from surrogym_client.cli.output import give
-    from surrogym_client.reproduce.pictures import draw_tasks
     from surrogym_client.reproduce.table import report
+    from surrogym_shared.terminal import give, progress
 
-    text = report(rows)
-    (out / "efficiency.md").write_text(text, encoding="utf-8")
-    pictures = draw_tasks(out, rows)
+    with progress("table", quiet=quiet) as update:
+        update(0.0, f"drawing {len(rows)} rows")
+        from surrogym_client.reproduce.pictures import draw_tasks
+
+        text = report(rows)
+        (out / "efficiency.md").write_text(text, encoding="utf-8")
+        pictures = draw_tasks(out, rows)
+        update(1.0, "done")
     result = {"out": str(out), "rows": [vars(row) for row in rows], "pictures": [str(path) for path in pictures]}
     give(result, lambda: text, as_json=as_json, quiet=quiet)

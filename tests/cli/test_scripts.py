@@ -1,0 +1,85 @@
+"""For scripts: every command takes --json and --quiet, and with both prints one JSON document and not a word more."""
+
+from __future__ import annotations
+
+import json
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from support.commands import command_line, options
+from support.server import ServerProcess
+from surrogym_client.reproduce.rows import Row, write_rows
+
+ELSEWHERE = {
+    "conformance": "tests/client/test_conformance.py",
+    "demo": "tests/demo/test_demo.py",
+    "evaluate": "test_commands.py",
+    "export-policy": "tests/client/test_policy_export.py",
+    "optimise": "tests/server/cli/test_optimise.py",
+    "reproduce efficiency": "test_reproduce.py",
+    "reproduce paper": "test_reproduce_paper.py",
+    "serve": "tests/server/cli/test_serve.py",
+    "train": "test_commands.py",
+}
+LINES = """
+register CartPole-v1 --name NAME --budget 6 --initial 4
+sample NAME --max-queries 4
+status
+status NAME
+improve NAME --queries 1
+change NAME --pause
+export NAME --out samples.csv
+delete NAME --yes
+doctor
+report pendulum
+export pendulum --out pendulum.surrogate
+import pendulum.surrogate --name NAME
+delete NAME --yes
+"""
+
+
+def all_commands(group: Any = command_line(), before: tuple[str, ...] = ()) -> Iterator[str]:
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from all_commands(command, (*before, name))
+        else:
+            yield " ".join((*before, name))
+
+
+@pytest.mark.parametrize("command", list(all_commands()))
+def test_every_command_speaks_json_and_keeps_quiet(command: str) -> None:
+    assert {"--json", "--quiet"} <= options(*command.split())
+
+
+def test_a_script_reads_one_document_and_nothing_else(surrogym, pendulum_server: ServerProcess, tmp_path: Path) -> None:
+    write_rows(
+        tmp_path / "rows.csv", [Row("pendulum", "oracle", 0, 14, 0, 0, 300_000, mean=-170.0, min=-300.0, seconds=9.0)]
+    )
+    name, server, run = f"script-{uuid.uuid4().hex[:8]}", ("--server", pendulum_server.url), set()
+    for line in ["reproduce table --rows rows.csv", *LINES.replace("NAME", name).strip().splitlines()]:
+        words = line.split()
+        run.add(" ".join(words[: 1 + (words[0] == "reproduce")]))
+        said = surrogym(*words, "--json", "--quiet", *(server if words[0] != "reproduce" else ()))
+        assert (said.code, said.err) == (0, ""), line
+        assert isinstance(json.loads(said.out), dict), line
+    assert run | ELSEWHERE.keys() == set(all_commands())
+
+
+@pytest.mark.parametrize(
+    ("line", "shown"), [("report pendulum", "report: reading pendulum"), ("export pendulum -o s.csv", "export: done")]
+)
+def test_what_may_take_seconds_says_how_far_it_is(surrogym, pendulum_server: ServerProcess, line, shown) -> None:
+    assert shown in surrogym(*line.split(), "--server", pendulum_server.url).err
+
+
+def test_a_wait_says_what_for(surrogym, pendulum_server: ServerProcess) -> None:
+    server = ("--server", pendulum_server.url)
+    said = surrogym("sample", "nowhere", "--wait", "0.1", *server)
+    assert said.err.startswith("wait: for 'nowhere' to be registered\n")
+    assert surrogym("register", "Pendulum-v1", "--wait", "1.1", "--server", "http://127.0.0.1:9").err.startswith(
+        "wait: for a server at http://127.0.0.1:9\n"
+    )
