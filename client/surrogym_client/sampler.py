@@ -17,7 +17,14 @@ import numpy as np
 from surrogym_client.answers import reset_seed, sample_of
 from surrogym_client.api import Api
 from surrogym_client.connection import Retries
-from surrogym_client.errors import InvalidInput, LeaseExpired, NotThere, ServerUnreachable, SurrogymClientError
+from surrogym_client.errors import (
+    InvalidInput,
+    LeaseExpired,
+    NotThere,
+    ServerUnreachable,
+    SurrogymClientError,
+    Unavailable,
+)
 from surrogym_client.original.errors import StepFailed, UnknownEnvironment
 from surrogym_client.original.protocol import Environment, OriginalEnvironment, RolloutEnvironment
 from surrogym_client.original.rollouts import answering
@@ -25,7 +32,8 @@ from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, StepQuery
 
 FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "failed")
-PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)  # with a server that is away
+PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)  # with a server or a storage that is away
+AWAY = (ServerUnreachable, Unavailable)
 
 T = TypeVar("T")
 Outcome = Literal["answered", "failed"]
@@ -112,7 +120,7 @@ class Sampler:
 
         Raises:
             UnknownSurrogate: there is none of this name, or it was deleted.
-            ServerUnreachable: the server stayed away for too long.
+            ServerUnreachable, Unavailable: the server, or its storage, stayed away for too long.
             UnknownEnvironment: the environment can't be made, or is another one than the surrogate's.
         """
         self._started = time.monotonic()
@@ -282,7 +290,7 @@ class Heartbeat:
     def _renew(self, query: Query) -> None:
         try:
             self._api.renew(self._surrogate, query.id, query.lease_token, lease_seconds=self._lease_seconds)
-        except ServerUnreachable:
+        except AWAY:
             return  # the next beat tries again
         except SurrogymClientError:
             self.release(query)  # a late answer is still a true observation, so the step goes on
@@ -294,16 +302,16 @@ def _shape(spec: EnvironmentSpec) -> str:
 
 
 def _patiently(request: Callable[[], T]) -> T:
-    """Ask until the server is back; every request here may be repeated.
+    """Ask until the server and its storage are back; every request here may be repeated.
 
     Raises:
-        ServerUnreachable: it stayed away for longer than ``PATIENCE``.
+        ServerUnreachable, Unavailable: they stayed away for longer than ``PATIENCE``.
     """
     delays = PATIENCE.delays()
     while True:
         try:
             return request()
-        except ServerUnreachable:
+        except AWAY:
             pause = next(delays, None)
             if pause is None:
                 raise

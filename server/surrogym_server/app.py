@@ -95,7 +95,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
         InvalidInput: the address of the database can't be used.
         Unavailable: the database is taken, or does not answer.
     """
-    storage = open_storage(settings.database_url)
+    storage = open_storage(settings.database_url, settings.synchronous)
     app = FastAPI(
         title="Surrogym",
         version=version("surrogym"),

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, FilePath, ValidationError, mo
 
 from surrogym_server.errors import InvalidInput
 from surrogym_server.logs import LogFormat
+from surrogym_server.storage.records import Synchronous
 from surrogym_shared.wire import MAX_LANES, Role
 
 PREFIX = "SURROGYM_"
@@ -29,6 +30,9 @@ class Settings(BaseModel):
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65_535, description="0 takes any free port")] = 8000
     database: str = Field(default="surrogym.db", min_length=1, description="SQLite file, or a SQLAlchemy URL")
+    synchronous: Annotated[
+        Synchronous, Field(description="of a SQLite file: full survives a loss of power, normal a crash alone")
+    ] = "full"
     tokens: dict[str, Role] = Field(default_factory=dict, description="role of each bearer token")
     insecure: bool = Field(default=False, description="allow another address than loopback without a token")
     tls_certificate: FilePath | None = Field(default=None, description="chain of certificates, as PEM")

@@ -12,10 +12,11 @@ from support.moody import SPEC, GivesNonsense, HangsLeft, Line, RaisesLeft, Slow
 from surrogym_client import original
 from surrogym_client.api import Api
 from surrogym_client.connection import Retries
-from surrogym_client.errors import ServerUnreachable, UnknownSurrogate
+from surrogym_client.errors import ServerUnreachable, Unavailable, UnknownSurrogate
 from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.isolated import IsolatedEnvironment
 from surrogym_client.sampler import Sampler, SamplerSettings
+from surrogym_shared.codes import Code, Problem
 
 ONE_ROUND = SamplerSettings(name="worker", max_queries=6, wait_seconds=5.0, time_limit=60.0)
 
@@ -44,6 +45,36 @@ def test_every_query_is_answered_and_the_worker_stops_when_the_design_is_done(ap
     assert report.phase == view.phase
     assert view.phase in ("ready", "over_budget")
     assert [outcome for _, outcome, _ in told] == ["answered"] * 6
+
+
+class StorageAway(Api):
+    """Its server's storage can't be used for a moment, each time something is asked of it."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__(url)
+        self.refused = set()
+
+    def _refuse_once(self, *request):
+        if request not in self.refused:
+            self.refused.add(request)
+            problem = Problem(title="unavailable", status=503, code=Code.UNAVAILABLE, detail="the disk is full")
+            raise Unavailable(problem)
+
+    def claim(self, name, sampler, **options):
+        self._refuse_once("claim")
+        return super().claim(name, sampler, **options)
+
+    def add_samples(self, name, sampler, samples, **options):
+        self._refuse_once("add", samples[0].query_id)
+        return super().add_samples(name, sampler, samples, **options)
+
+
+def test_a_storage_that_is_away_is_waited_for_and_no_step_is_taken_twice(server_process, line):
+    with StorageAway(server_process.url) as api:
+        report = Sampler(api, line, Line(), ONE_ROUND).run()
+        assert len(api.refused) == 7
+        ledger = api.surrogate(line).ledger
+    assert (report.answered, report.failed, ledger.total, ledger.unresolved) == (6, 0, 6, 0)
 
 
 def test_once_stops_after_the_first_claim(api, line):

@@ -18,6 +18,13 @@ def test_defaults_listen_on_loopback_alone():
     assert settings.database_url == "sqlite:///surrogym.db"
 
 
+def test_a_commit_waits_for_the_disk_unless_a_setting_says_otherwise():
+    assert read_settings({}).synchronous == "full"
+    assert read_settings({"SURROGYM_SYNCHRONOUS": "normal"}).synchronous == "normal"
+    with pytest.raises(InvalidInput, match="synchronous"):
+        read_settings({}, synchronous="off")
+
+
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "robot.example"])
 def test_another_address_needs_a_token(host: str):
     with pytest.raises(InvalidInput, match=rf"^host {host} is not loopback: expected a token"):

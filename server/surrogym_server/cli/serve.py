@@ -27,6 +27,9 @@ def serve(
     database: Annotated[
         str | None, typer.Option(help="SQLite file, or a SQLAlchemy URL. [default: surrogym.db]")
     ] = None,
+    synchronous: Annotated[
+        str | None, typer.Option(help="Of a SQLite file: full waits for the disk, normal not always. [default: full]")
+    ] = None,
     token_file: Annotated[
         Path | None, typer.Option(help="File with one token a line: an admin token, or role:token.")
     ] = None,
@@ -69,6 +72,7 @@ def serve(
             host=host,
             port=port,
             database=database,
+            synchronous=synchronous,
             token_file=token_file,
             insecure=insecure,
             tls_certificate=tls_certificate,

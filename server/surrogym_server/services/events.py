@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 
-from surrogym_server.errors import UnknownSurrogate
+from surrogym_server.errors import Unavailable, UnknownSurrogate
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import EventRecord
@@ -46,6 +46,8 @@ class EventService:
                     page = await asyncio.to_thread(self._storage.events.list, name, after, PAGE)
                 except UnknownSurrogate:
                     return
+                except Unavailable:  # it goes on when storage is back
+                    page = []
                 for event in page:
                     yield event
                     after = event.id

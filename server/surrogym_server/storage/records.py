@@ -21,6 +21,7 @@ Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "fa
 Purpose = Literal["initial", "adaptive", "manual"]
 QueryStatus = Literal["pending", "leased", "answered", "set_aside"]
 QueryKind = Literal["step", "rollout"]
+Synchronous = Literal["full", "normal"]  # of a SQLite file: wait for the disk at every commit, or not always
 EventKind = Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger"]
 
 OPEN_STATUSES: tuple[QueryStatus, ...] = ("pending", "leased")

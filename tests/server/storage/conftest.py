@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
-import os
-import pwd
-import shutil
-import signal
-import subprocess
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psycopg
 import pytest
 
+from support.postgresql import Postgresql, running_postgresql
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LeasedQuery, NewDesign, NewModel, NewSample, NewSurrogate
 from surrogym_server.storage.sql import open_storage
@@ -25,55 +18,12 @@ from surrogym_server.storage.sql import open_storage
 SPEC = {"environment": "Pendulum-v1", "coordinates": [{"name": "angle"}, {"name": "speed"}]}
 SECONDS = 60.0  # a lease no test outlives
 NAME = "pendulum"
-DATABASES = itertools.count()
 
 
 @pytest.fixture(scope="session")
-def postgresql_server() -> Iterator[str]:
-    """The folder of a running server's socket."""
-    programs = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"), key=lambda path: int(path.parts[4]))
-    if not programs:
-        pytest.skip("PostgreSQL's programs are not here; install them with: apt install postgresql")
-    folder = Path(tempfile.mkdtemp(prefix="surrogym-pg-"))
-    user = _owner_of(folder)
-    try:
-        initdb = [programs[-1], "-D", folder / "data", "-A", "trust", "-U", "postgres", "-N"]
-        subprocess.run(initdb, check=True, stdout=subprocess.DEVNULL, cwd=folder, **user)
-        settings = (
-            "listen_addresses=",
-            f"unix_socket_directories={folder}",
-            "fsync=off",
-            "max_connections=200",
-        )
-        command = [programs[-1].with_name("postgres"), "-D", folder / "data"]
-        command += itertools.chain.from_iterable(("-c", setting) for setting in settings)
-        with open(folder / "log", "wb") as log:
-            server = subprocess.Popen(command, stdout=log, stderr=log, cwd=folder, **user)
-        _wait_for(server, folder)
-        yield str(folder)
-        server.send_signal(signal.SIGQUIT)  # at once: its files are thrown away
-        server.wait(30)
-    finally:
-        shutil.rmtree(folder)
-
-
-def _owner_of(folder: Path) -> dict[str, Any]:
-    """PostgreSQL refuses root; root runs it as the user Debian made for it."""
-    if os.geteuid() != 0:
-        return {}
-    owner = pwd.getpwnam("postgres")
-    os.chown(folder, owner.pw_uid, owner.pw_gid)
-    return {"user": owner.pw_uid, "group": owner.pw_gid, "extra_groups": []}
-
-
-def _wait_for(server: subprocess.Popen[bytes], folder: Path) -> None:
-    while server.poll() is None:
-        try:
-            psycopg.connect(host=str(folder), user="postgres", dbname="postgres").close()
-            return
-        except psycopg.OperationalError:
-            time.sleep(0.05)
-    pytest.fail((folder / "log").read_text())
+def postgresql() -> Iterator[Postgresql]:
+    with running_postgresql() as running:
+        yield running
 
 
 @pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.postgresql)])
@@ -81,11 +31,8 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     """The address of an empty database."""
     if request.param == "sqlite":
         return f"sqlite:///{tmp_path}/surrogym.db"
-    folder = request.getfixturevalue("postgresql_server")
-    name = f"test_{next(DATABASES)}"
-    with psycopg.connect(host=folder, user="postgres", dbname="postgres", autocommit=True) as connection:
-        connection.execute(f"CREATE DATABASE {name}")
-    return f"postgresql://postgres@/{name}?host={folder}"
+    running: Postgresql = request.getfixturevalue("postgresql")
+    return running.new_database()
 
 
 @pytest.fixture

@@ -7,7 +7,9 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 import sqlalchemy as sa
@@ -16,13 +18,15 @@ from alembic.migration import MigrationContext
 
 from surrogym_server.errors import InvalidInput, Unavailable
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import database, open_storage
+from surrogym_server.storage.sql.database import connect
 from surrogym_server.storage.sql.tables import metadata
 
 WRITER = """
 import sys
 from surrogym_server.storage.records import NewSample, NewSurrogate
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import database, open_storage
+from surrogym_server.storage.sql.database import connect
 
 storage = open_storage(sys.argv[1])
 storage.surrogates.create(NewSurrogate("a", {}, 30, 0.9))
@@ -109,17 +113,33 @@ def test_a_postgresql_that_is_not_there_is_unavailable(tmp_path: Path) -> None:
         open_storage(f"postgresql://postgres@/x?host={tmp_path}")
 
 
-def test_sqlite_waits_for_the_disk_before_it_acknowledges(tmp_path: Path) -> None:
-    from surrogym_server.storage.sql.database import connect
-
-    database = connect(f"sqlite:///{tmp_path}/surrogym.db")
-    with database.write() as connection:
+@pytest.mark.parametrize(("options", "synchronous"), [((), 2), (("full",), 2), (("normal",), 1)])
+def test_sqlite_waits_for_the_disk_before_it_acknowledges(tmp_path: Path, options: tuple[Any], synchronous: int):
+    opened = connect(f"sqlite:///{tmp_path}/surrogym.db", *options)
+    with opened.write() as connection:
         pragmas = {
             name: connection.exec_driver_sql(f"PRAGMA {name}").scalar()
             for name in ("journal_mode", "synchronous", "foreign_keys")
         }
-    database.close()
-    assert pragmas == {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1}
+    opened.close()
+    assert pragmas == {"journal_mode": "wal", "synchronous": synchronous, "foreign_keys": 1}
+
+
+def test_a_writer_that_stays_keeps_the_others_waiting_for_a_while_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(database, "BUSY_SECONDS", 0.05)
+    opened = connect(f"sqlite:///{tmp_path}/surrogym.db")
+
+    def second() -> None:
+        with opened.write():
+            pytest.fail("two writers at once")
+
+    with ThreadPoolExecutor(1) as thread, opened.write(), pytest.raises(Unavailable, match="others have been writing"):
+        thread.submit(second).result()
+    with opened.write():
+        pass
+    opened.close()
 
 
 def test_a_killed_writer_loses_nothing_it_acknowledged(url: str) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,12 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL, Connection, Engine
 
 from surrogym_server.errors import InvalidInput, Unavailable
+from surrogym_server.storage.records import Synchronous
 from surrogym_server.storage.sql.filelock import FileLock
 
-BUSY_SECONDS = 30
+BUSY_SECONDS = 5  # how long a statement waits for what another program or thread keeps
 POOL = {"pool_size": 8, "max_overflow": 56, "pool_timeout": BUSY_SECONDS}
+POSTGRESQL = {"connect_timeout": BUSY_SECONDS, "options": f"-c lock_timeout={BUSY_SECONDS}s"}
 
 CLOCKS: dict[str, sa.ColumnElement[float]] = {
     "sqlite": sa.literal_column("(julianday('now') - 2440587.5) * 86400.0", sa.Double()),
@@ -36,7 +39,7 @@ class Database:
         self._lock = lock
         self._writing = engine.execution_options(begin="BEGIN IMMEDIATE")
         # SQLite's own waiting polls; a lock in this process wakes the next writer at once
-        self._turn = threading.Lock() if engine.dialect.name == "sqlite" else contextlib.nullcontext()
+        self._turn = threading.Lock() if engine.dialect.name == "sqlite" else None
 
     @contextlib.contextmanager
     def read(self) -> Iterator[Connection]:
@@ -45,13 +48,25 @@ class Database:
 
     @contextlib.contextmanager
     def write(self) -> Iterator[Connection]:
-        with _translated(), self._turn, self._writing.begin() as connection:
+        with self._take_turn(), _translated(), self._writing.begin() as connection:
             yield connection
 
     def close(self) -> None:
         self._engine.dispose()
         if self._lock is not None:
             self._lock.close()
+
+    @contextlib.contextmanager
+    def _take_turn(self) -> Iterator[None]:
+        if self._turn is None:
+            yield
+            return
+        if not self._turn.acquire(timeout=BUSY_SECONDS):
+            raise Unavailable(f"the database can't be used now: others have been writing for {BUSY_SECONDS} s")
+        try:
+            yield
+        finally:
+            self._turn.release()
 
 
 def clock(connection: Connection) -> sa.ColumnElement[float]:
@@ -64,8 +79,13 @@ def conflict_insert(connection: Connection, table: sa.Table) -> sqlite.Insert | 
     return sqlite.insert(table) if connection.dialect.name == "sqlite" else postgresql.insert(table)
 
 
-def connect(url: str) -> Database:
+def connect(url: str, synchronous: Synchronous = "full") -> Database:
     """Make the database of ``sqlite:///path/to/file`` or ``postgresql://user@host/name``.
+
+    Args:
+        url: its address.
+        synchronous: of a SQLite file; ``full`` waits for the disk at every commit, ``normal`` may lose the last
+            commits with the power, though not with the process. PostgreSQL has a setting of its own.
 
     Raises:
         InvalidInput: another kind of address.
@@ -77,7 +97,7 @@ def connect(url: str) -> Database:
         raise InvalidInput(f"expected a database address such as sqlite:///surrogym.db, got {url!r}") from None
     match parsed.get_backend_name():
         case "sqlite" if parsed.database and parsed.database != ":memory:":
-            return _sqlite(Path(parsed.database))
+            return _sqlite(Path(parsed.database), synchronous)
         case "postgresql":
             return _postgresql(parsed)
         case _:
@@ -85,21 +105,21 @@ def connect(url: str) -> Database:
             raise InvalidInput(f"expected sqlite:///path or postgresql://user@host/name, got {shown}")
 
 
-def _sqlite(path: Path) -> Database:
+def _sqlite(path: Path, synchronous: Synchronous) -> Database:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise Unavailable(f"expected a folder for the database, got {path.parent}: {error}") from None
     lock = FileLock(path.with_name(path.name + ".lock"))
     engine = sa.create_engine(URL.create("sqlite", database=str(path)), connect_args={"timeout": BUSY_SECONDS}, **POOL)
-    sa.event.listen(engine, "connect", _prepare_sqlite)
+    sa.event.listen(engine, "connect", partial(_prepare_sqlite, synchronous))
     sa.event.listen(engine, "begin", _begin_sqlite)
     return Database(engine, lock)
 
 
-def _prepare_sqlite(connection: Any, _: object) -> None:
+def _prepare_sqlite(synchronous: Synchronous, connection: Any, _: object) -> None:
     connection.isolation_level = None  # the driver starts no transactions; _begin_sqlite does
-    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
+    for pragma in ("journal_mode=WAL", f"synchronous={synchronous}", "foreign_keys=ON"):
         connection.execute(f"PRAGMA {pragma}").close()
 
 
@@ -108,7 +128,9 @@ def _begin_sqlite(connection: Connection) -> None:
 
 
 def _postgresql(url: URL) -> Database:
-    engine = sa.create_engine(url.set(drivername="postgresql+psycopg"), pool_pre_ping=True, **POOL)
+    driven = url.set(drivername="postgresql+psycopg")
+    unsaid = {name: value for name, value in POSTGRESQL.items() if name not in url.query}
+    engine = sa.create_engine(driven, connect_args=unsaid, pool_pre_ping=True, **POOL)
     return Database(engine)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlalchemy as sa
 
 from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import Synchronous
 from surrogym_server.storage.sql.database import Database, connect
 from surrogym_server.storage.sql.designs import SqlDesigns
 from surrogym_server.storage.sql.ledger import SqlLedger
@@ -39,19 +40,20 @@ class SqlStorage(Storage):
         self._database.close()
 
 
-def open_storage(url: str) -> Storage:
+def open_storage(url: str, synchronous: Synchronous = "full") -> Storage:
     """Open a database, and bring its schema up to date.
 
     Args:
         url: ``sqlite:///path/to/file`` (made if it is not there, for one server at a time) or
             ``postgresql://user:password@host/name`` (for several).
+        synchronous: as in ``connect``.
 
     Raises:
         InvalidInput: another kind of address.
         Unavailable: another server holds the SQLite file, PostgreSQL does not answer, or the database was
             written by a newer program.
     """
-    database = connect(url)
+    database = connect(url, synchronous)
     try:
         migrate(database)
     except BaseException:
