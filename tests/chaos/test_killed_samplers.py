@@ -1,0 +1,50 @@
+"""kill -9 of samplers in the middle of a step: their queries go to others or are set aside, and no step is hidden."""
+
+from __future__ import annotations
+
+import random
+import time
+from pathlib import Path
+
+import pytest
+
+from support.chaos import SEED, times
+from support.noting import NotingSamplers, Tally, create, finished, noting_samplers, until
+from support.server import running_server
+from surrogym_client.api import Api
+
+KILLS = times(short=3, full=50)
+SAMPLERS, BUDGET, KILLS_A_RUN = 3, times(short=9, full=16), 10
+LEASE_SECONDS = 2.0
+LATEST = 0.08  # seconds into a step
+
+
+def kill_one(source: random.Random, samplers: NotingSamplers) -> None:
+    """Kill one that is in the middle of a step, at a random moment of it, and start another in its place."""
+    assert until(samplers.in_a_step), "nobody steps"
+    chosen = source.choice(samplers.in_a_step() or list(samplers.working))
+    time.sleep(source.uniform(0.0, LATEST))
+    samplers.kill(chosen)
+    samplers.start()
+
+
+@pytest.mark.timeout(3_600)
+def test_every_query_ends_answered_or_set_aside_with_its_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    source, tally = random.Random(SEED), Tally()
+    with running_server(tmp_path) as server, Api(server.url) as api:
+        while tally.kills < KILLS:
+            name = f"run-{tally.kills}"
+            create(api, name, BUDGET)
+            folder = tmp_path / name
+            with noting_samplers(server.url, name, folder, count=SAMPLERS, lease_seconds=LEASE_SECONDS) as samplers:
+                for _ in range(min(KILLS_A_RUN, KILLS - tally.kills)):
+                    kill_one(source, samplers)
+                    tally.kills += 1
+                    if finished(api, name):
+                        break
+                assert until(lambda: finished(api, name)), f"the design completes, but is {api.surrogate(name)}"  # noqa: B023
+                assert until(lambda: not samplers.in_a_step()), "whoever took a step hands it in"
+            tally.judge(api, name, samplers.notes(), patient=False)
+        assert "Traceback" not in server.log
+    with capsys.disabled():
+        print(f"\nsamplers, {tally}")
