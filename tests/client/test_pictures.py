@@ -25,7 +25,15 @@ from surrogym_client.vector import RemoteVectorEnv
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
 SPECS = {name: task.spec() for name, task in TASKS.items()} | {name: make() for name, make in SPECIFICATIONS.items()}
-SHOWN = ("Pendulum-v1", "CartPole-v1", "Acrobot-v1", "MountainCarContinuous-v0", "Reacher-v5", "InvertedPendulum-v5")
+SHOWN = (
+    SWING_UP,
+    "Pendulum-v1",
+    "CartPole-v1",
+    "Acrobot-v1",
+    "MountainCarContinuous-v0",
+    "Reacher-v5",
+    "InvertedPendulum-v5",
+)
 LINE = EnvironmentSpec(
     environment="line:Line",
     coordinates=(Coordinate(name="x", sampling=Uniform(low=-1, high=1)),),
@@ -130,7 +138,6 @@ def test_an_environment_of_ones_own_draws_itself(own: None) -> None:
     [
         (LINE, None, r"expected original='package\.module:factory'"),
         (LINE, "line:Blind", r"have a method picture\(coordinates\), got a Blind"),
-        (SPECS[SWING_UP], None, "no picture of its own"),
         (
             LINE.model_copy(update={"observation": (ObservationEntry(name="s", term=Term.sin(x=1)),)}),
             "line:Line",

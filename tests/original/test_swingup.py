@@ -61,3 +61,16 @@ def test_gymnasium_makes_both_kinds():
     assert gymnasium.make("surrogym/CartPoleSwingUpNarrow-v0").unwrapped.width == 0.25
     with pytest.raises(ValueError, match="expected one of smooth, narrow, got 'steep'"):
         CartPoleSwingUp("steep")
+
+
+def test_the_picture_has_the_pole_where_it_stands_and_the_goal_where_it_does_not():
+    env = CartPoleSwingUp(render_mode="rgb_array")
+    env.state = np.array([0.5, 0, np.pi / 2, 0])  # level, from half a metre to the right of the middle
+    frame = env.render()
+    assert (frame.shape, frame.dtype) == ((300, 600, 3), np.uint8)
+    pole, goal = [202, 152, 101], [240, 190, 180]
+    assert frame[150, 300 + 120].tolist() == frame[150, 300 + 60].tolist() == pole
+    assert frame[150 - 72, 300].tolist() == goal
+    env.state = UPRIGHT.copy()
+    assert env.render()[150 - 72, 300].tolist() == pole
+    assert CartPoleSwingUp().render() is None

@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from surrogym_client.original.drawing import Canvas
 from surrogym_client.registration import SWING_UP, SWING_UP_NARROW, SWING_UP_STEPS
 from surrogym_shared.spec import (
     BoxAction,
@@ -35,6 +36,7 @@ STEP_SECONDS = 0.1
 SUBSTEPS = 10
 GRAVITY = 9.82
 LENGTH = 0.6
+PIXELS_PER_METRE = 120
 
 # How far from its target the pole's tip may be (m) before the reward falls to exp(-1/2). Hanging, it is 1.2 away:
 # that pays 0.14 under the smooth reward and 1e-5 under PILCO's.
@@ -48,14 +50,17 @@ class CartPoleSwingUp(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     are the angle's cosine and sine, and the horizontal position of the pole's tip as well.
 
     Reward of the state after the step: exp(-d^2 / (2 width^2)), d from the pole's tip to where it is when the pole
-    stands above the origin. No state ends an episode.
+    stands above the origin. No state ends an episode. The picture has a mark there.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own type)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / STEP_SECONDS)}  # noqa: RUF012 (Gymnasium's type)
 
-    def __init__(self, reward: Literal["smooth", "narrow"] = "smooth") -> None:
+    def __init__(self, reward: Literal["smooth", "narrow"] = "smooth", render_mode: str | None = None) -> None:
         if reward not in WIDTH:
             raise ValueError(f"reward: expected one of {', '.join(WIDTH)}, got {reward!r}")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode: expected None or rgb_array, got {render_mode!r}")
+        self.render_mode = render_mode
         self.masscart, self.masspole, self.length, self.friction = 0.5, 0.5, LENGTH, 0.1
         self.width = WIDTH[reward]
         self.state: NDArray[np.float64] = np.zeros(4)
@@ -78,6 +83,19 @@ class CartPoleSwingUp(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             state = self._runge_kutta(state, force, STEP_SECONDS / SUBSTEPS)
         self.state = np.array(state)
         return self._observation(), self._reward(), False, False, {}
+
+    def render(self) -> Any:
+        """The picture (300, 600, 3) of the state, in 5 m by 2.5 m; None without a render mode."""
+        if self.render_mode is None:
+            return None
+        x, _, angle, _ = map(float, self.state)
+        tip = (self._tip(x, angle), -self.length * math.cos(angle))
+        canvas = Canvas(600, 300, PIXELS_PER_METRE)
+        canvas.stroke((-3, 0), (3, 0), 0.01, (120, 120, 120))
+        canvas.stroke((0, self.length), (0, self.length), 0.1, (240, 190, 180))
+        canvas.stroke((x - 0.15, 0), (x + 0.15, 0), 0.14, (40, 40, 40))
+        canvas.stroke((x, 0), tip, 0.06, (202, 152, 101))
+        return canvas.picture()
 
     def _runge_kutta(self, state: State, force: float, h: float) -> State:
         k1 = self._derivative(state, force)

@@ -1,0 +1,45 @@
+"""Pictures by numpy alone: each stroke is blended by how far every pixel is from it.
+
+Shapes: a frame is (height, width, 3) float64, 0 to 255; points are in the world's units, y upwards from the middle.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Frame = NDArray[np.float64]
+Point = tuple[float, float]
+Colour = tuple[int, int, int]
+
+WHITE = 255.0
+
+
+class Canvas:
+    """A white frame that strokes are drawn on.
+
+    Args:
+        width: pixels.
+        height: pixels.
+        scale: pixels of a unit of the world, whose origin is in the middle.
+    """
+
+    def __init__(self, width: int, height: int, scale: float) -> None:
+        self._frame: Frame = np.full((height, width, 3), WHITE)
+        self._scale = scale
+        self._x = (np.arange(width) + 0.5 - width / 2) / scale  # (width,)
+        self._y = (height / 2 - np.arange(height) - 0.5)[:, None] / scale  # (height, 1)
+
+    def stroke(self, start: Point, end: Point, thickness: float, colour: Colour) -> None:
+        """A line with round ends; a disc where both ends are the same point."""
+        (ax, ay), (bx, by) = start, end
+        dx, dy = bx - ax, by - ay
+        along = ((self._x - ax) * dx + (self._y - ay) * dy) / max(dx**2 + dy**2, 1e-12)
+        nearest = np.clip(along, 0.0, 1.0)
+        away = np.hypot(self._x - ax - nearest * dx, self._y - ay - nearest * dy) - thickness / 2
+        cover = np.clip(0.5 - away * self._scale, 0.0, 1.0)[..., None]  # edges are as wide as a pixel
+        self._frame += cover * (np.array(colour) - self._frame)
+
+    def picture(self) -> NDArray[np.uint8]:
+        """The frame as (height, width, 3) uint8."""
+        return np.round(self._frame).astype(np.uint8)
