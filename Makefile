@@ -7,14 +7,17 @@ WORKERS ?= 2
 ARGS ?=
 
 BIN := .venv/bin
-PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint constraints.txt
+# What is not imported needs no bytecode: compiling every module takes longer than unpacking it.
+PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile --constraint constraints.txt
 PINS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: demo test audit test-all docs docs-serve format-check lint types imports unit chaos bench acquisition format postgresql chromium screenshots clean help
+.PHONY: demo install test audit test-all docs docs-serve format-check lint types imports unit chaos bench acquisition format postgresql chromium screenshots clean help
 
-demo: .venv/all  ## Solve Pendulum with server, sampler and trainer on this machine (ARGS="--seed 1")
+demo: .venv/demo  ## Solve Pendulum with server, sampler and trainer on this machine (ARGS="--seed 1")
 	@exec $(BIN)/surrogym demo pendulum $(ARGS)
+
+install: .venv/all  ## Everything a user may want into .venv: MuJoCo, pictures and exports as well
 
 test: format-check lint types imports audit unit  ## Everything that guards the project
 
@@ -96,10 +99,15 @@ help:  ## This list
 	    { echo "Python 3.11 or newer is needed: make PYTHON=python3.12 ..."; exit 1; }
 	$(PYTHON) -m venv .venv
 
+.venv/demo: $(PINS) | .venv/bin/python
+	@echo "installing into .venv; this takes a minute or two the first time"
+	@$(PIP) --editable ".[server,train]"
+	@touch $@
+
 .venv/all: $(PINS) | .venv/bin/python
 	@echo "installing into .venv; this takes some minutes the first time"
 	@$(PIP) --editable ".[all]"
-	@touch $@
+	@touch $@ .venv/demo
 
 .venv-extras: pyproject.toml constraints-extras.txt | .venv/bin/python
 	@echo "installing RLlib, TorchRL, MLflow and Weights & Biases into .venv-extras"
@@ -111,4 +119,4 @@ help:  ## This list
 .venv/dev: $(PINS) | .venv/bin/python
 	@echo "installing into .venv; this takes some minutes the first time"
 	@$(PIP) --editable ".[dev]"
-	@touch $@ .venv/all
+	@touch $@ .venv/all .venv/demo
