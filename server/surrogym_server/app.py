@@ -180,7 +180,9 @@ def _build_services(
     )
     samplers = Samplers()
     services = Services(
-        surrogates=SurrogateService(storage, _define, design.plan, cache, engine.live, engine.notices, samplers),
+        surrogates=SurrogateService(
+            storage, _define, _complete, design.plan, cache, engine.live, engine.notices, samplers
+        ),
         queries=QueryService(storage, definitions, engine.notices, samplers),
         samples=SampleService(storage, definitions, engine.notices, samplers),
         models=ModelService(storage, definitions, cache, engine.notices),
@@ -194,6 +196,10 @@ def _build_services(
 
 def _define(spec: dict[str, Any]) -> EnvironmentDefinition:
     return definition_from_spec(EnvironmentSpec.model_validate(spec))
+
+
+def _complete(spec: dict[str, Any]) -> dict[str, Any]:
+    return EnvironmentSpec.model_validate(spec).model_dump(mode="json")
 
 
 def _add_dashboard(app: FastAPI) -> None:

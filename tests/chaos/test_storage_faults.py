@@ -148,7 +148,7 @@ class Stepping:
     def __exit__(self, *_: object) -> None:
         self._ending.set()
         self._thread.join(60)
-        self._port.__exit__(None, None, None)
+        self._port.disconnect()
 
     def go_on(self, steps: int = 20) -> None:
         """Return after so many more steps; raises what has ended them."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +14,7 @@ from numpy.typing import NDArray
 
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import LiveSessions
-from surrogym_server.errors import InvalidInput, NoModel
+from surrogym_server.errors import InvalidInput, NoModel, SpecConflict
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Define
 from surrogym_server.services.notices import Notices
@@ -28,6 +30,10 @@ from surrogym_server.surrogate.definition import EnvironmentDefinition
 
 Array = NDArray[np.float64]
 Plan = Callable[[EnvironmentDefinition, int], tuple[dict[str, Any], Array, Array, tuple[Array, ...]]]
+Complete = Callable[[dict[str, Any]], dict[str, Any]]
+
+ABSENT = object()
+SHOWN = 120  # characters of a value in an error
 
 
 @dataclass(frozen=True)
@@ -49,16 +55,24 @@ class SurrogateService:
         self,
         storage: Storage,
         define: Define,
+        complete: Complete,
         plan: Plan,
         models: ModelCache,
         live: LiveSessions,
         notices: Notices,
         samplers: Samplers,
     ) -> None:
-        """``plan`` gives the first queries under a budget: (state, coordinates (m, C), action (m, F),
-        rollouts (T, F) each)."""
+        """
+        Args:
+            storage: holds them.
+            define: the definition of a spec.
+            complete: a spec with every field that this program knows, as JSON; an older one lacked some.
+            plan: the first queries under a budget: (state, coordinates (m, C), action (m, F), rollouts (T, F) each).
+            models, live, notices, samplers: of this process.
+        """
         self._storage = storage
         self._define = define
+        self._complete = complete
         self._plan = plan
         self._models = models
         self._live = live
@@ -73,7 +87,7 @@ class SurrogateService:
             InvalidSpec: a spec that the preset can't represent.
         """
         state, coordinates, action, rollouts = self._plan(self._define(spec), budget)
-        self._storage.surrogates.create(
+        present, created = self._storage.surrogates.create(
             NewSurrogate(
                 name=name,
                 spec=spec,
@@ -85,6 +99,8 @@ class SurrogateService:
                 query_rollouts=rollouts,
             )
         )
+        if not created:
+            check_same(name, self._complete(present.spec), self._complete(spec))
         self._notices.post(name)
         return self.status(name)
 
@@ -141,3 +157,28 @@ class SurrogateService:
             samplers=tuple(self._samplers.alive(name)),
             sessions=sum(session.surrogate == name for session in self._live),
         )
+
+
+def check_same(name: str, had: Any, got: Any) -> None:
+    """Raises ``SpecConflict`` where two specs differ, which says where."""
+    if had != got:
+        where, old, new = _difference(had, got)
+        raise SpecConflict(
+            f"{name!r} exists with another spec: {where} was created as {_short(old)}, got {_short(new)}"
+        )
+
+
+def _difference(had: Any, got: Any, where: str = "") -> tuple[str, Any, Any]:
+    """The first place where two JSON values differ, as ``coordinates.0.name``, and what stands there."""
+    if isinstance(had, dict) and isinstance(got, dict):
+        pairs = [(key, had.get(key, ABSENT), got.get(key, ABSENT)) for key in {**had, **got}]
+    elif isinstance(had, list) and isinstance(got, list) and len(had) == len(got):
+        pairs = [(str(i), *pair) for i, pair in enumerate(zip(had, got, strict=True))]
+    else:
+        return where, had, got
+    key, old, new = next(pair for pair in pairs if pair[1] != pair[2])
+    return _difference(old, new, f"{where}.{key}" if where else key)
+
+
+def _short(value: Any) -> str:
+    return "nothing" if value is ABSENT else textwrap.shorten(json.dumps(value), SHOWN, placeholder=" ...")

@@ -50,10 +50,7 @@ class Surrogates(ABC):
     def create(self, new: NewSurrogate) -> tuple[SurrogateRecord, bool]:
         """Create a surrogate in phase ``collecting`` with its initial queries; says whether it is new.
 
-        The same name and spec again returns what is there, unchanged, and False.
-
-        Raises:
-            SpecConflict: the name exists with another spec.
+        A name that is taken returns what is there, unchanged, and False; whether it is the same is for the caller.
         """
 
     @abstractmethod

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import textwrap
 from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
-from surrogym_server.errors import SpecConflict
 from surrogym_server.storage import port
 from surrogym_server.storage.records import NewSurrogate, Phase, SurrogateRecord
 from surrogym_server.storage.sql.database import Database, clock, conflict_insert
@@ -25,10 +22,6 @@ COLUMNS = [
 ]
 
 
-ABSENT = object()
-SHOWN = 120  # characters of a value in an error
-
-
 class SqlSurrogates(port.Surrogates):
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -36,7 +29,7 @@ class SqlSurrogates(port.Surrogates):
     def create(self, new: NewSurrogate) -> tuple[SurrogateRecord, bool]:
         with self._database.write() as connection:
             if not _insert(connection, new):
-                return _same(read(connection, new.name), new), False
+                return read(connection, new.name), False
             held = hold(connection, new.name)
             append_event(connection, held, "created", name=new.name)
             insert_queries(connection, held, "initial", 0, new.query_coordinates, new.query_action, new.query_rollouts)
@@ -128,32 +121,6 @@ def _insert(connection: Connection, new: NewSurrogate) -> bool:
     )
     free = insert.on_conflict_do_nothing(index_elements=["name"]).returning(surrogates.c.id)
     return connection.execute(free).scalar() is not None
-
-
-def _same(present: SurrogateRecord, new: NewSurrogate) -> SurrogateRecord:
-    given = json.loads(json.dumps(new.spec))
-    if present.spec != given:
-        where, had, got = _difference(present.spec, given)
-        raise SpecConflict(
-            f"{new.name!r} exists with another spec: {where} was created as {_short(had)}, got {_short(got)}"
-        )
-    return present
-
-
-def _difference(had: Any, got: Any, where: str = "") -> tuple[str, Any, Any]:
-    """The first place where two JSON values differ, as ``coordinates.0.name``, and what stands there."""
-    if isinstance(had, dict) and isinstance(got, dict):
-        pairs = [(key, had.get(key, ABSENT), got.get(key, ABSENT)) for key in {**had, **got}]
-    elif isinstance(had, list) and isinstance(got, list) and len(had) == len(got):
-        pairs = [(str(i), *pair) for i, pair in enumerate(zip(had, got, strict=True))]
-    else:
-        return where, had, got
-    key, old, new = next(pair for pair in pairs if pair[1] != pair[2])
-    return _difference(old, new, f"{where}.{key}" if where else key)
-
-
-def _short(value: Any) -> str:
-    return "nothing" if value is ABSENT else textwrap.shorten(json.dumps(value), SHOWN, placeholder=" ...")
 
 
 def _apply(connection: Connection, held: Row[Any], changes: dict[str, Any]) -> None:
