@@ -5,19 +5,22 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
+from functools import partial
 from html.parser import HTMLParser
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 
 from support.server import ServerProcess
 from surrogym_client.api import Api
 from surrogym_client.report.figures import draw_fidelity, svg
+from surrogym_client.report.maps import Cut, cuts
 from surrogym_client.report.page import page
 from surrogym_shared.wire import ModelView, SampleView, SurrogateView
 
 SVG = "data:image/svg+xml;base64,"
-Known = tuple[SurrogateView, list[ModelView], list[SampleView]]
+Known = tuple[SurrogateView, list[ModelView], list[SampleView], str, list[Cut]]
 
 
 class Page(HTMLParser):
@@ -49,13 +52,23 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def known(pendulum_server: ServerProcess) -> Known:
     with Api(pendulum_server.url) as api:
-        return api.surrogate("pendulum"), api.models("pendulum"), list(api.samples("pendulum"))
+        view = api.surrogate("pendulum")
+        shown = cuts(view, partial(api.query_uncertainty, "pendulum"))
+        return view, api.models("pendulum"), list(api.samples("pendulum")), "http://here, surrogym 0.1.0", shown
 
 
 def test_it_says_what_is_known(known: Known) -> None:
-    view, models, samples = known
-    read = Page(page(view, models, samples, "http://here, surrogym 0.1.0"))
-    titles = ["Ledger", "Fidelity", "Samples", "Structure and hyperparameters of model 1", "Models", "Specification"]
+    view, models, *_ = known
+    read = Page(page(*known))
+    titles = [
+        "Ledger",
+        "Fidelity",
+        "Samples",
+        "Maps",
+        "Structure and hyperparameters of model 1",
+        "Models",
+        "Specification",
+    ]
     assert [text for text in read.texts if text in titles] == titles
     for output in models[-1].fidelity.outputs:
         assert read.texts.count(output.name) >= 2
@@ -66,7 +79,7 @@ def test_it_says_what_is_known(known: Known) -> None:
 
 
 def test_it_loads_nothing_and_its_policy_lets_nothing_load(known: Known) -> None:
-    text = page(*known, "here")
+    text = page(*known)
     read = Page(text)
     assert {tag for tag, _ in read.tags} & {"script", "link", "iframe", "object", "a"} == set()
     for _, attributes in read.tags:
@@ -80,21 +93,31 @@ def test_it_loads_nothing_and_its_policy_lets_nothing_load(known: Known) -> None
 
 
 def test_its_figures_are_whole_pictures_with_words_for_who_can_not_see_them(known: Known) -> None:
-    images = Page(page(*known, "here")).of("img")
-    assert len(images) == 2
+    images = Page(page(*known)).of("img")
+    assert len(images) == 3
     for image in images:
         assert image["alt"]
         drawn = base64.b64decode(image["src"].removeprefix(SVG)).decode()
         assert ElementTree.fromstring(drawn).tag == "{http://www.w3.org/2000/svg}svg"
-        assert re.findall(r"(?:href|src)=\"(?!#)", drawn) == []
+        assert re.findall(r"(?:href|src)=\"(?!#|data:image/png;)", drawn) == []
 
 
 def test_the_same_figure_is_the_same_text(known: Known) -> None:
     assert svg(draw_fidelity(known[1], 0.999)) == svg(draw_fidelity(known[1], 0.999))
 
 
+def test_a_map_says_what_the_server_says_of_its_points(known: Known, pendulum_server: ServerProcess) -> None:
+    (cut,) = known[-1]
+    tolerances = np.array([output.tolerance for output in known[1][-1].fidelity.outputs])
+    with Api(pendulum_server.url) as api:
+        corner = api.query_uncertainty("pendulum", [[np.pi, -8.0]], [[0.0]])
+    assert (cut.across, cut.up) == (0, 1)
+    assert cut.uncertainty[0, -1] == pytest.approx((np.array(corner.deviation[0]) / tolerances).max())
+    assert cut.log_index[0, -1] == pytest.approx(max(corner.log_uncertainty_index[0]))
+
+
 def test_what_strangers_wrote_stays_text(known: Known) -> None:
-    view, models, samples = known
+    view, models, samples, *_ = known
     hostile = "</td><script>alert(1)</script>"
     model = models[0].model_copy(update={"description": {"outputs": [{"name": hostile, hostile: [hostile]}]}})
     view = view.model_copy(update={"error": hostile, "environment": hostile})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -23,8 +24,8 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write one HTML page that needs nothing else: fidelity against samples, where they fell, the ledger, structure and
-    hyperparameters, and every model.
+    """Write one HTML page that needs nothing else: fidelity against samples, where they fell, maps of uncertainty,
+    occupancy and index, the ledger, structure and hyperparameters, and every model.
 
     Example: surrogym report pendulum --out report.html
     """
@@ -34,10 +35,13 @@ def command(
     with on_interrupt(lambda: stays), progress("report", quiet=quiet) as update, connect(server, token) as api:
         update(0.0, f"reading {surrogate}")
         view, models, samples = api.surrogate(surrogate), api.models(surrogate), list(api.samples(surrogate))
+        from surrogym_client.report.maps import cuts
+
+        shown = cuts(view, partial(api.query_uncertainty, surrogate))
         update(0.3, "drawing")
         from surrogym_client.report.page import page
 
-        text = page(view, models, samples, f"{api.url}, surrogym {api.health().version}")
+        text = page(view, models, samples, f"{api.url}, surrogym {api.health().version}", shown)
         size = out.write_text(text, encoding="utf-8")
         update(1.0, "done")
     words = f"{size} bytes written to {out}"

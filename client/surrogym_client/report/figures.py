@@ -1,7 +1,8 @@
-"""Figures of a surrogate: how sure each model was, and where the real steps began."""
+"""Figures of a surrogate: how sure each model was, where the latest is not, and where the real steps began."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from io import StringIO
 
@@ -9,15 +10,19 @@ import matplotlib
 
 matplotlib.use("Agg")
 
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from surrogym_client.report.maps import Cut, pairs
 from surrogym_shared.spec import Coordinate, limits
 from surrogym_shared.wire import ModelView, SampleView, SurrogateView
 
 COLOURS = {"initial": "#4c72b0", "adaptive": "#dd8452", "manual": "#55a868"}
 WIDTH = 6.0  # inches
 SMALLEST = 1e-9  # of what is drawn on a logarithmic axis
+DECADES = 6  # of the index: what lies further below its highest value is nothing
+LOG_10 = math.log(10)
 
 
 def draw_fidelity(models: Sequence[ModelView], target: float) -> Figure:
@@ -41,11 +46,10 @@ def draw_fidelity(models: Sequence[ModelView], target: float) -> Figure:
 
 def draw_samples(view: SurrogateView, samples: Sequence[SampleView]) -> Figure:
     """Where the real steps began, two coordinates a picture."""
-    coordinates = view.spec.coordinates
-    pairs = [(i, min(i + 1, len(coordinates) - 1)) for i in range(0, len(coordinates), 2)]
-    figure = Figure(figsize=(WIDTH, 0.8 * WIDTH * len(pairs)), layout="constrained")
-    for n, (i, j) in enumerate(pairs):
-        axes = figure.add_subplot(len(pairs), 1, n + 1)
+    coordinates, shown = view.spec.coordinates, pairs(view.spec)
+    figure = Figure(figsize=(WIDTH, 0.8 * WIDTH * len(shown)), layout="constrained")
+    for n, (i, j) in enumerate(shown):
+        axes = figure.add_subplot(len(shown), 1, n + 1)
         for purpose, colour in COLOURS.items():
             chosen = [s.coordinates for s in samples if s.purpose == purpose]
             if chosen:
@@ -56,6 +60,26 @@ def draw_samples(view: SurrogateView, samples: Sequence[SampleView]) -> Figure:
         if n == 0 and samples:
             figure.legend(loc="outside upper right")
     figure.suptitle(f"{view.name}: real steps of the design", x=0.02, ha="left")
+    return figure
+
+
+def draw_maps(view: SurrogateView, cuts: Sequence[Cut]) -> Figure:
+    """Uncertainty, occupancy and index over two coordinates, a row for each cut."""
+    figure = Figure(figsize=(1.5 * WIDTH, 0.45 * WIDTH * len(cuts)), layout="constrained")
+    rows = figure.subplots(len(cuts), 3, squeeze=False)
+    for row, cut in zip(rows, cuts, strict=True):
+        x, y = (view.spec.coordinates[which] for which in (cut.across, cut.up))
+        highest = cut.log_index.max() / LOG_10
+        panels = (
+            ("uncertainty / tolerance", cut.uncertainty, {"norm": LogNorm(0.1, 10, clip=True), "cmap": "Oranges"}),
+            ("occupancy", cut.occupancy, {"vmin": 0.0, "cmap": "Blues"}),
+            ("log10 of the index", cut.log_index / LOG_10, {"vmin": highest - DECADES, "cmap": "Purples"}),
+        )
+        for axes, (title, values, how) in zip(row, panels, strict=True):
+            extent = (*limits(x.sampling), *limits(y.sampling))
+            image = axes.imshow(values, origin="lower", extent=extent, aspect="auto", **how)
+            figure.colorbar(image, ax=axes, label=title)
+            axes.set(xlabel=with_unit(x), ylabel=with_unit(y))
     return figure
 
 

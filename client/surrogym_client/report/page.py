@@ -10,7 +10,8 @@ from datetime import UTC, datetime
 from html import escape
 from typing import Any
 
-from surrogym_client.report.figures import draw_fidelity, draw_samples, svg
+from surrogym_client.report.figures import draw_fidelity, draw_maps, draw_samples, svg
+from surrogym_client.report.maps import Cut
 from surrogym_client.versions import versions
 from surrogym_shared.wire import ModelView, SampleView, SurrogateView
 
@@ -39,7 +40,13 @@ FIDELITY = {
 LEDGER = ("initial", "adaptive", "manual", "total", "evaluation", "unresolved")
 
 
-def page(view: SurrogateView, models: Sequence[ModelView], samples: Sequence[SampleView], server: str) -> str:
+def page(
+    view: SurrogateView,
+    models: Sequence[ModelView],
+    samples: Sequence[SampleView],
+    server: str,
+    cuts: Sequence[Cut] = (),
+) -> str:
     """The whole page of a surrogate, HTML in one file.
 
     Args:
@@ -47,6 +54,7 @@ def page(view: SurrogateView, models: Sequence[ModelView], samples: Sequence[Sam
         models: all of them, oldest first; there may be none yet.
         samples: all of them.
         server: where it is, and of which version.
+        cuts: what the latest model says over two coordinates.
     """
     sections = [_summary(view), _spent(view)]
     if models:
@@ -54,6 +62,8 @@ def page(view: SurrogateView, models: Sequence[ModelView], samples: Sequence[Sam
     if samples:
         figure = _picture(svg(draw_samples(view, samples)), "Where the real steps began, two coordinates a picture")
         sections.insert(-2 if models else len(sections), _section("Samples", figure))
+    if cuts:
+        sections.insert(-2, _maps(view, cuts))
     specification = escape(view.spec.model_dump_json(indent=2))
     sections.append(_section("Specification", f"<details><summary>JSON</summary><pre>{specification}</pre></details>"))
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
@@ -102,6 +112,12 @@ def _fidelity(view: SurrogateView, models: Sequence[ModelView]) -> str:
     )
     alt = "Confidence index and leave-one-out error of every output against the number of real samples"
     return _section("Fidelity", _picture(svg(draw_fidelity(models, view.target)), alt) + table)
+
+
+def _maps(view: SurrogateView, cuts: Sequence[Cut]) -> str:
+    alt = "Uncertainty in tolerances, occupancy, and the index, over two coordinates a row"
+    note = "<p>The worst output; the other coordinates and the action are in the middle of their ranges.</p>"
+    return _section("Maps", _picture(svg(draw_maps(view, cuts)), alt) + note)
 
 
 def _structure(model: ModelView) -> str:

@@ -1,0 +1,70 @@
+"""What a model says over two coordinates, the others and the action in the middle of their ranges: as the server's page
+shows it, without its sliders.
+
+Shapes: S cells along a side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
+from surrogym_shared.wire import SurrogateView, Uncertainty
+
+Array = NDArray[np.float64]
+Ask = Callable[[list[list[float]], list[list[float]]], Uncertainty]  # of coordinates (n, C) and action (n, F)
+
+SIDE = 33
+
+
+@dataclass(frozen=True)
+class Cut:
+    """Over coordinates ``across`` and ``up``, by their numbers; the largest over the outputs."""
+
+    across: int
+    up: int
+    uncertainty: Array  # (S, S), in tolerances; rows go up
+    occupancy: Array  # (S, S)
+    log_index: Array  # (S, S), natural logarithm
+
+
+def pairs(spec: EnvironmentSpec) -> list[tuple[int, int]]:
+    """Numbers of coordinates to show together: each once, the last with itself where it is left over."""
+    last = len(spec.coordinates) - 1
+    return [(i, min(i + 1, last)) for i in range(0, last + 1, 2)]
+
+
+def cuts(view: SurrogateView, ask: Ask) -> list[Cut]:
+    """One for each pair of coordinates; none without a model."""
+    if view.fidelity is None:
+        return []
+    tolerances = np.array([output.tolerance for output in view.fidelity.outputs])
+    return [_cut(view.spec, across, up, tolerances, ask) for across, up in pairs(view.spec) if across != up]
+
+
+def _cut(spec: EnvironmentSpec, across: int, up: int, tolerances: Array, ask: Ask) -> Cut:
+    ends = np.array([limits(coordinate.sampling) for coordinate in spec.coordinates])
+    points = np.tile(ends.mean(1), (SIDE * SIDE, 1))
+    x, y = (np.linspace(ends[which, 0], ends[which, 1], SIDE) for which in (across, up))
+    points[:, [across, up]] = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    said = ask(points.tolist(), np.tile(_middle(spec), (len(points), 1)).tolist())
+    return Cut(
+        across,
+        up,
+        uncertainty=(np.array(said.deviation) / tolerances).max(1).reshape(SIDE, SIDE),
+        occupancy=np.array(said.input_probability)[:, 0].reshape(SIDE, SIDE),
+        log_index=np.array(said.log_uncertainty_index).max(1).reshape(SIDE, SIDE),
+    )
+
+
+def _middle(spec: EnvironmentSpec) -> Array:
+    """An action (F,): the middle of a box, the first of choices."""
+    action = spec.action
+    if not isinstance(action, BoxAction):
+        return np.zeros(action.size)
+    middle: Array = np.mean([action.low, action.high], axis=0)
+    return middle
