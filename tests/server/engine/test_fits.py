@@ -90,6 +90,18 @@ def test_closing_ends_the_process_in_the_middle_of_a_fit(started: Started, tmp_p
         time.sleep(0.01)
 
 
+def test_closing_does_not_wait_for_a_process_that_is_still_starting(started: Started):
+    """It imports for seconds where others keep the machine busy, and a stop of the server would wait for it."""
+    beginning = time.monotonic()
+    run(started(jobs.answer))
+    whole_start = time.monotonic() - beginning
+    fits = started(jobs.answer)
+    fits.start()
+    closing = time.monotonic()
+    fits.close()
+    assert time.monotonic() - closing < whole_start / 2
+
+
 def _alive(process: int) -> bool:
     try:
         os.kill(process, 0)
