@@ -20,6 +20,7 @@ from surrogym_client.train import (
     planned_steps,
     train,
 )
+from surrogym_client.training import chosen_for
 from surrogym_client.waiting import wait_for_design
 from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
@@ -52,7 +53,9 @@ def train_and_improve(
     """Learn a policy, with rounds of queries where it goes as long as the design is not ready.
 
     Each round submits the states that the policy visits from the declared starts, as a checkpoint of its own, so the
-    same seeds ask the same queries.
+    same seeds ask the same queries. The rounds move lanes by the mean: their policies go where the model promises most.
+    The last training is ``chosen_for`` what the design came to; by draws it begins anew, as a network that has learned
+    from wrong models stays with what these taught it.
 
     Args:
         api: the server.
@@ -73,7 +76,7 @@ def train_and_improve(
     visited = 0
     whole, part = shares(settings, improve.rounds)
 
-    def learn(steps: int, whole: int) -> None:
+    def learn(steps: int, whole: int, settings: TrainSettings = settings) -> None:
         now = replace(settings, total_steps=steps, start_from=out if rounds else settings.start_from)
         rounds.append(train(port, out, now, _shifted(progress, _steps(rounds) + visited, whole)))
 
@@ -89,7 +92,9 @@ def train_and_improve(
             wait_for_design(api, name, improve.patience_seconds, waiting, after_round=view.round)
         left = whole - _steps(rounds)
         left = max(left if settings.total_steps else min(planned_steps(settings), left), 1)
-        learn(left, _steps(rounds) + visited + left)
+        last = chosen_for(api.surrogate(name), settings)
+        last = replace(last, anew=last is not settings and settings.start_from is None)
+        learn(left, _steps(rounds) + visited + left, last)
     except TrainingInterrupted as interruption:
         raise TrainingInterrupted(_together([*rounds, interruption.result], visited)) from None
     except KeyboardInterrupt:

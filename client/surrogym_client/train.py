@@ -97,17 +97,24 @@ def train(
     try:
         statistics = observation_statistics(port, settings.seed)
 
-        def network(attempt: int = 0, start_from: Path | None = None) -> BaseAlgorithm:
+        def made(attempt: int, start_from: Path | None = None) -> BaseAlgorithm:
             asked = replace(settings, seed=settings.seed + ATTEMPT_SEED * attempt, start_from=start_from)
             return _learner(algorithm, wrapped, asked, spec, statistics, gamma)
 
-        learner = network()
-        total = _whole_rollouts(learner, total)
-        checks = Checks(total, progress, lambda learner: imagined_return(port, learner, settings), learner)
-        if settings.start_from is not None and checks.worth_keeping(known := network(start_from=settings.start_from)):
-            learner = known
+        untrained = made(0)
+        total = _whole_rollouts(untrained, total)
+        checks = Checks(total, progress, lambda learner: imagined_return(port, learner, settings), untrained)
+
+        def network(attempt: int) -> BaseAlgorithm:
+            """A new one; when it is its turn the saved policy, where that earns more than an untrained one."""
+            if settings.start_from is not None and attempt == int(settings.anew):
+                saved = made(0, settings.start_from)
+                if checks.worth_keeping(saved):
+                    return saved
+            return made(attempt) if attempt else untrained
+
         with tracking(settings, out) as callbacks:
-            learner, whole = _learned(learner, network, checks, callbacks)
+            learner, whole = _learned(network, checks, callbacks)
         checks.restore_best()
         out.parent.mkdir(parents=True, exist_ok=True)
         learner.save(out)
@@ -130,10 +137,11 @@ def train(
 
 
 def _learned(
-    learner: BaseAlgorithm, another: Callable[[int], BaseAlgorithm], checks: Checks, callbacks: Sequence[BaseCallback]
+    network: Callable[[int], BaseAlgorithm], checks: Checks, callbacks: Sequence[BaseCallback]
 ) -> tuple[BaseAlgorithm, bool]:
     """The network that learned last, and whether the training came to its end, and not to an interruption."""
-    for attempt in itertools.count(1):
+    for attempt in itertools.count():
+        learner = network(attempt)
         try:
             learner.learn(
                 _whole_rollouts(learner, checks.left), callback=[checks, *callbacks], reset_num_timesteps=True
@@ -142,7 +150,6 @@ def _learned(
             return learner, False
         if not checks.given_up:
             return learner, True
-        learner = another(attempt)
     raise AssertionError("unreachable")
 
 

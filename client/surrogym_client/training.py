@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from surrogym_shared.wire import SurrogateView
+
 CHECKS = 12  # of the imagined return in one training; the best policy is kept
 CHECK_EPISODES = 64
+DRAWS: dict[str, Any] = {"variant": "probabilistic", "particles": 1, "spread": 0.0}  # each step of a lane is a draw
 
 Tracker = Literal["tensorboard", "wandb", "mlflow"]
 
@@ -26,6 +29,7 @@ class TrainSettings:
     seed: int = 0
     start_box: float = 0.5
     start_from: Path | None = None  # go on from a saved policy
+    anew: bool = False  # begin with a new network, and go on from the saved policy only where that learns nothing
     threads: int = 1
     tracker: Tracker | None = None  # of Stable-Baselines3's algorithms; CMA-ES has none
     tensorboard: Path | None = (
@@ -33,6 +37,18 @@ class TrainSettings:
     )
     session: dict[str, Any] = field(default_factory=dict)
     hyperparameters: dict[str, Any] = field(default_factory=dict)
+
+
+def chosen_for(view: SurrogateView, settings: TrainSettings) -> TrainSettings:
+    """The settings for a policy that is to be used, by what its surrogate's design came to.
+
+    Where that is not ready the policy learns on draws, a state a lane (TS1 of Chua et al. 2018): what relies on the
+    mean where the model is unsure fails in the original environment. Who names a variant keeps it, and preset ``paper``
+    has AUR-D.
+    """
+    if "variant" in settings.session or view.phase == "ready" or view.spec.design.preset == "paper":
+        return settings
+    return replace(settings, session=DRAWS | settings.session)
 
 
 @dataclass(frozen=True)

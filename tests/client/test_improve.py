@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from uuid import uuid4
 
@@ -17,6 +18,7 @@ from surrogym_client.improve import ImproveSettings, shares, train_and_improve
 from surrogym_client.original.classic import pendulum
 from surrogym_client.original.gymnasium import GymnasiumEnvironment
 from surrogym_client.train import MAX_STEPS, TrainProgress, TrainSettings
+from surrogym_client.training import DRAWS, chosen_for
 from surrogym_client.transport import HttpSurrogate
 from surrogym_client.waiting import wait_for_design
 from surrogym_shared.spec import Design, EnvironmentSpec
@@ -77,9 +79,22 @@ def test_rounds_go_on_until_the_design_is_ready(
     assert view.ledger.initial == initial
     assert result.virtual_steps == 400 + rounds * VISIT, "the steps asked for are those of all trainings"
     assert result.path.exists()
+    assert result.settings["session"] == (DRAWS if rounds else {}), "only an unsure model is trained on by draws"
     steps = [now.steps for now in seen]
     assert steps == sorted(steps)
     assert all(isinstance(now, TrainProgress) and now.steps <= now.total_steps for now in seen)
+
+
+def test_who_names_a_variant_and_preset_paper_keep_it(pendulum_server: ServerProcess) -> None:
+    with Api(pendulum_server.url) as api:
+        view = api.surrogate("pendulum")
+    unsure = view.model_copy(update={"phase": "over_budget"})
+    paper = unsure.model_copy(update={"spec": view.spec.model_copy(update={"design": Design(preset="paper")})})
+    named = replace(SETTINGS, session={"variant": "deterministic", "penalty": 1.0})
+    assert chosen_for(unsure, named) is named
+    assert chosen_for(paper, SETTINGS) is SETTINGS
+    assert chosen_for(view.model_copy(update={"phase": "ready"}), SETTINGS) is SETTINGS
+    assert chosen_for(unsure, replace(SETTINGS, session={"penalty": 1.0})).session == {**DRAWS, "penalty": 1.0}
 
 
 def test_rounds_share_the_steps_that_were_asked_for() -> None:

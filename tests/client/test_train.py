@@ -239,6 +239,27 @@ def test_a_network_that_learns_nothing_is_given_up_for_another(surrogate, tmp_pa
     assert again == pytest.approx(result.imagined_return)
 
 
+@pytest.mark.parametrize(("steps", "given_up"), [(128, False), (2_000, True)], ids=["too early to say", "hopeless"])
+def test_anew_a_saved_policy_waits_until_a_new_network_is_given_up(
+    surrogate, tmp_path: Path, monkeypatch, steps, given_up
+):
+    turns, plain = [], training._learner
+
+    def seen(algorithm, env, settings, *rest):
+        turns.append(settings.start_from)
+        return plain(algorithm, env, settings, *rest)
+
+    saved, session = tmp_path / "saved.zip", {"time_limit": 4}
+    train(surrogate, saved, small(session=session, total_steps=2_000))
+    monkeypatch.setattr(training, "_learner", seen)
+    settings = small(start_from=saved, anew=True, session=session, total_steps=steps, hyperparameters=IDLE)
+    result = train(surrogate, tmp_path / "policy.zip", settings)
+    assert turns == ([None, saved] if given_up else [None])
+    if given_up:
+        earned = imagined_return(surrogate, PPO.load(saved, device="cpu"), settings)
+        assert result.imagined_return >= earned - 1e-6
+
+
 @pytest.mark.parametrize(("ours", "theirs"), [(0, 1), (1, 0)])
 def test_a_saved_policy_that_earns_no_more_than_an_untrained_one_is_not_gone_on_from(
     surrogate, tmp_path: Path, ours, theirs

@@ -63,8 +63,12 @@ def command(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of policy and virtual environment.")] = 0,
     variant: Annotated[
-        Variant, typer.Option(help="The state moves by the mean, as particles, or along a drawn function.")
-    ] = "deterministic",
+        Variant | None,
+        typer.Option(
+            help="The state moves by the mean, as particles, or along a drawn function. "
+            "[default: by the mean; at last by draws, where the design is not ready]"
+        ),
+    ] = None,
     particles: Annotated[int | None, typer.Option(min=1, help="Particles of variant probabilistic.")] = None,
     propagation: Annotated[
         Propagation | None, typer.Option(help="How a particle moves: by the mean or by a draw. [default: sample]")
@@ -267,20 +271,21 @@ def _train(
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.improve import ImproveSettings, train_and_improve
     from surrogym_client.train import train
+    from surrogym_client.training import chosen_for
     from surrogym_client.transport import Api, HttpSurrogate
     from surrogym_shared.terminal import progress
 
     with (
         HttpSurrogate(url, surrogate, token) as port,
+        Api(url, token) as api,
         progress("train", quiet=quiet) as update,
         _recording(progress_file, update) as record,
     ):
         try:
             if rounds is None:
-                return train(port, out, settings, record)
-            with Api(url, token) as api:
-                improve = ImproveSettings(*rounds)
-                return train_and_improve(api, surrogate, port, out, settings, improve, record, _waiting(update))
+                return train(port, out, chosen_for(api.surrogate(surrogate), settings), record)
+            improve = ImproveSettings(*rounds)
+            return train_and_improve(api, surrogate, port, out, settings, improve, record, _waiting(update))
         except ValueError as error:
             raise CommandError(str(error)) from error
 
