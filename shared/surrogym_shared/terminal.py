@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -55,7 +56,25 @@ def _screen() -> Iterator[Callable[[str], None]]:
     from rich.text import Text
 
     with Live(auto_refresh=False) as live:
-        yield lambda text: live.update(Text(text), refresh=True)
+
+        def draw(text: str) -> None:
+            with _interrupt_afterwards():
+                live.update(Text(text), refresh=True)
+
+        yield draw
+
+
+@contextmanager
+def _interrupt_afterwards() -> Iterator[None]:
+    """Let Ctrl-C wait for the end of what is within: half a drawing would be drawn again below itself."""
+    came: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if came:
+        raise KeyboardInterrupt
 
 
 @contextmanager
