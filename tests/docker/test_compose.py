@@ -58,6 +58,17 @@ def test_the_sampler_carries_no_torch() -> None:
     assert not [line for line in whole("sampler") if "torch" in line]
 
 
+def test_torch_is_its_cpu_build_unless_a_build_argument_says_cuda() -> None:
+    assert "ARG TORCH=cpu" in whole("torch")
+    assert all(service["build"]["args"]["TORCH"] == "${TORCH:-cpu}" for service in BUILT.values())
+    (choice,) = [line for line in whole("torch") if "torch.version.cuda" in line]
+    cpu, cuda, other, _ = choice.split(";;")
+    assert "--extra-index-url" in cpu
+    assert "torch.version.cuda is None" in cpu
+    assert "--extra-index-url" not in cuda
+    assert "exit 1" in other
+
+
 def test_every_install_is_pinned_and_no_image_keeps_a_cache() -> None:
     installs = [line for line in DOCKERFILE.splitlines() if "pip install" in line]
     assert installs
