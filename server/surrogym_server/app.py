@@ -164,8 +164,8 @@ def _build_services(
 ) -> tuple[Services, Sweeper]:
     definitions = Definitions(storage, _define)
     cache = ModelCache(
-        load=lambda name, version: load_model(storage, definitions, name, version),
-        newest=lambda name: storage.models.get(name).version,
+        load=lambda surrogate, version: load_model(storage, definitions, surrogate, version),
+        newest=storage.models.newest,
     )
     designer = Designer(
         storage,
@@ -191,7 +191,7 @@ def _build_services(
         events=EventService(storage, engine.notices),
         storage=storage,
     )
-    return services, Sweeper(storage, engine.live, settings.sweep_seconds, counts)
+    return services, Sweeper(storage, engine.live, cache, settings.sweep_seconds, counts)
 
 
 def _define(spec: dict[str, Any]) -> EnvironmentDefinition:

@@ -1,11 +1,15 @@
-"""Loaded models by surrogate and version, the most recently used ones kept."""
+"""Loaded models by surrogate and version, the most recently used ones kept.
+
+A surrogate is known by its id: a name may be deleted and given anew, here or by another server of the database.
+"""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from threading import Lock
 
+from surrogym_server.errors import NoModel
 from surrogym_server.surrogate.model import SurrogateModel
 
 CAPACITY = 64
@@ -16,24 +20,24 @@ class ModelCache:
 
     def __init__(
         self,
-        load: Callable[[str, int], SurrogateModel],
-        newest: Callable[[str], int],
+        load: Callable[[int, int], SurrogateModel],
+        newest: Callable[[], Mapping[int, int]],
         capacity: int = CAPACITY,
     ) -> None:
         """
         Args:
-            load: the model of a surrogate's version; raises ``UnknownModel``.
-            newest: the newest version of a surrogate; raises ``NoModel``.
+            load: the model of a surrogate's version; raises ``UnknownModel`` or ``UnknownSurrogate``.
+            newest: the newest stored version of each surrogate that has any.
             capacity: how many models are kept.
         """
         self._load = load
         self._newest = newest
         self._capacity = capacity
-        self._models: OrderedDict[tuple[str, int], SurrogateModel] = OrderedDict()
-        self._latest: dict[str, int] = {}
+        self._models: OrderedDict[tuple[int, int], SurrogateModel] = OrderedDict()
+        self._latest: dict[int, int] = {}
         self._lock = Lock()
 
-    def get(self, surrogate: str, version: int) -> SurrogateModel:
+    def get(self, surrogate: int, version: int) -> SurrogateModel:
         """The model of a version. Raises ``UnknownModel`` or ``UnknownSurrogate``."""
         with self._lock:
             if model := self._models.get((surrogate, version)):
@@ -43,28 +47,51 @@ class ModelCache:
         self._keep(surrogate, version, model)
         return model
 
-    def latest(self, surrogate: str) -> int:
-        """The newest version. Raises ``NoModel`` or ``UnknownSurrogate``."""
+    def latest(self, surrogate: int) -> int:
+        """The newest version that is known here. Raises ``NoModel`` or ``UnknownSurrogate``."""
         with self._lock:
             if version := self._latest.get(surrogate):
                 return version
-        return self.publish(surrogate, self._newest(surrogate))
+        return self.refresh(surrogate)
 
-    def publish(self, surrogate: str, version: int) -> int:
+    def refresh(self, surrogate: int) -> int:
+        """The newest version that is stored, another server's too. Raises ``NoModel`` or ``UnknownSurrogate``."""
+        version = self._newest().get(surrogate)
+        if version is None:
+            raise NoModel("expected a surrogate with a model, but nothing has been fitted yet")
+        return self.publish(surrogate, version)
+
+    def look(self) -> list[int]:
+        """Publish what other servers have stored of the surrogates that are in use here, and forget those that are
+        gone; returns the latter."""
+        with self._lock:
+            known = list(self._latest.items())
+        if not known:
+            return []
+        newest = self._newest()
+        gone = [surrogate for surrogate, _ in known if surrogate not in newest]
+        for surrogate in gone:
+            self.forget(surrogate)
+        for surrogate, version in known:
+            if newest.get(surrogate, version) > version:
+                self.publish(surrogate, newest[surrogate])
+        return gone
+
+    def publish(self, surrogate: int, version: int) -> int:
         """Let lanes move to a version when they reset, unless a newer one is known; returns the newest."""
         self.get(surrogate, version)
         with self._lock:
             self._latest[surrogate] = max(version, self._latest.get(surrogate, 0))
             return self._latest[surrogate]
 
-    def forget(self, surrogate: str) -> None:
+    def forget(self, surrogate: int) -> None:
         """Drop all of a surrogate that was deleted."""
         with self._lock:
             self._latest.pop(surrogate, None)
             for key in [key for key in self._models if key[0] == surrogate]:
                 del self._models[key]
 
-    def _keep(self, surrogate: str, version: int, model: SurrogateModel) -> None:
+    def _keep(self, surrogate: int, version: int, model: SurrogateModel) -> None:
         with self._lock:
             self._models[surrogate, version] = model
             while len(self._models) > self._capacity:

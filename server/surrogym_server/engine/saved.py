@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from surrogym_server.engine.occupancy import Reservoir
 from surrogym_server.engine.session import Answer, Fingerprint, Outcome, Session
-from surrogym_server.errors import InvalidInput
+from surrogym_server.errors import InvalidInput, UnknownSession
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.virtual import LaneState, VirtualSettings
 from surrogym_shared.port import ResetResult, StepResult
@@ -29,6 +29,7 @@ def session_to_bytes(session: Session) -> bytes:
         "format": FORMAT,
         "id": session.id,
         "surrogate": session.surrogate,
+        "surrogate_id": session.surrogate_id,
         "settings": asdict(session.settings),
         "seed": session.seed,
         "model": session.model,
@@ -47,11 +48,17 @@ def session_to_bytes(session: Session) -> bytes:
     return buffer.getvalue()
 
 
-def session_from_bytes(definition: EnvironmentDefinition, data: bytes) -> Session:
+def session_from_bytes(definition: EnvironmentDefinition, data: bytes, surrogate_id: int = 0) -> Session:
     """The session that ``session_to_bytes`` saved; its next step is bit-identical.
+
+    Args:
+        definition: of its surrogate.
+        data: what was saved.
+        surrogate_id: of the surrogate that has its surrogate's name now.
 
     Raises:
         InvalidInput: saved by another version of this program.
+        UnknownSession: its surrogate was deleted, and another one has its name.
     """
     with np.load(io.BytesIO(data), allow_pickle=False) as file:
         arrays: Arrays = {name: file[name] for name in file.files}
@@ -60,6 +67,8 @@ def session_from_bytes(definition: EnvironmentDefinition, data: bytes) -> Sessio
         arrays["lanes/path"] = np.zeros((len(arrays["versions"]), 0))
     elif header["format"] != FORMAT:
         raise InvalidInput(f"expected a session saved in format {FORMAT}, got {header['format']}")
+    if header.get("surrogate_id", surrogate_id) != surrogate_id:
+        raise UnknownSession(f"the surrogate of session {header['id']!r} was deleted")
     opened_by = header["opened_by"]
     return Session(
         id=header["id"],
@@ -73,6 +82,7 @@ def session_from_bytes(definition: EnvironmentDefinition, data: bytes) -> Sessio
         answer=_answer(header, arrays),
         visited=_visited(header, arrays),
         opened_by=None if opened_by is None else (opened_by[0], opened_by[1]),
+        surrogate_id=surrogate_id,
     )
 
 

@@ -83,6 +83,7 @@ class Session:
     answer: Answer | None = None
     visited: Reservoir | None = None
     opened_by: tuple[str, str] | None = None  # idempotency key and digest of the opening
+    surrogate_id: int = 0  # in storage, where there is one
 
     @property
     def nbytes(self) -> int:
@@ -112,6 +113,7 @@ def open_session(
     version: int,
     occupancy: bool,
     opened_by: tuple[str, str] | None = None,
+    surrogate_id: int = 0,
 ) -> Session:
     """A session whose lanes are not reset yet, all under one model version."""
     return Session(
@@ -125,6 +127,7 @@ def open_session(
         versions=np.full(settings.num_envs, version, dtype=np.int64),
         visited=Reservoir(seed) if occupancy else None,
         opened_by=opened_by,
+        surrogate_id=surrogate_id,
     )
 
 

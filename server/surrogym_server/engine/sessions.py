@@ -172,10 +172,10 @@ class LiveSessions:
         """End a session; harmless when it has ended."""
         self._live.pop(id, None)
 
-    def close_all_of(self, surrogate: str) -> None:
-        """End the sessions of a surrogate."""
+    def close_all_of(self, surrogate: int) -> None:
+        """End the sessions of a surrogate, by its id."""
         for session in self:
-            if session.surrogate == surrogate:
+            if session.surrogate_id == surrogate:
                 self.close(session.id)
 
     def sweep(self) -> list[str]:

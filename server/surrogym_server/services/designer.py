@@ -29,6 +29,7 @@ logger = logging.getLogger(__name__)
 
 FIT_LEASE_SECONDS = 30.0
 RENEWALS_PER_LEASE = 3
+ATTEMPTS = 5  # of a fit whose process is killed, or whose result can't be stored
 
 
 class FitRunner(Protocol):
@@ -72,6 +73,7 @@ class Designer:
         self._owner = owner
         self._threads = threads
         self._look_seconds = look_seconds
+        self._unavailable: dict[str, int] = {}  # fits in a row that had no process, or no storage, by surrogate
 
     async def run(self) -> None:
         """Fit what is due, for ever; ends by cancellation, and what was being fitted stays due."""
@@ -117,16 +119,25 @@ class Designer:
             result = await self._fits.run(await asyncio.to_thread(self._job, lease))
             await asyncio.to_thread(self._commit, lease, result)
             self._counts.fits.observe(result.seconds)
+            self._unavailable.pop(name, None)
         except asyncio.CancelledError:
             self._abort(lease, None)
             raise
         except Exception as error:
             self._counts.failed_fits += 1
-            logger.warning("the fit of %s failed", name, exc_info=not isinstance(error, SurrogymError))
-            await asyncio.to_thread(self._abort, lease, f"the fit failed: {error}")
+            logger.warning("the fit of %s failed: %s", name, error, exc_info=not isinstance(error, SurrogymError))
+            again = isinstance(error, Unavailable) and self._may_try_again(name)
+            await asyncio.to_thread(self._abort, lease, None if again else f"the fit failed: {error}")
         finally:
             keeper.cancel()
             self._notices.post(name)
+
+    def _may_try_again(self, name: str) -> bool:
+        """Whether a fit that could not be done now stays due; it does for so many attempts in a row."""
+        attempts = self._unavailable.pop(name, 0) + 1
+        if attempts < ATTEMPTS:
+            self._unavailable[name] = attempts
+        return attempts < ATTEMPTS
 
     async def _keep(self, lease: FitLease) -> None:
         while True:
@@ -175,8 +186,9 @@ class Designer:
             query_action=result.query_action,
             query_rollouts=result.query_rollouts,
         )
+        surrogate = self._storage.surrogates.get(lease.surrogate).id
         version = self._storage.designs.commit(lease, design)
-        self._models.publish(lease.surrogate, version)
+        self._models.publish(surrogate, version)
 
     def _abort(self, lease: FitLease, error: str | None) -> None:
         with suppress(SurrogymError):

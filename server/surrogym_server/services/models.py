@@ -34,8 +34,9 @@ class Said(Generic[T]):
     result: T
 
 
-def load_model(storage: Storage, definitions: Definitions, name: str, version: int) -> SurrogateModel:
-    """A stored model, ready to predict. Raises ``UnknownModel`` or ``UnknownSurrogate``."""
+def load_model(storage: Storage, definitions: Definitions, surrogate: int, version: int) -> SurrogateModel:
+    """A stored model of a surrogate's id, ready to predict. Raises ``UnknownModel`` or ``UnknownSurrogate``."""
+    name = storage.surrogates.name_of(surrogate)
     return from_bytes(definitions.get(name), storage.models.blob(name, version))
 
 
@@ -76,7 +77,7 @@ class ModelService:
             blob=data,
         )
         version = self._storage.models.add(name, new)
-        self._models.publish(name, version)
+        self._models.publish(record.id, version)
         self._notices.post(name)
         return self._storage.models.get(name, version)
 
@@ -109,6 +110,6 @@ class ModelService:
         return Said(version, model.definition.outputs, imagine(model, start, actions, draws=draws, seed=seed))
 
     def _model(self, name: str, version: int | None) -> tuple[int, SurrogateModel]:
-        self._storage.surrogates.get(name)
-        version = self._models.latest(name) if version is None else version
-        return version, self._models.get(name, version)
+        surrogate = self._storage.surrogates.get(name).id
+        version = self._models.refresh(surrogate) if version is None else version
+        return version, self._models.get(surrogate, version)

@@ -208,8 +208,8 @@ class SessionService:
         restored = 0
         for saved in self._storage.sessions.take():
             try:
-                definition = self._definitions.get(saved.surrogate)
-                self._live.add(session_from_bytes(definition, saved.data))
+                surrogate = self._storage.surrogates.get(saved.surrogate).id
+                self._live.add(session_from_bytes(self._definitions.get(saved.surrogate), saved.data, surrogate))
             except SurrogymError:
                 continue
             restored += 1
@@ -233,15 +233,17 @@ class SessionService:
             raise TooLarge(f"expected at most {MAX_PATHWISE_LANES} lanes of variant pathwise, got {settings.num_envs}")
 
     def _expected_bytes(self, surrogate: str, opening: Opening) -> int:
-        version = self._models.latest(surrogate) if opening.model == "latest" else opening.model
-        model = self._models.get(surrogate, version)
+        id = self._storage.surrogates.get(surrogate).id
+        version = self._models.refresh(id) if opening.model == "latest" else opening.model
+        model = self._models.get(id, version)
         return expected_bytes(self._definitions.get(surrogate), opening.settings, model.path_size)
 
     def _open(self, surrogate: str, opening: Opening, digest: str) -> Session:
         definition = self._definitions.get(surrogate)
-        latest = self._models.latest(surrogate)
+        id = self._storage.surrogates.get(surrogate).id
+        latest = self._models.refresh(id)
         version = latest if opening.model == "latest" else opening.model
-        self._models.get(surrogate, version)
+        self._models.get(id, version)
         return open_session(
             secrets.token_urlsafe(SESSION_ID_BYTES),
             surrogate,
@@ -252,6 +254,7 @@ class SessionService:
             version=version,
             occupancy=opening.occupancy,
             opened_by=None if opening.key is None else (opening.key, digest),
+            surrogate_id=id,
         )
 
     def _step(self, session: Session, u: Array, mask: Bools | None, deviations: bool) -> tuple[Session, Any]:
@@ -260,12 +263,12 @@ class SessionService:
             u,
             mask,
             deviations,
-            lambda version: self._models.get(session.surrogate, version),
+            lambda version: self._models.get(session.surrogate_id, version),
             self._latest(session),
         )
 
     def _latest(self, session: Session) -> int:
-        return self._models.latest(session.surrogate) if session.model == "latest" else session.model
+        return self._models.latest(session.surrogate_id) if session.model == "latest" else session.model
 
 
 def _columns(action: Array, dimensions: int) -> Array:

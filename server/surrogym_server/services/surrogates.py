@@ -136,9 +136,10 @@ class SurrogateService:
 
     async def delete(self, name: str) -> None:
         """Remove a surrogate with its samples, models and sessions; raises ``UnknownSurrogate``."""
+        surrogate = await asyncio.to_thread(lambda: self._storage.surrogates.get(name).id)
         await asyncio.to_thread(self._storage.surrogates.delete, name)
-        self._live.close_all_of(name)
-        self._models.forget(name)
+        self._live.close_all_of(surrogate)
+        self._models.forget(surrogate)
         self._notices.post(name)
 
     def _status(self, record: SurrogateRecord) -> SurrogateStatus:

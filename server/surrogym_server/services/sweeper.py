@@ -1,10 +1,11 @@
-"""The sweeper: ends the leases and the sessions whose time has come."""
+"""The sweeper: ends the leases and the sessions whose time has come, and sees what other servers have stored."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 
+from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import LiveSessions
 from surrogym_server.errors import SurrogymError
 from surrogym_server.services.counts import Counts
@@ -14,9 +15,12 @@ logger = logging.getLogger(__name__)
 
 
 class Sweeper:
-    def __init__(self, storage: Storage, live: LiveSessions, seconds: float, counts: Counts) -> None:
+    def __init__(
+        self, storage: Storage, live: LiveSessions, models: ModelCache, seconds: float, counts: Counts
+    ) -> None:
         self._storage = storage
         self._live = live
+        self._models = models
         self._seconds = seconds
         self._counts = counts
 
@@ -33,5 +37,7 @@ class Sweeper:
             logger.info("session %s was idle and has expired", id)
         try:
             self._counts.expired_leases += await asyncio.to_thread(self._storage.queries.sweep_expired)
+            for surrogate in await asyncio.to_thread(self._models.look):
+                self._live.close_all_of(surrogate)
         except SurrogymError as error:
             logger.warning("leases were not swept: %s", error)

@@ -57,6 +57,10 @@ class Surrogates(ABC):
     def get(self, name: str) -> SurrogateRecord: ...
 
     @abstractmethod
+    def name_of(self, id: int) -> str:
+        """Raises ``UnknownSurrogate`` when it was deleted."""
+
+    @abstractmethod
     def list(self) -> list[SurrogateRecord]:
         """All of them, oldest first."""
 
@@ -246,6 +250,10 @@ class Models(ABC):
     @abstractmethod
     def get(self, name: str, version: int | None = None) -> ModelRecord:
         """Raises ``UnknownModel`` for a version that is not there, ``NoModel`` when there is none at all."""
+
+    @abstractmethod
+    def newest(self) -> dict[int, int]:
+        """The newest version of each surrogate that has a model, by the surrogate's id."""
 
     @abstractmethod
     def blob(self, name: str, version: int | None = None) -> bytes:

@@ -50,6 +50,7 @@ class NewSurrogate:
 
 @dataclass(frozen=True)
 class SurrogateRecord:
+    id: int  # never used twice, unlike a name
     name: str
     spec: JSON
     budget: int

@@ -9,22 +9,19 @@ import pytest
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.errors import NoModel
 
+A, NOBODY = 7, 8
+
 
 class Store:
-    """Versions by surrogate; a model is its own name."""
+    """Newest versions by surrogate; a model is its own name."""
 
     def __init__(self) -> None:
-        self.newest = {"a": 1}
-        self.loaded: list[tuple[str, int]] = []
+        self.newest = {A: 1}
+        self.loaded: list[tuple[int, int]] = []
 
-    def load(self, name: str, version: int) -> Any:
-        self.loaded.append((name, version))
-        return f"{name}{version}"
-
-    def latest(self, name: str) -> int:
-        if name not in self.newest:
-            raise NoModel("none yet")
-        return self.newest[name]
+    def load(self, surrogate: int, version: int) -> Any:
+        self.loaded.append((surrogate, version))
+        return f"{surrogate} {version}"
 
 
 @pytest.fixture
@@ -34,36 +31,53 @@ def store() -> Store:
 
 @pytest.fixture
 def cache(store: Store) -> ModelCache:
-    return ModelCache(store.load, store.latest, capacity=2)
+    return ModelCache(store.load, lambda: store.newest, capacity=2)
 
 
 def test_a_model_is_loaded_once(cache: ModelCache, store: Store):
-    assert [cast(str, cache.get("a", 1)) for _ in range(3)] == ["a1"] * 3
-    assert store.loaded == [("a", 1)]
+    assert [cast(str, cache.get(A, 1)) for _ in range(3)] == [f"{A} 1"] * 3
+    assert store.loaded == [(A, 1)]
 
 
 def test_the_least_recently_used_is_dropped(cache: ModelCache, store: Store):
     for version in (1, 2, 1, 3, 1, 2):
-        cache.get("a", version)
-    assert store.loaded == [("a", 1), ("a", 2), ("a", 3), ("a", 2)]
+        cache.get(A, version)
+    assert store.loaded == [(A, 1), (A, 2), (A, 3), (A, 2)]
 
 
 def test_what_is_published_is_the_newest_and_loaded_already(cache: ModelCache, store: Store):
-    assert cache.latest("a") == 1
-    cache.publish("a", 2)
-    assert (cache.latest("a"), store.loaded) == (2, [("a", 1), ("a", 2)])
-    cache.publish("a", 1)
-    assert cache.latest("a") == 2, "an older one that comes late changes nothing"
+    assert cache.latest(A) == 1
+    cache.publish(A, 2)
+    assert (cache.latest(A), store.loaded) == (2, [(A, 1), (A, 2)])
+    cache.publish(A, 1)
+    assert cache.latest(A) == 2, "an older one that comes late changes nothing"
 
 
 def test_there_may_be_none(cache: ModelCache):
     with pytest.raises(NoModel):
-        cache.latest("nobody")
+        cache.latest(NOBODY)
 
 
 def test_a_deleted_surrogate_begins_again(cache: ModelCache, store: Store):
-    cache.publish("a", 5)
-    cache.forget("a")
+    cache.publish(A, 5)
+    cache.forget(A)
     store.loaded.clear()
-    assert cache.latest("a") == 1
-    assert store.loaded == [("a", 1)]
+    assert cache.latest(A) == 1
+    assert store.loaded == [(A, 1)]
+
+
+def test_what_another_server_stores_is_seen(cache: ModelCache, store: Store):
+    assert cache.latest(A) == 1
+    store.newest[A] = 2
+    assert (cache.latest(A), cache.refresh(A), cache.latest(A)) == (1, 2, 2), "when it is asked for"
+    store.newest[A] = 3
+    assert (cache.look(), cache.latest(A)) == ([], 3), "and when somebody looks"
+
+
+def test_a_surrogate_that_another_server_has_deleted_is_gone(cache: ModelCache, store: Store):
+    cache.latest(A)
+    del store.newest[A]
+    assert cache.look() == [A]
+    with pytest.raises(NoModel):
+        cache.latest(A)
+    assert cache.look() == []

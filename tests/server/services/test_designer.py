@@ -12,10 +12,10 @@ import pytest
 from support import pendulum
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.errors import InvalidInput, NumericalFailure
+from surrogym_server.errors import InvalidInput, NumericalFailure, Unavailable
 from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
-from surrogym_server.services.designer import Designer, phase_after
+from surrogym_server.services.designer import ATTEMPTS, Designer, phase_after
 from surrogym_server.services.models import load_model
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
@@ -53,8 +53,7 @@ def runner() -> Runner:
 @pytest.fixture
 def cache(storage: Storage, definitions: Definitions) -> ModelCache:
     return ModelCache(
-        lambda name, version: load_model(storage, definitions, name, version),
-        lambda name: storage.models.get(name).version,
+        lambda surrogate, version: load_model(storage, definitions, surrogate, version), storage.models.newest
     )
 
 
@@ -68,6 +67,18 @@ def designer(storage: Storage, definitions: Definitions, cache: ModelCache, runn
         )
 
     return make
+
+
+def designer_of(designer: Callable[[], Designer]) -> Callable[[int], None]:
+    """Lets one designer look for what is due so many times."""
+    made: list[Designer] = []
+
+    async def run(times: int) -> None:
+        made.append(made[-1] if made else designer())
+        for _ in range(times):
+            await made[-1].fit_all_due()
+
+    return lambda times: asyncio.run(run(times))
 
 
 def fit_all(designer: Callable[[], Designer]) -> None:
@@ -90,7 +101,7 @@ def test_a_fit_leaves_a_model_and_the_next_queries(answered: Storage, designer, 
     adaptive = answered.queries.list(NAME, ("pending",))
     assert 1 <= len(adaptive) <= pendulum.BUDGET - pendulum.INITIAL
     assert {query.purpose for query in adaptive} == {"adaptive"}
-    assert cache.latest(NAME) == 1
+    assert cache.latest(answered.surrogates.get(NAME).id) == 1
     assert answered.models.get(NAME).samples == pendulum.INITIAL
 
 
@@ -127,6 +138,43 @@ def test_an_error_nobody_thought_of_fails_the_design_and_not_the_designer(answer
     runner.function = refuse(ZeroDivisionError("surprise"))
     fit_all(designer)
     assert answered.surrogates.get(NAME).error == "the fit failed: surprise"
+
+
+def test_a_fit_whose_process_is_killed_is_tried_again(answered: Storage, designer, runner: Runner):
+    made = designer_of(designer)
+    runner.function = refuse(Unavailable("the process that fits died twice"))
+    made(ATTEMPTS - 1)
+    record = answered.surrogates.get(NAME)
+    assert (record.phase, record.error) == ("collecting", None)
+    runner.function = run_design_job
+    made(1)
+    assert answered.surrogates.get(NAME).phase == "sampling"
+    assert len(runner.jobs) == ATTEMPTS
+
+
+def test_a_fit_that_is_always_killed_ends_with_its_error(answered: Storage, designer, runner: Runner):
+    made = designer_of(designer)
+    runner.function = refuse(Unavailable("the process that fits died twice"))
+    made(ATTEMPTS + 3)
+    record = answered.surrogates.get(NAME)
+    assert (record.phase, record.error) == ("failed", "the fit failed: the process that fits died twice")
+    assert len(runner.jobs) == ATTEMPTS
+    answered.surrogates.change(NAME, paused=False)
+    made(1)
+    assert (answered.surrogates.get(NAME).phase, len(runner.jobs)) == ("collecting", ATTEMPTS + 1), "it counts anew"
+
+
+def test_a_storage_that_is_away_when_a_fit_is_done_has_it_done_again(answered: Storage, designer, runner, monkeypatch):
+    def away(*_: object) -> int:
+        raise Unavailable("the database can't be used now")
+
+    made = designer_of(designer)
+    with monkeypatch.context() as patched:
+        patched.setattr(answered.designs, "commit", away)
+        made(1)
+    assert answered.surrogates.get(NAME).error is None
+    made(1)
+    assert answered.surrogates.get(NAME).phase == "sampling"
 
 
 def test_a_fit_that_a_shutdown_cuts_short_stays_due(answered: Storage, designer, runner: Runner):

@@ -9,7 +9,7 @@ import pytest
 
 from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.records import NewSurrogate
+from surrogym_server.storage.records import NewDesign, NewSurrogate
 
 
 def test_a_new_surrogate_is_collecting_with_its_initial_queries(storage: Storage, make: Callable[..., str]) -> None:
@@ -35,6 +35,25 @@ def test_a_name_that_is_taken_keeps_its_spec(storage: Storage) -> None:
     first, _ = storage.surrogates.create(NewSurrogate("a", {"x": 1}, 30, 0.9))
     assert storage.surrogates.create(NewSurrogate("a", {"x": 2}, 30, 0.9)) == (first, False)
     assert storage.surrogates.get("a").spec == {"x": 1}
+
+
+def test_a_name_given_anew_is_another_surrogate(
+    storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None], design: Callable[..., NewDesign]
+) -> None:
+    name = make()
+    before = storage.surrogates.get(name).id
+    assert (storage.surrogates.name_of(before), storage.models.newest()) == (name, {})
+    answer_all(name)
+    lease = storage.designs.begin(name, "server", 60.0)
+    assert lease is not None
+    storage.designs.commit(lease, design())
+    assert storage.models.newest() == {before: 1}
+    storage.surrogates.delete(name)
+    assert storage.models.newest() == {}
+    with pytest.raises(UnknownSurrogate):
+        storage.surrogates.name_of(before)
+    make()
+    assert storage.surrogates.get(name).id > before
 
 
 def test_surrogates_are_listed_in_order_of_creation(storage: Storage, make: Callable[..., str]) -> None:

@@ -34,6 +34,11 @@ class SqlModels(port.Models):
         with self._database.read() as connection:
             return ModelRecord(**_one(connection, name, version, *COLUMNS)._mapping)
 
+    def newest(self) -> dict[int, int]:
+        with self._database.read() as connection:
+            wanted = sa.select(models.c.surrogate_id, sa.func.max(models.c.version)).group_by(models.c.surrogate_id)
+            return {int(surrogate): int(version) for surrogate, version in connection.execute(wanted)}
+
     def blob(self, name: str, version: int | None = None) -> bytes:
         with self._database.read() as connection:
             return bytes(_one(connection, name, version, models.c.blob).blob)

@@ -7,6 +7,7 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
+from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage import port
 from surrogym_server.storage.records import NewSurrogate, Phase, SurrogateRecord
 from surrogym_server.storage.sql.database import Database, clock, conflict_insert
@@ -16,7 +17,7 @@ from surrogym_server.storage.sql.tables import surrogates
 COLUMNS = [
     getattr(surrogates.c, name)
     for name in (
-        *("name", "spec", "budget", "target", "tolerances", "phase", "paused", "round", "state", "error"),
+        *("id", "name", "spec", "budget", "target", "tolerances", "phase", "paused", "round", "state", "error"),
         *("extra_queries", "checkpoint", "created_at"),
     )
 ]
@@ -38,6 +39,13 @@ class SqlSurrogates(port.Surrogates):
     def get(self, name: str) -> SurrogateRecord:
         with self._database.read() as connection:
             return read(connection, name)
+
+    def name_of(self, id: int) -> str:
+        with self._database.read() as connection:
+            name = connection.execute(sa.select(surrogates.c.name).where(surrogates.c.id == id)).scalar()
+        if name is None:
+            raise UnknownSurrogate("expected a surrogate that is there, got one that was deleted")
+        return str(name)
 
     def list(self) -> list[SurrogateRecord]:
         with self._database.read() as connection:
