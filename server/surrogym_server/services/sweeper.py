@@ -31,7 +31,8 @@ class Sweeper:
             await asyncio.sleep(self._seconds)
 
     async def sweep(self) -> None:
-        """Sweep once. A lease that ends here leaves its query to the next sampler, or sets it aside."""
+        """Sweep once. A lease that ends here leaves its query to the next sampler, or sets it aside; a session whose
+        surrogate another server has deleted ends."""
         for id in self._live.sweep():
             self._counts.expired_sessions += 1
             logger.info("session %s was idle and has expired", id)
@@ -40,4 +41,6 @@ class Sweeper:
             for surrogate in await asyncio.to_thread(self._models.look):
                 self._live.close_all_of(surrogate)
         except SurrogymError as error:
-            logger.warning("leases were not swept: %s", error)
+            logger.warning("a sweep was cut short, the next one follows: %s", error)
+        except Exception:  # leases must go on to end, whatever one sweep meets
+            logger.exception("a sweep failed; the next one follows")
