@@ -3,7 +3,7 @@
 surrogym register drone:Drone --name drone --budget 60
 surrogym sample drone --env drone:Drone --until-done
 surrogym train drone --out drone.zip
-surrogym evaluate drone.zip --env drone:Drone --episodes 20
+surrogym evaluate drone.zip --env drone:Drone --first-seed 20000
 """
 
 import math

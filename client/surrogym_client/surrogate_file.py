@@ -19,6 +19,7 @@ from surrogym_shared.wire import NewSample, SurrogateView
 
 ENTRY_POINTS = "surrogym.ports"  # what steps a surrogate in this process, brought by the server's package
 BATCH = 1_024  # samples in a request
+PURPOSES = ("initial", "adaptive", "manual", "evaluation")
 
 
 class NotImportable(SurrogymClientError):
@@ -32,15 +33,24 @@ def export_surrogate(api: Api, name: str) -> SurrogateFile:
         NoModel: nothing has been fitted yet.
         SurrogymClientError: as every request.
     """
-    latest = api.model(name)
-    return SurrogateFile(name, api.surrogate(name).spec, api.export_model(name, latest.version), _samples(api, name))
+    latest, view = api.model(name), api.surrogate(name)
+    return SurrogateFile(
+        name,
+        view.spec,
+        api.export_model(name, latest.version),
+        _samples(api, name),
+        tolerances={output.name: output.tolerance for output in latest.fidelity.outputs},
+        ledger=view.ledger.model_dump(include=set(PURPOSES)),
+    )
 
 
 def import_surrogate(
     api: Api, file: SurrogateFile, name: str | None = None, progress: Callable[[float], None] = lambda _: None
 ) -> SurrogateView:
-    """Make a surrogate of a file: it serves the same model at once. Its design is paused, and its samples count as
-    manual ones. Where anything fails, or Ctrl-C is pressed, nothing of it stays.
+    """Make a surrogate of a file: it serves the same model at once, judged by the same tolerances.
+
+    Its design is paused, and its samples count as manual ones. Where anything fails, or Ctrl-C is pressed, nothing of
+    it stays.
 
     Args:
         api: the server; needs the role admin.
@@ -61,7 +71,7 @@ def import_surrogate(
     else:
         raise NotImportable(f"expected a name that is free, got {name!r}: give another by --name")
     try:
-        api.patch_surrogate(name, paused=True)
+        api.patch_surrogate(name, paused=True, tolerances=file.tolerances or None)
         api.import_model(name, file.model)
         samples = [_sample(file.samples, i) for i in range(len(file.samples))]
         for first in range(0, len(samples), BATCH):

@@ -2,8 +2,8 @@
 
 The file is safetensors: eight bytes with the length of a JSON header, the header, then arrays as raw bytes. The model's
 arrays and its own metadata stand as the server exports them; beside them are ``samples.*`` arrays and, as metadata
-``surrogate``, format, name and specification. So any reader of safetensors opens it, and the server's reader of models
-takes what ``model`` gives back.
+``surrogate``, format, name, specification, tolerances and ledger. So any reader of safetensors opens it, and the
+server's reader of models takes what ``model`` gives back.
 
 Shapes: n samples, C coordinates, F action entries.
 """
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
@@ -69,6 +69,8 @@ class SurrogateFile:
     spec: EnvironmentSpec
     model: bytes
     samples: RealSamples
+    tolerances: dict[str, float] = field(default_factory=dict)  # by output, as the model was judged
+    ledger: dict[str, int] = field(default_factory=dict)  # real steps by purpose, where it comes from
 
     def to_bytes(self) -> bytes:
         """The whole as one file. Raises ``NotASurrogateFile`` where ``model`` is no safetensors file."""
@@ -80,7 +82,13 @@ class SurrogateFile:
             raw, start = np.ascontiguousarray(array, DTYPES[kind]).tobytes(), sum(map(len, parts))
             header[name] = {"dtype": kind, "shape": list(array.shape), "data_offsets": [start, start + len(raw)]}
             parts.append(raw)
-        own = {"format": FORMAT, "name": self.name, "spec": self.spec.model_dump(mode="json")}
+        own = {
+            "format": FORMAT,
+            "name": self.name,
+            "spec": self.spec.model_dump(mode="json"),
+            "tolerances": self.tolerances,
+            "ledger": self.ledger,
+        }
         header[METADATA] = header.get(METADATA, {}) | {OWN: json.dumps(own)}
         return _joined(header, b"".join(parts))
 
@@ -104,6 +112,8 @@ class SurrogateFile:
             end = min(entry["data_offsets"][0] for entry in entries.values())
             model = _joined(header, body[:end])
             name = str(own["name"])
+            tolerances = {str(output): float(value) for output, value in own.get("tolerances", {}).items()}
+            ledger = {str(purpose): int(steps) for purpose, steps in own.get("ledger", {}).items()}
         except NotASurrogateFile:
             raise
         except ValidationError as error:
@@ -113,7 +123,7 @@ class SurrogateFile:
         except UNREADABLE as error:
             raise NotASurrogateFile(f"expected a surrogate's file, got {len(data)} bytes: {error!r}") from error
         _require_shapes(spec, samples)
-        return cls(name, spec, model, samples)
+        return cls(name, spec, model, samples, tolerances, ledger)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -13,6 +15,7 @@ from typing import Any
 import typer
 
 PLAIN_SECONDS = 5.0  # between lines of progress where no bar can be drawn
+FIRST_SECONDS = 2.0  # before the first of them: what is over by then, or refused, needs none
 WATCH_SECONDS = 1.0  # between looks at what is watched
 
 Update = Callable[[float | None, str], None]  # share done in [0, 1], None for as before; a few words
@@ -89,14 +92,21 @@ def on_interrupt(words: Callable[[], str]) -> Iterator[None]:
 
 @contextmanager
 def progress(title: str, *, quiet: bool = False) -> Iterator[Update]:
-    """A bar on a terminal, plain lines elsewhere, nothing when quiet."""
+    """A bar on a terminal, plain lines elsewhere for what takes longer than ``FIRST_SECONDS``, nothing when quiet."""
     if quiet:
         yield _silent
     elif sys.stderr.isatty():
         with _bar(title) as update:
             yield update
     else:
-        yield _Lines(title)
+        lines = _Lines(title)
+        first = threading.Timer(FIRST_SECONDS, lines.begin)
+        first.daemon = True
+        first.start()
+        try:
+            yield lines
+        finally:
+            first.cancel()
 
 
 @contextmanager
@@ -116,18 +126,24 @@ def _bar(title: str) -> Iterator[Update]:
 
 
 class _Lines:
-    """Progress as lines, not too many of them."""
+    """Progress as lines, not too many of them, and none before ``begin``; the end is said in any case."""
 
     def __init__(self, title: str) -> None:
         self._title = title
-        self._next = 0.0
-        self._last = ""
+        self._next = math.inf
+        self._words = self._last = ""
 
     def __call__(self, share: float | None, words: str) -> None:
-        due = time.monotonic() >= self._next or (share or 0.0) >= 1.0
-        if due and words != self._last:
-            self._next, self._last = time.monotonic() + PLAIN_SECONDS, words
-            say(f"{self._title}: {words}")
+        self._words = words
+        if time.monotonic() >= self._next or (share or 0.0) >= 1.0:
+            self.begin()
+
+    def begin(self) -> None:
+        """Say what is known by now; the first time from another thread."""
+        if self._words != self._last:
+            self._last = self._words
+            say(f"{self._title}: {self._words}")
+        self._next = time.monotonic() + PLAIN_SECONDS
 
 
 def _silent(share: float | None, words: str) -> None:

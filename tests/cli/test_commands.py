@@ -104,9 +104,10 @@ def test_a_surrogate_leaves_and_enters_as_one_file(surrogym, pendulum_server, na
     assert surrogym("export", "pendulum", "--out", "pendulum.surrogate", *server).code == 0
     entered = surrogym("import", "pendulum.surrogate", "--name", name, *server)
     assert entered.out == (
-        f"{name}: Pendulum-v1, model 1 and 12 real samples, design paused; next: surrogym train {name}\n"
+        f"{name}: Pendulum-v1, model 1 and 12 real samples (there 12 initial), design paused; "
+        f"next: surrogym train {name}\n"
     )
-    taken = surrogym("import", "pendulum.surrogate", *server)
+    taken = surrogym("import", "pendulum.surrogate", "--quiet", *server)
     assert (taken.code, taken.err) == (
         1,
         "error: expected a name that is free, got 'pendulum': give another by --name\n",

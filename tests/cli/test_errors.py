@@ -57,7 +57,7 @@ def test_an_address_that_is_none(surrogym):
         (("register", "--spec", "crossed.json"), "uniform range crosses: expected low < high, got [1.0, -1.0]"),
         (("train", "pendulum", "--start-from", "missing.zip"), "missing.zip: no such policy file"),
         (("evaluate", "missing.zip", "--env", "Pendulum-v1"), "missing.zip: no such policy file"),
-        (("evaluate", "junk.zip", "--env", "Pendulum-v1"), "junk.zip is no policy of PPO"),
+        (("evaluate", "junk.zip", "--env", "Pendulum-v1", "--quiet"), "junk.zip is no policy of PPO"),
         (("evaluate", "junk.zip"), "expected --env with the original environment, got none"),
         (("evaluate", "junk.zip", "--env", "Nowhere-v1"), "no adapter knows the environment 'Nowhere-v1'"),
         (

@@ -70,15 +70,16 @@ def test_a_script_reads_one_document_and_nothing_else(surrogym, pendulum_server:
 
 
 @pytest.mark.parametrize(
-    ("line", "shown"), [("report pendulum", "report: reading pendulum"), ("export pendulum -o s.csv", "export: done")]
+    ("line", "shown"), [("report pendulum", "report: done"), ("export pendulum -o s.csv", "export: done")]
 )
 def test_what_may_take_seconds_says_how_far_it_is(surrogym, pendulum_server: ServerProcess, line, shown) -> None:
     assert shown in surrogym(*line.split(), "--server", pendulum_server.url).err
 
 
-def test_a_wait_says_what_for(surrogym, pendulum_server: ServerProcess) -> None:
+def test_a_wait_says_what_for(surrogym, pendulum_server: ServerProcess, monkeypatch) -> None:
+    monkeypatch.setattr("surrogym_shared.terminal.FIRST_SECONDS", 0.05)
     server = ("--server", pendulum_server.url)
-    said = surrogym("sample", "nowhere", "--wait", "0.1", *server)
+    said = surrogym("sample", "nowhere", "--wait", "0.5", *server)
     assert said.err.startswith("wait: for 'nowhere' to be registered\n")
     assert surrogym("register", "Pendulum-v1", "--wait", "1.1", "--server", "http://127.0.0.1:9").err.startswith(
         "wait: for a server at http://127.0.0.1:9\n"

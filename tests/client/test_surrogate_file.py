@@ -65,6 +65,8 @@ def test_an_imported_surrogate_steps_the_same_and_remembers_its_real_steps(
     with Api(pendulum_server.url) as api, HttpSurrogate(pendulum_server.url, name) as imported:
         view = import_surrogate(api, read, name)
         assert (view.paused, view.model_version, view.ledger.manual) == (True, 1, len(read.samples))
+        assert view.fidelity == api.surrogate("pendulum").fidelity, "judged by the same tolerances"
+        assert read.ledger["initial"] + read.ledger["adaptive"] + read.ledger["manual"] == len(read.samples)
         with HttpSurrogate(pendulum_server.url, "pendulum") as served:
             assert_same(steps_of(imported, "deterministic"), steps_of(served, "deterministic"))
         again = export_surrogate(api, name)

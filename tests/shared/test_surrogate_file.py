@@ -85,6 +85,8 @@ HOSTILE = {
     "samples of negative shape": lambda h: h["samples.reward"].update(shape=[-4]),
     "samples of another dtype": lambda h: h["samples.reward"].update(dtype="O"),
     "samples of different lengths": lambda h: h["samples.reward"].update(shape=[3], data_offsets=[0, 24]),
+    "tolerances that are none": lambda h: with_own(h, tolerances={"theta": "small"}),
+    "a ledger that is a list": lambda h: with_own(h, ledger=[1]),
     "an entry that is a number": lambda h: h.update({"samples.reward": 3}),
 }
 

@@ -23,7 +23,7 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Make a surrogate of a file: it serves the same model at once, with its design paused.
+    """Make a surrogate of a file: it serves the same model at once, judged by the same tolerances, its design paused.
 
     Its real samples are stored as manual ones. surrogym change NAME --resume lets the design go on, with its initial
     queries first.
@@ -41,6 +41,12 @@ def command(
         view = import_surrogate(api, read, name, lambda share: update(share, f"{len(read.samples)} real samples"))
     words = (
         f"{view.name}: {view.environment or 'own environment'}, model {view.model_version} and {view.samples} real "
-        f"samples, design paused; next: surrogym train {view.name}"
+        f"samples{_origin(read.ledger)}, design paused; next: surrogym train {view.name}"
     )
     give(view.model_dump(mode="json"), lambda: words, as_json=as_json, quiet=quiet)
+
+
+def _origin(ledger: dict[str, int]) -> str:
+    """What the real steps were where the file comes from."""
+    steps = ", ".join(f"{count} {purpose}" for purpose, count in ledger.items() if count)
+    return f" (there {steps})" if steps else ""

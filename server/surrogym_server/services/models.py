@@ -67,7 +67,7 @@ class ModelService:
             InvalidInput: no model of this surrogate.
         """
         record = self._storage.surrogates.get(name)
-        model = from_bytes(self._definitions.get(name), data)
+        model = from_bytes(self._definitions.get(name).with_tolerances(record.tolerances), data)
         new = NewModel(
             samples=model.samples,
             data_hash=model.digest,
