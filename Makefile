@@ -12,7 +12,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile
 PINS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: demo install test audit test-all docs docs-serve format-check lint types imports unit chaos bench acquisition format postgresql chromium screenshots clean help
+.PHONY: demo install test audit test-all docs docs-serve format-check lint types imports unit chaos bench bench-memory acquisition format postgresql chromium screenshots clean help
 
 demo: .venv/demo  ## Solve Pendulum with server, sampler and trainer on this machine (ARGS="--seed 1")
 	@exec $(BIN)/surrogym demo pendulum $(ARGS)
@@ -51,10 +51,8 @@ audit: .venv/dev  ## Ask for known holes of the pinned packages, where that can 
 chaos: .venv/dev postgresql  ## Faults and attacks in full length; make test has a short form (ARGS="-k killed")
 	CHAOS=full $(BIN)/pytest --durations 0 tests/chaos tests/security $(ARGS)
 
-bench: .venv/dev  ## What steps, predictions and trainings cost on this machine, beside echoes, libraries and other systems
-	@for part in step peers train growth predict; do \
-	    echo; echo "== $$part"; $(BIN)/python tests/benchmarks/bench_$$part.py $(ARGS) || exit 1; \
-	done
+bench: .venv/dev  ## What steps, predictions and trainings cost here, beside echoes, libraries and other systems (ARGS="--quick")
+	$(BIN)/python tests/benchmarks/bench.py $(ARGS)
 
 bench-memory: .venv/dev  ## Resident memory of a server with 64 sessions of 256 lanes, 10 minutes (ARGS="--minutes 1")
 	$(BIN)/python tests/benchmarks/bench_memory.py $(ARGS)

@@ -6,8 +6,6 @@ with a pause between rounds so that the rest of the machine goes on.
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 import time
 from contextlib import ExitStack
@@ -17,7 +15,8 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
-from bench_step import machine, process_ids, surrogym_server
+from bench_step import process_ids, surrogym_server
+from common import parser, started, write
 
 from surrogym_client.transport import HttpSurrogate
 from surrogym_shared.wire import OpenSession
@@ -63,22 +62,21 @@ def run(url: str, pid: int, minutes: float) -> tuple[list[tuple[float, float]], 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("build/benchmarks"), help="folder of the JSON file")
-    parser.add_argument("--minutes", type=float, default=10.0)
-    options = parser.parse_args()
+    made = parser(__doc__)
+    made.add_argument("--minutes", type=float, default=10.0)
+    options = started(made)
+    minutes = min(options.minutes, 0.5) if options.quick else options.minutes
     with surrogym_server() as url:
-        readings, steps = run(url, process_ids["surrogym"], options.minutes)
+        readings, steps = run(url, process_ids["surrogym"], minutes)
     mib = np.array([m for _, m in readings])
     quarter = max(1, len(mib) // 4)
     growth = float(mib[-quarter:].mean() / mib[:quarter].mean() - 1)
-    report: dict[str, Any] = {"machine": machine(), "steps": steps, "growth": growth, "readings": readings}
-    print(f"{SESSIONS} sessions of {LANES} lanes, {options.minutes:g} minutes, {steps:,} environment steps")
+    report: dict[str, Any] = {"steps": steps, "growth": growth, "readings": readings}
+    print(f"{SESSIONS} sessions of {LANES} lanes, {minutes:g} minutes, {steps:,} environment steps")
     print(
         f"resident: {mib.min():.1f} to {mib.max():.1f} MiB after the warm-up, last quarter {growth:+.2%} of the first"
     )
-    options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "memory.json").write_text(json.dumps(report, indent=1))
+    write(options.out, "memory", report)
     sys.exit(growth > FLAT)
 
 

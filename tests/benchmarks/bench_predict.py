@@ -1,22 +1,20 @@
 """What a prediction costs, beside scikit-learn, GPyTorch and the bare matrix products in the same run.
 
-Run by ``make bench``, on one thread, unless told otherwise. Subjects take turns, so that what else the machine does
+Run by ``make bench``, on one thread but where it says two. Subjects take turns, so that what else the machine does
 hits all alike; read the ratios, not the milliseconds. "Products" are those that a prediction can't do without, in
 blocks of the same size: exponents, polynomial parts, means, and in place of each triangular solve the product with a
-matrix of the same size.
+matrix of the same size. The libraries are installed by name into an environment of their own, and their calls are
+timed in a process there.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
 import statistics
 import sys
+import tempfile
 import time
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +22,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 import torch
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel
-from threadpoolctl import threadpool_limits
+from common import Call, Subject, parser, slopes, started, timed, write
+from owned import Child, installed
 
 from support.real_steps import random_steps
 from surrogym_client.original.classic import pendulum
@@ -36,35 +33,28 @@ from surrogym_server.surrogate.learn import learn
 from surrogym_server.surrogate.model import SurrogateModel
 from surrogym_server.virtual import VirtualSettings, create, reset, step
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore", DeprecationWarning)  # of torch.jit, at import
-    import gpytorch
-
 POINTS, OUTPUTS, INPUTS = 125, 4, 4
 BATCHES = (1, 1_024, 8_192)
 LANES = (1, 4, 16, 64, 256, 1_024, 4_096)
 SIZES = (10, 30, 100, 300, 1_000, 2_000)
 PARTICLE_LANES, PARTICLES, SAMPLES = 64, (10, 100, 1_000, 4_000), 50
 LENGTHSCALE, NOISE = 1.5, 1e-4
-COMPARISON, TURN = 5.0, 0.05  # seconds
+LIBRARIES = {"scikit-learn": "scikit_learn", "GPyTorch": "gpytorch", "GPyTorch, fast_pred_var": "gpytorch_fast"}
+COMPARISON, QUICK, TURN, LEAST_ROUNDS = 5.0, 0.5, 0.05, 2  # seconds; turns of each subject
 
-Call = Callable[[], Any]
 Row = dict[str, Any]
 
 
-def measure(subjects: dict[str, Call]) -> dict[str, float]:
+def measure(subjects: Mapping[str, Subject], seconds: float) -> dict[str, float]:
     """Median milliseconds of each. They take turns, each of ``TURN`` seconds, and one call at least."""
+    counts = {name: max(1, int(TURN / min(subject(2)))) for name, subject in subjects.items()}
     taken: dict[str, list[float]] = {name: [] for name in subjects}
-    for call in subjects.values():
-        call()
-    end = time.perf_counter() + COMPARISON
-    while time.perf_counter() < end:
-        for name, call in subjects.items():
-            turn = time.perf_counter()
-            while (start := time.perf_counter()) - turn < TURN:
-                call()
-                taken[name].append(time.perf_counter() - start)
-    return {name: 1e3 * statistics.median(seconds) for name, seconds in taken.items()}
+    rounds, end = 0, time.perf_counter() + seconds
+    while rounds < LEAST_ROUNDS or time.perf_counter() < end:
+        for name, subject in subjects.items():
+            taken[name] += subject(counts[name])
+        rounds += 1
+    return {name: 1e3 * statistics.median(each) for name, each in taken.items()}
 
 
 def processes(points: int) -> list[Posterior]:
@@ -97,80 +87,57 @@ def products(serving: Serving, rows: int, wanted: Sequence[int]) -> Call:
     return lambda: in_blocks(serving.rows, block, z)
 
 
-def scikit_learn(posteriors: Sequence[Posterior], at: np.ndarray) -> Call:
-    kernel = ConstantKernel(1.0, "fixed") * RBF([LENGTHSCALE] * INPUTS, "fixed")
-    fitted = [GaussianProcessRegressor(kernel, alpha=NOISE).fit(p.x.numpy(), p.y.numpy()) for p in posteriors]
-    return lambda: [regressor.predict(at, return_std=True) for regressor in fitted]
-
-
-class BatchOfProcesses(gpytorch.models.ExactGP):
-    """All outputs as one batch of independent processes, as GPyTorch recommends."""
-
-    def __init__(self, posteriors: Sequence[Posterior]) -> None:
-        batch = torch.Size([len(posteriors)])
-        likelihood = gpytorch.likelihoods.GaussianLikelihood(batch_shape=batch)
-        likelihood.noise = NOISE
-        x = torch.stack([p.x for p in posteriors])
-        super().__init__(x, torch.stack([p.y for p in posteriors]), likelihood)
-        self.mean_module = gpytorch.means.ZeroMean(batch_shape=batch)
-        rbf = gpytorch.kernels.RBFKernel(ard_num_dims=INPUTS, batch_shape=batch)
-        self.covar_module = gpytorch.kernels.ScaleKernel(rbf, batch_shape=batch)
-        self.covar_module.outputscale, rbf.lengthscale = 1.0, LENGTHSCALE
-        self.double()
-        self.eval()
-
-    def forward(self, x: torch.Tensor) -> gpytorch.distributions.MultivariateNormal:
-        return gpytorch.distributions.MultivariateNormal(self.mean_module(x), self.covar_module(x))
-
-
-def gpytorch_prediction(posteriors: Sequence[Posterior], at: torch.Tensor, fast_variance: bool) -> Call:
-    model, repeated = BatchOfProcesses(posteriors), at.expand(OUTPUTS, *at.shape)
-
-    def predict() -> tuple[torch.Tensor, torch.Tensor]:
-        with torch.no_grad(), gpytorch.settings.fast_pred_var(fast_variance):
-            predicted = model(repeated)
-            return predicted.mean, predicted.variance
-
-    return predict
-
-
-def predictions(batch: int) -> Row:
+def predictions(batch: int, out: Path, seconds: float) -> Row:
     posteriors = processes(POINTS)
     serving = compiled(posteriors)
     at = torch.from_numpy(np.random.default_rng(1).normal(size=(batch, INPUTS)))
-    subjects = {
-        "Surrogym": lambda: serving.mean_and_deviation(at, range(OUTPUTS)),
-        "products": products(serving, batch, range(OUTPUTS)),
-        "scikit-learn": scikit_learn(posteriors, at.numpy()),
-        "GPyTorch": gpytorch_prediction(posteriors, at, False),
-        "GPyTorch, fast_pred_var": gpytorch_prediction(posteriors, at, True),
-    }
-    check(subjects)
-    return {"batch": batch, **measure(subjects)}
+
+    def ours() -> tuple[torch.Tensor, torch.Tensor]:
+        return serving.mean_and_deviation(at, range(OUTPUTS))
+
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        told = folder / "told.npz"
+        np.savez(
+            told,
+            x=posteriors[0].x.numpy(),
+            y=np.stack([p.y.numpy() for p in posteriors]),
+            at=at.numpy(),
+            lengthscale=np.full(INPUTS, LENGTHSCALE),
+            noise=NOISE,
+        )
+        subjects = {"Surrogym": timed(ours), "products": timed(products(serving, batch, range(OUTPUTS)))}
+        for shown, name in LIBRARIES.items():
+            python = installed(out, name.removesuffix("_fast"))
+            subjects[shown] = stack.enter_context(Child(python, "predict", name, str(told)))
+            if name != "gpytorch_fast":  # it approximates
+                check(shown, ours(), np.load(f"{told}.predicted.npz"))
+        return {"batch": batch, **measure(subjects, seconds)}
 
 
-def check(subjects: dict[str, Call]) -> None:
+def check(name: str, ours: tuple[torch.Tensor, torch.Tensor], theirs: Mapping[str, np.ndarray]) -> None:
     """All predict the same."""
-    mean, deviation = subjects["Surrogym"]()
-    for name, (theirs, spread) in {
-        "scikit-learn": tuple(torch.tensor(np.stack(a, -1)) for a in zip(*subjects["scikit-learn"](), strict=True)),
-        "GPyTorch": tuple(t.T for t in subjects["GPyTorch"]()),
-    }.items():
-        spread = spread if name == "scikit-learn" else spread.sqrt()
-        torch.testing.assert_close(mean, theirs, rtol=0, atol=1e-5)
-        torch.testing.assert_close(deviation, spread, rtol=1e-3, atol=1e-4)
+    for what, value, tolerance in zip(("mean", "deviation"), ours, ((0, 1e-5), (1e-3, 1e-4)), strict=True):
+        relative, absolute = tolerance
+        torch.testing.assert_close(
+            value, torch.from_numpy(theirs[what]), rtol=relative, atol=absolute, msg=lambda m: f"{name}: {m}"
+        )
 
 
-def growth(points: int) -> Row:
-    """1,024 predictions of four outputs, mean alone and with variance."""
-    serving = compiled(processes(points))
+def growth(points: int, seconds: float) -> Row:
+    """1,024 predictions of four outputs, mean alone and with variance; one more sample; a factorisation anew."""
+    posteriors = processes(points)
+    serving = compiled(posteriors)
     at = torch.from_numpy(np.random.default_rng(1).normal(size=(1_024, INPUTS)))
+    one = posteriors[0]
     subjects = {
-        "mean": lambda: serving.mean(at),
-        "mean, variance": lambda: serving.mean_and_deviation(at, range(OUTPUTS)),
-        "products": products(serving, len(at), range(OUTPUTS)),
+        "mean": timed(lambda: serving.mean(at)),
+        "mean, variance": timed(lambda: serving.mean_and_deviation(at, range(OUTPUTS))),
+        "products": timed(products(serving, len(at), range(OUTPUTS))),
+        "extend": timed(lambda: one.extend(at[0], at[0, 0])),
+        "factorise": timed(lambda: condition(one.hyper, one.x, one.y)),
     }
-    return {"n": points, **measure(subjects)}
+    return {"n": points, **measure(subjects, seconds)}
 
 
 def pendulum_model() -> SurrogateModel:
@@ -184,22 +151,51 @@ def stepping(model: SurrogateModel, lanes: int, **chosen: Any) -> Call:
     return lambda: step(model, settings, state, u)
 
 
-def steps(model: SurrogateModel, lanes: int) -> Row:
-    subjects = {"AUR-D": stepping(model, lanes), "AUR-D, penalty": stepping(model, lanes, penalty=3.0)}
-    made = measure(subjects)
+def steps(model: SurrogateModel, lanes: int, seconds: float) -> Row:
+    subjects = {"AUR-D": timed(stepping(model, lanes)), "AUR-D, penalty": timed(stepping(model, lanes, penalty=3.0))}
+    made = measure(subjects, seconds)
     return {"N": lanes, **made, "AUR-D, us a lane": 1e3 * made["AUR-D"] / lanes}
 
 
-def particles(model: SurrogateModel, count: int) -> Row:
-    shape = {"variant": "probabilistic", "particles": count, "penalty": 3.0}
+def particles(model: SurrogateModel, count: int, seconds: float) -> Row:
     stages = [stage.serving for stage in model._stages if stage is not None]
     bare = [products(s, PARTICLE_LANES * count, list(s.processes)) for s in stages]
     subjects = {
-        "AUR-P": stepping(model, PARTICLE_LANES, **shape),
-        "products": lambda: [call() for call in bare],
+        "AUR-P": timed(stepping(model, PARTICLE_LANES, particles=count, **AUR_P)),
+        "products": timed(lambda: [call() for call in bare]),
     }
-    made = measure(subjects)
+    made = measure(subjects, seconds)
     return {"lanes x particles": f"{PARTICLE_LANES} x {count}", **made, "steps a second": 1e3 / made["AUR-P"]}
+
+
+AUR_P = {"variant": "probabilistic", "penalty": 3.0}
+
+
+def two_threads(model: SurrogateModel, seconds: float) -> Iterator[Row]:
+    """Large work on one thread of torch and on two, which need two cores that nothing else uses."""
+    serving = compiled(processes(POINTS))
+    at = torch.from_numpy(np.random.default_rng(1).normal(size=(8_192, INPUTS)))
+    for what, call in {
+        "AUR-D, N=1,024": stepping(model, 1_024),
+        "AUR-D, N=4,096": stepping(model, 4_096),
+        "AUR-P, 64 x 1,000": stepping(model, PARTICLE_LANES, particles=1_000, **AUR_P),
+        "mean, variance, 8,192": lambda: serving.mean_and_deviation(at, range(OUTPUTS)),
+    }.items():
+        made = measure({f"{count} threads": threaded(count, call) for count in (1, 2)}, seconds)
+        yield {"what": what, **made, "1 over 2": made["1 threads"] / made["2 threads"]}
+
+
+def threaded(count: int, call: Call) -> Subject:
+    """With so many threads of torch for its turns, and one afterwards."""
+
+    def calls(wanted: int) -> list[float]:
+        torch.set_num_threads(count)
+        try:
+            return timed(call)(wanted)
+        finally:
+            torch.set_num_threads(1)
+
+    return calls
 
 
 def table(title: str, rows: Sequence[Row]) -> None:
@@ -210,34 +206,28 @@ def table(title: str, rows: Sequence[Row]) -> None:
         print("  ".join(text.rjust(width) for text, width in zip(shown, widths, strict=True)))
 
 
-def machine() -> Row:
-    return {
-        "cores": os.cpu_count(),
-        "load": os.getloadavg(),
-        "platform": platform.platform(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-    }
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("build/benchmarks"), help="folder of the JSON file")
-    parser.add_argument("--threads", type=int, default=1, help="of one torch operation")
-    options = parser.parse_args()
-    torch.set_num_threads(options.threads)
-    threadpool_limits(options.threads, user_api="blas")  # scikit-learn's
-    model, report = pendulum_model(), {"machine": machine(), "threads": options.threads}
-    for title, rows in {
-        f"mean and variance, n={POINTS}, {OUTPUTS} outputs": (predictions(batch) for batch in BATCHES),
-        f"AUR-P step, Pendulum, n={SAMPLES}": (particles(model, count) for count in PARTICLES),
-        f"AUR-D step, Pendulum, n={SAMPLES}": (steps(model, lanes) for lanes in LANES),
-        f"1,024 predictions of {OUTPUTS} outputs": (growth(points) for points in SIZES),
-    }.items():
-        report[title] = list(rows)
+    options = started(parser(__doc__))
+    seconds = QUICK if options.quick else COMPARISON
+    model, report = pendulum_model(), {}
+    parts: dict[str, Callable[[], Iterator[Row]]] = {
+        f"mean and variance, n={POINTS}, {OUTPUTS} outputs": lambda: (
+            predictions(batch, options.out, seconds) for batch in BATCHES
+        ),
+        f"AUR-P step, Pendulum, n={SAMPLES}": lambda: (particles(model, count, seconds) for count in PARTICLES),
+        f"AUR-D step, Pendulum, n={SAMPLES}": lambda: (steps(model, lanes, seconds) for lanes in LANES),
+        f"1,024 predictions of {OUTPUTS} outputs": lambda: (growth(points, seconds) for points in SIZES),
+        "threads": lambda: two_threads(model, seconds),
+    }
+    for title, rows in parts.items():
+        report[title] = list(rows())
         table(title, report[title])
-    options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "predict.json").write_text(json.dumps(report, indent=1))
+    grown = report[f"1,024 predictions of {OUTPUTS} outputs"]
+    report["slopes of n"] = {name: slopes(SIZES, [row[name] for row in grown]) for name in grown[0] if name != "n"}
+    print("\ntime grows from each n to the next by the power")
+    for name, found in report["slopes of n"].items():
+        print(f"{name:>16}  " + "  ".join(f"{slope:5.2f}" for slope in found))
+    write(options.out, "predict", report)
 
 
 if __name__ == "__main__":

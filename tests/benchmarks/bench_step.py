@@ -6,10 +6,6 @@ read the ratios, not the microseconds.
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
 import socket
 import subprocess
 import sys
@@ -17,14 +13,13 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
-import torch
+from common import MICROSECONDS, Call, figures, parser, ratio, started, take_turns, timed, write
 from servers import TRIVIAL
 from websockets.sync.client import connect
 
@@ -44,21 +39,12 @@ from surrogym_shared.wire import OpenSession
 
 SERVERS = str(Path(__file__).with_name("servers.py"))
 LANES = (1, 16, 256, 1024)
-ROUNDS, CALLS, WARM_UP = 20, 40, 100
+ROUNDS, CALLS, WARM_UP = 40, 30, 100
 SAMPLES = 50
-MICROSECONDS = 1e6  # of a second
 JSON_REPLY_BYTES = {1: 190, 16: 1_600, 256: 22_500, 1024: 89_000}  # about, of a Pendulum step
 
-Call = Callable[[], Any]
+Measured = dict[str, dict[str, float]]
 process_ids: dict[str, int] = {}  # of the servers that run, by their first argument
-
-
-@dataclass(frozen=True)
-class Figures:
-    """Microseconds of one call."""
-
-    p50: float
-    p99: float
 
 
 @contextmanager
@@ -110,22 +96,16 @@ def surrogym_server() -> Iterator[str]:
             yield url
 
 
-def measure(subjects: dict[str, Call]) -> dict[str, Figures]:
-    """p50 and p99 of each; rounds take turns."""
-    for call in subjects.values():
-        for _ in range(WARM_UP):
-            call()
-    taken: dict[str, list[float]] = {name: [] for name in subjects}
-    for _ in range(ROUNDS):
-        for name, call in subjects.items():
-            for _ in range(CALLS):
-                start = time.perf_counter()
-                call()
-                taken[name].append(time.perf_counter() - start)
-    return {
-        name: Figures(*(float(q) for q in np.quantile(seconds, [0.5, 0.99]) * MICROSECONDS))
-        for name, seconds in taken.items()
-    }
+def measure(subjects: dict[str, Call], beside: Callable[[str], str | None], quick: bool) -> Measured:
+    """p50 and p99 of each, and its ratio to what it is measured beside, a median over rounds that take turns."""
+    turns = take_turns({name: timed(call) for name, call in subjects.items()}, 4 if quick else ROUNDS, CALLS, WARM_UP)
+    measured = {name: figures(rounds) for name, rounds in turns.items()}
+    for name, found in measured.items():
+        if (echo := beside(name)) is not None:
+            found["ratio"] = ratio(turns[name], turns[echo])
+        if name.endswith("stream") and READY in turns:
+            found["to library"] = ratio(turns[name], turns[READY])
+    return measured
 
 
 def stepping(port: SurrogatePort, lanes: int) -> Call:
@@ -181,11 +161,11 @@ def http_echo(stack: ExitStack, url: str, content: bytes, size: int) -> Call:
     return lambda: connection.send("POST", f"?{size}", content)
 
 
-def round_trips(url: str, echo: str, lanes: int) -> dict[str, Figures]:
+def round_trips(url: str, echo: str, lanes: int, quick: bool) -> Measured:
     with ExitStack() as stack:
         subjects = {
             "echo, WebSocket": stream_echo(stack, echo, lanes),
-            "echo, WebSocket library": library_echo(stack, echo, lanes),
+            READY: library_echo(stack, echo, lanes),
             "trivial, stream": remote(stack, url, TRIVIAL, "stream", lanes),
             "pendulum, stream": remote(stack, url, "pendulum", "stream", lanes),
             "echo, HTTP": http_echo(stack, echo, request(BinaryForm(), lanes), reply_bytes(lanes)),
@@ -195,7 +175,7 @@ def round_trips(url: str, echo: str, lanes: int) -> dict[str, Figures]:
             "trivial, json": remote(stack, url, TRIVIAL, "json", lanes),
             "pendulum, json": remote(stack, url, "pendulum", "json", lanes),
         }
-        return measure(subjects)
+        return measure(subjects, lambda name: BESIDE.get(name.partition(", ")[2]), quick)
 
 
 def in_process(url: str) -> LocalSurrogate:
@@ -204,66 +184,47 @@ def in_process(url: str) -> LocalSurrogate:
     return LocalSurrogate(spec, from_bytes(definition_from_spec(spec), model))
 
 
-def throughput(url: str, lanes: int) -> dict[str, Figures]:
+def throughput(url: str, lanes: int, quick: bool) -> Measured:
     """The same model stepped in this process and over the stream."""
     with ExitStack() as stack:
         subjects = {
             "in process": stepping(in_process(url), lanes),
             "stream": remote(stack, url, "pendulum", "stream", lanes),
         }
-        return measure(subjects)
+        return measure(subjects, lambda _: "in process", quick)
 
 
 READY = "echo, WebSocket library"
 BESIDE = {"stream": "echo, WebSocket", "binary": "echo, HTTP", "json": "echo, HTTP JSON"}
 
 
-def show_trips(lanes: int, figures: dict[str, Figures]) -> None:
-    for name, found in figures.items():
-        echo = figures[BESIDE.get(name.partition(", ")[2], name)]
-        ratio = f"{found.p50 / echo.p50:8.2f}" if echo is not found else " " * 8
-        ready = f"{found.p50 / figures[READY].p50:12.2f}" if name.endswith("stream") else ""
-        print(f"{lanes:6} {name:26}{found.p50:10.0f}{found.p99:10.0f}{ratio}{ready}")
+def show_trips(lanes: int, measured: Measured) -> None:
+    for name, found in measured.items():
+        against = "".join(f"{found[key]:12.2f}" if key in found else " " * 12 for key in ("ratio", "to library"))
+        print(f"{lanes:6} {name:26}{found['p50']:10.0f}{found['p99']:10.0f}{against}")
 
 
-def show_throughput(lanes: int, figures: dict[str, Figures]) -> None:
-    share = figures["in process"].p50 / figures["stream"].p50
-    per_second = {name: lanes / found.p50 * MICROSECONDS for name, found in figures.items()}
+def show_throughput(lanes: int, measured: Measured) -> None:
+    per_second = {name: lanes / found["p50"] * MICROSECONDS for name, found in measured.items()}
+    share = 1 / measured["stream"]["ratio"]
     print(f"{lanes:6} " + "".join(f"{name} {rate:12,.0f}   " for name, rate in per_second.items()) + f"{share:6.1%}")
 
 
-def machine() -> dict[str, Any]:
-    return {
-        "cores": os.cpu_count(),
-        "load": os.getloadavg(),
-        "platform": platform.platform(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-    }
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("build/benchmarks"), help="folder of the JSON file")
-    parser.add_argument("--lanes", type=int, nargs="*", choices=LANES, default=LANES)
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
-    report: dict[str, Any] = {"machine": machine(), "round_trip_us": {}, "step_us": {}}
-    print(", ".join(f"{name} {value}" for name, value in report["machine"].items()))
+    made = parser(__doc__)
+    made.add_argument("--lanes", type=int, nargs="*", choices=LANES, default=LANES)
+    options = started(made)
+    report: dict[str, Any] = {"round_trip_us": {}, "step_us": {}}
     with echo_server() as echo, surrogym_server() as url:
-        print(f"{'N':>6} {'round trip':26}{'p50 us':>10}{'p99 us':>10}{'to echo':>8}{'to library':>12}")
+        print(f"{'N':>6} {'round trip':26}{'p50 us':>10}{'p99 us':>10}{'to echo':>12}{'to library':>12}")
         for lanes in options.lanes:
-            figures = round_trips(url, echo, lanes)
-            show_trips(lanes, figures)
-            report["round_trip_us"][lanes] = {name: vars(found) for name, found in figures.items()}
+            report["round_trip_us"][lanes] = round_trips(url, echo, lanes, options.quick)
+            show_trips(lanes, report["round_trip_us"][lanes])
         print(f"\n{'N':>6} environment steps per second, and the stream's share of in process")
         for lanes in options.lanes:
-            figures = throughput(url, lanes)
-            show_throughput(lanes, figures)
-            report["step_us"][lanes] = {name: vars(found) for name, found in figures.items()}
-    options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "step.json").write_text(json.dumps(report, indent=1))
+            report["step_us"][lanes] = throughput(url, lanes, options.quick)
+            show_throughput(lanes, report["step_us"][lanes])
+    write(options.out, "step", report)
 
 
 if __name__ == "__main__":

@@ -2,34 +2,26 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import statistics
 import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-import torch
-from bench_step import in_process, machine, surrogym_server
+from bench_step import in_process, surrogym_server
+from common import parser, started, write
 from stable_baselines3 import PPO
 
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.transport import HttpSurrogate
 
-LANES, STEPS, ROUNDS = 16, 256, 6  # steps of each lane between two updates, of which a round makes two
-UPDATES = 2
+LANES, STEPS, PAIRS = 16, 256, 20  # steps of each lane between two updates, and of a turn
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("build/benchmarks"), help="folder of the JSON file")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    report: dict[str, Any] = {"machine": machine()}
+    options = started(parser(__doc__))
     with surrogym_server() as url, ExitStack() as stack:
         remote = stack.enter_context(HttpSurrogate(url, "pendulum", transport="stream"))
         ports = {"in process": in_process(url), "stream": remote}
@@ -37,22 +29,25 @@ def main() -> None:
             name: PPO("MlpPolicy", SurrogateVecEnv.from_port(port, num_envs=LANES, seed=0), n_steps=STEPS, seed=0)
             for name, port in ports.items()
         }
-        taken: dict[str, list[float]] = {name: [] for name in learners}
         for learner in learners.values():
             learner.learn(LANES * STEPS)
-        for _ in range(ROUNDS):
+        taken: dict[str, list[float]] = {name: [] for name in learners}
+        for _ in range(3 if options.quick else PAIRS):
             for name, learner in learners.items():
                 start = time.perf_counter()
-                learner.learn(UPDATES * LANES * STEPS)
+                learner.learn(LANES * STEPS)
                 taken[name].append(time.perf_counter() - start)
         for learner in learners.values():
             learner.get_env().close()
-    report["seconds"] = {name: statistics.median(seconds) for name, seconds in taken.items()}
-    report["ratio"] = statistics.median(r / i for r, i in zip(taken["stream"], taken["in process"], strict=True))
-    print(f"PPO, {LANES} lanes, {UPDATES * LANES * STEPS:,} steps, seconds: {report['seconds']}")
-    print(f"remote takes {report['ratio']:.3f} of in process, median of {ROUNDS} pairs")
-    options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "train.json").write_text(json.dumps(report, indent=1))
+    pairs = sorted(r / i for r, i in zip(taken["stream"], taken["in process"], strict=True))
+    seconds = {name: statistics.median(each) for name, each in taken.items()}
+    quartiles = pairs[len(pairs) // 4], pairs[-1 - len(pairs) // 4]
+    report = {"seconds": seconds, "ratio": statistics.median(pairs), "quartiles": quartiles, "pairs": taken}
+    print(f"PPO, {LANES} lanes, {LANES * STEPS:,} steps, seconds: {seconds}")
+    print(
+        f"remote takes {report['ratio']:.3f} of in process, median of {len(pairs)} pairs, half of them in {quartiles}"
+    )
+    write(options.out, "train", report)
 
 
 if __name__ == "__main__":

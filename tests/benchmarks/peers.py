@@ -1,7 +1,8 @@
-"""Other systems serving a trivial environment; runs in an environment of their own, see bench_peers.py.
+"""Other systems serving a trivial environment, and other libraries predicting; runs where they are installed, owned.py.
 
-``peers.py serve NAME PORT`` serves it; ``peers.py step NAME PORT`` answers each line of its input, a number, by a line
-with the seconds of so many steps, as JSON.
+``peers.py serve NAME PORT`` serves it. ``peers.py step NAME PORT`` and ``peers.py predict NAME FILE`` answer each line
+of their input, a number, by a line with the seconds of so many calls, as JSON. FILE (NPZ) says what to predict, and
+what was predicted is written beside it.
 """
 
 from __future__ import annotations
@@ -121,19 +122,81 @@ def step_openenv(port: int):  # type: ignore[no-untyped-def]
     return lambda: env.step(action)
 
 
-def answer(step) -> None:  # type: ignore[no-untyped-def]
+def predict_scikit_learn(file: str):  # type: ignore[no-untyped-def]
+    import numpy as np
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+
+    told = np.load(file)
+    kernel = ConstantKernel(1.0, "fixed") * RBF(told["lengthscale"], "fixed")
+    fitted = [GaussianProcessRegressor(kernel, alpha=float(told["noise"])).fit(told["x"], y) for y in told["y"]]
+
+    def predict():  # type: ignore[no-untyped-def]
+        return [regressor.predict(told["at"], return_std=True) for regressor in fitted]
+
+    mean, deviation = (np.stack(part, -1) for part in zip(*predict(), strict=True))
+    np.savez(f"{file}.predicted", mean=mean, deviation=deviation)
+    return predict
+
+
+def predict_gpytorch(file: str):  # type: ignore[no-untyped-def]
+    return _gpytorch(file, fast_variance=False)
+
+
+def predict_gpytorch_fast(file: str):  # type: ignore[no-untyped-def]
+    return _gpytorch(file, fast_variance=True)
+
+
+def _gpytorch(file: str, fast_variance: bool):  # type: ignore[no-untyped-def]
+    """All outputs as one batch of independent processes, as GPyTorch recommends."""
+    import gpytorch
+    import numpy as np
+    import torch
+
+    torch.set_num_threads(1)
+    told = {name: torch.from_numpy(array) for name, array in np.load(file).items()}
+    outputs, inputs = len(told["y"]), told["x"].shape[1]
+    batch = torch.Size([outputs])
+    likelihood = gpytorch.likelihoods.GaussianLikelihood(batch_shape=batch)
+    likelihood.noise = float(told["noise"])
+
+    class Processes(gpytorch.models.ExactGP):  # type: ignore[misc]
+        def __init__(self) -> None:
+            super().__init__(told["x"].expand(outputs, -1, -1), told["y"], likelihood)
+            self.mean_module = gpytorch.means.ZeroMean(batch_shape=batch)
+            rbf = gpytorch.kernels.RBFKernel(ard_num_dims=inputs, batch_shape=batch)
+            self.covar_module = gpytorch.kernels.ScaleKernel(rbf, batch_shape=batch)
+            self.covar_module.outputscale, rbf.lengthscale = 1.0, told["lengthscale"]
+
+        def forward(self, x):  # type: ignore[no-untyped-def]
+            return gpytorch.distributions.MultivariateNormal(self.mean_module(x), self.covar_module(x))
+
+    model = Processes().double().eval()
+    repeated = told["at"].expand(outputs, *told["at"].shape)
+
+    def predict():  # type: ignore[no-untyped-def]
+        with torch.no_grad(), gpytorch.settings.fast_pred_var(fast_variance):
+            predicted = model(repeated)
+            return predicted.mean, predicted.variance
+
+    mean, variance = predict()
+    np.savez(f"{file}.predicted", mean=mean.T.numpy(), deviation=variance.T.sqrt().numpy())
+    return predict
+
+
+def answer(call) -> None:  # type: ignore[no-untyped-def]
     print(json.dumps([]), flush=True)  # ready
     for line in sys.stdin:
         taken = []
         for _ in range(int(line)):
             start = time.perf_counter()
-            step()
+            call()
             taken.append(time.perf_counter() - start)
         print(json.dumps(taken), flush=True)
 
 
 if __name__ == "__main__":
-    what, name, port = sys.argv[1], sys.argv[2], int(sys.argv[3])
-    found = globals()[f"{what}_{name}"](port)
-    if what == "step":
+    what, name, where = sys.argv[1:]
+    found = globals()[f"{what}_{name}"](where if what == "predict" else int(where))
+    if what != "serve":
         answer(found)

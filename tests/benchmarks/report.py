@@ -1,0 +1,143 @@
+"""What was to be reached and what was, as one table in Markdown, from the JSON files of the parts that were run.
+
+``report.py --out FOLDER`` prints it again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from common import OUT
+
+Line = tuple[str, str, str, bool | None]  # what, target, reached, whether; None where there is no target
+PEERS = ("openenv", "rlmesh", "dm_env_rpc")
+
+
+def table(out: Path) -> str:
+    """The lines of every part whose file is in the folder."""
+    lines = ["| what | target | reached | |", "| --- | --- | --- | --- |"]
+    for part, read in PARTS.items():
+        if not (file := out / f"{part}.json").exists():
+            continue
+        found = json.loads(file.read_text())
+        for what, target, reached, held in read(found):
+            said = "" if held is None else "yes" if held else "**no**"
+            lines.append(f"| {what} | {target} | {reached} | {said} |")
+    return "\n".join([*lines, "", *_machines(out)])
+
+
+def step(found: dict[str, Any]) -> Iterator[Line]:
+    for lanes, measured in found["round_trip_us"].items():
+        trip, echo = measured["trivial, stream"], measured["echo, WebSocket library"]
+        reached = f"{trip['to library']:.2f} x ({trip['p50']:.0f} beside {echo['p50']:.0f} µs)"
+        yield f"stream beside uvicorn's echo, N = {lanes}", "1.5 x", reached, trip["to library"] <= 1.5
+    for lanes, measured in found["round_trip_us"].items():
+        trip, echo = measured["trivial, stream"], measured["echo, WebSocket"]
+        reached = f"{trip['ratio']:.2f} x ({trip['p50']:.0f} beside {echo['p50']:.0f} µs)"
+        yield f"the same, the echo through our own client, N = {lanes}", "", reached, None
+    for lanes, measured in found["round_trip_us"].items():
+        trip, echo = measured["trivial, binary"], measured["echo, HTTP"]
+        reached = f"{trip['ratio']:.2f} x ({trip['p50']:.0f} beside {echo['p50']:.0f} µs)"
+        yield f"binary HTTP beside Starlette's echo, N = {lanes}", "1.3 x", reached, trip["ratio"] <= 1.3
+    for lanes, measured in found["step_us"].items():
+        share, rate = 1 / measured["stream"]["ratio"], int(lanes) / measured["stream"]["p50"]
+        target, held = ("85 %", share >= 0.85) if lanes == "1024" else ("", None)
+        reached = f"{share:.0%} of in process ({rate:.2f} million env-steps/s)"
+        yield f"Pendulum over the stream, N = {lanes}", target, reached, held
+
+
+def peers(found: dict[str, Any]) -> Iterator[Line]:
+    us = found["us"]
+    others = {name: us[name]["p50"] for name in PEERS if name in us}
+    shown = ", ".join(f"{name} {p50:,.0f}" for name, p50 in others.items())
+    ours = us["Surrogym, stream"]["p50"]
+    fastest = len(others) == len(PEERS) and ours < min(others.values())
+    yield "N = 1, p50, beside other systems", "fastest", f"{ours:.0f} µs beside {shown}", fastest
+
+
+def train(found: dict[str, Any]) -> Iterator[Line]:
+    low, high = found["quartiles"]
+    reached = f"{found['ratio']:.3f} x (half of {len(found['pairs']['stream'])} pairs {low:.3f} to {high:.3f})"
+    yield "PPO, 16 lanes, remote beside in process", "1.10 x", reached, found["ratio"] <= 1.1
+
+
+def fit(found: dict[str, Any]) -> Iterator[Line]:
+    for lanes, measured in found["lanes"].items():
+        rest, busy = measured["rest"], measured["samples and fits"]
+        later = (busy["p99"] - rest["p99"]) / 1e3
+        reached = (
+            f"p50 {rest['p50']:.0f} to {busy['p50']:.0f} µs, p99 {rest['p99']:.0f} to {busy['p99']:.0f} µs, longest "
+            f"{rest['longest'] / 1e3:.1f} to {busy['longest'] / 1e3:.1f} ms ({measured['fits']} fits)"
+        )
+        yield f"steps while samples come and fits run, N = {lanes}", "p99 later by < 5 ms", reached, later < 5
+
+
+def predict(found: dict[str, Any]) -> Iterator[Line]:
+    predictions, particles, _, growth, threads = (rows for rows in found.values() if isinstance(rows, list))
+    for row in predictions:
+        sklearn, gpytorch, bare = (row[name] / row["Surrogym"] for name in ("scikit-learn", "GPyTorch", "products"))
+        best = min(gpytorch, row["GPyTorch, fast_pred_var"] / row["Surrogym"])
+        target = {1: "faster", 1_024: "faster, 3 x products", 8_192: "faster, 10 x GPyTorch, 3 x products"}[
+            row["batch"]
+        ]
+        held = min(sklearn, best) > 1 and (row["batch"] == 1 or 1 / bare <= 3) and (row["batch"] < 8_192 or best >= 10)
+        reached = (
+            f"{row['Surrogym']:.3f} ms; scikit-learn {sklearn:.1f} x, GPyTorch {best:.1f} x as long; "
+            f"{1 / bare:.1f} x the products"
+        )
+        yield f"mean and variance, n = 125, 4 outputs, batch {row['batch']:,}", target, reached, held
+    row = next(row for row in particles if row["lanes x particles"] == "64 x 1000")
+    share = row["AUR-P"] / row["products"]
+    reached = f"{row['steps a second']:.1f} steps/s, {share:.1f} x the products"
+    yield "AUR-P, 64 lanes x 1,000 particles, n = 50", "3 x products", reached, share <= 3
+    for row in threads:
+        yield f"two threads, {row['what']}", "", f"{row['1 over 2']:.2f} x as fast as one", None
+    largest = growth[-1]
+    reached = f"{largest['extend']:.2f} ms, a factorisation anew {largest['factorise']:.1f} ms"
+    yield f"one more sample at n = {largest['n']:,}", "", reached, None
+
+
+def growth(found: dict[str, Any]) -> Iterator[Line]:
+    most = {int(count): each for count, each in found["sessions"].items()}
+    reached = "; ".join(f"{c}: {f['requests/s']:,.0f}/s, p99 {f['p99 us'] / 1e3:.1f} ms" for c, f in most.items())
+    yield "concurrent sessions of 16 lanes", "", reached, None
+
+
+def memory(found: dict[str, Any]) -> Iterator[Line]:
+    mib = [m for _, m in found["readings"]]
+    reached = f"{min(mib):.1f} to {max(mib):.1f} MiB, last quarter {found['growth']:+.1%} of the first"
+    yield "resident memory, 64 sessions of 256 lanes", "flat (3 %)", reached, found["growth"] <= 0.03
+
+
+PARTS = {
+    "step": step,
+    "peers": peers,
+    "train": train,
+    "fit": fit,
+    "predict": predict,
+    "growth": growth,
+    "memory": memory,
+}
+
+
+def _machines(out: Path) -> list[str]:
+    """When each part was run, and how loaded the machine was at its end."""
+    found = {part: json.loads((out / f"{part}.json").read_text()) for part in PARTS if (out / f"{part}.json").exists()}
+    if not found:
+        return ["nothing was run yet"]
+    one = next(iter(found.values()))["machine"]
+    loads = ", ".join(
+        f"{part} {each['machine']['time']} load {each['machine']['load'][0]}" for part, each in found.items()
+    )
+    named = f"{one['cores']} cores of {one['processor']}, Python {one['python']}, torch {one['torch']}"
+    return [f"{named}. Ran: {loads}."]
+
+
+if __name__ == "__main__":
+    made = argparse.ArgumentParser(description=__doc__)
+    made.add_argument("--out", type=Path, default=OUT)
+    print(table(made.parse_args().out))
