@@ -35,6 +35,14 @@ def _one_thread() -> None:
     torch.set_num_threads(1)
 
 
+@pytest.fixture(params=["cpu", "cuda"])
+def device(request: pytest.FixtureRequest) -> torch.device:
+    """Every device that steps can be computed on; a machine without the one leaves its tests out, and says so."""
+    if request.param == "cuda" and not torch.cuda.is_available():
+        pytest.skip("torch has no CUDA here")
+    return torch.device(request.param)
+
+
 @pytest.fixture(scope="session")
 def server_process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
     """One real server for the whole run; its tests keep apart by the names of their surrogates."""

@@ -39,6 +39,7 @@ from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_q
 from surrogym_server.engine.fits import Fits
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import MEBIBYTE, Limits, LiveSessions
+from surrogym_server.errors import InvalidInput
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
@@ -92,9 +93,10 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     """The server as an ASGI app. Its database is open from here to the end of its lifespan.
 
     Raises:
-        InvalidInput: the address of the database can't be used.
+        InvalidInput: the address of the database can't be used, or the device is not there.
         Unavailable: the database is taken, or does not answer.
     """
+    _check_device(settings.device)
     storage = open_storage(settings.database_url, settings.synchronous)
     app = FastAPI(
         title="Surrogym",
@@ -120,6 +122,12 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
         app.include_router(room.router)
     _add_dashboard(app)
     return app
+
+
+def _check_device(name: str) -> None:
+    if name == "cuda" and not torch.cuda.is_available():
+        why = "this torch build has no CUDA" if torch.version.cuda is None else "torch finds no GPU that it can use"
+        raise InvalidInput(f"setting device: expected cpu, got cuda, and {why}")
 
 
 def say_goodbye(app: FastAPI) -> None:
@@ -186,7 +194,9 @@ def _build_services(
         queries=QueryService(storage, definitions, engine.notices, samplers),
         samples=SampleService(storage, definitions, engine.notices, samplers),
         models=ModelService(storage, definitions, cache, engine.notices),
-        sessions=SessionService(storage, definitions, cache, engine.live, settings.max_lanes, counts),
+        sessions=SessionService(
+            storage, definitions, cache, engine.live, settings.max_lanes, counts, torch.device(settings.device)
+        ),
         designer=designer,
         events=EventService(storage, engine.notices),
         storage=storage,

@@ -37,7 +37,7 @@ class Settings(BaseModel):
     insecure: bool = Field(default=False, description="allow another address than loopback without a token")
     tls_certificate: FilePath | None = Field(default=None, description="chain of certificates, as PEM")
     tls_key: FilePath | None = Field(default=None, description="its private key, as PEM")
-    device: Annotated[Literal["cpu"], Field(description="what predicts; accelerators are not used yet")] = "cpu"
+    device: Annotated[Literal["cpu", "cuda"], Field(description="what steps sessions; fits use the CPU")] = "cpu"
     threads: Annotated[int, Field(ge=1, le=1024, description="of one torch operation")] = 1
     session_idle_seconds: Annotated[float, Field(gt=0)] = 3_600.0
     max_body_bytes: Annotated[int, Field(ge=1_024)] = 32 * 1024 * 1024

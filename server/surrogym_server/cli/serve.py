@@ -38,6 +38,9 @@ def serve(
     ] = None,
     tls_certificate: Annotated[Path | None, typer.Option(help="PEM file; the server then speaks HTTPS alone.")] = None,
     tls_key: Annotated[Path | None, typer.Option(help="PEM file with the certificate's private key.")] = None,
+    device: Annotated[
+        str | None, typer.Option(help="What steps sessions: cpu, or cuda where torch has it. [default: cpu]")
+    ] = None,
     threads: Annotated[int | None, typer.Option(help="Threads of one torch operation. [default: 1]")] = None,
     session_idle_seconds: Annotated[
         float | None, typer.Option(help="Idle time after which a session expires. [default: 3600]")
@@ -77,6 +80,7 @@ def serve(
             insecure=insecure,
             tls_certificate=tls_certificate,
             tls_key=tls_key,
+            device=device,
             threads=threads,
             session_idle_seconds=session_idle_seconds,
             log_level=log_level,

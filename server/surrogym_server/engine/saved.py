@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from surrogym_server.engine.occupancy import Reservoir
 from surrogym_server.engine.session import Answer, Fingerprint, Outcome, Session
 from surrogym_server.errors import InvalidInput, UnknownSession
+from surrogym_server.gp import placed
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.virtual import LaneState, VirtualSettings
 from surrogym_shared.port import ResetResult, StepResult
@@ -77,7 +78,7 @@ def session_from_bytes(definition: EnvironmentDefinition, data: bytes, surrogate
         settings=VirtualSettings(**header["settings"]),
         seed=header["seed"],
         model=header["model"],
-        lanes=LaneState.from_arrays(_unprefixed("lanes", arrays)),
+        lanes=placed(LaneState.from_arrays(_unprefixed("lanes", arrays)), definition.device),
         versions=arrays["versions"],
         answer=_answer(header, arrays),
         visited=_visited(header, arrays),

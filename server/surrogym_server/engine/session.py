@@ -249,7 +249,7 @@ def _result(transition: Transition, versions: Versions) -> StepResult:
 def _visited(session: Session, chosen: Bools | None) -> Session:
     if session.visited is None:
         return session
-    states = session.lanes.q.numpy()
+    states = session.lanes.q.cpu().numpy()
     return replace(session, visited=session.visited.visit(states if chosen is None else states[chosen]))
 
 

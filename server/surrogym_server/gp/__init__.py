@@ -19,11 +19,13 @@ from surrogym_server.gp.fit import FitOptions, Fitted, fit
 from surrogym_server.gp.joint import Joint
 from surrogym_server.gp.kernel import Hyperparameters
 from surrogym_server.gp.pathwise import Pathwise
+from surrogym_server.gp.placing import CPU, placed
 from surrogym_server.gp.posterior import Posterior, Sparse, condition
 from surrogym_server.gp.serving import Output, Serving
 from surrogym_server.gp.sparse import condition_sparse, spread
 
 __all__ = [
+    "CPU",
     "FitOptions",
     "Fitted",
     "Hyperparameters",
@@ -37,5 +39,6 @@ __all__ = [
     "condition_sparse",
     "fit",
     "in_blocks",
+    "placed",
     "spread",
 ]

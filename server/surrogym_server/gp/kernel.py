@@ -30,15 +30,6 @@ class Hyperparameters:
         parts += ["quadratic"] if self.quadratic_variance > 0 else []
         return " + ".join(parts)
 
-    def to(self, device: torch.device) -> Hyperparameters:
-        return Hyperparameters(
-            self.lengthscale.to(device),
-            self.signal_variance,
-            self.linear_variance,
-            self.quadratic_variance,
-            self.noise_variance,
-        )
-
 
 def covariance(hyper: Hyperparameters, a: Tensor, b: Tensor) -> Tensor:
     """Latent covariance of inputs a (..., m, d) and b (..., n, d), shape (..., m, n).

@@ -73,7 +73,7 @@ class Pathwise:
     def _prior(self, x: Tensor) -> Tensor:
         """Features of the prior at x (m, d), whose scalar products are its covariance: (m, 2 S + polynomial ones)."""
         hyper = self.posterior.hyper
-        phase = (x / hyper.lengthscale) @ _frequencies(x.shape[1])
+        phase = (x / hyper.lengthscale) @ _frequencies(x.shape[1], x.device)
         scale = math.sqrt(hyper.signal_variance / FREQUENCIES)
         parts = [scale * phase.cos(), scale * phase.sin()]
         if hyper.linear_variance > 0:
@@ -84,6 +84,7 @@ class Pathwise:
 
 
 @cache
-def _frequencies(d: int) -> Tensor:
+def _frequencies(d: int, device: torch.device) -> Tensor:
     """Frequencies (d, S) of the squared exponential in length scales: standard normal, the same for ever."""
-    return torch.from_numpy(np.random.Generator(np.random.Philox(key=d)).standard_normal((d, FREQUENCIES)))
+    drawn = np.random.Generator(np.random.Philox(key=d)).standard_normal((d, FREQUENCIES))
+    return torch.from_numpy(drawn).to(device)

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from surrogym_server.gp.blocks import in_blocks
 from surrogym_server.gp.kernel import Hyperparameters
+from surrogym_server.gp.placing import CPU
 from surrogym_server.gp.posterior import Posterior
 
 BLOCK = 262_144  # covariances held at once: they stay in the cache, and memory is bounded at any batch size
@@ -91,10 +92,11 @@ class Serving:
     processes: dict[int, _Process]  # by column; constant outputs have none
 
     @classmethod
-    def of(cls, outputs: Sequence[Output], columns: int, width: int) -> Serving:
-        """Compile outputs for ``columns`` means of inputs (m, ``width``); columns without an output are 0."""
+    def of(cls, outputs: Sequence[Output], columns: int, width: int, device: torch.device = CPU) -> Serving:
+        """Compile outputs, all on a device, for ``columns`` means of inputs (m, ``width``); columns without an output
+        are 0."""
         total = sum(len(o.posterior.y) for o in outputs if o.posterior is not None)
-        like = torch.zeros(0, dtype=torch.float64)
+        like = torch.zeros(0, dtype=torch.float64, device=device)
         exponents, weights = like.new_zeros(2 * width + 1, total), like.new_zeros(total, columns)
         polynomials = like.new_zeros(2 * width + 1, columns)
         processes, begin = {}, 0
@@ -152,7 +154,7 @@ def _process(output: Output, posterior: Posterior, span: slice, polynomial: Tens
     has_polynomial = hyper.linear_variance > 0 or hyper.quadratic_variance > 0
     return _Process(
         span=span,
-        inputs=torch.tensor(output.inputs),
+        inputs=torch.tensor(output.inputs, device=posterior.x.device),
         inverse_lengthscale=1 / hyper.lengthscale,
         scaled=posterior.x / hyper.lengthscale,
         factor=posterior.factor / hyper.signal_variance,
@@ -181,7 +183,7 @@ def _polynomial(posterior: Posterior, inputs: Sequence[int], width: int) -> Tens
 
 def _prior(hyper: Hyperparameters, inputs: Sequence[int], width: int) -> Tensor:
     """k(x, x) = z^2 p: the coefficients p (D,) of z^2 = [x^2, x^4, 1]."""
-    each = torch.ones(len(inputs), 1, dtype=hyper.lengthscale.dtype)
+    each = torch.ones_like(hyper.lengthscale)[:, None]
     constant = each.new_full((1,), hyper.signal_variance + hyper.linear_variance)
     return _in_z(hyper.linear_variance * each, hyper.quadratic_variance * each, constant, inputs, width)[:, 0]
 
@@ -189,7 +191,7 @@ def _prior(hyper: Hyperparameters, inputs: Sequence[int], width: int) -> Tensor:
 def _in_z(linear: Tensor, quadratic: Tensor, constant: Tensor, inputs: Sequence[int], width: int) -> Tensor:
     """Coefficients of a function of some inputs, (d, n), (d, n) and (n,), as rows of z: (2 width + 1, n)."""
     rows = linear.new_zeros(2 * width + 1, linear.shape[1])
-    at = torch.tensor(inputs)
+    at = torch.tensor(inputs, device=linear.device)
     rows[at], rows[width + at], rows[-1] = linear, quadratic, constant
     return rows
 

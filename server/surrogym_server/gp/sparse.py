@@ -70,4 +70,4 @@ def _pivots(hyper: Hyperparameters, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         left = (left - rows[count].square()).clamp_min_(0)
         left[pivot] = 0.0
         chosen.append(pivot)
-    return torch.tensor(chosen), rows[: len(chosen)], left
+    return torch.tensor(chosen, device=x.device), rows[: len(chosen)], left

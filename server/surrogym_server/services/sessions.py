@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from surrogym_server.engine.models import ModelCache
@@ -28,6 +29,7 @@ from surrogym_server.engine.session import (
 )
 from surrogym_server.engine.sessions import LiveSessions, Work
 from surrogym_server.errors import InvalidInput, NotReset, SurrogymError, TooLarge
+from surrogym_server.gp import CPU
 from surrogym_server.services.activity import SessionActivity, Tallies
 from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
@@ -67,13 +69,16 @@ class SessionService:
         live: LiveSessions,
         max_lanes: int,
         counts: Counts,
+        device: torch.device = CPU,
     ) -> None:
+        """``device`` is where sessions are stepped; what comes in and goes out is not on it."""
         self._storage = storage
         self._definitions = definitions
         self._models = models
         self._live = live
         self._max_lanes = max_lanes
         self._counts = counts
+        self._device = device
         self._tallies = Tallies()
         self._opening = asyncio.Lock()
         self._deadline: float | None = None
@@ -209,7 +214,8 @@ class SessionService:
         for saved in self._storage.sessions.take():
             try:
                 surrogate = self._storage.surrogates.get(saved.surrogate).id
-                self._live.add(session_from_bytes(self._definitions.get(saved.surrogate), saved.data, surrogate))
+                definition = self._definitions.get(saved.surrogate).on(self._device)
+                self._live.add(session_from_bytes(definition, saved.data, surrogate))
             except SurrogymError:
                 continue
             restored += 1
@@ -239,7 +245,7 @@ class SessionService:
         return expected_bytes(self._definitions.get(surrogate), opening.settings, model.path_size)
 
     def _open(self, surrogate: str, opening: Opening, digest: str) -> Session:
-        definition = self._definitions.get(surrogate)
+        definition = self._definitions.get(surrogate).on(self._device)
         id = self._storage.surrogates.get(surrogate).id
         latest = self._models.refresh(id)
         version = latest if opening.model == "latest" else opening.model
@@ -263,7 +269,7 @@ class SessionService:
             u,
             mask,
             deviations,
-            lambda version: self._models.get(session.surrogate_id, version),
+            lambda version: self._models.get(session.surrogate_id, version).on(self._device),
             self._latest(session),
         )
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from surrogym_server.gp import CPU, placed
 from surrogym_server.surrogate.terms import Term, TermSet, compile_terms
 
 Relation = Literal["<", "<=", ">", ">="]
@@ -32,8 +33,8 @@ class Conditions:
     membership: Tensor  # (K, G)
 
     @classmethod
-    def of(cls, groups: Sequence[Sequence[Inequality]], coordinates: int) -> Conditions:
-        """Compile groups over C coordinates. A group of none always holds."""
+    def of(cls, groups: Sequence[Sequence[Inequality]], coordinates: int, device: torch.device = CPU) -> Conditions:
+        """Compile groups over C coordinates on a device. A group of none always holds."""
         inequalities = [i for group in groups for i in group]
         belongs = [g for g, group in enumerate(groups) for _ in group]
         sign = np.array([1.0 if i.relation in (">", ">=") else -1.0 for i in inequalities])
@@ -42,7 +43,8 @@ class Conditions:
         threshold = np.where(strict, np.nextafter(bound, np.inf), bound)
         membership = np.eye(len(groups))[belongs].reshape(len(inequalities), len(groups))
         terms = compile_terms([i.term for i in inequalities], coordinates)
-        return cls(terms, *(torch.from_numpy(array) for array in (sign, threshold, membership)))
+        compiled = cls(terms, *(torch.from_numpy(array) for array in (sign, threshold, membership)))
+        return placed(compiled, device)
 
     def __call__(self, q: Tensor) -> Tensor:
         """Which groups hold at q (..., C), (..., G)."""

@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from surrogym_server.gp import CPU, placed
 from surrogym_server.surrogate.conditions import Conditions, Inequality
 from surrogym_server.surrogate.terms import Term, TermSet, compile_terms
 
@@ -44,6 +45,7 @@ class DeclaredReward:
     after: bool
     terminal: float  # what a step that ends the episode pays beyond
     coordinates: int
+    device: torch.device = CPU  # where its tensors are
 
     def __call__(self, q: Tensor, u: Tensor) -> Tensor:
         """Reward (m,) of the state q (m, C) that counts and the action u (m, F)."""
@@ -65,7 +67,8 @@ class DeclaredReward:
         weights = torch.tensor([quantity.action for quantity in quantities], dtype=torch.float64)
         terms = compile_terms([quantity.term for quantity in quantities], self.coordinates)
         conditions = Conditions.of([term.when for term in self.terms], self.coordinates)
-        return terms, weights.T if quantities else weights.reshape(1, 0), conditions
+        compiled = terms, weights.T if quantities else weights.reshape(1, 0), conditions
+        return placed(compiled, self.device)
 
 
 def _shaped(shape: Shape, x: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from surrogym_server.gp import CPU, placed
 from surrogym_server.surrogate.conditions import Conditions, Inequality
 from surrogym_server.surrogate.declared import DeclaredReward
 from surrogym_server.surrogate.distributions import Distribution
@@ -96,6 +97,11 @@ class EnvironmentDefinition:
     learns_termination: bool = False  # from samples; no groups are declared then
     declared_reward: DeclaredReward | None = None
     max_rollout: int | None = None  # longest action sequence from a reset; None where any state can be set
+    device: torch.device = CPU  # where its tensors are, and those of states and actions that it is given
+
+    def on(self, device: torch.device) -> EnvironmentDefinition:
+        """The same for states on another device."""
+        return self if device == self.device else placed(self, device)
 
     def with_tolerances(self, tolerances: Mapping[str, float]) -> EnvironmentDefinition:
         """The same with these tolerances, by output, in the place of its own."""
@@ -120,7 +126,7 @@ class EnvironmentDefinition:
     @cached_property
     def observe(self) -> TermSet:
         """Observation of coordinates: q (..., C) -> o (..., D)."""
-        return compile_terms(self.observation_terms, len(self.coordinates))
+        return placed(compile_terms(self.observation_terms, len(self.coordinates)), self.device)
 
     @cached_property
     def observation_combines(self) -> bool:
@@ -132,7 +138,8 @@ class EnvironmentDefinition:
     def observation_scaling(self) -> tuple[Tensor, Tensor]:
         """Mean and deviation of the observation over the sampling range, (D,) each; an entry that never varies has
         deviation 1."""
-        p = torch.from_numpy(np.random.default_rng(0).uniform(size=(SCALING_POINTS, len(self.coordinates))))
+        drawn = np.random.default_rng(0).uniform(size=(SCALING_POINTS, len(self.coordinates)))
+        p = torch.from_numpy(drawn).to(self.device)
         q = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(self.coordinates)], -1)
         shown = self.observe(q)
         deviation = shown.std(0, correction=0)
@@ -141,21 +148,21 @@ class EnvironmentDefinition:
     @cached_property
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Saturation bounds, (C,) each."""
-        low = torch.tensor([c.low for c in self.coordinates], dtype=torch.float64)
-        return low, torch.tensor([c.high for c in self.coordinates], dtype=torch.float64)
+        low, high = self._columns([(c.low, c.high) for c in self.coordinates])
+        return low, high
 
     @cached_property
     def reach(self) -> tuple[Tensor, Tensor]:
         """Saturation bounds, (C,) each; where there is none, ``REACH`` widths of the sampling range beyond it, so that
         a model that diverges stays finite."""
         low, high = self.bounds
-        ends = torch.tensor([(c.sampling.low, c.sampling.high) for c in self.coordinates], dtype=torch.float64)
-        room = REACH * (ends[:, 1] - ends[:, 0])
-        return torch.maximum(low, ends[:, 0] - room), torch.minimum(high, ends[:, 1] + room)
+        begin, end = self._sampled
+        room = REACH * (end - begin)
+        return torch.maximum(low, begin - room), torch.minimum(high, end + room)
 
     def in_range(self, q: Tensor) -> Tensor:
         """Whether states q (n, C) lie in the sampling range, (n,) bool."""
-        low, high = torch.tensor([(c.sampling.low, c.sampling.high) for c in self.coordinates], dtype=torch.float64).T
+        low, high = self._sampled
         inside: Tensor = ((q >= low) & (q <= high)).all(-1)
         return inside
 
@@ -171,7 +178,16 @@ class EnvironmentDefinition:
 
     @cached_property
     def _termination(self) -> Conditions:
-        return Conditions.of(self.termination_groups, len(self.coordinates))
+        return Conditions.of(self.termination_groups, len(self.coordinates), self.device)
+
+    @cached_property
+    def _sampled(self) -> tuple[Tensor, Tensor]:
+        """Ends of the sampling range, (C,) each."""
+        low, high = self._columns([(c.sampling.low, c.sampling.high) for c in self.coordinates])
+        return low, high
+
+    def _columns(self, rows: Sequence[tuple[float, ...]]) -> tuple[Tensor, ...]:
+        return torch.tensor(rows, dtype=torch.float64, device=self.device).T.contiguous().unbind()
 
 
 def wrap(angle: Tensor) -> Tensor:

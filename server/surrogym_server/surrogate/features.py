@@ -137,7 +137,10 @@ class Encoder:
         """Compile maps: their features by function, the lead's last."""
         wanted = {feature for feature_map in maps for feature in features(definition, feature_map)}
         ordered = sorted(wanted, key=lambda f: (f.function == "lead", f))
-        groups = tuple((function, *_group(tuple(same))) for function, same in groupby(ordered, lambda f: f.function))
+        groups = tuple(
+            (function, *_group(tuple(same), definition.device))
+            for function, same in groupby(ordered, lambda f: f.function)
+        )
         return cls(definition, groups, {feature: column for column, feature in enumerate(ordered)})
 
     def inputs(self, feature_map: FeatureMap) -> tuple[int, ...]:
@@ -208,12 +211,12 @@ def _of_action(definition: EnvironmentDefinition, feature_map: FeatureMap, entry
     return [Feature("affine", place, (count - 1) / 2, math.sqrt((count**2 - 1) / 12))]
 
 
-def _group(same: tuple[Feature, ...]) -> tuple[slice | Tensor, Tensor, Tensor]:
+def _group(same: tuple[Feature, ...], device: torch.device) -> tuple[slice | Tensor, Tensor, Tensor]:
     """Entries, as a slice where they are neighbours, or weights (C, k); centres and scales."""
-    centre, scale = torch.tensor([(f.centre, f.scale) for f in same], dtype=torch.float64).T
+    centre, scale = torch.tensor([(f.centre, f.scale) for f in same], dtype=torch.float64, device=device).T
     if same[0].weights:
-        return torch.tensor([f.weights for f in same], dtype=torch.float64).T, centre, scale
+        return torch.tensor([f.weights for f in same], dtype=torch.float64, device=device).T, centre, scale
     entries = [feature.entry for feature in same]
     neighbours = entries == list(range(entries[0], entries[0] + len(entries)))
-    index = slice(entries[0], entries[-1] + 1) if neighbours else torch.tensor(entries)
+    index = slice(entries[0], entries[-1] + 1) if neighbours else torch.tensor(entries, device=device)
     return index, centre, scale

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from surrogym_server.gp import Output, Posterior, in_blocks
+from surrogym_server.gp import Output, Posterior, in_blocks, placed
 from surrogym_server.surrogate.definition import EnvironmentDefinition, wrap
 from surrogym_server.surrogate.features import Encoder, FeatureMap, leading
 from surrogym_server.surrogate.recover import ObservationInverse
@@ -75,6 +75,18 @@ class SurrogateModel:
     ending: Region | None = None  # where episodes end, if that is learned
     jumps: tuple[Jump, ...] = ()  # of the reward, beyond its process
 
+    def on(self, device: torch.device) -> SurrogateModel:
+        """The same with its arrays on a device, made once."""
+        if device == self.definition.device:
+            return self
+        if device not in self._elsewhere:
+            self._elsewhere[device] = placed(self, device)
+        return self._elsewhere[device]
+
+    @cached_property
+    def _elsewhere(self) -> dict[torch.device, SurrogateModel]:
+        return {}
+
     @property
     def description(self) -> dict[str, Any]:
         """Structure and hyperparameters of every output, for people."""
@@ -128,7 +140,9 @@ class SurrogateModel:
     @cached_property
     def scales(self) -> Tensor:
         """Deviation of each output's targets over the samples, (O,), in its own unit."""
-        return torch.tensor([o.scale for o in (*self.transitions, self.reward)], dtype=torch.float64)
+        return torch.tensor(
+            [o.scale for o in (*self.transitions, self.reward)], dtype=torch.float64, device=self.definition.device
+        )
 
     def terminated(self, q: Tensor) -> Tensor:
         """Whether an episode ends on arriving at q (m, C), (m,)."""
@@ -238,7 +252,7 @@ def paid(terminal_reward: float, reward: Tensor, terminated: Tensor) -> Tensor:
 def clip(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
     """Coordinates q (..., C) inside their saturation bounds, and a diverging model's within its reach."""
     low, high = definition.reach
-    return torch.clamp(q, low.to(q.device), high.to(q.device))
+    return torch.clamp(q, low, high)
 
 
 def settle(definition: EnvironmentDefinition, q: Tensor) -> Tensor:

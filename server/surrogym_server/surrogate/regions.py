@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
+from surrogym_server.gp import placed
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.features import encode
 from surrogym_server.surrogate.terms import Part, Term, TermSet, compile_terms
@@ -42,7 +43,7 @@ class Axes:
             found[Term((Part("linear", 1.0, weights),))] = definition.coordinates[index].name
         for name, term in zip(definition.observation_names, definition.observation_terms, strict=True):
             found.setdefault(term, name)
-        return cls(tuple(found.values()), compile_terms(list(found), size))
+        return cls(tuple(found.values()), placed(compile_terms(list(found), size), definition.device))
 
     def __len__(self) -> int:
         return 3 * len(self.names)
@@ -119,7 +120,8 @@ class Thresholds:
         membership = outside.new_zeros(len(cuts), len(self.rules))
         for place, (row, cut) in enumerate(cuts):
             membership[place, row] = cut.weight
-        return torch.tensor([cut.axis for _, cut in cuts]), outside, inside - outside, membership
+        compiled = torch.tensor([cut.axis for _, cut in cuts]), outside, inside - outside, membership
+        return placed(compiled, self.definition.device)
 
 
 @dataclass(frozen=True)
@@ -175,7 +177,7 @@ def jumped(jumps: Sequence[Jump], q: Tensor) -> tuple[Tensor, Tensor]:
 
     Of jumps whose regions overlap the first one counts.
     """
-    added, variance, free = q.new_zeros(len(q)), q.new_zeros(len(q)), torch.ones(len(q), dtype=torch.bool)
+    added, variance, free = q.new_zeros(len(q)), q.new_zeros(len(q)), q.new_ones(len(q), dtype=torch.bool)
     for jump in jumps:
         inside = jump.region.probability(q)
         added = added + jump.size * ((inside > 0.5) & free)

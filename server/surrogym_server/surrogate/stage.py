@@ -37,15 +37,16 @@ class Stage:
     @classmethod
     def of(cls, encoder: Encoder, outputs: Sequence[Output], columns: int, *, lead: bool, begin: int) -> Stage:
         """Compile outputs for ``columns`` of them; their draws' weights start at ``begin``."""
-        noise, drawn = torch.zeros(columns, dtype=torch.float64), []
+        device = encoder.definition.device
+        noise, drawn = torch.zeros(columns, dtype=torch.float64, device=device), []
         for output in outputs:
             if output.posterior is None:
                 continue
             noise[output.column] = output.scale * math.sqrt(output.posterior.hyper.noise_variance)
             pathwise = Pathwise(output.posterior)
             span = slice(begin, begin := begin + pathwise.size)
-            drawn.append(Drawn(output.column, span, torch.tensor(output.inputs), output.scale, pathwise))
-        return cls(encoder, Serving.of(outputs, columns, encoder.width(lead)), noise, tuple(drawn), begin)
+            drawn.append(Drawn(output.column, span, torch.tensor(output.inputs, device=device), output.scale, pathwise))
+        return cls(encoder, Serving.of(outputs, columns, encoder.width(lead), device), noise, tuple(drawn), begin)
 
     def predict(
         self, x: Tensor, wanted: tuple[int, ...], kick: Tensor | None, process: Tensor | None, paths: Tensor | None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -48,10 +48,6 @@ class TermSet:
             basis = torch.cat([q, phase.sin(), phase.cos()], -1)
         value = linear(basis, self.coefficients, self.constant)
         return value if self.low is None else torch.clamp(value, self.low, self.high)
-
-    def to(self, device: torch.device) -> TermSet:
-        tensors = (getattr(self, field.name) for field in fields(self))
-        return TermSet(*(None if t is None else t.to(device) for t in tensors))  # type: ignore[arg-type]
 
 
 def compile_terms(terms: Sequence[Term], coordinates: int) -> TermSet:

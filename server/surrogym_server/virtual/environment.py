@@ -70,16 +70,17 @@ def create(definition: EnvironmentDefinition, settings: VirtualSettings, seed: i
     """N lanes that have not been reset yet."""
     count, size = settings.num_envs, len(definition.coordinates)
     particles = settings.particles if settings.variant == "probabilistic" else 0
-    zeros = torch.zeros(count, dtype=torch.int64)
+    zeros = torch.zeros(count, dtype=torch.int64, device=definition.device)
+    none = zeros.new_zeros(count, 0, dtype=torch.float64)
     return LaneState(
-        seed=torch.full((count,), seed, dtype=torch.int64),
-        lane=torch.arange(count),
+        seed=torch.full_like(zeros, seed),
+        lane=torch.arange(count, device=definition.device),
         episode=zeros - 1,
         elapsed=zeros,
-        phase=torch.full((count,), NEW, dtype=torch.int8),
-        q=torch.zeros(count, size, dtype=torch.float64),
-        particles=torch.zeros(count, particles, size, dtype=torch.float64),
-        path=torch.zeros(count, 0, dtype=torch.float64),
+        phase=torch.full_like(zeros, NEW, dtype=torch.int8),
+        q=none.new_zeros(count, size),
+        particles=none.new_zeros(count, particles, size),
+        path=none,
     )
 
 
@@ -98,7 +99,7 @@ def reset(
     Raises:
         InvalidInput: mask or list of seeds of another length, or a seed that is negative or too large.
     """
-    chosen = _mask(mask, len(lanes))
+    chosen = _mask(mask, lanes)
     if seed is not None:
         lanes = _seeded(lanes, seed, chosen)
     lanes = _begin(definition, settings, lanes, chosen)
@@ -120,16 +121,16 @@ def step(
         NotReset: a lane that was never reset, or that ended under autoreset disabled.
     """
     definition = model.definition
-    moving, beginning = _divided(settings, lanes, _mask(mask, len(lanes)))
+    moving, beginning = _divided(settings, lanes, _mask(mask, lanes))
     active = lanes.take(moving)
     if settings.variant == "pathwise":
         active = with_paths(model, active)
-    moved = _move(model, settings, active, torch.from_numpy(u)[moving], deviations)
+    moved = _move(model, settings, active, torch.from_numpy(u).to(definition.device)[moving], deviations)
     untrusted = _untrusted(model, settings, moved)
     active, cut = _advanced(settings, active, moved, untrusted)
     after = lanes.put(moving, active)
     terminated, truncated = _scatter(moving, moved.terminated), _scatter(moving, cut)
-    final_lanes = torch.zeros(0, dtype=torch.int64)
+    final_lanes = lanes.seed[:0]
     final_observation = np.zeros((0, len(definition.observation_names)), dtype=np.float32)
     if settings.autoreset_mode == "same_step":
         beginning = terminated | truncated
@@ -139,15 +140,15 @@ def step(
     after = _begin(definition, settings, after, beginning)
     return after, Transition(
         observation=_observe(definition, after),
-        reward=_scatter(moving, moved.reward).numpy(),
-        terminated=terminated.numpy(),
-        truncated=truncated.numpy(),
-        final_lanes=final_lanes.numpy(),
+        reward=_array(_scatter(moving, moved.reward)),
+        terminated=_array(terminated),
+        truncated=_array(truncated),
+        final_lanes=_array(final_lanes),
         final_observation=final_observation,
-        reset_lanes=beginning.numpy(),
-        reward_mean=_scatter(moving, moved.reward_mean).numpy(),
-        deviation=None if moved.deviation is None or not deviations else _scatter(moving, moved.deviation).numpy(),
-        untrusted=None if untrusted is None else _scatter(moving, untrusted).numpy(),
+        reset_lanes=_array(beginning),
+        reward_mean=_array(_scatter(moving, moved.reward_mean)),
+        deviation=None if moved.deviation is None or not deviations else _array(_scatter(moving, moved.deviation)),
+        untrusted=None if untrusted is None else _array(_scatter(moving, untrusted)),
     )
 
 
@@ -225,12 +226,12 @@ def _seeded(lanes: LaneState, seed: int | Sequence[int], chosen: Chosen) -> Lane
     if outside:
         raise InvalidInput(f"seed: expected 0 to 2^63 - 1, got {outside[0]}")
     if isinstance(seed, int):
-        seeds, numbers = torch.full_like(lanes.seed, seed), torch.arange(len(lanes))
+        seeds, numbers = torch.full_like(lanes.seed, seed), torch.arange(len(lanes), device=lanes.seed.device)
     else:
         if len(seed) != len(lanes):
             raise InvalidInput(f"seed: expected an integer or {len(lanes)} of them, got {len(seed)}")
-        seeds, numbers = torch.tensor(list(seed), dtype=torch.int64), torch.zeros_like(lanes.lane)
-    replaced = torch.ones(len(lanes), dtype=torch.bool) if isinstance(chosen, slice) else chosen
+        seeds, numbers = torch.tensor(list(seed), device=lanes.seed.device), torch.zeros_like(lanes.lane)
+    replaced = torch.ones_like(lanes.seed, dtype=torch.bool) if isinstance(chosen, slice) else chosen
     return replace(
         lanes,
         seed=torch.where(replaced, seeds, lanes.seed),
@@ -240,16 +241,21 @@ def _seeded(lanes: LaneState, seed: int | Sequence[int], chosen: Chosen) -> Lane
 
 
 def _observe(definition: EnvironmentDefinition, lanes: LaneState) -> Floats:
-    observation: Floats = definition.observe(lanes.q).to(torch.float32).numpy()
-    return observation
+    return _array(definition.observe(lanes.q).to(torch.float32))
 
 
-def _mask(mask: Bools | None, count: int) -> Chosen:
+def _array(values: Tensor) -> NDArray[Any]:
+    """As the wire wants it, wherever it was computed."""
+    array: NDArray[Any] = values.cpu().numpy()
+    return array
+
+
+def _mask(mask: Bools | None, lanes: LaneState) -> Chosen:
     if mask is None:
         return EVERY
-    if len(mask) != count:
-        raise InvalidInput(f"mask: expected {count} entries, got {len(mask)}")
-    return torch.as_tensor(mask, dtype=torch.bool)
+    if len(mask) != len(lanes):
+        raise InvalidInput(f"mask: expected {len(lanes)} entries, got {len(mask)}")
+    return torch.as_tensor(mask, dtype=torch.bool, device=lanes.seed.device)
 
 
 def _scatter(chosen: Chosen, values: Tensor) -> Tensor:

@@ -40,14 +40,14 @@ class LaneState:
         """The lanes of an index or mask, in its order."""
         if isinstance(index, slice):
             return self
-        at = torch.as_tensor(index)
+        at = torch.as_tensor(index, device=self.seed.device)
         return LaneState(*(getattr(self, f.name)[at] for f in fields(self)))
 
     def put(self, index: NDArray[Any] | Chosen, other: LaneState) -> LaneState:
         """These lanes with those of an index or mask replaced by ``other``."""
         if isinstance(index, slice):
             return other
-        at = torch.as_tensor(index)
+        at = torch.as_tensor(index, device=self.seed.device)
         replaced = []
         for f in fields(self):
             values = getattr(other, f.name)
@@ -66,7 +66,7 @@ class LaneState:
         return sum(int(getattr(self, f.name).nbytes) for f in fields(self))
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
-        return {f.name: getattr(self, f.name).numpy() for f in fields(self)}
+        return {f.name: getattr(self, f.name).cpu().numpy() for f in fields(self)}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> LaneState:

@@ -37,7 +37,7 @@ def normal_noise(lanes: LaneState, purpose: Purpose, particles: int, size: int) 
 def _words(lanes: LaneState, purpose: Purpose, particles: int, size: int) -> Tensor:
     """Random words, (N, particles, ceil(size / 4), 4): one counter gives four of them."""
     blocks = -(-size // 4)
-    draw = torch.arange(particles * blocks).reshape(1, particles, blocks)
+    draw = torch.arange(particles * blocks, device=lanes.seed.device).reshape(1, particles, blocks)
     seed, lane, episode, step = (x[:, None, None] for x in (lanes.seed, lanes.lane, lanes.episode, lanes.elapsed))
     third = step | (int(purpose) << STEP_BITS)
     return philox((lane & MASK, episode & MASK, third, draw), (seed & MASK, (seed >> 32) & MASK))

@@ -29,9 +29,10 @@ def start_particles(
     definition: EnvironmentDefinition, lanes: LaneState, q: Tensor, count: int, spread: float
 ) -> Tensor:
     """Particles around starts q (N, C), (N, P, C): normal with a fixed low deviation in each dimension (section 4)."""
-    deviation = torch.tensor([_deviation(definition, i, spread) for i in range(len(definition.coordinates))])
+    each = [_deviation(definition, i, spread) for i in range(len(definition.coordinates))]
+    deviation = torch.tensor(each, dtype=q.dtype, device=q.device)
     noise = normal_noise(lanes, Purpose.SPREAD, count, len(definition.coordinates))
-    return settle(definition, q[:, None] + deviation.to(q.dtype) * noise)
+    return settle(definition, q[:, None] + deviation * noise)
 
 
 def _deviation(definition: EnvironmentDefinition, index: int, spread: float) -> float:

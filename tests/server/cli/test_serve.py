@@ -14,12 +14,14 @@ from typing import Any
 
 import httpx
 import pytest
+import torch
 
 from support import pendulum
 from support.server import running_server, start_server
 
 SERVE = [sys.executable, "-m", "surrogym_server", "serve"]
 PATIENCE = 60.0
+WITHOUT_CUDA = pytest.mark.skipif(torch.cuda.is_available(), reason="torch has CUDA here")
 
 
 def serve(*options: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -54,6 +56,8 @@ def test_a_taken_port_is_one_sentence(server_process: Any, tmp_path: Path):
         (["--token-file", "/no/such/file"], {}, "/no/such/file"),
         ([], {"WEB_CONCURRENCY": "4"}, "expected one worker process, got WEB_CONCURRENCY=4"),
         (["--database", "mysql://x/y"], {}, "mysql"),
+        (["--device", "tpu"], {}, "setting device: Input should be 'cpu' or 'cuda'"),
+        pytest.param([], {"SURROGYM_DEVICE": "cuda"}, "setting device: expected cpu, got cuda", marks=WITHOUT_CUDA),
         (["--database", "/dev/null/surrogym.db"], {}, "/dev/null"),
     ],
 )

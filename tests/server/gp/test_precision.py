@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from surrogym_server.gp import Hyperparameters, Output, Posterior, Serving, condition, serving
+from surrogym_server.gp import Hyperparameters, Output, Posterior, Serving, condition, placed, serving
 
 DIGITS = 60
 NOISE = 1e-8
@@ -45,7 +45,7 @@ def reference(hyper: Hyperparameters, x: np.ndarray, y: np.ndarray, at: np.ndarr
 
 
 def served(posterior: Posterior, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    compiled = Serving.of([Output(0, posterior, (0, 1))], columns=1, width=2)
+    compiled = Serving.of([Output(0, posterior, (0, 1))], columns=1, width=2, device=at.device)
     mean, deviation = compiled.mean_and_deviation(at, [0])
     torch.testing.assert_close(compiled.mean(at), mean, rtol=0, atol=0)
     return mean[:, 0], deviation[:, 0].square()
@@ -53,7 +53,7 @@ def served(posterior: Posterior, at: torch.Tensor) -> tuple[torch.Tensor, torch.
 
 @pytest.mark.parametrize("length", [0.5, 2.0, 20.0])
 @pytest.mark.parametrize(("linear", "quadratic"), [(0.0, 0.0), (0.7, 0.3)])
-def test_ill_conditioned(rng, monkeypatch, length, linear, quadratic):
+def test_ill_conditioned(rng, monkeypatch, device, length, linear, quadratic):
     x = rng.normal(size=(12, 2))
     x = np.concatenate([x, x[:4] + 1e-4 * rng.normal(size=(4, 2)), x[:4] + 1e-6 * rng.normal(size=(4, 2))])
     y = np.sin(x[:, 0]) + 0.4 * x.sum(1) - 0.2 * x[:, 1] ** 2
@@ -61,13 +61,14 @@ def test_ill_conditioned(rng, monkeypatch, length, linear, quadratic):
     hyper = Hyperparameters(length * torch.tensor([1.0, 1.5], dtype=torch.float64), 1.3, linear, quadratic, NOISE)
     with mpmath.workdps(DIGITS):
         mean, variance, prior = reference(hyper, x, y, at).T
-    posterior = condition(hyper, torch.from_numpy(x), torch.from_numpy(y))
+    posterior = placed(condition(hyper, torch.from_numpy(x), torch.from_numpy(y)), device)
     assert posterior.jitter == 0
-    predictions = [posterior.mean_and_variance(torch.from_numpy(at)), served(posterior, torch.from_numpy(at))]
+    points = torch.from_numpy(at).to(device)
+    predictions = [posterior.mean_and_variance(points), served(posterior, points)]
     for tolerance in (0.0, math.inf):
         monkeypatch.setattr(serving, "MEAN_TOLERANCE", tolerance)
         monkeypatch.setattr(serving, "VARIANCE_TOLERANCE", tolerance)
-        predictions.append(served(posterior, torch.from_numpy(at)))
-    for ours, latent in ((m.numpy(), v.numpy()) for m, v in predictions):
+        predictions.append(served(posterior, points))
+    for ours, latent in ((m.cpu().numpy(), v.cpu().numpy()) for m, v in predictions):
         assert np.max(np.abs(ours - mean) / np.sqrt(prior)) < 1e-7
         assert np.all(np.abs(latent - variance) <= 1e-9 * prior + 1e-3 * variance)

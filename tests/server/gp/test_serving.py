@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from surrogym_server.gp import Hyperparameters, Output, Serving, condition, in_blocks, serving
+from surrogym_server.gp import Hyperparameters, Output, Serving, condition, in_blocks, placed, serving
 
 INPUTS = ((0, 1, 2), (3, 1, 0), (2, 4, 3))
 WIDTH, COLUMNS, CONSTANT = 5, 5, 4
@@ -30,12 +30,12 @@ def at(rng) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1.0], ids=["differences", "products"])
-def test_every_output_is_its_posterior(outputs, at, monkeypatch, tolerance):
+def test_every_output_is_its_posterior(outputs, at, monkeypatch, device, tolerance):
     monkeypatch.setattr(serving, "MEAN_TOLERANCE", tolerance)
     monkeypatch.setattr(serving, "VARIANCE_TOLERANCE", tolerance)
-    compiled = Serving.of(outputs, COLUMNS, WIDTH)
-    mean, deviation = compiled.mean_and_deviation(at, range(COLUMNS))
-    torch.testing.assert_close(compiled.mean(at), mean, rtol=0, atol=0)
+    compiled = Serving.of(placed(tuple(outputs), device), COLUMNS, WIDTH, device)
+    mean, deviation = (values.cpu() for values in compiled.mean_and_deviation(at.to(device), range(COLUMNS)))
+    torch.testing.assert_close(compiled.mean(at.to(device)).cpu(), mean, rtol=0, atol=0)
     assert (mean[:, 2] == 0).all()
     assert (mean[:, CONSTANT] == 2.5).all()
     assert (deviation[:, [2, CONSTANT]] == 0).all()

@@ -1,0 +1,90 @@
+"""Steps on every device that this machine has agree with those on the CPU, and nothing of them stays behind there."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
+
+from support.real_steps import random_steps
+from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.gp import CPU, placed, serving
+from surrogym_server.surrogate.learn import learn
+from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.virtual import LaneState, Transition, VirtualSettings, create, environment, reset, step
+
+LANES, STEPS = 6, 4
+VARIANTS: dict[str, dict[str, Any]] = {
+    "deterministic": {"penalty": 3.0},
+    "noisy, trusted": {"process_noise": True, "trust": 10.0, "start_box": 0.5},
+    "probabilistic": {"variant": "probabilistic", "particles": 8},
+    "pathwise": {"variant": "pathwise"},
+}
+
+
+@pytest.fixture(scope="module", params=["pendulum", "learned ending", "paper"])
+def model(request: pytest.FixtureRequest) -> SurrogateModel:
+    spec = cartpole() if request.param == "learned ending" else pendulum()
+    if request.param == "paper":
+        spec = spec.model_copy(update={"design": spec.design.model_copy(update={"preset": "paper"})})
+    if request.param == "learned ending":
+        spec = spec.model_copy(update={"termination": "learned"})
+    return learn(definition_from_spec(spec), random_steps(spec, 14, seed=0)).model
+
+
+def run(model: SurrogateModel, settings: VirtualSettings) -> tuple[LaneState, list[Transition]]:
+    """Some steps from a seeded reset, some lanes of which are reset again."""
+    definition, rng = model.definition, np.random.default_rng(0)
+    low, high = definition.action.limits if definition.action.low else (0, np.array(definition.action.nvec) - 1)
+    lanes, _ = reset(definition, settings, create(definition, settings, 0), list(range(LANES)))
+    made = []
+    for _ in range(STEPS):
+        lanes, moved = step(model, settings, lanes, rng.uniform(low, high, (LANES, definition.action.size)).round())
+        made.append(moved)
+    lanes, _ = reset(definition, settings, lanes, mask=np.arange(LANES) % 2 == 0)
+    return lanes, made
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_steps_agree_with_those_on_the_cpu(model, variant, device):
+    settings = VirtualSettings(LANES, autoreset_mode="same_step", time_limit=3, **VARIANTS[variant])
+    here, there = run(model, settings), run(model.on(device), settings)
+    assert {getattr(there[0], field.name).device.type for field in fields(LaneState)} == {device.type}
+    for ours, theirs in zip(here[1], there[1], strict=True):
+        for field in fields(Transition):
+            if (expected := getattr(ours, field.name)) is not None:
+                np.testing.assert_allclose(getattr(theirs, field.name), expected, rtol=1e-6, atol=1e-6)
+
+
+def test_a_model_is_placed_once(model):
+    meta = torch.device("meta")
+    assert model.on(CPU) is model
+    assert model.on(meta) is model.on(meta)
+    assert model.on(meta).transitions[0].posterior.factor.device == meta
+    assert model.transitions[0].posterior.factor.device == CPU
+
+
+@pytest.mark.parametrize("differences", [False, True])
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_nothing_of_a_step_is_made_on_the_cpu(model, variant, differences, monkeypatch):
+    """Tensors that only pretend to be anywhere: an operation on two devices is refused. ``meta`` is the other one."""
+    conditions = iter([True])  # all lanes run; nobody is to be reset
+    monkeypatch.setattr(FakeTensor, "__bool__", lambda _: next(conditions, False))
+    monkeypatch.setattr(serving, "_error_bounds", lambda _: (float(differences), float(differences)))
+    arrived: list[torch.Tensor] = []
+    monkeypatch.setattr(environment, "_array", lambda values: arrived.append(values) or np.zeros(0))
+    settings = VirtualSettings(LANES, autoreset_mode="disabled", time_limit=3, **VARIANTS[variant])
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        with pytest.raises(RuntimeError, match="same device"):
+            torch.zeros(2) + torch.zeros(2, device="meta")
+        there = placed(model, torch.device("meta"))
+        lanes, _ = reset(there.definition, settings, create(there.definition, settings, 0), seed=1)
+        if settings.variant == "pathwise":
+            lanes = replace(lanes, path=there.draw(lanes.q.new_zeros(LANES, there.path_size)))
+        step(there, settings, lanes, np.zeros((LANES, model.definition.action.size)))
+    assert {values.device.type for values in arrived} == {"meta"}
