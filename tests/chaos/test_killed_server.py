@@ -23,7 +23,7 @@ LEASE_SECONDS = 4.0  # a restart takes as long, so that some leases end meanwhil
 @pytest.mark.parametrize(
     ("kills", "with_samplers"),
     [
-        pytest.param(times(short=2, full=100), False, id="alone"),
+        pytest.param(times(short=1, full=100), False, id="alone"),
         pytest.param(times(short=1, full=20), True, id="with-its-samplers"),
     ],
 )

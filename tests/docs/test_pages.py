@@ -53,6 +53,12 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert broken == []
 
 
+@each_page
+def test_the_tests_that_a_page_names_are_there(page: Path) -> None:
+    named = re.findall(r"\btests/[\w/]+(?:\.py)?", page.read_text(encoding="utf-8"))
+    assert [name for name in named if not (ROOT / name).exists()] == []
+
+
 def named(words: list[str]) -> list[str]:
     """The words that name the command, two where it is one of a group."""
     group = getattr(command_line().commands[words[0]], "commands", {})
