@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import resource
+import shutil
 import sqlite3
 import subprocess
 import threading
@@ -57,7 +58,8 @@ def in_a_file(folder: Path) -> Iterator[Place]:
     def limited(server: ServerProcess) -> Iterator[None]:
         """Its files can't grow beyond a size: what a quota does, and no privilege is needed for it."""
         pid = server.process.pid
-        before = resource.prlimit(pid, resource.RLIMIT_FSIZE, (MIB // 4, resource.RLIM_INFINITY))
+        before = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (MIB // 4, before[1]))
         try:
             yield
         finally:
@@ -78,7 +80,7 @@ def on_a_small_disk(folder: Path) -> Iterator[Place]:
     disk = folder / "disk"
     disk.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=8m", "none", str(disk)]
-    if os.geteuid() or subprocess.run(mount, capture_output=True).returncode:
+    if os.geteuid() or not shutil.which("mount") or subprocess.run(mount, capture_output=True).returncode:
         pytest.skip("a file system can't be mounted here; the limit of a file's size stands for it")
 
     @contextmanager
