@@ -22,6 +22,7 @@ from support.teaching import teach
 from surrogym_client.api import Api
 from surrogym_client.original.classic import pendulum
 
+OWN_LINES = 30  # of an environment, blank ones left out
 PRINTED_URL = "http://127.0.0.1:8000"
 PAGES = ["docs/tutorial.md"]
 ALL_PAGES = [
@@ -130,3 +131,10 @@ def test_each_page_with_commands_is_followed_or_known_to_be_run_elsewhere() -> N
         str(page.relative_to(ROOT)) for page in pages if re.search(r"^```(?!json|text|$)\S", page.read_text(), re.M)
     }
     assert found == {*PAGES, *ALL_PAGES, *OTHERWISE}
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/tutorial.md"])
+def test_ones_own_environment_takes_less_than_thirty_lines(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    (own,) = [content for kind, content in steps(text) if kind == "file" and content.startswith("cart.py\n")]
+    assert len([line for line in own.splitlines()[1:] if line]) < OWN_LINES
