@@ -10,6 +10,7 @@ from fastapi.responses import Response
 from fastapi.routing import APIRoute
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.routing import WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -74,8 +75,20 @@ async def _carried(by_type: Mapping[str, forms.Carry], id: str, request: Request
     if carry is None:
         raise HTTPException(415, f"expected content type {' or '.join(by_type)}, got {media_type or 'none'}")
     sessions = request.state.services.sessions.within(seconds_left(request.headers))
-    content = await carry(sessions, id, await request.body())
+    content = await carry(sessions, id, await _body(request))
     return Response(content, media_type=media_type)
+
+
+async def _body(request: Request) -> bytes:
+    """``Request.body`` without its generator: nearly every body comes in one message. Raises ``ClientDisconnect``."""
+    parts = []
+    while True:
+        message = await request.receive()
+        if message["type"] == "http.disconnect":
+            raise ClientDisconnect
+        parts.append(message.get("body", b""))
+        if not message.get("more_body", False):
+            return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
 class StepDoor:
