@@ -47,6 +47,7 @@ SHORTER = {
     "evaluate": ["--episodes", "1"],
     "optimise": ["--updates", "1"],
 }
+IN_PROGRAMS = {"0_000": "00", "num_envs=16": "num_envs=2"}
 ELSEWHERE = {
     "make": "tests/demo and the Makefile itself",
     "docker": "tests/docker",
@@ -73,6 +74,7 @@ BLOCK = re.compile(r"^```(python|console)\n(.*?)^```$", re.DOTALL | re.MULTILINE
 SAVED = re.compile(r"[Ss]ave (?:this|it) as `(\S+\.py)`")
 
 
+@pytest.mark.timeout(900)  # on a machine that others use as well
 @pytest.mark.parametrize("page", PAGES + (ALL_PAGES if os.environ.get("DOCS") == "full" else []))
 def test_a_page_is_followed_from_top_to_bottom(page: str, tmp_path: Path) -> None:
     server_folder, folder = tmp_path / "server", tmp_path / "reader"
@@ -108,7 +110,9 @@ def follow(server: ServerProcess, folder: Path, kind: str, content: str) -> None
         name, _, code = content.partition("\n")
         (folder / name).write_text(code, encoding="utf-8")
     elif kind == "program":
-        run(server, folder, "-c", content.replace(PRINTED_URL, server.url).replace("0_000", "00"))
+        for long, short in IN_PROGRAMS.items():
+            content = content.replace(long, short)
+        run(server, folder, "-c", content.replace(PRINTED_URL, server.url))
     elif (words := shortened(shlex.split(content, comments=True))) is not None:
         run(server, folder, *words)
 
