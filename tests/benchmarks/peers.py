@@ -7,6 +7,7 @@ what was predicted is written beside it.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import sys
 import time
@@ -116,10 +117,11 @@ def serve_openenv(port: int) -> None:
 def step_openenv(port: int):  # type: ignore[no-untyped-def]
     from openenv.core.generic_client import GenericEnvClient
 
-    env = GenericEnvClient(base_url=f"http://127.0.0.1:{port}").connect()
-    env.reset()
+    env, loop = GenericEnvClient(base_url=f"http://127.0.0.1:{port}"), asyncio.new_event_loop()
+    loop.run_until_complete(env.connect())
+    loop.run_until_complete(env.reset())
     action = {"u": [0.0]}
-    return lambda: env.step(action)
+    return lambda: loop.run_until_complete(env.step(action))
 
 
 def predict_scikit_learn(file: str):  # type: ignore[no-untyped-def]
