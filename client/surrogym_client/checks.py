@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from surrogym_client.training import CHECKS, TrainProgress
 
 PATIENCE = 0.25  # of the steps, in which a network has to earn more than it did untrained
+PROOF = 0.5  # of the steps, in which it has to earn half of what the saved policy earns beyond that
 PATIENT_ROLLOUTS = 8  # at least
 
 
@@ -22,13 +23,14 @@ class Checks(BaseCallback):
 
     A network that earns no more than an untrained one after a quarter of the steps is given up, while there is as much
     left for another: rewards that come at the end alone leave some networks without a first success, and they stop
-    exploring before they have one.
+    exploring before they have one. Where a saved policy waits, a network has half of the steps to come half as far.
 
     Args:
         total: virtual steps of the training.
         progress: called after every rollout.
         imagine: a learner's imagined return.
         untrained: a learner that has learned nothing yet.
+        saved: a policy from before, for which a network is given up that does not come near it.
     """
 
     def __init__(
@@ -37,12 +39,14 @@ class Checks(BaseCallback):
         progress: Callable[[TrainProgress], None] | None,
         imagine: Callable[[BaseAlgorithm], float],
         untrained: BaseAlgorithm,
+        saved: BaseAlgorithm | None = None,
     ) -> None:
         super().__init__()
         self._total = total
         self._progress = progress
         self._imagine = imagine
         self._floor = imagine(untrained)
+        self._half_way = self._floor if saved is None else max((self._floor + imagine(saved)) / 2, self._floor)
         self._spent = 0  # by the networks before
         self._rollouts = 0  # of this one
         self._checked = 0  # checks made
@@ -127,4 +131,5 @@ class Checks(BaseCallback):
     def _hopeless(self) -> bool:
         assert self.best is not None
         tried = self._rollouts >= PATIENT_ROLLOUTS and self.num_timesteps >= PATIENCE * self._total
-        return tried and self.best <= self._floor and self.left >= PATIENCE * self._total
+        bar = self._half_way if self.num_timesteps >= PROOF * self._total else self._floor
+        return tried and self.best <= bar and self.left >= PATIENCE * self._total

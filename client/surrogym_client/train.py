@@ -101,16 +101,16 @@ def train(
             asked = replace(settings, seed=settings.seed + ATTEMPT_SEED * attempt, start_from=start_from)
             return _learner(algorithm, wrapped, asked, spec, statistics, gamma)
 
+        saved = None if settings.start_from is None else made(0, settings.start_from)
         untrained = made(0)
         total = _whole_rollouts(untrained, total)
-        checks = Checks(total, progress, lambda learner: imagined_return(port, learner, settings), untrained)
+        waiting = saved if settings.anew else None
+        checks = Checks(total, progress, lambda learner: imagined_return(port, learner, settings), untrained, waiting)
 
         def network(attempt: int) -> BaseAlgorithm:
             """A new one; when it is its turn the saved policy, where that earns more than an untrained one."""
-            if settings.start_from is not None and attempt == int(settings.anew):
-                saved = made(0, settings.start_from)
-                if checks.worth_keeping(saved):
-                    return saved
+            if saved is not None and attempt == int(settings.anew) and checks.worth_keeping(saved):
+                return saved
             return made(attempt) if attempt else untrained
 
         with tracking(settings, out) as callbacks:

@@ -29,7 +29,7 @@ class TrainSettings:
     seed: int = 0
     start_box: float = 0.5
     start_from: Path | None = None  # go on from a saved policy
-    anew: bool = False  # begin with a new network, and go on from the saved policy only where that learns nothing
+    anew: bool = False  # begin with a new network, and go on from the saved policy only where that falls short
     threads: int = 1
     tracker: Tracker | None = None  # of Stable-Baselines3's algorithms; CMA-ES has none
     tensorboard: Path | None = (

@@ -1,5 +1,6 @@
 """Training over any port: settings from the specification alone, the cap on virtual steps, and what is written."""
 
+import itertools
 import json
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from stable_baselines3 import PPO, SAC
 
 from support.real_steps import random_steps
 from surrogym_client import train as training
+from surrogym_client.checks import Checks
 from surrogym_client.imagined import imagined_returns
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_client.original.loading import make
@@ -239,25 +241,24 @@ def test_a_network_that_learns_nothing_is_given_up_for_another(surrogate, tmp_pa
     assert again == pytest.approx(result.imagined_return)
 
 
-@pytest.mark.parametrize(("steps", "given_up"), [(128, False), (2_000, True)], ids=["too early to say", "hopeless"])
-def test_anew_a_saved_policy_waits_until_a_new_network_is_given_up(
-    surrogate, tmp_path: Path, monkeypatch, steps, given_up
+@pytest.mark.parametrize(
+    ("steps", "earned", "given_up"),
+    [(128, 0.0, False), (2_000, 0.0, True), (2_000, 40.0, True), (2_000, 60.0, False)],
+    ids=["too early to say", "nothing learned", "not half as far", "half as far"],
+)
+def test_anew_a_saved_policy_waits_until_a_new_network_falls_short(
+    surrogate, tmp_path: Path, monkeypatch, steps, earned, given_up
 ):
-    turns, plain = [], training._learner
-
-    def seen(algorithm, env, settings, *rest):
-        turns.append(settings.start_from)
-        return plain(algorithm, env, settings, *rest)
-
-    saved, session = tmp_path / "saved.zip", {"time_limit": 4}
-    train(surrogate, saved, small(session=session, total_steps=2_000))
-    monkeypatch.setattr(training, "_learner", seen)
+    """An untrained network earns nothing, the saved policy 100."""
+    saved, session, turns, plain = tmp_path / "saved.zip", {"time_limit": 4}, [], Checks.worth_keeping
+    train(surrogate, saved, small(session=session))
+    returns = itertools.chain([0.0, 100.0], itertools.repeat(earned))
+    monkeypatch.setattr(training, "imagined_return", lambda *_: next(returns))
+    monkeypatch.setattr(Checks, "worth_keeping", lambda self, known: turns.append(self.steps) or plain(self, known))
     settings = small(start_from=saved, anew=True, session=session, total_steps=steps, hyperparameters=IDLE)
-    result = train(surrogate, tmp_path / "policy.zip", settings)
-    assert turns == ([None, saved] if given_up else [None])
-    if given_up:
-        earned = imagined_return(surrogate, PPO.load(saved, device="cpu"), settings)
-        assert result.imagined_return >= earned - 1e-6
+    train(surrogate, tmp_path / "policy.zip", settings)
+    assert len(turns) == given_up
+    assert not turns or (0.45 if earned else 0.2) * steps < turns[0] < (0.65 if earned else 0.4) * steps
 
 
 @pytest.mark.parametrize(("ours", "theirs"), [(0, 1), (1, 0)])
