@@ -136,7 +136,7 @@ class _Search:
     def imagined(self) -> float:
         """Imagined return of the mean."""
         settings = self._settings
-        returns = imagined_returns(self._port, self.policy, CHECK_EPISODES, settings.seed, **settings.session)
+        returns = imagined_returns(self._port, self.policy, CHECK_EPISODES, settings.seed, **settings.judging)
         return float(returns.mean())
 
     def _network(self, vector: NDArray[np.float64]) -> Network:

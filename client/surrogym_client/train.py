@@ -192,7 +192,7 @@ def imagined_return(port: SurrogatePort, learner: BaseAlgorithm, settings: Train
     def predict(observation: Any) -> Any:
         return learner.predict(observation, deterministic=True)[0]
 
-    return float(imagined_returns(port, predict, CHECK_EPISODES, settings.seed, **settings.session).mean())
+    return float(imagined_returns(port, predict, CHECK_EPISODES, settings.seed, **settings.judging).mean())
 
 
 def _learner(

@@ -11,6 +11,7 @@ from surrogym_shared.wire import SurrogateView
 CHECKS = 12  # of the imagined return in one training; the best policy is kept
 CHECK_EPISODES = 64
 DRAWS: dict[str, Any] = {"variant": "probabilistic", "particles": 1, "spread": 0.0}  # each step of a lane is a draw
+FUNCTIONS: dict[str, Any] = {"variant": "pathwise"}  # each episode follows one function
 
 Tracker = Literal["tensorboard", "wandb", "mlflow"]
 
@@ -36,19 +37,26 @@ class TrainSettings:
         None  # folder of TensorBoard's files; None: beside the policy, where the tracker has some
     )
     session: dict[str, Any] = field(default_factory=dict)
+    judge: dict[str, Any] | None = None  # session fields by which policies are compared; None: those they learn in
     hyperparameters: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def judging(self) -> dict[str, Any]:
+        return self.session if self.judge is None else self.judge
 
 
 def chosen_for(view: SurrogateView, settings: TrainSettings) -> TrainSettings:
     """The settings for a policy that is to be used, by what its surrogate's design came to.
 
     Where that is not ready the policy learns on draws, a state a lane (TS1 of Chua et al. 2018): what relies on the
-    mean where the model is unsure fails in the original environment. Who names a variant keeps it, and preset ``paper``
-    has AUR-D.
+    mean where the model is unsure fails in the original environment. Policies are compared by functions of the
+    posterior: draws shake a lane out of a state in which the policy would leave it for good. Who names a variant keeps
+    it, and preset ``paper`` has AUR-D.
     """
     if "variant" in settings.session or view.phase == "ready" or view.spec.design.preset == "paper":
         return settings
-    return replace(settings, session=DRAWS | settings.session)
+    other = {name: value for name, value in settings.session.items() if name not in DRAWS}
+    return replace(settings, session=DRAWS | settings.session, judge=FUNCTIONS | other)
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,10 @@ def test_who_names_a_variant_and_preset_paper_keep_it(pendulum_server: ServerPro
     assert chosen_for(unsure, named) is named
     assert chosen_for(paper, SETTINGS) is SETTINGS
     assert chosen_for(view.model_copy(update={"phase": "ready"}), SETTINGS) is SETTINGS
-    assert chosen_for(unsure, replace(SETTINGS, session={"penalty": 1.0})).session == {**DRAWS, "penalty": 1.0}
+    chosen = chosen_for(unsure, replace(SETTINGS, session={"penalty": 1.0, "particles": 2}))
+    assert chosen.session == {**DRAWS, "penalty": 1.0, "particles": 2}
+    assert chosen.judging == {"variant": "pathwise", "penalty": 1.0}, "particles are none of a function's"
+    assert SETTINGS.judging == SETTINGS.session, "who learns by the mean is compared by it"
 
 
 def test_rounds_share_the_steps_that_were_asked_for() -> None:

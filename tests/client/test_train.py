@@ -273,3 +273,12 @@ def test_a_saved_policy_that_earns_no_more_than_an_untrained_one_is_not_gone_on_
     result = train(surrogate, tmp_path / "policy.zip", settings)
     assert earned[0] != earned[1]
     assert result.imagined_return == pytest.approx(max(earned))
+
+
+def test_policies_are_compared_by_what_was_asked_for_and_not_by_what_they_learn_in(surrogate, tmp_path: Path):
+    session = {"time_limit": 4}
+    asked = small(session=session, judge={"variant": "pathwise", "time_limit": 3})
+    result = train(surrogate, tmp_path / "policy.zip", asked)
+    kept = PPO.load(result.path, device="cpu")
+    assert imagined_return(surrogate, kept, asked) == pytest.approx(result.imagined_return)
+    assert imagined_return(surrogate, kept, small(session=session)) < result.imagined_return, "a fourth cost more"
