@@ -9,7 +9,6 @@ import pytest
 from support.scripted_server import lost_reply, reply, scripted_server
 from support.terminal import on_terminal
 from surrogym_client.api import Api
-from surrogym_client.cli.columns import columns
 from surrogym_shared import wire
 
 EMPTY = reply(wire.SurrogateList(surrogates=[]).model_dump_json())
@@ -84,21 +83,3 @@ def test_on_a_narrow_terminal_nothing_is_cut_and_ctrl_c_ends_it(pendulum_server)
     assert [line for line in lines if len(line) > 60] == []
     assert "Traceback" not in terminal.shown
     assert {f"output               {name}" for name in ("theta", "speed", "reward")} <= set(lines)
-
-
-def test_columns_fit():
-    rows = [("name", "a long heading"), ("pendulum", 0.123456), ("x", None)]
-    assert columns(rows).splitlines() == ["name      a long heading", "pendulum  0.1235", "x         -"]
-    assert columns(rows, 17).splitlines() == [
-        "          a long",
-        "name      heading",
-        "pendulum  0.1235",
-        "x         -",
-    ]
-    assert columns(rows, 16).splitlines() == [
-        "name            pendulum",
-        "a long heading  0.1235",
-        "",
-        "name            x",
-        "a long heading  -",
-    ]

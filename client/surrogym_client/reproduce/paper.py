@@ -21,7 +21,8 @@ from surrogym_client.original import make
 from surrogym_client.policy_file import load_policy
 from surrogym_client.reproduce.paper_cases import Cell
 from surrogym_client.reproduce.paper_measures import Unseen, confidences, run_variation, some
-from surrogym_client.reproduce.paper_table import markdown, per_seed, table
+from surrogym_client.reproduce.paper_table import per_seed, table
+from surrogym_client.reproduce.table import markdown
 from surrogym_client.sampler import Outcome, Sampler, SamplerSettings
 from surrogym_client.train import TrainProgress, TrainSettings, train
 from surrogym_client.transport import HttpSurrogate

@@ -42,12 +42,6 @@ def per_seed(rows: Sequence[Row]) -> Iterator[tuple[str, str, int, str, float]]:
             yield row["task"], row["arm"], row["seed"], what, number(row)
 
 
-def markdown(lines: Sequence[Sequence[str]]) -> str:
-    """The first line is the heading."""
-    ruled = [lines[0], ["---"] * len(lines[0]), *lines[1:]]
-    return "".join(f"| {' | '.join(line)} |\n" for line in ruled)
-
-
 def _cell(rows: Sequence[Row], arm: str, number: Number, shown: str) -> str:
     return _spread([row for row in rows if row["arm"] == arm], number, shown)
 

@@ -39,7 +39,7 @@ seed. Imagined: what the surrogate promised. Target reached: by how many seeds o
 def report(rows: Sequence[Row]) -> str:
     """Targets, the main table, the questions that pairs of arms answer, and where the rows come from."""
     groups = grouped(rows)
-    parts = [_targets(groups), _markdown([HEADING, *(_line(group, of) for group, of in groups.items())]), NOTES]
+    parts = [_targets(groups), markdown([HEADING, *(_line(group, of) for group, of in groups.items())]), NOTES]
     if contrasts := _contrasts(groups):
         parts += [
             "Difference of interquartile means, first arm minus second, with a 95 % bootstrap interval:\n",
@@ -69,6 +69,12 @@ def column(rows: Sequence[Row], name: str) -> NDArray[np.float64]:
     return np.array([value for row in rows if (value := getattr(row, name)) is not None], dtype=np.float64)
 
 
+def markdown(lines: Sequence[Sequence[str]]) -> str:
+    """A table, of which the first line is the heading."""
+    rows = [lines[0], ["---"] * len(lines[0]), *lines[1:]]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
 def _targets(groups: dict[Group, list[Row]]) -> str:
     lines = [("task", "budget", "target for each seed", "reached", "worst seed")]
     for (task, arm, budget), rows in groups.items():
@@ -76,7 +82,7 @@ def _targets(groups: dict[Group, list[Row]]) -> str:
             means = column(rows, "mean")
             worst = _number(means.min()) if len(means) else "-"
             lines.append((task, str(budget), TASKS[task].target.words, _reached(rows), worst))
-    return _markdown(lines) if len(lines) > 1 else ""
+    return markdown(lines) if len(lines) > 1 else ""
 
 
 def _line(group: Group, rows: Sequence[Row]) -> Sequence[str]:
@@ -123,7 +129,7 @@ def _contrasts(groups: dict[Group, list[Row]]) -> str:
                         first if low > 0 else second if high < 0 else "undecided",
                     )
                 )
-    return _markdown(lines) if len(lines) > 1 else ""
+    return markdown(lines) if len(lines) > 1 else ""
 
 
 def _origin(rows: Sequence[Row]) -> str:
@@ -167,8 +173,3 @@ def _share(values: NDArray[np.float64]) -> str:
 
 def _number(value: float) -> str:
     return f"{value:.1f}" if abs(value) >= 10 else f"{value:.3g}"
-
-
-def _markdown(lines: Sequence[Sequence[str]]) -> str:
-    rows = [lines[0], ["---"] * len(lines[0]), *lines[1:]]
-    return "".join(f"| {' | '.join(row)} |\n" for row in rows)

@@ -53,6 +53,7 @@ def command(
 
 def present(rows: Sequence[Row], out: Path, *, as_json: bool, quiet: bool) -> None:
     """Write table and pictures of rows, and show the table."""
+    from surrogym_client.cli.columns import fitted
     from surrogym_client.reproduce.table import report
     from surrogym_shared.terminal import give, progress
 
@@ -65,4 +66,4 @@ def present(rows: Sequence[Row], out: Path, *, as_json: bool, quiet: bool) -> No
         pictures = draw_tasks(out, rows)
         update(1.0, "done")
     result = {"out": str(out), "rows": [vars(row) for row in rows], "pictures": [str(path) for path in pictures]}
-    give(result, lambda: text, as_json=as_json, quiet=quiet)
+    give(result, lambda: fitted(text), as_json=as_json, quiet=quiet)
