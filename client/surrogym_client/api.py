@@ -176,9 +176,9 @@ class Api:
         body = wire.RenewLease(lease_token=lease_token, lease_seconds=lease_seconds)
         self._send(f"{_surrogate(name)}/queries/{query_id}:renew", body)
 
-    def fail(self, name: str, query_id: int, lease_token: str, error: str) -> None:
-        """Give a query back with the error it caused."""
-        body = wire.FailQuery(lease_token=lease_token, error=error)
+    def fail(self, name: str, query_id: int, lease_token: str, error: str, *, begun: bool = True) -> None:
+        """Give a query back with the error it caused, and whether a real step may have been taken."""
+        body = wire.FailQuery(lease_token=lease_token, error=error, begun=begun)
         self._send(f"{_surrogate(name)}/queries/{query_id}:fail", body)
 
     def ask(

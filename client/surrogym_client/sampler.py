@@ -34,6 +34,7 @@ from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, StepQu
 FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "failed")
 PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)  # with a server or a storage that is away
 AWAY = (ServerUnreachable, Unavailable)
+STOPPED = "the sampler was stopped"
 
 T = TypeVar("T")
 Outcome = Literal["answered", "failed"]
@@ -164,16 +165,17 @@ class Sampler:
 
     def _work(self, queries: list[Query], heartbeat: Heartbeat) -> None:
         """Answer queries one by one; those left when a person interrupts are given back."""
-        left = list(queries)
+        left, begun = list(queries), None
         heartbeat.hold(left)
         try:
             while left and not self._stopping.is_set():
-                self._answer(left[0])
+                begun = left[0]
+                self._answer(begun)
                 heartbeat.release(left.pop(0))
         finally:
             for query in left:
                 heartbeat.release(query)
-                self._give_back(query, "the sampler was stopped")
+                self._give_back(query, STOPPED, begun=query is begun)
 
     def _answer(self, query: Query) -> None:
         taken: list[NewSample] = []
@@ -181,7 +183,7 @@ class Sampler:
         try:
             self._take(query, taken)
         except StepFailed as failed:
-            error = str(failed)
+            error = str(failed) or "no reason given"
         except Exception as raised:  # an environment that is not isolated may raise anything
             error = f"{type(raised).__name__}: {raised}"
         except BaseException:  # a person interrupts: what was done to the original environment is told all the same
@@ -194,7 +196,7 @@ class Sampler:
         if taken:
             self._count(query, "answered", error)
         else:
-            self._fail(query, error or "the sampler was stopped")
+            self._fail(query, error or STOPPED, begun=bool(error))
 
     def _take(self, query: Query, taken: list[NewSample]) -> None:
         """Take the real steps of a query, and put each into ``taken`` as soon as it is done."""
@@ -219,13 +221,13 @@ class Sampler:
             _patiently(lambda: self._api.add_samples(self._surrogate, self._settings.name, samples))
             self._steps += len(samples)
 
-    def _fail(self, query: Query, error: str) -> None:
-        _patiently(lambda: self._give_back(query, error or "no reason given"))
+    def _fail(self, query: Query, error: str, *, begun: bool) -> None:
+        _patiently(lambda: self._give_back(query, error, begun=begun))
         self._count(query, "failed", error)
 
-    def _give_back(self, query: Query, error: str) -> None:
+    def _give_back(self, query: Query, error: str, *, begun: bool) -> None:
         try:
-            self._api.fail(self._surrogate, query.id, query.lease_token, error[:4_000])
+            self._api.fail(self._surrogate, query.id, query.lease_token, error[:4_000], begun=begun)
         except (LeaseExpired, NotThere):
             return  # the query has gone to the next one already
 

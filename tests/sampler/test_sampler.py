@@ -120,9 +120,31 @@ def test_stop_ends_the_worker_and_gives_back_what_it_holds(api, line):
     settings = SamplerSettings(batch=6, wait_seconds=5.0)
     sampler = Sampler(api, line, Line(), settings, lambda *_: sampler.stop())
     report = sampler.run()
+    view = api.surrogate(line)
     assert report.answered == 1
-    assert api.surrogate(line).queries.leased == 0
-    assert api.surrogate(line).queries.pending == 5
+    assert (view.queries.leased, view.queries.pending) == (0, 5)
+    assert view.ledger.unresolved == 0, "what was not begun moved no robot"
+
+
+class Interrupted(Line):
+    """A person stops the second step while it is under way."""
+
+    def __init__(self):
+        self.steps = 0
+
+    def step_from(self, coordinates, action):
+        self.steps += 1
+        if self.steps == 2:
+            raise KeyboardInterrupt
+        return super().step_from(coordinates, action)
+
+
+def test_an_interrupted_step_may_have_been_taken_and_those_behind_it_were_not(api, line):
+    with pytest.raises(KeyboardInterrupt):
+        Sampler(api, line, Interrupted(), SamplerSettings(batch=6, wait_seconds=5.0)).run()
+    view = api.surrogate(line)
+    assert (view.ledger.total, view.ledger.unresolved) == (1, 1)
+    assert (view.queries.leased, view.queries.pending) == (0, 5)
 
 
 def test_two_workers_share_the_queries(api, line):

@@ -65,7 +65,7 @@ def renew(name: str, query_id: int, body: Annotated[RenewLease, example(examples
 @router.post("/queries/{query_id}:fail", summary="Give a query back", dependencies=[SAMPLE], responses=LEASE_ERRORS)
 def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.FAIL)], use: Use) -> QueryView:
     """It goes to the next sampler; one that keeps failing is set aside, and the design goes on without it."""
-    return convert.query_view(use.queries.fail(name, query_id, body.lease_token, body.error))
+    return convert.query_view(use.queries.fail(name, query_id, body.lease_token, body.error, begun=body.begun))
 
 
 @router.post(

@@ -63,9 +63,13 @@ class QueryService:
         if sampler := self._storage.queries.get(name, query_id).sampler:
             self._samplers.heard(name, sampler)
 
-    def fail(self, name: str, query_id: int, token: str, error: str) -> QueryRecord:
-        """Give a query back with an error. Raises ``UnknownQuery``, ``ForeignLease`` or ``LeaseExpired``."""
-        record = self._storage.queries.fail(name, query_id, token, error)
+    def fail(self, name: str, query_id: int, token: str, error: str, *, begun: bool) -> QueryRecord:
+        """Give a query back with an error, and whether a step of it may have been taken.
+
+        Raises:
+            UnknownQuery, ForeignLease, LeaseExpired: as the storage says.
+        """
+        record = self._storage.queries.fail(name, query_id, token, error, begun=begun)
         self._notices.post(name)
         return record
 

@@ -140,7 +140,7 @@ class Queries(ABC):
     """The queue of queries and their leases.
 
     A query is pending, leased, answered or set_aside. A lease that fails or expires makes it pending again,
-    and the last of ``MAX_ATTEMPTS`` sets it aside.
+    and the last of ``MAX_ATTEMPTS`` sets it aside. One that is given back unbegun is no attempt: no step was taken.
     """
 
     @abstractmethod
@@ -173,8 +173,10 @@ class Queries(ABC):
         """
 
     @abstractmethod
-    def fail(self, name: str, query_id: int, token: str, error: str) -> QueryRecord:
+    def fail(self, name: str, query_id: int, token: str, error: str, *, begun: bool = True) -> QueryRecord:
         """End the lease with an error; the query goes to the next one or is set aside. A repeat is harmless.
+
+        ``begun``: a real step may have been taken, so that the ledger counts it as unresolved.
 
         Raises:
             UnknownQuery: no such query.

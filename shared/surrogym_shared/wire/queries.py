@@ -75,6 +75,7 @@ class RenewLease(Request):
 class FailQuery(Request):
     lease_token: Key
     error: Annotated[str, Field(min_length=1, max_length=4_000)]
+    begun: bool = Field(default=True, description="whether a real step may have been taken; false: it counts nowhere")
 
 
 class QueryView(Reply):

@@ -145,6 +145,26 @@ def test_an_answer_after_a_failure_resolves_it(
     assert storage.ledger.read(name) == LedgerRecord(initial=1)
 
 
+def test_a_query_given_back_unbegun_counts_nowhere(
+    storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
+) -> None:
+    name = make(queries=1)
+    for attempt in range(1, MAX_ATTEMPTS + 2):
+        [leased] = storage.queries.claim(name, "a", 1, LONG)
+        assert leased.attempt == attempt
+        query = storage.queries.fail(name, leased.id, leased.token, "stopped", begun=False)
+        assert storage.queries.fail(name, leased.id, leased.token, "stopped", begun=False) == query, "a repeat"
+        assert query.status == "pending"
+    with pytest.raises(LeaseExpired):
+        storage.queries.fail(name, leased.id, leased.token, "fell over")
+    assert storage.ledger.read(name) == LedgerRecord()
+    for status in ("pending", "pending", "set_aside"):
+        [again] = storage.queries.claim(name, "a", 1, LONG)
+        assert storage.queries.fail(name, again.id, again.token, "fell over").status == status, "its attempts are left"
+    storage.samples.add(name, "a", [answer(leased)])
+    assert storage.ledger.read(name) == LedgerRecord(initial=1, unresolved=3, failed=3), "it was begun after all"
+
+
 def test_failing_twice_under_one_lease_counts_once(storage: Storage, make: Callable[..., str]) -> None:
     name = make(queries=1)
     [leased] = storage.queries.claim(name, "a", 1, LONG)

@@ -124,8 +124,13 @@ def sweep(connection: Connection, held: Row[Any]) -> int:
 
 
 def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], error: str) -> None:
-    """Make leased queries pending again, or set them aside after their last attempt."""
-    next_status = sa.case((queries.c.attempts >= MAX_ATTEMPTS, "set_aside"), else_="pending")
+    """Make leased queries pending again, or set them aside after their last attempt; the leases have their outcome."""
+    spent = (
+        sa.select(sa.func.count())
+        .where(leases.c.query_id == queries.c.id, leases.c.outcome.in_(("failed", "expired")))
+        .scalar_subquery()
+    )
+    next_status = sa.case((spent >= MAX_ATTEMPTS, "set_aside"), else_="pending")
     rows = connection.execute(
         sa.update(queries)
         .where(queries.c.id.in_(query_ids), queries.c.status == "leased")

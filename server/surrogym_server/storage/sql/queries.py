@@ -85,14 +85,15 @@ class SqlQueries(port.Queries):
                 raise _ended(query_id)
             return float(renewed)
 
-    def fail(self, name: str, query_id: int, token: str, error: str) -> QueryRecord:
+    def fail(self, name: str, query_id: int, token: str, error: str, *, begun: bool = True) -> QueryRecord:
+        outcome = "failed" if begun else "unbegun"
         with self._database.write() as connection:
             held = hold(connection, name)
             lease = leasing.of_query(connection, held.id, query_id, token)
             if lease.outcome == "open" and lease.expires > held.now:
-                leasing.set_outcome(connection, [lease.id], "failed")
+                leasing.set_outcome(connection, [lease.id], outcome)
                 leasing.give_back(connection, held, [query_id], error)
-            elif lease.outcome != "failed":
+            elif lease.outcome != outcome:
                 raise _ended(query_id)
             return _read(connection, held.id, query_id)
 

@@ -120,7 +120,7 @@ leases = sa.Table(
     sa.Column("attempt", sa.Integer, nullable=False),
     sa.Column("begun", sa.Double, nullable=False),
     sa.Column("expires", sa.Double, nullable=False),
-    sa.Column("outcome", sa.Text, nullable=False),  # open, answered, failed, expired
+    sa.Column("outcome", sa.Text, nullable=False),  # open, answered, failed, unbegun, expired
     sa.Index(None, "surrogate_id", "outcome", "expires"),
     sa.Index(  # a query has one open lease at most
         "uq_leases_open",
