@@ -16,7 +16,7 @@ from surrogym_client.api import Api, check_protocol, new_key, parse
 from surrogym_client.connection import Connection, Retries, Timeouts
 from surrogym_client.errors import ProtocolMismatch, SessionLost
 from surrogym_client.forms import UNREADABLE, BinaryForm, Form, JsonForm
-from surrogym_client.stream import Stream, StreamUnavailable
+from surrogym_client.stream import Stream, StreamLost, StreamUnavailable
 from surrogym_shared import wire
 from surrogym_shared.frames import Shape
 from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult
@@ -27,7 +27,7 @@ __all__ = ["Api", "HttpSurrogate", "Retries", "Timeouts", "Transport"]
 Transport = Literal["auto", "stream", "binary", "json"]
 T = TypeVar("T")
 
-_UPGRADE_PAUSE_SECONDS = 60.0  # until a stream is asked for again where HTTP alone gets through
+_UPGRADE_PAUSE_SECONDS = 60.0  # until a stream is asked for again where none got through, or broke before any answer
 
 
 @dataclass
@@ -56,7 +56,7 @@ class HttpSurrogate:
         retries: how long to go on after lost connections, lost replies and 503.
         transport: how reset, step and rollout travel. ``stream`` is the fastest: frames over a WebSocket;
             ``binary`` is frames over HTTP, ``json`` what a person can read. ``auto`` takes the stream, and
-            HTTP with frames where the stream does not get through.
+            HTTP with frames where the stream does not get through: refused, or opened and never answering.
 
     Raises:
         ValueError: a transport there is none of.
@@ -87,6 +87,7 @@ class HttpSurrogate:
         self._form: Form = JsonForm() if transport == "json" else BinaryForm()
         self._live: dict[str, _Live] = {}
         self._upgrade_after = math.inf if self.connection.proxied else 0.0  # by time.monotonic
+        self._streamed = False  # some stream has brought an answer
         self._spec: EnvironmentSpec | None = None
 
     def __repr__(self) -> str:
@@ -211,13 +212,27 @@ class HttpSurrogate:
                 return by_http()
             first = False
             try:
-                return live.stream.exchange(content, timeout)
+                answer = live.stream.exchange(content, timeout)
+                self._streamed = True
             except StreamUnavailable:
                 answer = by_http()
-                self._upgrade_after = time.monotonic() + _UPGRADE_PAUSE_SECONDS
-                return answer
+                self._avoid_stream(_UPGRADE_PAUSE_SECONDS)
+            except StreamLost:
+                if not self._streamed:
+                    self._avoid_stream(_UPGRADE_PAUSE_SECONDS)
+                raise
+            except TimeoutError:
+                if (
+                    not self._streamed
+                ):  # something on the way lets the upgrade through alone: it would wait as long again
+                    self._avoid_stream(math.inf)
+                raise
+            return answer
 
         return stream_first
+
+    def _avoid_stream(self, seconds: float) -> None:
+        self._upgrade_after = time.monotonic() + seconds
 
     def _look_up(self, session: str) -> _Live:
         """A session that another client opened."""

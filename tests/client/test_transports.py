@@ -12,10 +12,11 @@ import pytest
 
 from support.scripted_server import Answer, ScriptedServer, problem, reply, scripted_server, session_view
 from surrogym_client import errors
-from surrogym_client.connection import Connection, Retries
+from surrogym_client.connection import Connection, Retries, Timeouts
 from surrogym_client.transport import HttpSurrogate
 from surrogym_shared import frames, wire
 from surrogym_shared.codes import Code
+from surrogym_shared.messages import KEY_BYTES, header
 from surrogym_shared.port import StepResult
 
 QUICK = Retries(seconds=2.0, first_delay=0.01, longest_delay=0.05)
@@ -24,6 +25,10 @@ WEBSOCKET_KEY = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"  # RFC 6455, 1.3
 
 
 def step(seq: int) -> Answer:
+    return binary(step_frame(seq))
+
+
+def step_frame(seq: int) -> bytes:
     result = StepResult(
         observation=np.zeros((2, 2), dtype=np.float32),
         reward=np.full(2, float(seq)),
@@ -35,7 +40,7 @@ def step(seq: int) -> Answer:
         reward_mean=np.zeros(2),
         deviation=None,
     )
-    return binary(frames.encode(frames.step_reply(seq, result)))
+    return frames.encode(frames.step_reply(seq, result))
 
 
 def binary(content: bytes) -> Answer:
@@ -49,16 +54,41 @@ def binary(content: bytes) -> Answer:
     return answer
 
 
-def upgrade_and_cut(handler: BaseHTTPRequestHandler) -> None:
-    """Accept the stream, take one message, and cut the connection."""
+def upgrade(handler: BaseHTTPRequestHandler) -> None:
     key = handler.headers["Sec-WebSocket-Key"].encode()
     handler.send_response(101)
     handler.send_header("Upgrade", "websocket")
     handler.send_header("Connection", "Upgrade")
     handler.send_header("Sec-WebSocket-Accept", base64.b64encode(hashlib.sha1(key + WEBSOCKET_KEY).digest()).decode())
     handler.end_headers()
+
+
+def upgrade_and_cut(handler: BaseHTTPRequestHandler) -> None:
+    """Accept the stream, take one message, and cut the connection."""
+    upgrade(handler)
     handler.rfile.read(2)
     handler.close_connection = True
+
+
+def upgrade_and_swallow(handler: BaseHTTPRequestHandler) -> None:
+    """Accept the stream, and never answer what comes."""
+    upgrade(handler)
+    handler.rfile.read()
+    handler.close_connection = True
+
+
+def upgrade_answer_and_cut(reply: bytes) -> Answer:
+    """Accept the stream, answer its first message, take another, and cut the connection."""
+
+    def answer(handler: BaseHTTPRequestHandler) -> None:
+        upgrade(handler)
+        size = handler.rfile.read(2)[1] & 0x7F
+        handler.rfile.read(KEY_BYTES + size)
+        handler.wfile.write(header(len(reply)) + reply)
+        handler.rfile.read(2)
+        handler.close_connection = True
+
+    return answer
 
 
 def calls(server: ScriptedServer) -> list[tuple[str, str]]:
@@ -87,11 +117,25 @@ def test_where_the_upgrade_is_refused_frames_go_by_http(refusal: Answer):
 
 
 def test_a_step_lost_with_its_stream_is_repeated_by_http_under_its_seq():
-    script = [session_view(), upgrade_and_cut, step(1), upgrade_and_cut, step(2)]
+    script = [session_view(), upgrade_answer_and_cut(step_frame(1)), step(2), upgrade_and_cut, step(3)]
     with scripted_server(*script) as server, HttpSurrogate(server.url, "pendulum", retries=QUICK) as port:
         port.open(wire.OpenSession(num_envs=2))
-        assert [port.step("abc", ACTION).reward[0] for _ in range(2)] == [1.0, 2.0]
+        assert [port.step("abc", ACTION).reward[0] for _ in range(3)] == [1.0, 2.0, 3.0]
         assert calls(server) == [("GET", "stream"), ("POST", "step")] * 2, "the next step asks for a stream again"
+        assert seqs(server) == [2, 3]
+
+
+@pytest.mark.parametrize("useless", [upgrade_and_cut, upgrade_and_swallow])
+def test_a_stream_that_opens_and_never_answers_is_left_at_once(useless: Answer):
+    script = [session_view(), useless, step(1), step(2)]
+    hasty = Timeouts(step=0.3)
+    with (
+        scripted_server(*script) as server,
+        HttpSurrogate(server.url, "pendulum", retries=QUICK, timeouts=hasty) as port,
+    ):
+        port.open(wire.OpenSession(num_envs=2))
+        assert [port.step("abc", ACTION).reward[0] for _ in range(2)] == [1.0, 2.0]
+        assert calls(server) == [("GET", "stream"), ("POST", "step"), ("POST", "step")], "each step would wait again"
         assert seqs(server) == [1, 2]
 
 
