@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Awaitable, Callable
 
 import msgspec
 
 from surrogym_server import convert
 from surrogym_server.api.body import JSON, parse_json
+from surrogym_server.engine.session import Answer
 from surrogym_server.services.sessions import SessionService
 from surrogym_shared import frames
 from surrogym_shared.wire import ResetSession, RolloutSession, StepSession
 
 Carry = Callable[[SessionService, str, bytes], Awaitable[bytes]]
+
+SHORT_ROLLOUT = 32  # steps; a longer one's reply takes milliseconds to write, and others don't wait for that
 
 _JSON = msgspec.json.Encoder()
 
@@ -33,7 +37,7 @@ async def step_json(sessions: SessionService, id: str, content: bytes) -> bytes:
 async def rollout_json(sessions: SessionService, id: str, content: bytes) -> bytes:
     body = parse_json(RolloutSession, content)
     answer = await sessions.rollout(id, body.seq, convert.numbers("actions", body.actions))
-    return _JSON.encode(convert.rollout_reply(answer))
+    return await _rollout_written(_rollout_in_json, answer)
 
 
 async def carry_out(sessions: SessionService, id: str, shape: frames.Shape, request: frames.Request) -> bytes:
@@ -48,7 +52,22 @@ async def carry_out(sessions: SessionService, id: str, shape: frames.Shape, requ
             return frames.encode(convert.reset_frame(await sessions.reset(id, request.seq, seed, mask)))
         case frames.RolloutRequest():
             answer = await sessions.rollout(id, request.seq, frames.actions_of(request, shape))
-            return frames.encode(convert.rollout_frame(answer))
+            return await _rollout_written(_rollout_in_frames, answer)
+
+
+async def _rollout_written(write: Callable[[Answer], bytes], answer: Answer) -> bytes:
+    assert isinstance(answer.outcome, tuple)
+    return write(answer) if len(answer.outcome) <= SHORT_ROLLOUT else await asyncio.to_thread(write, answer)
+
+
+def _rollout_in_json(answer: Answer) -> bytes:
+    """Step by step: a thread that encodes lets no other one in."""
+    steps = [msgspec.Raw(_JSON.encode(step)) for step in convert.rollout_steps(answer)]
+    return _JSON.encode({"seq": answer.seq, "steps": steps})
+
+
+def _rollout_in_frames(answer: Answer) -> bytes:
+    return frames.encode(convert.rollout_frame(answer))
 
 
 def _framed(kind: type[frames.Request]) -> Carry:

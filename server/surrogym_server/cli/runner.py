@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import socket
@@ -53,6 +54,7 @@ class Runner(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
+        _exempt_from_collection()
         if self._ready_file is not None:
             _write_at_once(self._ready_file, self._url)
         self._tell(self._url)
@@ -79,6 +81,13 @@ def run(settings: Settings, ready_file: Path | None, exit_with_parent: bool, tel
         if exit_with_parent:
             threading.Thread(target=_end_with_parent, args=(runner, os.getppid()), daemon=True).start()
         runner.run(sockets=[listener])
+
+
+def _exempt_from_collection() -> None:
+    """What is there now stays for good: torch and all else that was imported. Each full collection would go through it,
+    for some 200 ms in which no step is answered."""
+    gc.collect()
+    gc.freeze()
 
 
 def _listen(host: str, port: int) -> socket.socket:

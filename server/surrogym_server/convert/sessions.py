@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import fields
 from typing import Any
 
@@ -120,10 +120,10 @@ def step_reply(answer: Answer) -> dict[str, Any]:
     return _step_fields(answer.seq, answer.outcome[0])
 
 
-def rollout_reply(answer: Answer) -> dict[str, Any]:
-    """The fields of ``RolloutReply``; its steps all carry the one seq of the request."""
+def rollout_steps(answer: Answer) -> Iterator[dict[str, Any]]:
+    """The fields of the steps of ``RolloutReply``, one by one; they all carry the one seq of the request."""
     assert isinstance(answer.outcome, tuple)
-    return {"seq": answer.seq, "steps": [_step_fields(answer.seq, step) for step in answer.outcome]}
+    return (_step_fields(answer.seq, step) for step in answer.outcome)
 
 
 def session_shape(session: Session) -> frames.Shape:

@@ -1,0 +1,69 @@
+"""Replies to rollouts: a long one is written in a thread of its own, and says what a short one says."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from typing import cast
+
+import msgspec
+import numpy as np
+import pytest
+
+from surrogym_server import convert
+from surrogym_server.api import forms
+from surrogym_server.engine.session import Answer, Fingerprint
+from surrogym_server.services.sessions import SessionService
+from surrogym_shared import frames, wire
+from surrogym_shared.port import StepResult
+
+SHAPE = frames.Shape(lanes=2, observation=3, action=1, outputs=3)
+
+
+def step(number: int) -> StepResult:
+    return StepResult(
+        observation=np.full((2, 3), number, dtype=np.float32),
+        reward=np.array([number, -0.5]),
+        terminated=np.zeros(2, dtype=bool),
+        truncated=np.ones(2, dtype=bool),
+        final_lanes=np.array([1]),
+        final_observation=np.zeros((1, 3), dtype=np.float32),
+        model_version=np.ones(2, dtype=np.int64),
+        reward_mean=np.zeros(2),
+        deviation=None,
+    )
+
+
+class Prepared:
+    """Answers a rollout of T steps with as many, all different."""
+
+    async def rollout(self, id: str, seq: int | None, actions: np.ndarray) -> Answer:
+        return Answer(7, Fingerprint(digest=id), tuple(step(number) for number in range(len(actions))))
+
+
+@pytest.fixture
+def writers(monkeypatch: pytest.MonkeyPatch) -> set[threading.Thread]:
+    """The threads that replies are written in."""
+    seen: set[threading.Thread] = set()
+    for name in ("rollout_frame", "rollout_steps"):
+        write = getattr(convert, name)
+        monkeypatch.setattr(
+            convert, name, lambda answer, write=write: seen.add(threading.current_thread()) or write(answer)
+        )
+    return seen
+
+
+@pytest.mark.parametrize("steps", [1, forms.SHORT_ROLLOUT, forms.SHORT_ROLLOUT + 1, 200])
+def test_a_long_reply_is_written_beside_the_event_loop(steps: int, writers: set[threading.Thread]):
+    sessions, actions = cast(SessionService, Prepared()), np.zeros((steps, 2, 1))
+    as_json = asyncio.run(forms.rollout_json(sessions, "abc", msgspec.json.encode({"actions": actions.tolist()})))
+    as_frame = asyncio.run(forms.carry_out(sessions, "abc", SHAPE, frames.rollout_request(None, actions)))
+    assert (threading.main_thread() in writers) == (steps <= forms.SHORT_ROLLOUT), "nobody else is answered meanwhile"
+    reply, frame = wire.RolloutReply.model_validate_json(as_json), frames.read_reply(as_frame)
+    assert isinstance(frame, frames.RolloutReply)
+    assert reply.seq == frame.seq == 7
+    assert [one.reward for one in reply.steps] == [[number, -0.5] for number in range(steps)]
+    assert {one.seq for one in reply.steps} == {7}
+    assert [frames.step_result(one, SHAPE).reward.tolist() for one in frame.steps] == [
+        one.reward for one in reply.steps
+    ]
