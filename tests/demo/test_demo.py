@@ -101,7 +101,8 @@ def test_a_small_demo_from_start_to_run_folder(demo, tmp_path):
     names = ("policy.zip", "policy.json", "spec.json", "samples.csv", "samples.npz")
     pictures = ("samples.png", "learning.png", "returns.png", "rollout.png")
     assert all((folder / name).stat().st_size > 0 for name in (*names, *pictures))
-    assert "live server: http://127.0.0.1:" in err
+    assert "a page to look at: http://127.0.0.1:" in err
+    assert f"next: surrogym serve --database {folder / 'surrogym.db'}" in err
     for shown in (
         "task ",
         "real queries",

@@ -62,11 +62,17 @@ def test_torch_is_its_cpu_build_unless_a_build_argument_says_cuda() -> None:
     assert "ARG TORCH=cpu" in whole("torch")
     assert all(service["build"]["args"]["TORCH"] == "${TORCH:-cpu}" for service in BUILT.values())
     (choice,) = [line for line in whole("torch") if "torch.version.cuda" in line]
-    cpu, cuda, other, _ = choice.split(";;")
-    assert "--extra-index-url" in cpu
-    assert "torch.version.cuda is None" in cpu
-    assert "--extra-index-url" not in cuda
-    assert "exit 1" in other
+    assert "exit 1" in choice
+    assert "set PIP_EXTRA_INDEX_URL" in choice
+    assert "ARG PIP_EXTRA_INDEX_URL" in whole("torch")
+
+
+def test_no_host_of_packages_is_named() -> None:
+    """Where packages come from is the reader's choice: pip's settings, or a build argument without a default."""
+    assert re.findall(r"\w+://([\w.]+)", DOCKERFILE) == ["127.0.0.1"]
+    assert all(
+        service["build"]["args"]["PIP_EXTRA_INDEX_URL"] == "${PIP_EXTRA_INDEX_URL:-}" for service in BUILT.values()
+    )
 
 
 def test_every_install_is_pinned_and_no_image_keeps_a_cache() -> None:

@@ -100,7 +100,7 @@ class SurrogateRun:
         return await_file(self._children.start("server", "surrogym_server", ["serve", *options]), ready)
 
     def _employ_sampler(self) -> None:
-        say(f"live server: {self._api.url}  (run folder: {self._folder})", quiet=self._quiet)
+        say(f"live server, with a page to look at: {self._api.url}  (run folder: {self._folder})", quiet=self._quiet)
         self._api.create_surrogate(self._settings.task, self._settings.spec())
         self._children.start("sampler", "surrogym_client", ["sample", *self._common])
 

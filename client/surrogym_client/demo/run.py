@@ -17,7 +17,7 @@ from surrogym_client.demo.report import metrics_of
 from surrogym_client.demo.settings import DemoSettings
 from surrogym_client.lifetime import terminations_as_interrupts
 from surrogym_client.versions import commit
-from surrogym_shared.terminal import on_interrupt
+from surrogym_shared.terminal import on_interrupt, say
 
 
 class Run(Protocol):
@@ -67,6 +67,8 @@ def run_demo(
             tell(metrics, folder)
         if settings.keep:
             run.linger()
+        elif (database := _database(folder)).exists():
+            say(f"next: surrogym serve --database {database}, and look at its page", quiet=quiet)
 
 
 def _run(settings: DemoSettings, folder: Path, children: Children, *, quiet: bool) -> Run:
@@ -91,7 +93,11 @@ def _empty_folder(folder: Path) -> Path:
 
 def _what_stays(folder: Path) -> str:
     """What there is to go on with after an interruption."""
-    database, policy = folder / "surrogym.db", folder / "policy.zip"
+    database, policy = _database(folder), folder / "policy.zip"
     kept = [f"the real samples (surrogym serve --database {database})"] if database.exists() else []
     kept += [f"the policy so far ({policy})"] if policy.exists() else []
     return f"interrupted; all processes have ended; kept in {folder}: {' and '.join(kept) or 'logs alone'}"
+
+
+def _database(folder: Path) -> Path:
+    return folder / "surrogym.db"
