@@ -21,6 +21,7 @@ from surrogym_client.transport import HttpSurrogate, Retries
 from surrogym_shared.wire import OpenSession
 
 LANES = 3
+POLL_SECONDS, ROLLOUT_SECONDS = 50.0, 1.5  # a stop ends the first, and has five seconds' patience with the second
 PATIENT = Retries(seconds=120)
 
 
@@ -43,11 +44,19 @@ def vec_env(restarting: RestartingServer) -> SurrogateVecEnv:
     return SurrogateVecEnv(restarting.url, "pendulum", LANES, seed=0, time_limit=6, retries=PATIENT)
 
 
+def long_rollout(port: HttpSurrogate, session: str) -> np.ndarray:
+    """Actions of a rollout that takes long on this machine, as busy as it is now."""
+    started, few = time.perf_counter(), 100
+    port.rollout(session, actions(few))
+    return actions(max(int(few * ROLLOUT_SECONDS / (time.perf_counter() - started)), few))
+
+
 def await_rollout(url: str) -> None:
     """Wait until a session has a request at work."""
     deadline = time.monotonic() + 60
-    while "surrogym_session_requests 1.0" not in httpx.get(f"{url}/metrics").text:
-        assert time.monotonic() < deadline
+    with httpx.Client(base_url=url) as client:
+        while "surrogym_session_requests 1.0" not in client.get("/metrics").text:
+            assert time.monotonic() < deadline
 
 
 def test_a_clean_restart_goes_unnoticed(restarting: RestartingServer):
@@ -77,14 +86,15 @@ def test_a_stop_lets_long_polls_end_and_running_steps_finish(restarting: Restart
         assert len(api.claim("leased", "first", max_queries=2, wait_seconds=5.0).queries) == 2
         session = port.open(OpenSession(num_envs=LANES, seed=0)).id
         port.reset(session)
-        poll = pool.submit(api.claim, "leased", "second", max_queries=1, wait_seconds=50.0)
-        rollout = pool.submit(port.rollout, session, actions(2_000))
+        long = long_rollout(port, session)
+        poll = pool.submit(api.claim, "leased", "second", max_queries=1, wait_seconds=POLL_SECONDS)
+        rollout = pool.submit(port.rollout, session, long)
         await_rollout(restarting.url)  # both are under way
         stopping = time.monotonic()
         assert restarting.stop() == 0
-        assert time.monotonic() - stopping < 30
+        assert time.monotonic() - stopping < POLL_SECONDS
         assert poll.result(timeout=10).queries == []
-        assert len(rollout.result(timeout=10)) == 2_000
+        assert len(rollout.result(timeout=10)) == len(long)
     restarting.start()
 
 

@@ -55,11 +55,13 @@ class Tally:
         assert all(query.error for query in set_aside)
         samples = list(api.samples(name))
         stored = {sample.id: (*sample.coordinates, *sample.action, sample.reward) for sample in samples}
+        answered = {query.id for query in queries if query.status == "answered"}
+        assert answered <= {sample.query_id for sample in samples}, "an answer is a sample"
         assert notes.acknowledged.items() <= stored.items(), "all is there, as acknowledged"
         assert len({(sample.query_id, sample.attempt) for sample in samples}) == len(samples), "none is there twice"
         assert ledger.total == len(stored)
-        answered = Counter(tuple(sample.requested_coordinates or ()) for sample in samples)
-        assert answered <= Counter(notes.begun), "none was made up"
+        asked = Counter(tuple(sample.requested_coordinates or ()) for sample in samples)
+        assert asked <= Counter(notes.begun), "none was made up"
         assert len(notes.begun) <= ledger.total + ledger.unresolved, "none is hidden"
         if patient:
             assert ledger.total == len(notes.acknowledged)
