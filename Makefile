@@ -10,6 +10,9 @@ BIN := .venv/bin
 # What is not imported needs no bytecode: compiling every module takes longer than unpacking it.
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile --constraint constraints.txt
 PINS := pyproject.toml constraints.txt
+# It is written when a module is first imported, also where the environment says not to (images of Python do): tests and
+# the demo start many processes, and each that imports torch would spend five seconds on compiling.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: demo install test audit test-all docs docs-serve format-check lint types imports unit chaos bench bench-memory acquisition format postgresql chromium screenshots clean help
