@@ -40,6 +40,7 @@ def test_the_page_follows_real_steps_and_a_server_that_goes_and_comes_back(
     page = open_page(server.url)
     unlock(page)
     expect(page.locator("main")).to_contain_text("No surrogate yet")
+    expect(page.locator("main pre")).to_contain_text(f"export SURROGYM_URL={server.url}")
     with Api(server.url, token=TOKEN) as api:
         spec = pendulum()
         api.create_surrogate("pendulum", spec)

@@ -130,6 +130,10 @@ def test_the_queue_says_who_holds_a_query_and_for_how_long(url: str, open_page: 
 def test_a_phone_needs_no_sideways_scrolling(url: str, open_page: Open, width: int):
     page = open_page(url, width=width, height=800)
     expect(page.get_by_role("link", name=re.compile("^pendulum"))).to_be_visible()
+    middles = page.locator(".top > :visible").evaluate_all(
+        "all => all.map(({offsetTop: y, offsetHeight: h}) => y + h / 2)"
+    )
+    assert max(middles) - min(middles) < 5  # the header is one line
     overflow = "document.documentElement.scrollWidth - innerWidth"
     assert page.evaluate(overflow) <= 0
     page.goto(f"{url}/#/s/pendulum")

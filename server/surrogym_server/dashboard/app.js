@@ -135,7 +135,9 @@ function theme(next) {
   const chosen = next ?? localStorage.getItem("surrogym-theme") ?? "system";
   localStorage.setItem("surrogym-theme", chosen);
   document.documentElement.dataset.theme = chosen;
-  document.getElementById("theme").textContent = `Theme: ${chosen}`;
+  const button = document.getElementById("theme");
+  button.setAttribute("aria-label", `Theme: ${chosen}`);
+  button.lastChild.textContent = chosen;
   page.view?.repaint();
 }
 

@@ -5,10 +5,13 @@ import { h, keyed } from "/page/dom.js";
 import { count, percent } from "/page/format.js";
 import { alive, confidenceMeter, costBar, phaseBadge } from "/page/parts.js";
 
+const HOME = ["http://127.0.0.1:8000", "http://localhost:8000"]; // where commands look by themselves
+const ADDRESS = HOME.includes(location.origin) ? "" : `export SURROGYM_URL=${location.origin}\n`;
+
 const EMPTY = () => h("div", { class: "card welcome" },
   h("h2", {}, "No surrogate yet"),
   h("p", {}, "Register an environment, and let a sampler answer the questions about it. This page follows by itself."),
-  h("pre", {}, "surrogym register Pendulum-v1 --name pendulum\nsurrogym sample pendulum"));
+  h("pre", {}, `${ADDRESS}surrogym register Pendulum-v1 --name pendulum\nsurrogym sample pendulum`));
 
 function row(surrogate) {
   const { name, environment, confidence_index: index, target, ledger, budget } = surrogate;

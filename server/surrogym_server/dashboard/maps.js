@@ -93,7 +93,7 @@ export function maps(name, spec, controls) {
       h("div", { class: "picks" }, x.label, y.label, h("label", { class: "pick" }, "of", output)),
       h("p", { class: "key" },
         ["initial", "adaptive", "manual"].map((purpose) => h("span", { class: `mark ${purpose}` }, purpose)),
-        h("span", { class: "mark cross" }, "the point")),
+        h("span", { class: "mark cross" }, "the point"), h("span", { class: "mark path" }, "episodes from there")),
       h("div", { class: "maps" }, Object.values(kinds).map((kind) => kind.figure)),
     ],
     moved: () => { draw(); ask(); },

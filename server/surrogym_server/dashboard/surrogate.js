@@ -70,7 +70,7 @@ function build(main, name, spec, context) {
   const steer = actions(name, context);
   const settable = spec.max_rollout === undefined || spec.max_rollout === null;
   const probing = probe(name, spec, controls, { onepisodes: map.paths, ask: settable && ((point) => steer.ask(point)) });
-  const [queue, ledger, versions, sessions] = [queueTable(), ledgerTable(), modelTable(), sessionTable()];
+  const [queue, ledger, versions, sessions] = [queueTable(), ledgerTable(), modelTable(), sessionTable(name)];
   const names = controls.ranges.map((range) => range.name);
   const showPoint = (coordinates, action) => {
     controls.move(coordinates, action);

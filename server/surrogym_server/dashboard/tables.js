@@ -70,7 +70,7 @@ export function modelTable() {
   };
 }
 
-export function sessionTable() {
+export function sessionTable(name) {
   const place = h("div");
   const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
   const render = shown(place, (sessions) => table("Sessions",
@@ -81,7 +81,7 @@ export function sessionTable() {
       return [h("code", {}, session.id.slice(0, 8)), count(session.num_envs), session.variant, `${session.model_version.join(", ")}${session.model === "latest" ? ", latest" : ""}`,
         count(session.steps), count(session.steps_per_second), count(session.episodes),
         session.returns.length ? number(mean(session.returns), 4) : "–", sparkline(session.returns), session.returns.length && before ? percent(taken / before) : "–"];
-    }), "No session is open. A trainer opens one: surrogym train"));
+    }), `No session is open. A trainer opens one: surrogym train ${name}`));
   return {
     element: section("sessions", "Sessions", "Virtual environments in use. Returns are means of the last hundred episodes, and imagined: no sign of success in the original environment.", place),
     show: render,
