@@ -15,6 +15,7 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.gradients import GradientSettings, _evened, optimise
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.surrogate.learn import learn
+from surrogym_shared.wire import OpenSession
 
 SMALL = GradientSettings(updates=12, lanes=16, horizon=20, units=8)
 
@@ -38,6 +39,17 @@ def test_steps_of_the_model_are_differentiable(surrogate):
 
     q = torch.tensor([[2.0, 0.5], [-0.4, -1.0]], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(returned, q, atol=1e-4)
+
+
+def test_gradients_go_through_what_a_step_has_made_first(surrogate):
+    fresh = local(surrogate.spec())
+    session = fresh.open(OpenSession(num_envs=2, seed=0)).id
+    fresh.reset(session)
+    fresh.step(session, np.zeros((2, 1)))
+    u = torch.full((2, 1), 0.3, dtype=torch.float64, requires_grad=True)
+    moved = fresh.model.transition(torch.zeros(2, 2, dtype=torch.float64), u)
+    (gradient,) = torch.autograd.grad(moved.reward.sum() + fresh.model.definition.observe(moved.q_next).sum(), u)
+    assert bool((gradient != 0).all())
 
 
 def test_it_learns_to_hold_the_pendulum_up(tmp_path: Path):

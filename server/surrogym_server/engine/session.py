@@ -183,12 +183,11 @@ def step_session(
 def _step_versions(
     session: Session, action: Floats, mask: Bools | None, deviations: bool, model_of: ModelOf
 ) -> tuple[LaneState, Transition]:
-    versions = np.unique(session.versions)
-    if len(versions) == 1:
-        model = model_of(int(versions[0]))
-        return step(model, session.settings, session.lanes, action, mask, deviations)
+    first = session.versions[0]
+    if (session.versions == first).all():
+        return step(model_of(int(first)), session.settings, session.lanes, action, mask, deviations)
     lanes, parts = session.lanes, []
-    for version in versions:
+    for version in np.unique(session.versions):
         index = np.flatnonzero(session.versions == version)
         part, transition = step(
             model_of(int(version)),

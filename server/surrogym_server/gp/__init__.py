@@ -17,6 +17,7 @@ beta      ``weights`` (n,)        (K + sigma_n^2 I)^-1 y
 from surrogym_server.gp.blocks import in_blocks
 from surrogym_server.gp.fit import FitOptions, Fitted, fit
 from surrogym_server.gp.joint import Joint
+from surrogym_server.gp.kept import kept
 from surrogym_server.gp.kernel import Hyperparameters
 from surrogym_server.gp.pathwise import Pathwise
 from surrogym_server.gp.placing import CPU, placed
@@ -39,6 +40,7 @@ __all__ = [
     "condition_sparse",
     "fit",
     "in_blocks",
+    "kept",
     "placed",
     "spread",
 ]

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from surrogym_server.gp.kept import kept
 from surrogym_server.gp.kernel import covariance
 from surrogym_server.gp.posterior import Posterior
 
@@ -57,7 +58,7 @@ class Pathwise:
             return measured @ self._sparse_noise
         return math.sqrt(posterior.hyper.noise_variance + posterior.jitter) * measured
 
-    @cached_property
+    @kept
     def _sparse_noise(self) -> Tensor:
         """Square root (n, n) of the noise that is left at inducing points, F F^T - k(Z, Z)."""
         posterior = self.posterior
@@ -84,6 +85,7 @@ class Pathwise:
 
 
 @cache
+@torch.inference_mode(False)
 def _frequencies(d: int, device: torch.device) -> Tensor:
     """Frequencies (d, S) of the squared exponential in length scales: standard normal, the same for ever."""
     drawn = np.random.Generator(np.random.Philox(key=d)).standard_normal((d, FREQUENCIES))

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from surrogym_server.gp import CPU, placed
+from surrogym_server.gp import CPU, kept, placed
 from surrogym_server.surrogate.conditions import Conditions, Inequality
 from surrogym_server.surrogate.terms import Term, TermSet, compile_terms
 
@@ -60,7 +59,7 @@ class DeclaredReward:
             total = total + term.weight * _shaped(term.shape, own) * holds[:, index]
         return total
 
-    @cached_property
+    @kept
     def _compiled(self) -> tuple[TermSet, Tensor, Conditions]:
         """All quantities' terms and action weights (F, X), and when each term counts."""
         quantities = [quantity for term in self.terms for quantity in term.of]

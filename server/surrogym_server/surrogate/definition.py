@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from surrogym_server.gp import CPU, placed
+from surrogym_server.gp import CPU, kept, placed
 from surrogym_server.surrogate.conditions import Conditions, Inequality
 from surrogym_server.surrogate.declared import DeclaredReward
 from surrogym_server.surrogate.distributions import Distribution
@@ -123,7 +123,7 @@ class EnvironmentDefinition:
             return (*self.observation_names, REWARD)
         return (*(self.coordinates[i].name for i in self.moving), REWARD)
 
-    @cached_property
+    @kept
     def observe(self) -> TermSet:
         """Observation of coordinates: q (..., C) -> o (..., D)."""
         return placed(compile_terms(self.observation_terms, len(self.coordinates)), self.device)
@@ -134,7 +134,7 @@ class EnvironmentDefinition:
         terms = self.observation_terms
         return any(len(t.parts) > 1 or any(np.count_nonzero(p.weights) > 1 for p in t.parts) for t in terms)
 
-    @cached_property
+    @kept
     def observation_scaling(self) -> tuple[Tensor, Tensor]:
         """Mean and deviation of the observation over the sampling range, (D,) each; an entry that never varies has
         deviation 1."""
@@ -145,13 +145,13 @@ class EnvironmentDefinition:
         deviation = shown.std(0, correction=0)
         return shown.mean(0), torch.where(deviation > 1e-9, deviation, 1.0)
 
-    @cached_property
+    @kept
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Saturation bounds, (C,) each."""
         low, high = self._columns([(c.low, c.high) for c in self.coordinates])
         return low, high
 
-    @cached_property
+    @kept
     def reach(self) -> tuple[Tensor, Tensor]:
         """Saturation bounds, (C,) each; where there is none, ``REACH`` widths of the sampling range beyond it, so that
         a model that diverges stays finite."""
@@ -176,11 +176,11 @@ class EnvironmentDefinition:
             return torch.zeros(q.shape[:-1], dtype=torch.bool, device=q.device)
         return self._termination(q).any(-1)
 
-    @cached_property
+    @kept
     def _termination(self) -> Conditions:
         return Conditions.of(self.termination_groups, len(self.coordinates), self.device)
 
-    @cached_property
+    @kept
     def _sampled(self) -> tuple[Tensor, Tensor]:
         """Ends of the sampling range, (C,) each."""
         low, high = self._columns([(c.sampling.low, c.sampling.high) for c in self.coordinates])

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from surrogym_server.gp import Output, Posterior, in_blocks, placed
+from surrogym_server.gp import Output, Posterior, in_blocks, kept, placed
 from surrogym_server.surrogate.definition import EnvironmentDefinition, wrap
 from surrogym_server.surrogate.features import Encoder, FeatureMap, leading
 from surrogym_server.surrogate.recover import ObservationInverse
@@ -137,7 +137,7 @@ class SurrogateModel:
         """How many numbers a draw is, W."""
         return sum(one.pathwise.size for stage in self._stages if stage for one in stage.drawn)
 
-    @cached_property
+    @kept
     def scales(self) -> Tensor:
         """Deviation of each output's targets over the samples, (O,), in its own unit."""
         return torch.tensor(
@@ -186,12 +186,14 @@ class SurrogateModel:
             mean, spread = _sum((mean, spread), reward)
         return q_next, mean, spread
 
-    def _rewarded(self, q: Tensor, u: Tensor, q_next: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
+    def _rewarded(self, q: Tensor, u: Tensor, q_next: Tensor, mean: Tensor) -> tuple[Tensor, Tensor | float]:
         """Rewards (m,) of steps from q (m, C) under u (m, F) to q_next (m, C), the process' mean and what jumps and a
-        declared reward add, and the variance (m,) of where the jumps are."""
+        declared reward add, and the variance (m,) of where the jumps are, 0 without any."""
         state = q_next if self.reward.feature_map.after else q
         if (known := self.definition.declared_reward) is not None:
             mean = mean + known(state, u)
+        if not self.jumps:
+            return mean, 0.0
         added, variance = jumped(self.jumps, state)
         return mean + added, variance
 
@@ -218,7 +220,7 @@ class SurrogateModel:
         paper = self.definition.design.preset == "paper"
         return len(self.transitions) if paper else len(self.definition.coordinates)
 
-    @cached_property
+    @kept
     def _stages(self) -> tuple[Stage, Stage | None, Stage | None]:
         """What reads (q, u), what reads the lead as well, and a reward that reads the next state."""
         after = self.reward.feature_map.after
@@ -239,7 +241,7 @@ class SurrogateModel:
         lead = any(o.feature_map.lead for _, o in outputs)
         return Stage.of(encoder, served, self._reward_column + 1, lead=lead, begin=begin)
 
-    @cached_property
+    @kept
     def _inverse(self) -> ObservationInverse:
         return ObservationInverse.of(self.definition)
 

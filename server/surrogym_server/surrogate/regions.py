@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor
 
-from surrogym_server.gp import placed
+from surrogym_server.gp import kept, placed
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.features import encode
 from surrogym_server.surrogate.terms import Part, Term, TermSet, compile_terms
@@ -107,11 +106,11 @@ class Thresholds:
         joined = "none of" if self.complement else "any of"
         return {"kind": "thresholds", "inside": joined, "rules": rules}
 
-    @cached_property
+    @kept
     def _axes(self) -> Axes:
         return Axes.of(self.definition)
 
-    @cached_property
+    @kept
     def _compiled(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Axis, outside and width of every cut, (K,) each, and each cut's weight in its rule, (K, R)."""
         cuts = [(row, cut) for row, rule in enumerate(self.rules) for cut in rule]
