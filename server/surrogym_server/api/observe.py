@@ -52,11 +52,12 @@ class Observed:
         try:
             await self._app(scope, receive, identified)
         finally:
-            if scope["type"] == "http":
+            if scope["type"] == "http" or status != FAILED:  # of streams those that were refused
                 self._note(scope, status, time.perf_counter() - started)
 
     def _note(self, scope: Scope, status: int, seconds: float) -> None:
-        method = scope["method"] if scope["method"] in METHODS else "other"
+        method = scope.get("method", "GET")  # a stream begins with a GET, and its scope names none
+        method = method if method in METHODS else "other"
         route = getattr(scope.get("route"), "path", UNKNOWN_ROUTE)
         key = (method, route, status)
         durations = self._counts.requests.get(key)

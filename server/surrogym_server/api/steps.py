@@ -24,7 +24,17 @@ from surrogym_shared.codes import Code
 from surrogym_shared.wire import ResetReply, ResetSession, RolloutReply, RolloutSession, StepReply, StepSession
 
 router = APIRouter(prefix="/v1/sessions/{id}", tags=["sessions"], route_class=LeanRoute)
-router.routes.append(WebSocketRoute("/v1/sessions/{id}/stream", StepStream()))
+
+
+class StreamRoute(WebSocketRoute):
+    """Says in the scope which route it is, as those of HTTP do."""
+
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        scope["route"] = self
+        await super().handle(scope, receive, send)
+
+
+router.routes.append(StreamRoute("/v1/sessions/{id}/stream", StepStream()))
 
 ERRORS = documented(
     Code.UNKNOWN_SESSION,

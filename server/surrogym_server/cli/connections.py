@@ -118,6 +118,10 @@ class PromptMessages(WebSocketsSansIOProtocol):
         finally:
             self._waiting = False
 
+    async def send(self, message: Any) -> None:
+        await super().send(message)
+        self.handshake_complete |= self.close_sent  # by a refusal; uvicorn would call it none, and log an error
+
     def _take(self, answer: Prompt) -> None:
         if self._chunks == 1:
             self._answer = answer

@@ -9,7 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import pytest
 from prometheus_client.parser import text_string_to_metric_families
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from support import pendulum
 from support.server import running_server
@@ -81,6 +85,23 @@ def test_a_refusal_names_its_request_and_the_client_prints_it(client: httpx.Clie
     problem = Problem.model_validate_json(reply.content)
     assert problem.request == reply.headers["x-request-id"]
     assert str(error_from_problem(problem)).endswith(f"[request {problem.request}]")
+
+
+def test_a_refused_stream_is_a_request_and_no_error_of_the_server(tmp_path: Path):
+    """Of another site's page, without a session: each is told why, and what the log says of it is that."""
+    with running_server(tmp_path) as server:
+        address = f"{server.url.replace('http', 'ws', 1)}/v1/sessions/nowhere/stream"
+        with pytest.raises(InvalidStatus) as foreign:
+            connect(address, origin=Origin("https://elsewhere.example"))
+        with pytest.raises(InvalidStatus) as missing:
+            connect(address)
+        counted = httpx.get(f"{server.url}/metrics").text
+        server.stop()
+    assert [said.value.response.status_code for said in (foreign, missing)] == [403, 404]
+    for status in (403, 404):
+        assert f"GET /v1/sessions/nowhere/stream -> {status} in" in server.log
+        assert f'{{method="GET",route="/v1/sessions/{{id}}/stream",status="{status}"}} 1.0' in counted
+    assert "ERROR" not in server.log
 
 
 def test_logs_are_objects_when_asked_and_name_the_request(tmp_path: Path):
