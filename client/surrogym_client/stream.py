@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import secrets
 import socket
+from contextlib import suppress
 from threading import Lock
 from urllib.parse import urlsplit
 
@@ -76,7 +77,8 @@ class Stream:
                 if seconds != connected.gettimeout():  # setting it is a call of the system
                     connected.settimeout(seconds)
                 key = secrets.token_bytes(KEY_BYTES)
-                connected.sendall(b"".join((header(len(message), MASKED), key, apply_mask(message, key))))
+                with suppress(ConnectionError):  # who refuses so large a message says so, and reads no more of it
+                    connected.sendall(b"".join((header(len(message), MASKED), key, apply_mask(message, key))))
                 return self._receive(connected)
             except (WebSocketException, ConnectionError) as error:
                 self.close()
@@ -125,8 +127,9 @@ class Stream:
                 return frame[extent.payload :]
             for frame, _ in whole:
                 self._protocol.receive_data(frame)
+            message = self._gathered(parts)
             self._flush(connected)  # pongs
-            if (message := self._gathered(parts)) is not None:
+            if message is not None:
                 return message
 
     def _gathered(self, parts: list[bytes]) -> bytes | None:

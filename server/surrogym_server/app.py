@@ -38,7 +38,7 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
 from surrogym_server.engine.fits import Fits
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.engine.sessions import MEBIBYTE, Limits, LiveSessions
+from surrogym_server.engine.sessions import MEBIBYTE, Limits, LiveSessions, Threads
 from surrogym_server.errors import InvalidInput
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.counts import Counts
@@ -64,7 +64,7 @@ DESCRIPTION = """Learns a virtual environment from a handful of real steps and s
 
 A sampler claims queries and adds samples; a trainer opens a session and steps it; the server chooses the queries.
 """
-STEP_THREADS = 4
+STEP_THREADS, ROLLOUT_THREADS = 4, 2
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class State(TypedDict):
 class _Engine:
     fits: Fits
     live: LiveSessions
-    threads: ThreadPoolExecutor
+    threads: tuple[ThreadPoolExecutor, ...]
     notices: Notices
 
 
@@ -155,17 +155,23 @@ async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: 
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        engine.threads.shutdown()
+        for threads in engine.threads:
+            threads.shutdown()
         await asyncio.to_thread(engine.fits.close)
         logger.info("sessions saved: %d", services.sessions.save())
         storage.close()
 
 
 def _build_engine(settings: Settings, design: DesignPort) -> _Engine:
-    threads = ThreadPoolExecutor(STEP_THREADS, thread_name_prefix="step")
-    limits = Limits(settings.max_sessions, settings.max_sessions_mib * MEBIBYTE, settings.max_waiting)
-    live = LiveSessions(threads, limits=limits, idle_seconds=settings.session_idle_seconds, workers=STEP_THREADS)
-    return _Engine(Fits(design.run), live, threads, Notices())
+    for_steps = ThreadPoolExecutor(STEP_THREADS, thread_name_prefix="step")
+    for_rollouts = ThreadPoolExecutor(ROLLOUT_THREADS, thread_name_prefix="rollout")
+    live = LiveSessions(
+        Threads(for_steps, STEP_THREADS),
+        Threads(for_rollouts, ROLLOUT_THREADS),
+        limits=Limits(settings.max_sessions, settings.max_sessions_mib * MEBIBYTE, settings.max_waiting),
+        idle_seconds=settings.session_idle_seconds,
+    )
+    return _Engine(Fits(design.run), live, (for_steps, for_rollouts), Notices())
 
 
 def _build_services(

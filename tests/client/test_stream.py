@@ -6,12 +6,13 @@ import pickle
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler
 
 import pytest
 from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
 
-from support.scripted_server import lost_reply, problem, reply, scripted_server
+from support.scripted_server import lost_reply, problem, reply, scripted_server, upgrade
 from surrogym_client import errors
 from surrogym_client.stream import Stream, StreamLost, StreamUnavailable
 from surrogym_shared.codes import Code
@@ -117,6 +118,22 @@ def test_a_message_that_is_too_large_is_no_lost_connection():
         pytest.raises(errors.TooLarge, match="expected a smaller message"),
     ):
         opened.exchange(b"x" * 2000, 30)
+
+
+def test_a_server_that_closes_in_the_middle_of_a_message_has_said_why():
+    def refuse(handler: BaseHTTPRequestHandler) -> None:
+        upgrade(handler)
+        handler.rfile.read(2)
+        reason = (1009).to_bytes(2, "big") + b"it is too big"
+        handler.wfile.write(bytes((0x88, len(reason))) + reason)
+        handler.close_connection = True
+
+    with (
+        scripted_server(refuse) as server,
+        stream(server.url) as opened,
+        pytest.raises(errors.TooLarge, match="expected a smaller message: it is too big"),
+    ):
+        opened.exchange(b"x" * 40_000_000, 30)
 
 
 @pytest.mark.parametrize(

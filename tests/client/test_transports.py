@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import pickle
 from http.server import BaseHTTPRequestHandler
 
 import numpy as np
 import pytest
 
-from support.scripted_server import Answer, ScriptedServer, problem, reply, scripted_server, session_view
+from support.scripted_server import Answer, ScriptedServer, problem, reply, scripted_server, session_view, upgrade
 from surrogym_client import errors
 from surrogym_client.connection import Connection, Retries, Timeouts
 from surrogym_client.transport import HttpSurrogate
@@ -21,7 +19,6 @@ from surrogym_shared.port import StepResult
 
 QUICK = Retries(seconds=2.0, first_delay=0.01, longest_delay=0.05)
 ACTION = np.array([[0.5], [-0.5]])
-WEBSOCKET_KEY = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"  # RFC 6455, 1.3
 
 
 def step(seq: int) -> Answer:
@@ -52,15 +49,6 @@ def binary(content: bytes) -> Answer:
         handler.wfile.write(content)
 
     return answer
-
-
-def upgrade(handler: BaseHTTPRequestHandler) -> None:
-    key = handler.headers["Sec-WebSocket-Key"].encode()
-    handler.send_response(101)
-    handler.send_header("Upgrade", "websocket")
-    handler.send_header("Connection", "Upgrade")
-    handler.send_header("Sec-WebSocket-Accept", base64.b64encode(hashlib.sha1(key + WEBSOCKET_KEY).digest()).decode())
-    handler.end_headers()
 
 
 def upgrade_and_cut(handler: BaseHTTPRequestHandler) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,6 +12,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 from surrogym_shared import wire
 from surrogym_shared.codes import STATUS, Code, Problem
+
+WEBSOCKET_KEY = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"  # RFC 6455, 1.3
 
 
 @dataclass
@@ -49,6 +53,16 @@ def reply(body: str, status: int = 200, content_type: str = "application/json", 
 def problem(code: Code, detail: str = "why") -> Answer:
     body = Problem(title=code.value, status=STATUS[code], code=code, detail=detail)
     return reply(body.model_dump_json(), STATUS[code], "application/problem+json")
+
+
+def upgrade(handler: BaseHTTPRequestHandler) -> None:
+    """Accept the stream; what follows is for the script to say."""
+    key = handler.headers["Sec-WebSocket-Key"].encode()
+    handler.send_response(101)
+    handler.send_header("Upgrade", "websocket")
+    handler.send_header("Connection", "Upgrade")
+    handler.send_header("Sec-WebSocket-Accept", base64.b64encode(hashlib.sha1(key + WEBSOCKET_KEY).digest()).decode())
+    handler.end_headers()
 
 
 def session_view(seq: int = 0, protocol: int = wire.PROTOCOL) -> Answer:

@@ -39,6 +39,20 @@ class _Live:
         return max(self.reserved, self.session.nbytes)
 
 
+@dataclass
+class Threads:
+    """Where long work is done."""
+
+    executor: Executor
+    workers: int  # how many threads it has
+    queued: list[float] = field(default_factory=list)  # seconds that the work given to it will take
+
+    @property
+    def wait(self) -> float:
+        """Seconds until work that is given now will be begun, about."""
+        return sum(self.queued) / self.workers if len(self.queued) >= self.workers else 0.0
+
+
 @dataclass(frozen=True)
 class Limits:
     """What all sessions together may take of this process."""
@@ -52,8 +66,8 @@ class LiveSessions:
     """Sessions by id: one request at a time in each, long ones in a thread.
 
     Args:
-        threads: where long work is done.
-        workers: how many threads those are.
+        threads: where long steps and resets are done.
+        rollouts: where long rollouts are, which may take minutes: steps don't queue behind them.
         limits: beyond them requests are refused.
         idle_seconds: a session that is not used for so long expires.
         clock: seconds, of which deadlines speak too.
@@ -61,20 +75,19 @@ class LiveSessions:
 
     def __init__(
         self,
-        threads: Executor,
+        threads: Threads,
+        rollouts: Threads,
         *,
         limits: Limits,
         idle_seconds: float,
-        workers: int = 1,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.idle_seconds = idle_seconds
         self.clock = clock
         self._threads = threads
-        self._workers = workers
+        self._rollouts = rollouts
         self._limits = limits
         self._requests = 0
-        self._queued: list[float] = []  # seconds that the work given to threads will take
         self._live: dict[str, _Live] = {}
         self._expired: OrderedDict[str, None] = OrderedDict()
 
@@ -212,27 +225,27 @@ class LiveSessions:
             self._check_deadline(deadline, expected)
             done, seconds = _timed(work, live.session)
         else:
-            done, seconds = await self._in_thread(live.session, work, expected, deadline)
+            threads = self._threads if steps == 1 else self._rollouts
+            done, seconds = await self._in_thread(threads, live.session, work, expected, deadline)
         known = live.seconds_per_step if live.seconds_per_step < float("inf") else seconds / steps
         live.seconds_per_step = (1 - FORGETTING) * known + FORGETTING * seconds / steps
         return done
 
     async def _in_thread(
-        self, session: Session, work: Work, expected: float, deadline: float | None
+        self, threads: Threads, session: Session, work: Work, expected: float, deadline: float | None
     ) -> tuple[tuple[Session, Outcome], float]:
         expected = expected if expected < float("inf") else 0.0
-        waiting = sum(self._queued) / self._workers if len(self._queued) >= self._workers else 0.0
-        self._check_deadline(deadline, waiting + expected)
+        self._check_deadline(deadline, threads.wait + expected)
 
         def in_time(session: Session) -> tuple[Session, Outcome]:
             self._check_deadline(deadline, expected)  # the wait may have been longer than was thought
             return work(session)
 
-        self._queued.append(expected)
+        threads.queued.append(expected)
         try:
-            return await asyncio.get_running_loop().run_in_executor(self._threads, _timed, in_time, session)
+            return await asyncio.get_running_loop().run_in_executor(threads.executor, _timed, in_time, session)
         finally:
-            self._queued.remove(expected)
+            threads.queued.remove(expected)
 
     def _check_deadline(self, deadline: float | None, seconds: float) -> None:
         if deadline is not None and (left := deadline - self.clock()) < seconds:

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from surrogym_server.engine.session import Fingerprint, Outcome, Session, reset_session
-from surrogym_server.engine.sessions import MEBIBYTE, Limits, LiveSessions
+from surrogym_server.engine.sessions import MEBIBYTE, Limits, LiveSessions, Threads
 from surrogym_server.errors import (
     DeadlineExceeded,
     Overloaded,
@@ -39,8 +39,8 @@ def clock() -> Clock:
 
 @pytest.fixture
 def live(clock: Clock) -> Iterator[LiveSessions]:
-    with ThreadPoolExecutor(2) as threads:
-        yield LiveSessions(threads, limits=LIMITS, idle_seconds=10, workers=2, clock=clock)
+    with ThreadPoolExecutor(2) as steps, ThreadPoolExecutor(1) as rollouts:
+        yield LiveSessions(Threads(steps, 2), Threads(rollouts, 1), limits=LIMITS, idle_seconds=10, clock=clock)
 
 
 def work(session: Session) -> tuple[Session, Outcome]:
@@ -89,6 +89,26 @@ def test_another_session_and_the_loop_go_on_meanwhile(live: LiveSessions, opened
         await waiting
 
     asyncio.run(both())
+
+
+def test_a_step_does_not_queue_behind_rollouts(opened: Open):
+    slow = Slow()
+    with ThreadPoolExecutor(1) as steps, ThreadPoolExecutor(1) as rollouts:
+        live = LiveSessions(Threads(steps, 1), Threads(rollouts, 1), limits=LIMITS, idle_seconds=10)
+        live.add(opened("planner"))
+        live.add(opened("trainer"))
+
+        async def both() -> None:
+            rollout = asyncio.create_task(live.advance("planner", 1, Fingerprint("d"), slow, steps=2))
+            while not slow.begun:
+                await asyncio.sleep(0.001)
+            try:
+                await asyncio.wait_for(live.advance("trainer", 1, Fingerprint("d"), work), 20)
+            finally:
+                slow.go.set()
+            await rollout
+
+        asyncio.run(both())
 
 
 def test_work_that_fails_changes_nothing(live: LiveSessions, opened: Open):

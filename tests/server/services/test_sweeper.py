@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.engine.sessions import Limits, LiveSessions
+from surrogym_server.engine.sessions import Limits, LiveSessions, Threads
 from surrogym_server.errors import Unavailable
 from surrogym_server.services.counts import Counts
 from surrogym_server.services.sweeper import Sweeper
@@ -26,7 +26,7 @@ def test_a_sweep_that_fails_is_followed_by_the_next(storage: Storage, monkeypatc
     async def run() -> int:
         counts = Counts()
         with ThreadPoolExecutor(1) as threads:
-            live = LiveSessions(threads, limits=Limits(), idle_seconds=60.0)
+            live = LiveSessions(Threads(threads, 1), Threads(threads, 1), limits=Limits(), idle_seconds=60.0)
             models = ModelCache(lambda *_: pytest.fail("nothing is in use"), storage.models.newest)
             sweeper = asyncio.create_task(Sweeper(storage, live, models, 0.001, counts).run())
             while met:
