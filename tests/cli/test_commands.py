@@ -152,8 +152,9 @@ def test_ones_own_environment_has_to_be_named_by_the_person(on_server, name, tmp
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum, tmp_path):
-    assert on_server("sample", pendulum, "--until-done", "--time-limit", "120", "--quiet").code == 0
+    assert on_server("sample", pendulum, "--until-done", "--time-limit", "300", "--quiet").code == 0
     session = ("--variant", "pathwise", "--trust", "9", "--process-noise", "--start-box", "0.25")
     options = ("--steps", "2000", "--num-envs", "4", "--seed", "3", *session)
     trained = on_server("train", pendulum, *options, "--json", "--quiet")

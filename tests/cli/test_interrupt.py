@@ -40,6 +40,7 @@ def test_sampling_shows_the_design_and_keeps_every_real_step(surrogym, pendulum_
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_training_saves_its_policy(pendulum_server: ServerProcess, surrogym_on_terminal, tmp_path: Path):
     options = ("--steps", "900000", "--num-envs", "16", "--set", "n_steps=64", "--variant", "pathwise")
     with surrogym_on_terminal("train", "pendulum", *options, "--out", "policy.zip") as terminal:
@@ -52,18 +53,20 @@ def test_training_saves_its_policy(pendulum_server: ServerProcess, surrogym_on_t
     assert card["spec"]["environment"] == "Pendulum-v1"
 
 
-def test_an_evaluation_that_is_interrupted_enters_its_real_steps(surrogym, pendulum_server, monkeypatch, tmp_path):
+def test_an_evaluation_that_is_interrupted_enters_its_real_steps(
+    on_server, server_process, name, monkeypatch, tmp_path
+):
+    assert on_server("register", "Pendulum-v1", "--name", name).code == 0
     (tmp_path / "policy.zip").write_bytes(b"")
-    (tmp_path / "policy.json").write_text('{"surrogate": "pendulum"}')
+    (tmp_path / "policy.json").write_text(json.dumps({"surrogate": name}))
 
     def interrupted(*_):
         raise EvaluationInterrupted(7)
 
     monkeypatch.setattr("surrogym_client.policy_file.load_policy", lambda *_: None)
     monkeypatch.setattr("surrogym_client.evaluate.evaluate", interrupted)
-    with Api(pendulum_server.url) as api:
-        before = api.surrogate("pendulum").ledger.evaluation
-        ended = surrogym("evaluate", "policy.zip", "--env", "Pendulum-v1", "--server", pendulum_server.url)
-        assert api.surrogate("pendulum").ledger.evaluation - before == 7
+    ended = on_server("evaluate", "policy.zip", "--env", "Pendulum-v1")
+    with Api(server_process.url) as api:
+        assert api.surrogate(name).ledger.evaluation == 7
     assert (ended.code, ended.out) == (INTERRUPTED, "")
     assert "interrupted after 7 real steps" in ended.err

@@ -15,10 +15,7 @@ from websockets.sync.client import connect
 from support import pendulum
 from support.chaos import SEED, times
 from support.hostile import mutated, resident_mib
-from support.server import ServerProcess, running_server
-from support.teaching import teach
-from surrogym_client.api import Api
-from surrogym_client.original.classic import pendulum as specification
+from support.server import ServerProcess
 from surrogym_shared import frames
 from surrogym_shared.codes import PROBLEM_MEDIA_TYPE, Problem
 
@@ -29,12 +26,10 @@ ACTION = np.array([[0.5], [-1.5]])
 pytestmark = pytest.mark.timeout(3_600)
 
 
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
-    with running_server(tmp_path_factory.mktemp("mutations"), "--log-level", "error") as server:
-        with Api(server.url) as api:
-            teach(api, "pendulum", specification(), queries=12)
-        yield server
+@pytest.fixture
+def server(pendulum_server: ServerProcess) -> ServerProcess:
+    """Nothing that is thrown at it may harm what other tests do there."""
+    return pendulum_server
 
 
 @pytest.fixture
@@ -44,12 +39,13 @@ def client(server: ServerProcess) -> Iterator[httpx.Client]:
 
 
 @pytest.fixture
-def session(client: httpx.Client) -> str:
+def session(client: httpx.Client) -> Iterator[str]:
     """A session of two lanes that has been reset."""
     opened = client.post("/v1/surrogates/pendulum/sessions", json={"seed": 0, "num_envs": 2}).raise_for_status()
     id: str = opened.json()["id"]
     client.post(f"/v1/sessions/{id}/reset", json={}).raise_for_status()
-    return id
+    yield id
+    client.delete(f"/v1/sessions/{id}").raise_for_status()
 
 
 def attack(server: ServerProcess, send: Callable[[bytes], None], content: bytes, seed: int) -> None:
@@ -103,6 +99,7 @@ def test_samples(server: ServerProcess, client: httpx.Client):
     attack(server, send, json.dumps(body).encode(), seed=3)
     view = client.get("/v1/surrogates/open").raise_for_status().json()
     assert view["phase"] == "collecting", "what got through was a sample, and no more"
+    client.delete("/v1/surrogates/open").raise_for_status()
 
 
 def test_the_stream(server: ServerProcess, client: httpx.Client, session: str):

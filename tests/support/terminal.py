@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-PATIENCE = 120.0
+PATIENCE = 240.0
 UPWARDS = re.compile(r"\x1b\[\d*A")  # what follows is drawn on a line of its own
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
