@@ -22,6 +22,7 @@ def test_the_command_alone_lists_all_commands(surrogym):
     said = surrogym("--help")
     assert said.code == 0
     assert all(f"  {command} " in said.out for command in (*COMMANDS, "serve", "optimise"))
+    assert "..." not in said.out.partition("Commands:")[2]  # each says what it does in a line that is whole
 
 
 def test_version(surrogym):

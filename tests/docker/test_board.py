@@ -69,4 +69,7 @@ def test_the_board_finds_its_data_source_and_grafana_the_board() -> None:
 def test_prometheus_looks_at_the_server_with_the_token() -> None:
     (job,) = yaml.safe_load((DOCKER / "prometheus.yaml").read_text())["scrape_configs"]
     assert job["static_configs"] == [{"targets": ["server:8000"]}]
-    assert job["authorization"]["credentials_file"] == "/run/secrets/token"
+    prometheus = yaml.safe_load((DOCKER / "compose.yaml").read_text())["services"]["prometheus"]
+    assert '"$$SURROGYM_TOKEN" > /dev/shm/token' in prometheus["entrypoint"][2]
+    assert prometheus["environment"]["SURROGYM_TOKEN"] == "${SURROGYM_TOKEN}"
+    assert job["authorization"]["credentials_file"] == "/dev/shm/token"

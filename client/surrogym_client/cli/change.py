@@ -25,7 +25,7 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Change a living surrogate; its model is judged anew, and what is left out stays.
+    """Change a living surrogate. Its model is judged anew, and what is left out stays.
 
     Example: surrogym change pendulum --tolerance theta=0.01 --budget 30
     """

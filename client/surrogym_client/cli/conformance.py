@@ -23,7 +23,7 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Check a server against the protocol, one line a check; exit status 1 where it fails one. With --quiet, failed
+    """Check a server against the protocol. One line a check; exit status 1 where it fails one. With --quiet, failed
     checks alone are shown.
 
     Example: surrogym conformance --server http://127.0.0.1:8000

@@ -22,7 +22,7 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Delete a surrogate: its samples, models and sessions are gone for good.
+    """Delete a surrogate. Its samples, models and sessions are gone for good.
 
     Example: surrogym delete pendulum --yes
     """

@@ -41,7 +41,8 @@ def command(
     exit_with_parent: ExitWithParent = False,
     quiet: Quiet = False,
 ) -> None:
-    """Start a server, a sampler and a trainer, solve a task from a few real steps, and show what came of it.
+    """Solve a task from a few real steps, on this machine. Server, sampler and trainer are started, and the last words
+    say what came of it.
 
     Example: surrogym demo pendulum --seed 0 --json metrics.json
     """

@@ -30,7 +30,7 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Check versions, server, token, round trip and, if one is named, an environment; one line each, with the way out
+    """Check versions, server, token, round trip, environment. One line each, with the way out
     of what is wrong. Exit status 1 where anything is; with --quiet, problems alone are shown.
 
     Example: surrogym doctor --env Pendulum-v1

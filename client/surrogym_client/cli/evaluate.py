@@ -50,7 +50,7 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Run real episodes with a policy and count successes; the real steps go to the surrogate's ledger.
+    """Run real episodes with a policy and count successes. The real steps go to the surrogate's ledger.
 
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 100
     """

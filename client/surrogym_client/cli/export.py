@@ -31,8 +31,8 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write a whole surrogate into one file (.surrogate), which surrogym import takes; or of it every real sample
-    (.csv, .npz), the latest model (.safetensors) or the specification (.json) alone.
+    """Write a whole surrogate into one file (.surrogate). It is what surrogym import takes. Other endings write
+    a part alone: every real sample (.csv, .npz), the latest model (.safetensors), the specification (.json).
 
     Example: surrogym export pendulum --out pendulum.surrogate
 

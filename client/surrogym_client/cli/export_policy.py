@@ -26,7 +26,8 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write a policy's most probable action as ONNX (.onnx) or as a torch.export program (.pt2).
+    """Write a policy as ONNX (.onnx) or for torch (.pt2). It gives the most probable action; .pt2 is a program of
+    torch.export.
 
     The file is checked to give the policy's actions on random observations. The policy itself is a zip that
     Stable-Baselines3 loads.

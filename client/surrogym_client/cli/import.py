@@ -23,7 +23,7 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Make a surrogate of a file: it serves the same model at once, judged by the same tolerances, its design paused.
+    """Make a surrogate of a file. It serves the same model at once, judged by the same tolerances, its design paused.
 
     Its real samples are stored as manual ones. surrogym change NAME --resume lets the design go on, with its initial
     queries first.

@@ -25,7 +25,7 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Ask the design for more queries; a sampler has to answer them.
+    """Ask the design for more queries. A sampler has to answer them.
 
     Example: surrogym improve pendulum --queries 10
     """

@@ -59,7 +59,7 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Register an original environment, so that samplers and trainers can use it by name.
+    """Register an original environment. Samplers and trainers can then use it by name.
 
     Example: surrogym register Pendulum-v1 --name pendulum --budget 30
     """

@@ -24,8 +24,8 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write one HTML page that needs nothing else: fidelity against samples, where they fell, maps of uncertainty,
-    occupancy and index, the ledger, structure and hyperparameters, and every model.
+    """Write one HTML page that needs nothing else. It has fidelity against samples, where they fell, maps of
+    uncertainty, occupancy and index, the ledger, structure and hyperparameters, and every model.
 
     Example: surrogym report pendulum --out report.html
     """

@@ -64,8 +64,8 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Answer queries: set the original environment to a state, take one real step, report it; or reset it and act,
-    where it can't be set to a state. Ctrl-C ends it.
+    """Answer queries by real steps. The original environment is set to a state, takes one real step, and that is
+    reported; where it can't be set to a state, it is reset and acts. Ctrl-C ends it.
 
     Example: surrogym sample pendulum --until-done
     """

@@ -39,7 +39,7 @@ def command(
     as_json: AsJson = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Names and phases alone, without a heading.")] = False,
 ) -> None:
-    """Show all surrogates, or one with its fidelity and its ledger of real steps.
+    """Show all surrogates, or one with fidelity and real steps.
 
     With --watch --json, every change is a line of JSON.
 

@@ -112,7 +112,7 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Train a policy in the virtual environment; no real step is taken, unless --improve asks a sampler for more.
+    """Train a policy in the virtual environment. No real step is taken, unless --improve asks a sampler for more.
 
     The imagined return that is shown is what the policy earns in the surrogate, not in the original environment.
 

@@ -31,7 +31,7 @@ def optimise(
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no remarks.")] = False,
 ) -> None:
-    """Optimise a policy by the gradient of its return through a model; continuous actions only, no server is asked.
+    """Optimise a policy by gradients through a model. Continuous actions only, no server is asked.
 
     The imagined return that is shown is what the policy earns in the model, not in the original environment.
 

@@ -36,7 +36,7 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Run the demo over tasks, arms and seeds; rows.csv, efficiency.md and a picture of each task go into a folder.
+    """Run the demo over tasks, arms and seeds. rows.csv, efficiency.md and a picture of each task go into a folder.
 
     A run that has its row in rows.csv is not repeated, so that the same command goes on after Ctrl-C. Arms: default,
     no_loop, variance, latin_hypercube, paper, paper_hypercube, oracle; docs/results.md says what each is.

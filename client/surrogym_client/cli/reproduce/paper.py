@@ -28,7 +28,7 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Run section 5 of the paper; results.md, results.csv, rows.json and figure05.png to figure15.png
+    """Run section 5 of the paper. results.md, results.csv, rows.json and figure05.png to figure15.png
     go into a folder.
 
     Example: surrogym reproduce paper --out runs/paper

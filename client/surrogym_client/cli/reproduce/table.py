@@ -30,7 +30,7 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Merge files of rows; efficiency.csv, efficiency.md and a picture of each task go into a folder.
+    """Merge files of rows. efficiency.csv, efficiency.md and a picture of each task go into a folder.
 
     Example: surrogym reproduce table --rows night/rows.csv --rows day/rows.csv --out runs/table
     """
