@@ -74,6 +74,7 @@ def test_the_lines_of_the_terminal_page_work(
     assert (tmp_path / "report.html").exists()
 
 
+@pytest.mark.timeout(900)  # on a machine that others use as well
 def test_a_policy_leaves_for_other_programs(server: ServerProcess, tmp_path: Path) -> None:
     train = ["train", "pendulum", "--steps", "512", "--num-envs", "16", "--quiet", "--server", server.url]
     run(tmp_path, "-m", "surrogym_client", *train)
