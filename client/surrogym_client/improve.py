@@ -11,7 +11,6 @@ from surrogym_client.api import Api
 from surrogym_client.evaluate import Predict
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.train import (
-    MAX_STEPS,
     TrainingInterrupted,
     TrainProgress,
     TrainResult,
@@ -27,6 +26,7 @@ from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import SurrogateView
 
 ROUND_SHARE = 0.25  # of a whole training, in each round before the last
+SUGGESTED_STEPS = 1_000_000  # virtual ones, the most that is suggested for all rounds together; the paper's cap
 VISIT_LANES = 32
 VISIT_STEPS = 1_000  # where the specification has no time limit
 
@@ -121,11 +121,14 @@ def _together(rounds: Sequence[TrainResult], visited: int) -> TrainResult:
 def shares(settings: TrainSettings, rounds: int) -> tuple[int, int]:
     """Virtual steps of the whole training, all rounds included, and of each round; visits come on top.
 
-    What was asked for bounds the whole; what is suggested is added to, up to the cap.
+    What was asked for bounds the whole; what is suggested is the last training's, and rounds come on top, up to the
+    paper's cap. A round has the same share of the last training either way.
     """
-    planned = planned_steps(settings)
-    part = max(1, int(min(ROUND_SHARE, 1 / (rounds + 1)) * planned))
-    return planned if settings.total_steps is not None else min(planned + rounds * part, MAX_STEPS), part
+    planned, share = planned_steps(settings), min(ROUND_SHARE, 1 / (rounds + 1))
+    if settings.total_steps is not None:
+        return planned, max(1, int(planned * share / (1 + rounds * share)))
+    part = max(1, int(share * planned))
+    return min(planned + rounds * part, SUGGESTED_STEPS), part
 
 
 def visit(port: SurrogatePort, policy: Path, settings: TrainSettings, checkpoint: str) -> int:

@@ -38,7 +38,7 @@ from surrogym_client.training import (
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import EnvironmentSpec
 
-MAX_STEPS = 1_000_000  # virtual steps of one training, the paper's cap
+MAX_STEPS = 10_000_000  # virtual steps that can be asked for: hours of PPO
 ON_POLICY_STEPS = 600_000
 OFF_POLICY_STEPS = 50_000  # these learn from every step, and take far longer for each
 LEARNING_RATE = 3e-3

@@ -190,8 +190,8 @@ def test_dqn_takes_one_discrete_action_and_sac_none(tmp_path: Path):
         ({"algorithm": "VecEnv"}, "unknown algorithm"),
         ({"algorithm": "DQN"}, "DQN can't be trained here"),
         ({"hyperparameters": {"learning_speed": 1}}, "PPO can't be trained here"),
-        ({"total_steps": 0}, "expected 1 to 1000000, got 0"),
-        ({"total_steps": MAX_STEPS + 1}, "expected 1 to 1000000, got 1000001"),
+        ({"total_steps": 0}, f"expected 1 to {MAX_STEPS}, got 0"),
+        ({"total_steps": MAX_STEPS + 1}, f"expected 1 to {MAX_STEPS}, got {MAX_STEPS + 1}"),
     ],
 )
 def test_what_can_not_be_trained_is_refused(surrogate, tmp_path: Path, settings, complaint):
