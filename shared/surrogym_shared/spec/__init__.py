@@ -1,0 +1,42 @@
+"""EnvironmentSpec: what is known of an original environment before the first query.
+
+Symbols: coordinates ``q`` (n, C), observation ``o`` (n, D), action ``u`` (n, F). A specification is data: adapters make
+it for known environments, people write it as JSON or Python for their own, and no part of it is ever evaluated as code.
+Every contradiction is refused here, with what was expected and what came.
+"""
+
+from __future__ import annotations
+
+from surrogym_shared.spec.actions import BoxAction, DiscreteAction, MultiDiscreteAction
+from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, NAME_PATTERN
+from surrogym_shared.spec.coordinates import Bounds, Coordinate, Fixed, Normal, Uniform, limits
+from surrogym_shared.spec.environment import Design, EnvironmentSpec
+from surrogym_shared.spec.rewards import DeclaredReward, Quantity, Reward, RewardTerm, Success
+from surrogym_shared.spec.terms import AllOf, Inequality, ObservationEntry, Part, Term
+
+__all__ = [
+    "MAX_DIMENSIONS",
+    "MAX_ROLLOUT_QUERY",
+    "NAME_PATTERN",
+    "AllOf",
+    "Bounds",
+    "BoxAction",
+    "Coordinate",
+    "DeclaredReward",
+    "Design",
+    "DiscreteAction",
+    "EnvironmentSpec",
+    "Fixed",
+    "Inequality",
+    "MultiDiscreteAction",
+    "Normal",
+    "ObservationEntry",
+    "Part",
+    "Quantity",
+    "Reward",
+    "RewardTerm",
+    "Success",
+    "Term",
+    "Uniform",
+    "limits",
+]

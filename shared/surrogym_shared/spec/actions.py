@@ -1,0 +1,63 @@
+"""What can be done in an environment."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from surrogym_shared.checks import Number, require, require_range
+from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_DISCRETE_ACTIONS, Frozen
+
+
+class BoxAction(Frozen):
+    """A continuous action in [low, high]. ``bins`` offers it to the policy as so many equally spaced discrete values a
+    dimension (the paper's discretised control); the model and the sampler always see the continuous value."""
+
+    kind: Literal["box"] = "box"
+    low: tuple[Number, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
+    high: tuple[Number, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
+    bins: tuple[Annotated[int, Field(ge=2, le=MAX_DISCRETE_ACTIONS, strict=True)], ...] | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        require(
+            len(self.low) == len(self.high),
+            f"action low and high differ in length: {len(self.low)} and {len(self.high)}",
+        )
+        for i, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
+            require_range(f"action {i}", low, high)
+        if self.bins is not None:
+            require(len(self.bins) == len(self.low), f"expected {len(self.low)} bins, got {len(self.bins)}")
+        return self
+
+    @property
+    def size(self) -> int:
+        return len(self.low)
+
+
+class DiscreteAction(Frozen):
+    """One of n actions, 0 to n - 1."""
+
+    kind: Literal["discrete"] = "discrete"
+    n: int = Field(ge=2, le=MAX_DISCRETE_ACTIONS, strict=True)
+
+    @property
+    def size(self) -> int:
+        return 1
+
+
+class MultiDiscreteAction(Frozen):
+    """Several discrete actions at once; entry i is 0 to nvec[i] - 1."""
+
+    kind: Literal["multi_discrete"] = "multi_discrete"
+    nvec: tuple[Annotated[int, Field(ge=2, le=MAX_DISCRETE_ACTIONS, strict=True)], ...] = Field(
+        min_length=1, max_length=MAX_DIMENSIONS
+    )
+
+    @property
+    def size(self) -> int:
+        return len(self.nvec)
+
+
+Action = Annotated[BoxAction | DiscreteAction | MultiDiscreteAction, Field(discriminator="kind")]

@@ -1,0 +1,117 @@
+"""Coordinates of the state q, their distributions and bounds."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from surrogym_shared.checks import Number, Width, require, require_range
+from surrogym_shared.spec.base import Frozen, Name
+
+
+class Uniform(Frozen):
+    """Uniform on [low, high]."""
+
+    kind: Literal["uniform"] = "uniform"
+    low: Number
+    high: Number
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        require_range("uniform range", self.low, self.high)
+        return self
+
+
+class Normal(Frozen):
+    """Normal, truncated to [low, high]; without limits it is truncated at three standard deviations."""
+
+    kind: Literal["normal"] = "normal"
+    mean: Number
+    std: Width
+    low: Number | None = None
+    high: Number | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        low, high = self.limits
+        require_range("truncated range", low, high)
+        z = max(low - self.mean, self.mean - high) / self.std
+        require(z < 6, f"truncation [{low}, {high}] lies {z:.1f} standard deviations from the mean {self.mean}")
+        return self
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        low = self.mean - 3 * self.std if self.low is None else self.low
+        high = self.mean + 3 * self.std if self.high is None else self.high
+        return low, high
+
+
+class Fixed(Frozen):
+    """One value; only for the start distribution."""
+
+    kind: Literal["fixed"] = "fixed"
+    value: Number
+
+
+SamplingDistribution = Annotated[Uniform | Normal, Field(discriminator="kind")]
+StartDistribution = Annotated[Uniform | Normal | Fixed, Field(discriminator="kind")]
+
+
+def limits(distribution: Uniform | Normal | Fixed) -> tuple[float, float]:
+    """Smallest and largest value a distribution can give."""
+    match distribution:
+        case Uniform():
+            return distribution.low, distribution.high
+        case Normal():
+            return distribution.limits
+        case Fixed():
+            return distribution.value, distribution.value
+
+
+class Bounds(Frozen):
+    """Saturation: the environment clips the coordinate to [low, high].
+
+    ``stops`` names a coordinate that is set to zero when this one runs into the bound (a wall; MountainCar's left end).
+    """
+
+    low: Number | None = None
+    high: Number | None = None
+    stops: Name | None = None
+
+    @model_validator(mode="after")
+    def _some(self) -> Self:
+        require(self.low is not None or self.high is not None, "bounds need a low or a high")
+        if self.low is not None and self.high is not None:
+            require_range("range of bounds", self.low, self.high)
+        return self
+
+
+class Coordinate(Frozen):
+    """One entry of q: part of the state that the original environment is set to.
+
+    ``linear`` and ``angle`` (wrapped to [-pi, pi)) move with the dynamics; ``constant`` is drawn at the start of an
+    episode and stays (Reacher's target). ``sampling`` is the distribution of design queries.
+    """
+
+    name: Name
+    kind: Literal["linear", "angle", "constant"] = "linear"
+    sampling: SamplingDistribution
+    bounds: Bounds | None = None
+    unit: str = ""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.kind != "linear":
+            require(self.bounds is None, f"coordinate {self.name!r}: only a linear coordinate can have bounds")
+        if self.bounds is not None:
+            low, high = limits(self.sampling)
+            inside = (self.bounds.low is None or self.bounds.low <= low) and (
+                self.bounds.high is None or high <= self.bounds.high
+            )
+            require(
+                inside,
+                f"coordinate {self.name!r}: sampling range [{low}, {high}] leaves its bounds "
+                f"[{self.bounds.low}, {self.bounds.high}]",
+            )
+        return self

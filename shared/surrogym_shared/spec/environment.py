@@ -1,0 +1,154 @@
+"""One environment as a whole, and the contradictions that are refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from surrogym_shared.checks import Positive, require, require_known, require_unique
+from surrogym_shared.spec.actions import Action
+from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, REWARD, Frozen, Name
+from surrogym_shared.spec.coordinates import Coordinate, StartDistribution, limits
+from surrogym_shared.spec.rewards import AnyReward, DeclaredReward, Reward, Success
+from surrogym_shared.spec.terms import AllOf, ObservationEntry, Term, Termination
+
+
+class Design(Frozen):
+    """The adaptive design of queries: what is chosen before the first one.
+
+    ``preset``: ``default`` or ``paper`` (the method as printed, repaired only where it cannot work). Every None takes
+    the preset's value. ``budget`` counts every real step of the design, initial ones included. ``tolerance`` is what
+    eq. 9 divides by the deviation where none is declared: ``relative``, 5 % of the output's deviation over the initial
+    design, or ``raw``, 1 in the output's own unit, as printed.
+    """
+
+    preset: Literal["default", "paper"] = "default"
+    budget: Annotated[int, Field(ge=2, le=100_000, strict=True)] | None = None
+    initial: Annotated[int, Field(ge=2, le=100_000, strict=True)] | None = None
+    target: Annotated[float, Field(gt=0.5, lt=1, strict=True)] = 0.999
+    acquisition: Literal["uncertainty_index", "variance", "integrated_variance", "latin_hypercube"] | None = None
+    tolerance: Literal["relative", "raw"] | None = None
+    monte_carlo: Annotated[int, Field(ge=16, le=100_000, strict=True)] | None = None
+    seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
+
+
+class EnvironmentSpec(Frozen):
+    """One original environment: coordinates, observation, action, start, termination, and the design of queries."""
+
+    environment: str = Field(default="", max_length=256, description="Gymnasium id, or free text for one's own")
+    coordinates: tuple[Coordinate, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
+    observation: tuple[ObservationEntry, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
+    action: Action
+    start: dict[Name, StartDistribution]
+    termination: Termination = ()
+    time_limit: Annotated[int, Field(ge=1, le=10_000_000, strict=True)] | None = None
+    query: Literal["step", "rollout"] = Field(
+        default="step",
+        description="``step``: it can be set to any state; ``rollout``: it can only be reset, and acted on from there",
+    )
+    max_rollout: Annotated[int, Field(ge=1, le=MAX_ROLLOUT_QUERY, strict=True)] | None = Field(
+        default=None, description="longest action sequence of one query; None: the time limit, 200 at most"
+    )
+    reward: AnyReward = Reward()
+    tolerances: dict[Name, Positive] = Field(
+        default_factory=dict,
+        description="by moving coordinate (preset paper: by observation entry), or 'reward', in the output's own unit",
+    )
+    success: Success | None = None
+    design: Design = Design()
+
+    @property
+    def coordinate_names(self) -> tuple[str, ...]:
+        return tuple(c.name for c in self.coordinates)
+
+    @property
+    def termination_groups(self) -> tuple[AllOf, ...]:
+        """Declared terminations; none where termination is learned."""
+        return () if self.termination == "learned" else self.termination
+
+    @property
+    def observation_names(self) -> tuple[str, ...]:
+        return tuple(o.name for o in self.observation)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        names = self.coordinate_names
+        require_unique("coordinate", names)
+        require_unique("observation", self.observation_names)
+        outputs = names if self.design.preset == "default" else (*names, *self.observation_names)
+        require(REWARD not in outputs, f"nothing that is learned beside the reward may be called {REWARD!r}")
+        require_known("start", self.start, names)
+        missing = [n for n in names if n not in self.start]
+        require(not missing, f"start distribution lacks {missing}: expected every coordinate of {list(names)}")
+        moving = [c.name for c in self.coordinates if c.kind != "constant"]
+        require(bool(moving), "expected at least one coordinate that moves (linear or angle)")
+        learned = moving if self.design.preset == "default" else self.observation_names
+        require_known("tolerances", self.tolerances, (*learned, REWARD))
+        for c in self.coordinates:
+            if c.bounds is not None:
+                if c.bounds.stops is not None:
+                    require_known(f"coordinate {c.name!r}: stops", (c.bounds.stops,), moving)
+                    self._require_stoppable(c.name, c.bounds.stops)
+                low, high = limits(self.start[c.name])
+                inside = (c.bounds.low is None or low >= c.bounds.low) and (
+                    c.bounds.high is None or high <= c.bounds.high
+                )
+                require(
+                    inside, f"start of {c.name!r}, [{low}, {high}], leaves its bounds [{c.bounds.low}, {c.bounds.high}]"
+                )
+        self._require_reward()
+        for where, term in self._terms():
+            for part in term.parts:
+                require_known(f"{where}: term", part.weights, names)
+        for entry in self.observation:
+            low = -math.inf if entry.low is None else entry.low
+            high = math.inf if entry.high is None else entry.high
+            require(low < high, f"observation {entry.name!r} crosses: expected low < high, got [{low}, {high}]")
+        require(
+            self.max_rollout is None or self.query == "rollout",
+            f"max_rollout {self.max_rollout} needs query 'rollout', got {self.query!r}",
+        )
+        require(
+            self.query == "step" or self.design.preset != "paper",
+            "preset 'paper' starts from a Latin hypercube over states: expected query 'step', got 'rollout'",
+        )
+        if self.design.budget is not None and self.design.initial is not None:
+            require(
+                self.design.initial <= self.design.budget,
+                f"design: initial {self.design.initial} exceeds the budget {self.design.budget}",
+            )
+        return self
+
+    def _require_reward(self) -> None:
+        if not isinstance(self.reward, DeclaredReward):
+            return
+        lengths = {len(quantity.action) for term in self.reward.terms for quantity in term.of} - {0}
+        require(
+            lengths <= {self.action.size},
+            f"reward: expected {self.action.size} weights of the action, got {sorted(lengths)}",
+        )
+        require(self.design.preset == "default", "preset 'paper' learns its reward: expected one of kind 'learned'")
+
+    def _require_stoppable(self, name: str, stopped: str) -> None:
+        require(stopped != name, f"coordinate {name!r} stops itself: expected another one")
+        bounds = self.coordinates[self.coordinate_names.index(stopped)].bounds
+        if bounds is not None:
+            holds = (bounds.low is None or bounds.low <= 0) and (bounds.high is None or bounds.high >= 0)
+            require(holds, f"coordinate {name!r} sets {stopped!r} to 0, outside its [{bounds.low}, {bounds.high}]")
+
+    def _terms(self) -> Iterable[tuple[str, Term]]:
+        for entry in self.observation:
+            yield f"observation {entry.name!r}", entry.term
+        for group in self.termination_groups:
+            for inequality in group:
+                yield "termination", inequality.term
+        if self.success is not None:
+            for inequality in self.success.hold:
+                yield "success", inequality.term
+        if isinstance(self.reward, DeclaredReward):
+            for paying in self.reward.terms:
+                yield from (("reward", quantity.term) for quantity in paying.of if quantity.term is not None)
+                yield from (("reward", inequality.term) for inequality in paying.when)

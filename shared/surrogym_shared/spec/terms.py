@@ -1,0 +1,106 @@
+"""Terms of the state, and what they give: observations, inequalities, terminations."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from surrogym_shared.checks import Finite, Number, require
+from surrogym_shared.spec.base import MAX_INEQUALITIES, MAX_TERM_PARTS, Frozen, Name
+
+
+class Part(Frozen):
+    """coefficient * phi(q), phi one of: ``one`` = 1, ``linear`` = a.q, ``sin`` = sin(a.q), ``cos`` = cos(a.q)."""
+
+    function: Literal["one", "linear", "sin", "cos"]
+    coefficient: Number = 1.0
+    weights: dict[Name, Number] = Field(default_factory=dict, description="a, by coordinate name")
+
+    @model_validator(mode="after")
+    def _weighted(self) -> Self:
+        if self.function == "one":
+            require(not self.weights, "a part with function 'one' takes no weights")
+        else:
+            require(bool(self.weights), f"a part with function {self.function!r} needs weights")
+        return self
+
+
+class Term(Frozen):
+    """A sum of parts, optionally clipped to [low, high]. Terms add with ``+`` and scale with ``*``."""
+
+    parts: tuple[Part, ...] = Field(min_length=1, max_length=MAX_TERM_PARTS)
+    low: Number | None = None
+    high: Number | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.low is not None and self.high is not None:
+            require(self.low < self.high, f"term clip crosses: expected low < high, got [{self.low}, {self.high}]")
+        return self
+
+    @classmethod
+    def constant(cls, value: float) -> Term:
+        return cls(parts=(Part(function="one", coefficient=value),))
+
+    @classmethod
+    def linear(cls, **weights: float) -> Term:
+        """``Term.linear(x=1)`` is the coordinate x."""
+        return cls(parts=(Part(function="linear", weights=weights),))
+
+    @classmethod
+    def sin(cls, **weights: float) -> Term:
+        return cls(parts=(Part(function="sin", weights=weights),))
+
+    @classmethod
+    def cos(cls, **weights: float) -> Term:
+        return cls(parts=(Part(function="cos", weights=weights),))
+
+    def clipped(self, low: float | None, high: float | None) -> Term:
+        return self.model_copy(update={"low": low, "high": high})
+
+    def __add__(self, other: Term) -> Term:
+        require(
+            self.low is None and self.high is None and other.low is None and other.high is None,
+            "clipped terms can't be added",
+        )
+        return Term(parts=self.parts + other.parts)
+
+    def __mul__(self, factor: float) -> Term:
+        require(self.low is None and self.high is None, "a clipped term can't be scaled")
+        parts = (p.model_copy(update={"coefficient": p.coefficient * factor}) for p in self.parts)
+        return Term(parts=tuple(parts))
+
+    __rmul__ = __mul__
+
+
+class ObservationEntry(Frozen):
+    """One entry of the observation: a name, the term that gives it, and the limits of the observation space."""
+
+    name: Name
+    term: Term
+    low: Finite | None = None
+    high: Finite | None = None
+
+
+class Inequality(Frozen):
+    """``term relation value``, for instance height > 1."""
+
+    term: Term
+    relation: Literal["<", "<=", ">", ">="]
+    value: Number
+
+
+AllOf = Annotated[tuple[Inequality, ...], Field(min_length=1, max_length=MAX_INEQUALITIES)]
+
+
+def _termination_kind(value: object) -> str:
+    return "learned" if isinstance(value, str) else "declared"
+
+
+Termination = Annotated[
+    Annotated[tuple[AllOf, ...], Field(max_length=MAX_INEQUALITIES), Tag("declared")]
+    | Annotated[Literal["learned"], Tag("learned")],
+    Discriminator(_termination_kind),
+    Field(description="ends when any of these all-of groups holds at q'; or 'learned' from samples that ended"),
+]
