@@ -66,11 +66,11 @@ class Postgresql:
     def connect(self, database: str = "postgres") -> psycopg.Connection[Any]:
         return psycopg.connect(host=str(self.folder), user="postgres", dbname=database, autocommit=True)
 
-    def new_database(self) -> str:
+    def new_database(self, options: str = "") -> str:
         """The address of an empty database."""
         name = f"test_{next(self._names)}"
         with self.connect() as connection:
-            connection.execute(f"CREATE DATABASE {name}")  # type: ignore[arg-type]
+            connection.execute(f"CREATE DATABASE {name} {options}")  # type: ignore[arg-type]
         return f"postgresql://postgres@/{name}?host={self.folder}"
 
     def _answers(self) -> bool:

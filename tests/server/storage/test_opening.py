@@ -16,8 +16,10 @@ import sqlalchemy as sa
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
+from support.postgresql import Postgresql
 from surrogym_server.errors import InvalidInput, Unavailable
 from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import NewSurrogate
 from surrogym_server.storage.sql import database, open_storage
 from surrogym_server.storage.sql.database import connect
 from surrogym_server.storage.sql.tables import metadata
@@ -65,6 +67,17 @@ def test_a_database_of_a_newer_program_is_refused_and_left_alone(url: str) -> No
         open_storage(url)
     with engine(url).connect() as connection:
         assert connection.execute(sa.text("SELECT version_num FROM alembic_version")).scalar() == "9999"
+
+
+@pytest.mark.postgresql
+def test_text_is_utf8_in_a_database_that_knows_no_encoding(postgresql: Postgresql) -> None:
+    url = postgresql.new_database("TEMPLATE template0 ENCODING 'SQL_ASCII' LC_COLLATE 'C' LC_CTYPE 'C'")
+    opened = open_storage(url)
+    opened.surrogates.create(NewSurrogate("a", {"environment": "Fräse 3 µm"}, 30, 0.9))
+    opened.close()
+    again = open_storage(url)
+    assert again.surrogates.list()[0].spec == {"environment": "Fräse 3 µm"}
+    again.close()
 
 
 def test_ping_answers_and_closing_twice_is_harmless(storage: Storage) -> None:

@@ -23,7 +23,11 @@ from surrogym_server.storage.sql.filelock import FileLock
 
 BUSY_SECONDS = 5  # how long a statement waits for what another program or thread keeps
 POOL = {"pool_size": 8, "max_overflow": 56, "pool_timeout": BUSY_SECONDS}
-POSTGRESQL = {"connect_timeout": BUSY_SECONDS, "options": f"-c lock_timeout={BUSY_SECONDS}s"}
+POSTGRESQL = {  # text is UTF-8 whatever the database's encoding: psycopg gives bytes where that is SQL_ASCII
+    "client_encoding": "utf8",
+    "connect_timeout": BUSY_SECONDS,
+    "options": f"-c lock_timeout={BUSY_SECONDS}s",
+}
 
 CLOCKS: dict[str, sa.ColumnElement[float]] = {
     "sqlite": sa.literal_column("(julianday('now') - 2440587.5) * 86400.0", sa.Double()),
