@@ -221,7 +221,7 @@ def _complete(spec: dict[str, Any]) -> dict[str, Any]:
 
 def _add_dashboard(app: FastAPI) -> None:
     for path, (name, media_type) in dashboard.FILES.items():
-        app.add_api_route(path, _static(name, media_type), include_in_schema=False)
+        app.add_api_route(path, _static(name, media_type), methods=["GET", "HEAD"], include_in_schema=False)
 
 
 def _static(name: str, media_type: str) -> Callable[[], Awaitable[Response]]:

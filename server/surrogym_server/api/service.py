@@ -16,12 +16,14 @@ from surrogym_shared.wire import Access, Health, Ready
 router = APIRouter(tags=["service"])
 
 
+@router.head("/healthz", include_in_schema=False)
 @router.get("/healthz", summary="That the process lives")
 async def healthz(request: Request) -> Health:
     """Needs no token and no database."""
     return Health(version=request.app.version)
 
 
+@router.head("/readyz", include_in_schema=False)
 @router.get("/readyz", summary="That it can work", responses=documented(Code.UNAVAILABLE))
 def readyz(use: Use) -> Ready:
     """Whether the database answers. Needs no token."""

@@ -117,7 +117,11 @@ def test_a_stream_authenticates_in_its_handshake(guarded: httpx.Client, header: 
 
 @pytest.mark.parametrize("path", sorted(PUBLIC))
 def test_health_and_the_page_are_public(guarded: httpx.Client, path: str):
-    assert guarded.get(path).status_code == 200
+    whole = guarded.get(path)
+    assert whole.status_code == 200
+    head = guarded.head(path)  # as wget --spider and load balancers ask
+    assert (head.status_code, head.content) == (200, b"")
+    assert head.headers["content-type"] == whole.headers["content-type"]
 
 
 def test_the_page_may_load_nothing_from_elsewhere(guarded: httpx.Client):
