@@ -42,6 +42,8 @@ def test_no_seed_is_left_out():
         " -140.0 | 2 of 4 | 50 (50) |"
     )
     assert line(text, "pendulum", "14").endswith("| 2 of 4 | -1000.0 |")
+    oracle = [replace(ROW, arm="oracle", seed=i, real_steps=steps) for i, steps in enumerate((1_008_448, 900_000))]
+    assert "| 954,224 (900,000 to 1,008,448) |" in line(report(oracle), "pendulum", "oracle")
 
 
 def test_a_run_that_ended_badly_counts_as_one_that_missed_the_target():

@@ -26,6 +26,7 @@ CONTRASTS = (  # what a pair of arms tells, at the same budget
     ("representation, on a hypercube", "latin_hypercube", "paper_hypercube"),
     ("acquisition", "no_loop", "variance"),
     ("closed loop", "default", "no_loop"),
+    ("adaptive queries and closed loop", "default", "latin_hypercube"),
     ("the whole of it", "default", "paper"),
     ("surrogate or original", "default", "oracle"),
 )
@@ -160,7 +161,7 @@ def _with_interval(means: NDArray[np.float64]) -> str:
 
 def _spread(values: NDArray[np.float64]) -> str:
     low, high = values.min(), values.max()
-    return f"{low:.0f}" if low == high else f"{np.median(values):g} ({low:.0f} to {high:.0f})"
+    return f"{low:,.0f}" if low == high else f"{np.median(values):,.10g} ({low:,.0f} to {high:,.0f})"
 
 
 def _median(values: NDArray[np.float64]) -> str:
