@@ -36,7 +36,7 @@ from surrogym_client.training import (
     TrainSettings,
 )
 from surrogym_shared.port import SurrogatePort
-from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_shared.spec import EnvironmentSpec
 
 MAX_STEPS = 10_000_000  # virtual steps that can be asked for: hours of PPO
 ON_POLICY_STEPS = 600_000
@@ -57,9 +57,6 @@ PPO_DEFAULTS: dict[str, Any] = {
     "learning_rate": _decaying,
     "gae_lambda": 0.97,
 }
-ENTROPY = (
-    0.003  # bonus of actions that are chosen from a few: the policy is less sure of itself where it has seen little
-)
 
 
 def train(
@@ -220,8 +217,6 @@ def _learner(
     own = issubclass(algorithm, OnPolicyAlgorithm)
     if own and spec.design.preset == "default":
         policy_kwargs["net_arch"] = WIDER
-        if not isinstance(spec.action, BoxAction):
-            defaults["ent_coef"] = ENTROPY
     try:
         return algorithm(
             PaperPolicy if own else "MlpPolicy",

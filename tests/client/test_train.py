@@ -18,7 +18,6 @@ from surrogym_client.policies import WIDER, PaperPolicy
 from surrogym_client.policy_file import load_policy
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.train import (
-    ENTROPY,
     MAX_STEPS,
     TrainProgress,
     TrainSettings,
@@ -33,7 +32,6 @@ from surrogym_client.train import (
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.surrogate.learn import learn
-from surrogym_shared.spec import Design
 
 SMALL = {"n_steps": 16, "batch_size": 32, "n_epochs": 2}
 
@@ -65,15 +63,6 @@ def test_a_policy_and_what_it_was_trained_with_are_written(surrogate, tmp_path: 
     assert written["settings"]["gamma"] == 0.985
     assert [p.steps for p in seen] == [128, 256]
     assert all(isinstance(p, TrainProgress) and p.total_steps == 256 for p in seen)
-
-
-@pytest.mark.parametrize(
-    ("preset", "made", "bonus"), [("default", cartpole, ENTROPY), ("default", pendulum, 0.0), ("paper", cartpole, 0.0)]
-)
-def test_actions_chosen_from_a_few_earn_a_bonus_for_entropy(tmp_path: Path, preset, made, bonus):
-    settings = small(total_steps=128)
-    result = train(local(made().model_copy(update={"design": Design(preset=preset)})), tmp_path / "p.zip", settings)
-    assert result.settings["ent_coef"] == bonus
 
 
 @pytest.mark.parametrize(("total", "taken"), [(128, 128), (255, 128), (300, 256), (1, 128)])
