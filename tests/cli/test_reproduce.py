@@ -41,7 +41,7 @@ def test_rows_of_several_sittings_become_one_table(surrogym, tmp_path):
     assert said.code == 0
     assert read_rows(tmp_path / "both" / "efficiency.csv") == [ROW, oracle]
     assert (tmp_path / "both" / "efficiency.md").read_text() in said.out
-    assert "| pendulum | oracle | 1 | 300000 | -170.0 |" in said.out
+    assert "| pendulum | oracle | 1 | 300,000 | -170.0 |" in said.out
     assert surrogym("reproduce", "table", "--rows=nowhere.csv").err == "error: nowhere.csv: no such file\n"
 
 
