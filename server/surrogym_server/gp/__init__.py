@@ -10,6 +10,7 @@ sigma_f^2 ``signal_variance``     variance of the squared-exponential part
 --        ``quadratic_variance``  variance of the quadratic part, 0 without one
 sigma_n^2 ``noise_variance``      noise, added once to the diagonal
 K         ``covariance(x, x)``    latent covariance, without noise
+s, p      ``Reflection``          signs and parity of functions with f(s x) = p f(x), if any
 beta      ``weights`` (n,)        (K + sigma_n^2 I)^-1 y
 ========  ======================  =========================================================
 """
@@ -18,7 +19,7 @@ from surrogym_server.gp.blocks import in_blocks
 from surrogym_server.gp.fit import FitOptions, Fitted, fit
 from surrogym_server.gp.joint import Joint
 from surrogym_server.gp.kept import kept
-from surrogym_server.gp.kernel import Hyperparameters
+from surrogym_server.gp.kernel import Hyperparameters, Reflection
 from surrogym_server.gp.pathwise import Pathwise
 from surrogym_server.gp.placing import CPU, placed
 from surrogym_server.gp.posterior import Posterior, Sparse, condition
@@ -34,6 +35,7 @@ __all__ = [
     "Output",
     "Pathwise",
     "Posterior",
+    "Reflection",
     "Serving",
     "Sparse",
     "condition",

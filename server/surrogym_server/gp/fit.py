@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
-from surrogym_server.gp.kernel import Hyperparameters
+from surrogym_server.gp.kernel import Hyperparameters, Polynomial, Reflection
 from surrogym_server.gp.posterior import Posterior, condition
 
 NOISE_FLOOR = 1e-8  # of the output's variance
@@ -54,12 +54,14 @@ class Fitted:
     theta: Array
 
 
-def fit(x: Tensor, y: Tensor, options: FitOptions, warm: Array | None = None) -> Fitted:
-    """Fit a process to x (n, d) and y (n,), both standardised.
+def fit(
+    x: Tensor, y: Tensor, options: FitOptions, warm: Array | None = None, reflection: Reflection | None = None
+) -> Fitted:
+    """Fit a process to x (n, d) and y (n,), both standardised, of functions that have the ``reflection`` if given.
 
     ``warm`` is the theta of an earlier fit. Raises NumericalFailure.
     """
-    objective = _Objective(x, y, options)
+    objective = _Objective(x, y, options, reflection)
     with _blas().limit(limits=1):
         found = [_minimum(objective, start) for start in _starts(objective.default_start, warm, len(y))]
     value, theta = min(found, key=lambda pair: pair[0])
@@ -96,11 +98,13 @@ def _starts(default: Array, warm: Array | None, points: int) -> Sequence[Array]:
 class _Objective:
     """Negative log evidence with priors, and its gradient. Squared differences are computed once."""
 
-    def __init__(self, x: Tensor, y: Tensor, options: FitOptions) -> None:
-        self.y, self.options = y, options
-        self.squared = (x[None] - x[:, None]).square().permute(2, 0, 1).flatten(1)  # (d, n n)
-        self.linear = 1 + x @ x.T
-        self.quadratic = x.square() @ x.square().T
+    def __init__(self, x: Tensor, y: Tensor, options: FitOptions, reflection: Reflection | None) -> None:
+        self.y, self.options, self.reflection = y, options, reflection
+        self.squared = [(1, _squared(x, x))]  # with the weight of their squared exponential
+        if reflection is not None:
+            self.squared.append((reflection.parity, _squared(x, x * reflection.signs)))
+        self.linear = Polynomial.of(1.0, 0.0, reflection, x)(x, x)
+        self.quadratic = Polynomial.of(0.0, 1.0, reflection, x)(x, x)
         n, d = x.shape
         lengthscale = (options.lengthscale_prior[0] + 0.5 * math.log(d), options.lengthscale_prior[1])
         priors = [lengthscale] * d + [options.signal_prior]
@@ -119,14 +123,17 @@ class _Objective:
         lengthscale = torch.as_tensor(values[: self.d], dtype=self.y.dtype, device=self.y.device)
         linear = float(values[self.d + 1]) if self.options.linear else 0.0
         quadratic = float(values[-2]) if self.options.quadratic else 0.0
-        return Hyperparameters(lengthscale, float(values[self.d]), linear, quadratic, float(values[-1]))
+        signal, noise = float(values[self.d]), float(values[-1])
+        return Hyperparameters(lengthscale, signal, linear, quadratic, noise, self.reflection)
 
     def __call__(self, theta: Array) -> tuple[float, Array]:
         hyper = self.hyper(theta)
         precision = hyper.lengthscale.square().reciprocal()
-        exponent = (-0.5 * precision) @ self.squared
-        smooth = hyper.signal_variance * exponent.exp_().reshape(self.n, self.n)
-        k = smooth + hyper.linear_variance * self.linear + hyper.quadratic_variance * self.quadratic
+        smooth = [
+            weight * hyper.signal_variance * ((-0.5 * precision) @ squared).exp_().reshape(self.n, self.n)
+            for weight, squared in self.squared
+        ]
+        k = sum(smooth) + hyper.linear_variance * self.linear + hyper.quadratic_variance * self.quadratic
         k.diagonal().add_(hyper.noise_variance)
         factor, info = torch.linalg.cholesky_ex(k)
         if bool(info):  # outside what float64 can factor: a wall for the line search
@@ -139,9 +146,10 @@ class _Objective:
         value = -float(log_evidence) + 0.5 * float(z @ z) + float(np.log(self.prior[:, 1]).sum())
         return value, z / self.prior[:, 1] - gradient
 
-    def _gradient(self, hyper: Hyperparameters, half: Tensor, smooth: Tensor, precision: Tensor) -> Array:
-        weighted = (half * smooth).flatten()
-        parts = [precision * (self.squared @ weighted), weighted.sum()[None]]
+    def _gradient(self, hyper: Hyperparameters, half: Tensor, smooth: list[Tensor], precision: Tensor) -> Array:
+        weighted = [(half * part).flatten() for part in smooth]
+        slopes = [squared @ part for (_, squared), part in zip(self.squared, weighted, strict=True)]
+        parts = [precision * torch.stack(slopes).sum(0), torch.stack(weighted).sum()[None]]
         if self.options.linear:
             parts.append(hyper.linear_variance * torch.vdot(half.flatten(), self.linear.flatten())[None])
         if self.options.quadratic:
@@ -149,3 +157,8 @@ class _Objective:
         parts.append(hyper.noise_variance * half.trace()[None])
         gradient: Array = torch.cat(parts).cpu().numpy()
         return gradient
+
+
+def _squared(a: Tensor, b: Tensor) -> Tensor:
+    """Squared differences of inputs a and b (n, d) in each entry, (d, n n)."""
+    return (b[None] - a[:, None]).square().permute(2, 0, 1).flatten(1)

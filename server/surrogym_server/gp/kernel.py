@@ -2,6 +2,12 @@
 
 k(x, x') = sigma_f^2 exp(-1/2 (x - x')^T Lambda (x - x')) + sigma_l^2 (1 + x^T x') + sigma_q^2 sum_j x_j^2 x'_j^2,
 and the noise is never inside it. The last part has no cross terms: it is a quadratic cost with diagonal weights.
+
+With a reflection s the process is of functions with f(s x) = p f(x) alone, s x elementwise. Its squared exponential is
+sigma_f^2 (e(x, x') + p e(x, s x')), the covariance of (f(x) + p f(s x)) / sqrt(2); its polynomial parts keep what has
+the parity p: of an odd function the entries that s turns, of an even one the constant, the others and the squares.
+Reference: Ginsbourger, Roustant, Durrande, "On degeneracy and invariances of random fields paths with applications in
+Gaussian process modelling", Journal of Statistical Planning and Inference (2016), section 3.
 """
 
 from __future__ import annotations
@@ -13,6 +19,49 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
+class Reflection:
+    """A symmetry of functions: f(signs x) = parity f(x)."""
+
+    signs: Tensor  # (d,) each 1 or -1
+    parity: int  # 1: even, -1: odd
+
+    @property
+    def kept(self) -> Tensor:
+        """Which entries x_j have the parity, (d,) of 0 and 1."""
+        return (1 + self.parity * self.signs) / 2
+
+
+@dataclass(frozen=True)
+class Polynomial:
+    """The coefficients of constant + sum_j linear_j x_j x'_j + sum_j quadratic_j x_j^2 x'_j^2."""
+
+    constant: float
+    linear: Tensor  # (d,)
+    quadratic: Tensor  # (d,)
+    has_squares: bool
+
+    @classmethod
+    def of(cls, linear: float, quadratic: float, reflection: Reflection | None, like: Tensor) -> Polynomial:
+        """The parts of variances ``linear`` and ``quadratic``, as far as they have the parity, at inputs (..., d)."""
+        ones = like.new_ones(like.shape[-1])
+        if reflection is None:
+            return cls(linear, linear * ones, quadratic * ones, quadratic > 0)
+        even = reflection.parity > 0
+        return cls(linear * even, linear * reflection.kept, quadratic * even * ones, even and quadratic > 0)
+
+    def __call__(self, a: Tensor, b: Tensor) -> Tensor:
+        """Between inputs a (..., m, d) and b (..., n, d), shape (..., m, n)."""
+        k = self.constant + (a * self.linear) @ b.mT
+        return k + (a.square() * self.quadratic) @ b.square().mT if self.has_squares else k
+
+    def diagonal(self, x: Tensor) -> Tensor:
+        """At inputs x (..., d) with themselves, shape (...)."""
+        squared = x.square()
+        k = self.constant + squared @ self.linear
+        return k + squared.square() @ self.quadratic if self.has_squares else k
+
+
+@dataclass(frozen=True)
 class Hyperparameters:
     """What the marginal likelihood chooses. Units: inputs and outputs are standardised."""
 
@@ -21,6 +70,7 @@ class Hyperparameters:
     linear_variance: float  # 0: no linear part
     quadratic_variance: float  # 0: no quadratic part
     noise_variance: float
+    reflection: Reflection | None = None
 
     @property
     def kernel(self) -> str:
@@ -30,26 +80,41 @@ class Hyperparameters:
         parts += ["quadratic"] if self.quadratic_variance > 0 else []
         return " + ".join(parts)
 
+    @property
+    def has_polynomial(self) -> bool:
+        return self.linear_variance > 0 or self.quadratic_variance > 0
+
+    @property
+    def polynomial(self) -> Polynomial:
+        """The parts beside the squared exponential."""
+        return Polynomial.of(self.linear_variance, self.quadratic_variance, self.reflection, self.lengthscale)
+
 
 def covariance(hyper: Hyperparameters, a: Tensor, b: Tensor) -> Tensor:
     """Latent covariance of inputs a (..., m, d) and b (..., n, d), shape (..., m, n).
 
     Distances are taken by differences: the expansion |a|^2 + |b|^2 - 2 a.b loses the digits that a small noise needs.
     """
-    distance = torch.cdist(a / hyper.lengthscale, b / hyper.lengthscale, compute_mode="donot_use_mm_for_euclid_dist")
-    k = hyper.signal_variance * torch.exp(-0.5 * distance.square())
-    if hyper.linear_variance > 0:
-        k = k + hyper.linear_variance * (1 + a @ b.mT)
-    if hyper.quadratic_variance > 0:
-        k = k + hyper.quadratic_variance * (a.square() @ b.square().mT)
-    return k
+    k = hyper.signal_variance * _smooth(hyper, a, b)
+    if (reflection := hyper.reflection) is not None:
+        k = k + hyper.signal_variance * reflection.parity * _smooth(hyper, a, b * reflection.signs)
+    return k + hyper.polynomial(a, b) if hyper.has_polynomial else k
 
 
 def variance(hyper: Hyperparameters, x: Tensor) -> Tensor:
     """Latent prior variance k(x, x) of inputs x (m, d), shape (m,)."""
     prior = torch.full(x.shape[:-1], hyper.signal_variance, dtype=x.dtype, device=x.device)
-    if hyper.linear_variance > 0:
-        prior = prior + hyper.linear_variance * (1 + x.square().sum(-1))
-    if hyper.quadratic_variance > 0:
-        prior = prior + hyper.quadratic_variance * x.square().square().sum(-1)
-    return prior
+    if (reflection := hyper.reflection) is not None:
+        prior = prior + hyper.signal_variance * reflection.parity * (x.square() @ to_mirror(hyper)).exp()
+    return prior + hyper.polynomial.diagonal(x) if hyper.has_polynomial else prior
+
+
+def to_mirror(hyper: Hyperparameters) -> Tensor:
+    """The exponent of e(x, s x) is x^2 times these coefficients, (d,): x is 2 x_j from s x where s turns x_j."""
+    assert hyper.reflection is not None
+    return (hyper.reflection.signs - 1) / hyper.lengthscale.square()
+
+
+def _smooth(hyper: Hyperparameters, a: Tensor, b: Tensor) -> Tensor:
+    distance = torch.cdist(a / hyper.lengthscale, b / hyper.lengthscale, compute_mode="donot_use_mm_for_euclid_dist")
+    return torch.exp(-0.5 * distance.square())

@@ -6,7 +6,8 @@ parts, whose features are finitely many, and takes the squared exponential by ra
 of the same frequency, so that its prior variance is exact). The update is exact, through the Cholesky factor.
 
 All draws share their frequencies, fixed for good, and each has weights of its own: N draws at one input each cost one
-matrix product and N scalar products. S frequencies leave the prior's covariance off by about sigma_f^2 / sqrt(2 S).
+matrix product and N scalar products. Under a reflection the features are those of (f(x) + p f(s x)) / sqrt(2). S
+frequencies leave the prior's covariance off by about sigma_f^2 / sqrt(2 S).
 Reference: Wilson et al., "Efficiently sampling functions from Gaussian process posteriors", ICML 2020, eq. 13;
 Rahimi and Recht, "Random features for large-scale kernel machines", NeurIPS 2007.
 """
@@ -74,14 +75,21 @@ class Pathwise:
     def _prior(self, x: Tensor) -> Tensor:
         """Features of the prior at x (m, d), whose scalar products are its covariance: (m, 2 S + polynomial ones)."""
         hyper = self.posterior.hyper
-        phase = (x / hyper.lengthscale) @ _frequencies(x.shape[1], x.device)
-        scale = math.sqrt(hyper.signal_variance / FREQUENCIES)
-        parts = [scale * phase.cos(), scale * phase.sin()]
+        parts = [self._waves(x)]
+        if (reflection := hyper.reflection) is not None:
+            parts = [(parts[0] + reflection.parity * self._waves(x * reflection.signs)) / math.sqrt(2)]
+        polynomial = hyper.polynomial
         if hyper.linear_variance > 0:
-            parts.append(math.sqrt(hyper.linear_variance) * torch.cat([x.new_ones(len(x), 1), x], 1))
+            parts += [x.new_full((len(x), 1), math.sqrt(polynomial.constant)), polynomial.linear.sqrt() * x]
         if hyper.quadratic_variance > 0:
-            parts.append(math.sqrt(hyper.quadratic_variance) * x.square())
+            parts.append(polynomial.quadratic.sqrt() * x.square())
         return torch.cat(parts, 1)
+
+    def _waves(self, x: Tensor) -> Tensor:
+        """Random Fourier features of the squared exponential at x (m, d), (m, 2 S)."""
+        hyper = self.posterior.hyper
+        phase = (x / hyper.lengthscale) @ _frequencies(x.shape[1], x.device)
+        return math.sqrt(hyper.signal_variance / FREQUENCIES) * torch.cat([phase.cos(), phase.sin()], 1)
 
 
 @cache

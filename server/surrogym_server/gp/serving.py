@@ -7,6 +7,7 @@ The exponent of the squared exponential is linear in z(x) = [x, x^2, 1] (element
 so exp(z A) holds the smooth covariances of all outputs with all their points. The polynomial parts are linear in z as
 well, z R, so their share of the mean collapses into z Q, Q = R beta, and all means are exp(z A) W + z Q.
 The variance, k(x, x) - |L^-1 k(X, x)|^2, is taken by a triangular solve for those outputs alone that it is asked of.
+A process with a reflection has the columns of its points and then those of their mirror images.
 
 The products lose digits that differences keep: |error of the exponent| <= (2 d + 2) eps (|x| + |X_i|)^2 / 2, inputs in
 length scales. ``of`` bounds what that does to the mean and the variance (see ``_error_bounds``), and where a bound is
@@ -23,7 +24,7 @@ import torch
 from torch import Tensor
 
 from surrogym_server.gp.blocks import in_blocks
-from surrogym_server.gp.kernel import Hyperparameters
+from surrogym_server.gp.kernel import Hyperparameters, to_mirror
 from surrogym_server.gp.placing import CPU
 from surrogym_server.gp.posterior import Posterior
 
@@ -54,10 +55,13 @@ class _Process:
     span: slice  # its columns of A
     inputs: Tensor  # columns of x
     inverse_lengthscale: Tensor  # (d,)
-    scaled: Tensor  # (n, d) points in length scales
+    scaled: Tensor  # (n, d) points in length scales, and their mirror images if there is a reflection: (2 n, d)
     factor: Tensor  # (n, n) lower, L / sigma_f^2
     polynomial: Tensor | None  # (D, n) R / sigma_f^2
-    prior: Tensor  # (D,) k(x, x) = z^2 prior
+    prior: Tensor  # (D,) k(x, x) = z^2 prior, and sigma_f^2 p e(x, s x) beside it
+    signal_variance: float
+    parity: int  # 0 without a reflection
+    mirror: Tensor | None  # (D,) the exponent of e(x, s x) is z mirror
     scale: float
     mean_by_differences: bool
     variance_by_differences: bool
@@ -74,10 +78,15 @@ class _Process:
         k = smooth[:, self.span]
         if self.variance_by_differences and not self.mean_by_differences:
             k = self.exponent(x).exp_()
+        prior = squared @ self.prior
+        if self.mirror is not None:
+            k, images = k.chunk(2, 1)
+            k.add_(images, alpha=self.parity)
+            prior.add_((z @ self.mirror).exp_(), alpha=self.parity * self.signal_variance)
         if self.polynomial is not None:
             k.addmm_(z, self.polynomial)
         v = torch.linalg.solve_triangular(self.factor, k.T, upper=False)
-        variance = squared @ self.prior - torch.linalg.vector_norm(v, dim=0).square_()
+        variance = prior - torch.linalg.vector_norm(v, dim=0).square_()
         deviation: Tensor = variance.clamp_min_(0).sqrt_().mul_(self.scale)
         return deviation
 
@@ -95,7 +104,7 @@ class Serving:
     def of(cls, outputs: Sequence[Output], columns: int, width: int, device: torch.device = CPU) -> Serving:
         """Compile outputs, all on a device, for ``columns`` means of inputs (m, ``width``); columns without an output
         are 0."""
-        total = sum(len(o.posterior.y) for o in outputs if o.posterior is not None)
+        total = sum(len(_points(o.posterior)) for o in outputs if o.posterior is not None)
         like = torch.zeros(0, dtype=torch.float64, device=device)
         exponents, weights = like.new_zeros(2 * width + 1, total), like.new_zeros(total, columns)
         polynomials = like.new_zeros(2 * width + 1, columns)
@@ -104,10 +113,10 @@ class Serving:
             polynomials[-1, output.column] = output.centre
             if (posterior := output.posterior) is None:
                 continue
-            span = slice(begin, begin := begin + len(posterior.y))
+            span = slice(begin, begin := begin + len(_points(posterior)))
             polynomial = _polynomial(posterior, output.inputs, width)
             exponents[:, span] = _exponents(posterior, output.inputs, width)
-            weights[span, output.column] = output.scale * posterior.hyper.signal_variance * posterior.weights
+            weights[span, output.column] = output.scale * posterior.hyper.signal_variance * _weights(posterior)
             polynomials[:, output.column] += output.scale * (polynomial @ posterior.weights)
             processes[output.column] = _process(output, posterior, span, polynomial, width)
         return cls(exponents, weights, polynomials, processes)
@@ -151,41 +160,67 @@ class Serving:
 def _process(output: Output, posterior: Posterior, span: slice, polynomial: Tensor, width: int) -> _Process:
     hyper = posterior.hyper
     mean_error, variance_error = _error_bounds(posterior)
-    has_polynomial = hyper.linear_variance > 0 or hyper.quadratic_variance > 0
+    mirror = None
+    if hyper.reflection is not None:
+        mirror = _in_z(*_squares_alone(to_mirror(hyper)), output.inputs, width)[:, 0]
     return _Process(
         span=span,
         inputs=torch.tensor(output.inputs, device=posterior.x.device),
         inverse_lengthscale=1 / hyper.lengthscale,
-        scaled=posterior.x / hyper.lengthscale,
+        scaled=_points(posterior) / hyper.lengthscale,
         factor=posterior.factor / hyper.signal_variance,
-        polynomial=polynomial / hyper.signal_variance if has_polynomial else None,
+        polynomial=polynomial / hyper.signal_variance if hyper.has_polynomial else None,
         prior=_prior(hyper, output.inputs, width),
+        signal_variance=hyper.signal_variance,
+        parity=0 if hyper.reflection is None else hyper.reflection.parity,
+        mirror=mirror,
         scale=output.scale,
         mean_by_differences=mean_error > MEAN_TOLERANCE,
         variance_by_differences=variance_error > VARIANCE_TOLERANCE,
     )
 
 
+def _points(posterior: Posterior) -> Tensor:
+    """Points that the squared exponential is taken at, (n, d), and their mirror images under a reflection, (2 n, d)."""
+    if (reflection := posterior.hyper.reflection) is None:
+        return posterior.x
+    return torch.cat([posterior.x, posterior.x * reflection.signs])
+
+
+def _weights(posterior: Posterior) -> Tensor:
+    """Of the points and their mirror images in the mean."""
+    if (reflection := posterior.hyper.reflection) is None:
+        return posterior.weights
+    return torch.cat([posterior.weights, reflection.parity * posterior.weights])
+
+
 def _exponents(posterior: Posterior, inputs: Sequence[int], width: int) -> Tensor:
-    """Columns of A, (D, n)."""
+    """Columns of A, (D, n), or (D, 2 n) with mirror images."""
+    points = _points(posterior)
     precision = posterior.hyper.lengthscale.square().reciprocal()
-    scaled = posterior.x / posterior.hyper.lengthscale
-    linear, quadratic = (posterior.x * precision).T, (-0.5 * precision)[:, None].expand(-1, len(scaled))
+    scaled = points / posterior.hyper.lengthscale
+    linear, quadratic = (points * precision).T, (-0.5 * precision)[:, None].expand(-1, len(scaled))
     return _in_z(linear, quadratic, -0.5 * scaled.square().sum(1), inputs, width)
 
 
 def _polynomial(posterior: Posterior, inputs: Sequence[int], width: int) -> Tensor:
     """Columns of R, (D, n)."""
-    hyper, x = posterior.hyper, posterior.x
-    constant = x.new_full((len(x),), hyper.linear_variance)
-    return _in_z(hyper.linear_variance * x.T, hyper.quadratic_variance * x.square().T, constant, inputs, width)
+    polynomial, x = posterior.hyper.polynomial, posterior.x
+    constant = x.new_full((len(x),), polynomial.constant)
+    return _in_z((x * polynomial.linear).T, (x.square() * polynomial.quadratic).T, constant, inputs, width)
 
 
 def _prior(hyper: Hyperparameters, inputs: Sequence[int], width: int) -> Tensor:
     """k(x, x) = z^2 p: the coefficients p (D,) of z^2 = [x^2, x^4, 1]."""
-    each = torch.ones_like(hyper.lengthscale)[:, None]
-    constant = each.new_full((1,), hyper.signal_variance + hyper.linear_variance)
-    return _in_z(hyper.linear_variance * each, hyper.quadratic_variance * each, constant, inputs, width)[:, 0]
+    polynomial = hyper.polynomial
+    constant = polynomial.linear.new_full((1,), hyper.signal_variance + polynomial.constant)
+    return _in_z(polynomial.linear[:, None], polynomial.quadratic[:, None], constant, inputs, width)[:, 0]
+
+
+def _squares_alone(coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of a function sum_j c_j x_j^2, for ``_in_z``."""
+    column = coefficients[:, None]
+    return torch.zeros_like(column), column, coefficients.new_zeros(1)
 
 
 def _in_z(linear: Tensor, quadratic: Tensor, constant: Tensor, inputs: Sequence[int], width: int) -> Tensor:
@@ -201,12 +236,14 @@ def _error_bounds(posterior: Posterior) -> tuple[float, float]:
 
     With delta the largest error of an exponent, that of the mean is at most sigma_f^2 delta |beta|_1, in prior
     deviations, and that of the variance 2 |L^-1 k| |L^-1 dk| <= 2 s sigma_f^2 delta sqrt(n) / sigma_n, in prior
-    variances; s^2 = sigma_f^2 + sigma_l^2 is the smallest prior variance.
+    variances; s^2 = sigma_f^2 + sigma_l^2 is the smallest prior variance. Mirror images double both; of an odd process
+    s^2 = sigma_f^2, as its variance is nothing at the mirror, where it is known.
     """
     hyper, (n, d) = posterior.hyper, posterior.x.shape
     reach = float((posterior.x / hyper.lengthscale).square().sum(1).max())
     delta = (2 * d + 2) * torch.finfo(posterior.x.dtype).eps * 4.5 * reach
-    s = math.sqrt(hyper.signal_variance + hyper.linear_variance)
+    s = math.sqrt(hyper.signal_variance + hyper.polynomial.constant)
+    delta *= 1 if hyper.reflection is None else 2
     mean = hyper.signal_variance * delta * float(posterior.weights.abs().sum()) / s
     noise = math.sqrt(hyper.noise_variance + posterior.jitter)
     return mean, 2 * hyper.signal_variance * delta * math.sqrt(n) / max(noise * s, 1e-300)

@@ -12,7 +12,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, WhiteKernel
 
-from surrogym_server.gp import FitOptions, fit
+from surrogym_server.gp import FitOptions, Reflection, fit
 from surrogym_server.gp.fit import _Objective
 
 FLAT = (0.0, 1e4)  # a prior that says nothing
@@ -32,11 +32,13 @@ def draw(rng: np.random.Generator, n: int, lengths: list[float], noise: float) -
     quadratic=st.booleans(),
     seed=st.integers(0, 2**32 - 1),
     noise=st.floats(-6.0, 0.0),
+    parity=st.sampled_from([0, 1, -1]),
 )
-def test_the_gradient_is_that_of_finite_differences(linear, quadratic, seed, noise):
+def test_the_gradient_is_that_of_finite_differences(linear, quadratic, seed, noise, parity):
     rng = np.random.default_rng(seed)
     x, y = draw(rng, 12, [1.0, 2.0], 0.1)
-    objective = _Objective(x, y, FitOptions(linear=linear, quadratic=quadratic))
+    reflection = Reflection(torch.tensor([-1.0, 1.0], dtype=torch.float64), parity) if parity else None
+    objective = _Objective(x, y, FitOptions(linear=linear, quadratic=quadratic), reflection)
     theta = rng.uniform(-1.5, 1.5, len(objective.default_start))
     theta[-1] = noise
     _, gradient = objective(theta)
@@ -55,7 +57,7 @@ def test_without_priors_the_objective_is_scikit_learns_evidence(rng, linear):
         kernel += ConstantKernel(0.6) * DotProduct(1.0)
         theta.append(0.6)
     reference = GaussianProcessRegressor(kernel, alpha=1e-3, optimizer=None).fit(x.numpy(), y.numpy())
-    objective = _Objective(x, y, FitOptions(linear=linear, **WITHOUT_PRIORS))
+    objective = _Objective(x, y, FitOptions(linear=linear, **WITHOUT_PRIORS), None)
     constant = (len(theta) + 1) * math.log(1e4)
     value, _ = objective(np.log([*theta, 1e-3]))
     assert -(value - constant) == pytest.approx(reference.log_marginal_likelihood_value_, rel=1e-6)
@@ -63,8 +65,8 @@ def test_without_priors_the_objective_is_scikit_learns_evidence(rng, linear):
 
 def test_priors_lower_the_score_by_their_log_density(rng):
     x, y = draw(rng, 10, [1.0], 1e-2)
-    vague = _Objective(x, y, FitOptions(linear=False, **WITHOUT_PRIORS))
-    informed = _Objective(x, y, FitOptions(linear=False, **(WITHOUT_PRIORS | {"signal_prior": (0.5, 0.25)})))
+    vague = _Objective(x, y, FitOptions(linear=False, **WITHOUT_PRIORS), None)
+    informed = _Objective(x, y, FitOptions(linear=False, **(WITHOUT_PRIORS | {"signal_prior": (0.5, 0.25)})), None)
     theta = np.array([0.0, 1.0, -3.0])
     expected = 0.5 * ((1.0 - 0.5) / 0.25) ** 2 + math.log(0.25) - math.log(1e4)
     assert informed(theta)[0] - vague(theta)[0] == pytest.approx(expected, abs=1e-6)
@@ -78,7 +80,7 @@ def test_the_optimum_is_no_worse_than_scikit_learns(seed):
         warnings.simplefilter("ignore", ConvergenceWarning)
         regressor = GaussianProcessRegressor(kernel, alpha=0, n_restarts_optimizer=2, random_state=0)
         theirs = regressor.fit(x.numpy(), y.numpy()).log_marginal_likelihood_value_
-    ours = fit(x, y, FitOptions(linear=False, **WITHOUT_PRIORS)).score + 4 * math.log(1e4)
+    ours = fit(x, y, FitOptions(linear=False, **WITHOUT_PRIORS), None).score + 4 * math.log(1e4)
     assert ours >= theirs - 1e-3
 
 

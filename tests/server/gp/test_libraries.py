@@ -80,16 +80,16 @@ class Reference(gpytorch.models.ExactGP):
         return gpytorch.distributions.MultivariateNormal(self.mean_module(x), self.covar_module(x))
 
 
-def test_gpytorch(rng, hyper):
+def test_gpytorch(rng, plain):
     x, y, at = points(rng)
     torch.set_default_dtype(torch.float64)
     try:
         with torch.no_grad(), gpytorch.settings.fast_computations(False, False, False):
-            reference = Reference(x, y, hyper)(Reference.expand(at))
+            reference = Reference(x, y, plain)(Reference.expand(at))
             mean, deviation = reference.mean.numpy(), reference.variance.sqrt().numpy()
     finally:
         torch.set_default_dtype(torch.float32)
-    assert_agree(condition(hyper, x, y), at, mean, deviation)
+    assert_agree(condition(plain, x, y), at, mean, deviation)
 
 
 def test_the_prior_variance_is_the_covariances_diagonal(rng, hyper):
