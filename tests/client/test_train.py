@@ -100,7 +100,7 @@ def distance(a: PaperPolicy, b: PaperPolicy) -> float:
 
 
 def test_an_episodes_penalty_comes_with_its_end(surrogate):
-    env, taken = SurrogateVecEnv.from_port(surrogate, 2, seed=0, penalty=3.0, time_limit=4), np.zeros(2)
+    env, taken = SurrogateVecEnv.from_port(surrogate, 2, seed=0, penalty=100.0, time_limit=4), np.zeros(2)
     env.reset()
     for _ in range(4):
         _, reward, _, infos = env.step(np.zeros((2, 1)))
@@ -111,7 +111,7 @@ def test_an_episodes_penalty_comes_with_its_end(surrogate):
 
 def test_a_penalty_is_reported(surrogate, tmp_path: Path):
     reports = []
-    for penalty in (0.0, 3.0):
+    for penalty in (0.0, 100.0):
         session = {"penalty": penalty, "time_limit": 4}
         result = train(surrogate, tmp_path / "policy.zip", small(session=session, total_steps=128), reports.append)
     free, penalised = reports[0], reports[-1]

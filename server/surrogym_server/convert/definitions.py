@@ -75,6 +75,7 @@ def _design(spec: wire.EnvironmentSpec) -> core.DesignDefinition:
         acquisition=design.acquisition or ("uncertainty_index" if paper else "integrated_variance"),
         tolerance=design.tolerance or ("raw" if paper else "relative"),
         monte_carlo=design.monte_carlo or MONTE_CARLO,
+        symmetry=design.symmetry,
         seed=design.seed,
     )
 

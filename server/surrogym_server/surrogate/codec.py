@@ -60,7 +60,7 @@ def from_bytes(definition: EnvironmentDefinition, data: bytes) -> SurrogateModel
         header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["surrogym"])
         tensors = load(data)
         stored, terminal_reward = header["format"], float(header["terminal_reward"])
-        outputs = tuple(read_output(entry, tensors, str(i)) for i, entry in enumerate(header["outputs"]))
+        outputs = tuple(read_output(definition, entry, tensors, str(i)) for i, entry in enumerate(header["outputs"]))
         if stored == 1 and definition.reward_timing == "after":
             outputs = (*outputs[:-1], _read_after(outputs[-1]))
         samples, digest = int(header["samples"]), str(header["digest"])

@@ -13,14 +13,16 @@ from torch import Tensor
 from surrogym_server.errors import InvalidInput
 from surrogym_server.gp import Hyperparameters, Posterior, Sparse
 from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.surrogate.features import Encoding, FeatureMap, State, encode
+from surrogym_server.surrogate.features import Encoding, FeatureMap, Parity, State, encode, reflection
 from surrogym_server.surrogate.model import OutputModel
 
 KNOWN_MAPS = frozenset(
-    FeatureMap(state, action, lead, after)
+    FeatureMap(state, action, lead, after, parity=parity)
     for state in get_args(State)
     for action in get_args(Encoding)
     for lead, after in ((False, False), (True, False), (False, True))
+    for parity in get_args(Parity)
+    if lead or state != "none"
 )
 
 
@@ -65,8 +67,16 @@ def output_header(output: OutputModel) -> dict[str, Any]:
     return entry
 
 
-def read_output(entry: dict[str, Any], tensors: Mapping[str, Tensor], prefix: str) -> OutputModel:
+def read_output(
+    definition: EnvironmentDefinition, entry: dict[str, Any], tensors: Mapping[str, Tensor], prefix: str
+) -> OutputModel:
     """The output of a header's entry. Raises LookupError, TypeError or ValueError where it is none."""
+    feature_map = _feature_map(entry["feature_map"])
+    if replace(feature_map, drift=()) not in KNOWN_MAPS:
+        raise ValueError(f"unknown feature map {feature_map}")
+    mirror = reflection(definition, feature_map)
+    if feature_map.parity and mirror is None:
+        raise ValueError(f"feature map {feature_map}: the environment's inputs have no mirror image")
     posterior = None
     if (stored := entry["posterior"]) is not None:
         arrays = {n: tensors[f"{prefix}.{n}"] for n in ("x", "y", "factor", "weights", "lengthscale")}
@@ -76,14 +86,12 @@ def read_output(entry: dict[str, Any], tensors: Mapping[str, Tensor], prefix: st
             float(stored["linear_variance"]),
             float(stored["quadratic_variance"]),
             float(stored["noise_variance"]),
+            mirror,
         )
         x, y, factor, weights = (arrays[name] for name in ("x", "y", "factor", "weights"))
         jitter, sparse = float(stored["jitter"]), _sparse(stored.get("sparse"))
         posterior = Posterior(hyper, x, y, factor, weights, jitter, sparse)
     scores = tuple((name, score) for name, score in entry["scores"])
-    feature_map = _feature_map(entry["feature_map"])
-    if replace(feature_map, drift=()) not in KNOWN_MAPS:
-        raise ValueError(f"unknown feature map {feature_map}")
     centre, scale = float(entry["centre"]), float(entry["scale"])
     return OutputModel(str(entry["name"]), feature_map, posterior, centre, scale, int(entry["left_out"]), scores)
 

@@ -76,7 +76,7 @@ def _form_header(form: Form) -> dict[str, Any]:
 
 def _read_form(definition: EnvironmentDefinition, entry: Any, tensors: Mapping[str, Tensor], prefix: str) -> Form:
     if "process" in entry:
-        return Classifier(definition, read_output(entry["process"], tensors, prefix))
+        return Classifier(definition, read_output(definition, entry["process"], tensors, prefix))
     rules = tuple(tuple(_cut(*cut) for cut in rule) for rule in entry["rules"])
     return Thresholds(definition, rules, bool(entry["complement"]))
 

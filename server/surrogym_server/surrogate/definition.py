@@ -75,6 +75,7 @@ class DesignDefinition:
     acquisition: Literal["uncertainty_index", "variance", "integrated_variance", "latin_hypercube"]
     tolerance: Literal["relative", "raw"]
     monte_carlo: int
+    symmetry: Literal["auto", "none"]
     seed: int
 
 

@@ -38,7 +38,7 @@ def region(learner: Learner, name: str, q: Tensor, inside: Tensor) -> Region:
 def _classifier(learner: Learner, name: str, q: Tensor, inside: Tensor) -> tuple[Classifier, float]:
     definition = learner.definition
     everything, u = torch.ones_like(inside), q.new_zeros(len(q), definition.action.size)
-    maps = [m for m in candidates(definition, follows=False) if m.action == "value"]
+    maps = [m for m in candidates(definition, follows=False, parity="") if m.action == "value"]
     inputs = {m: encode(definition, m, q, u) for m in maps}
     process = learner.output(name, 2 * inside.double() - 1, inputs, everything, everything)
     if process.posterior is None:

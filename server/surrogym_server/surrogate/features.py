@@ -14,12 +14,15 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from surrogym_server.gp import Reflection
 from surrogym_server.surrogate.definition import EnvironmentDefinition, wrap
 from surrogym_server.surrogate.distributions import scaling
 from surrogym_server.surrogate.drift import Drift
 
-State = Literal["cos_sin", "wrapped", "both", "observation"]
+State = Literal["cos_sin", "wrapped", "both", "observation", "none"]
 Encoding = Literal["value", "one_hot"]  # of discrete actions
+Parity = Literal["", "odd", "even"]
+CENTRED = 1e-9  # of its scale: how far from 0 the middle of a range may be
 
 
 @dataclass(frozen=True)
@@ -27,11 +30,13 @@ class FeatureMap:
     """How (q, u) is shown to one output's process.
 
     ``state``: angles as cos and sin, as the wrapped angle, or both; or the observation: as it is in the paper,
-    standardised elsewhere.
+    standardised elsewhere; or none of coordinates and action, but the lead alone.
     ``action``: discrete actions as evenly spaced values, or one-hot. ``lead``: the predicted, clipped next value of
     saturating coordinates is an input as well, so that what follows from it (an angle from its speed) sees no kink.
     ``after``: the state that the step led to is shown, not the one it began in; only for the reward. ``drift``: weights
-    (C,) of q for each angle; cos and sin of where the angle turns to by them are inputs as well.
+    (C,) of q for each angle; cos and sin of where the angle turns to by them are inputs as well. ``parity``: what the
+    output does when every coordinate and the action change their sign: nothing in particular, or it does so too
+    (odd), or it stays (even).
     """
 
     state: State = "cos_sin"
@@ -39,10 +44,11 @@ class FeatureMap:
     lead: bool = False
     after: bool = False
     drift: Drift = ()
+    parity: Parity = ""
 
     def __str__(self) -> str:
         extras = [name for name in ("lead", "after", "drift") if getattr(self, name)]
-        return ", ".join([self.state, f"action {self.action}", *extras])
+        return ", ".join([self.state, f"action {self.action}", *extras, *([self.parity] if self.parity else [])])
 
 
 def leading(definition: EnvironmentDefinition) -> tuple[int, ...]:
@@ -60,14 +66,17 @@ def reward_candidates(definition: EnvironmentDefinition) -> tuple[FeatureMap, ..
     Rewards are often told by what the observation combines, such as the way from a tip to its target.
     """
     timings = {"before": (False,), "after": (True,), "auto": (False, True)}[definition.reward_timing]
-    maps = candidates(definition, follows=False)
+    maps = candidates(definition, follows=False, parity="even")
     if definition.observation_combines and definition.design.preset == "default":
         maps += tuple(FeatureMap("observation", action) for action in dict.fromkeys(m.action for m in maps))
     return tuple(replace(m, after=after) for after in timings for m in maps)
 
 
-def candidates(definition: EnvironmentDefinition, follows: bool, drift: Drift = ()) -> tuple[FeatureMap, ...]:
-    """Maps worth comparing for one output; ``follows`` says that it may read the lead, ``drift`` how angles turn."""
+def candidates(
+    definition: EnvironmentDefinition, follows: bool, drift: Drift = (), parity: Parity = "odd"
+) -> tuple[FeatureMap, ...]:
+    """Maps worth comparing for one output; ``follows`` says that it may read the lead, ``drift`` how angles turn,
+    ``parity`` which one it has if the environment is its own mirror image."""
     if definition.design.preset == "paper":
         return (FeatureMap(state="observation"),)
     states: list[State] = ["cos_sin"]
@@ -78,7 +87,38 @@ def candidates(definition: EnvironmentDefinition, follows: bool, drift: Drift = 
         actions.append("one_hot")
     leads = [False, True] if follows and leading(definition) else [False]
     maps = tuple(FeatureMap(s, a, lead) for s, a, lead in product(states, actions, leads))
-    return maps + tuple(replace(m, drift=drift) for m in maps if drift and m.state == "cos_sin")
+    maps += tuple(replace(m, drift=drift) for m in maps if drift and m.state == "cos_sin")
+    maps += (FeatureMap("none", lead=True),) if any(leads) else ()
+    if definition.design.symmetry == "none":
+        return maps
+    mirrored = (replace(m, parity=parity) for m in maps)
+    return maps + tuple(m for m in mirrored if reflection(definition, m) is not None)
+
+
+def reflection(definition: EnvironmentDefinition, feature_map: FeatureMap) -> Reflection | None:
+    """What a map's features do when every coordinate and the action change their sign, for its parity; None without
+    one, or where they have no such rule: ranges that are not centred at 0, one-hot actions, observations."""
+    if not feature_map.parity:
+        return None
+    signs = [_sign(definition, feature) for feature in features(definition, feature_map)]
+    if not all(signs):
+        return None
+    parity = 1 if feature_map.parity == "even" else -1
+    return Reflection(torch.tensor(signs, dtype=torch.float64, device=definition.device), parity)
+
+
+def _sign(definition: EnvironmentDefinition, feature: Feature) -> int:
+    """1: the feature stays when all signs change; -1: it changes its own; 0: neither."""
+    match feature.function:
+        case "cos" | "turned_cos":
+            return 1
+        case "sin" | "turned_sin" | "wrapped":
+            return -1
+        case "affine" if feature.entry >= len(definition.coordinates) and definition.action.nvec:
+            return -1  # numbers of discrete actions count from one end; reversed they are each other's mirror image
+        case "affine" | "lead":
+            return -1 if abs(feature.centre) <= CENTRED * feature.scale else 0
+    return 0
 
 
 class Feature(NamedTuple):
@@ -96,14 +136,15 @@ def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tupl
     made: list[Feature] = []
     if feature_map.state == "observation":
         made += _of_observation(definition)
-    else:
+    elif feature_map.state != "none":
         for index in range(len(definition.coordinates)):
             made += _of_coordinate(definition, feature_map, index)
     for index, weights in zip(definition.angles, feature_map.drift, strict=False):
         turned = tuple(w + (i == index) for i, w in enumerate(weights))
         made += [Feature("turned_cos", index, weights=turned), Feature("turned_sin", index, weights=turned)]
-    for entry in range(definition.action.size):
-        made += _of_action(definition, feature_map, entry)
+    if feature_map.state != "none":
+        for entry in range(definition.action.size):
+            made += _of_action(definition, feature_map, entry)
     if feature_map.lead:
         made += [
             Feature("lead", place, *scaling(definition.coordinates[index].sampling))
@@ -154,7 +195,8 @@ class Encoder:
     def __call__(self, q: Tensor, u: Tensor) -> Tensor:
         """All features of coordinates q (..., C) and actions u (..., F) but those of the lead."""
         raw = torch.cat([q, u], -1)
-        return torch.cat([self._values(*group, raw) for group in self.groups if group[0] != "lead"], -1)
+        values = [self._values(*group, raw) for group in self.groups if group[0] != "lead"]
+        return torch.cat(values, -1) if values else raw[..., :0]
 
     def with_lead(self, x: Tensor, lead: Tensor) -> Tensor:
         """All features: x (..., d) of a call, and those of the lead (..., L)."""

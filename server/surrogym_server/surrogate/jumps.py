@@ -96,7 +96,7 @@ def _evidence(process: OutputModel, points: int, unit: float) -> float:
     """Log density of the points a process was fitted to, as multiples of ``unit``."""
     if process.posterior is None:
         return -points * (math.log(FLOOR) + 0.5 * math.log(2 * math.pi))
-    return max(score for _, score in process.scores) - points * math.log(process.scale / unit)
+    return dict(process.scores)[str(process.feature_map)] - points * math.log(process.scale / unit)
 
 
 def _paid_inside(residual: Tensor, spread: Tensor) -> float:

@@ -22,7 +22,9 @@ class Design(Frozen):
     ``preset``: ``default`` or ``paper`` (the method as printed, repaired only where it cannot work). Every None takes
     the preset's value. ``budget`` counts every real step of the design, initial ones included. ``tolerance`` is what
     eq. 9 divides by the deviation where none is declared: ``relative``, 5 % of the output's deviation over the initial
-    design, or ``raw``, 1 in the output's own unit, as printed.
+    design, or ``raw``, 1 in the output's own unit, as printed. ``symmetry``: ``auto`` looks whether the environment is
+    its own mirror image, every coordinate and the action with their signs changed, ``none`` does not; preset ``paper``
+    never does.
     """
 
     preset: Literal["default", "paper"] = "default"
@@ -32,6 +34,7 @@ class Design(Frozen):
     acquisition: Literal["uncertainty_index", "variance", "integrated_variance", "latin_hypercube"] | None = None
     tolerance: Literal["relative", "raw"] | None = None
     monte_carlo: Annotated[int, Field(ge=16, le=100_000, strict=True)] | None = None
+    symmetry: Literal["auto", "none"] = "auto"
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
 
 

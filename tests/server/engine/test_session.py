@@ -27,7 +27,7 @@ from surrogym_shared.port import StepResult
 
 Open = Callable[..., Session]
 Fitted = Callable[[int], SurrogateModel]
-VERSIONS = {1: 6, 2: 9}  # samples of each version's model
+VERSIONS = {1: 4, 2: 9}  # samples of each version's model
 ARRAYS = ("observation", "reward", "terminated", "truncated", "final_lanes", "final_observation", "deviation")
 ARRAYS += ("untrusted",)
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
-from support.real_steps import random_steps
+from support.real_steps import answer, random_steps
 from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.surrogate.definition import EnvironmentDefinition
@@ -47,3 +48,12 @@ def cartpole_model() -> SurrogateModel:
 def paper_model(pendulum_samples: Samples) -> SurrogateModel:
     design = pendulum().design.model_copy(update={"preset": "paper"})
     return learn(definition_from_spec(pendulum().model_copy(update={"design": design})), pendulum_samples).model
+
+
+@pytest.fixture(scope="session")
+def half_saturated() -> Samples:
+    """Pendulum steps close to the speed limit, where half of them end."""
+    rng = torch.Generator().manual_seed(0)
+    angle, side, torque = (2 * torch.rand(20, generator=rng, dtype=torch.float64) - 1 for _ in range(3))
+    q = torch.stack([torch.pi * angle, 7.6 * side.sign()], -1)
+    return answer(pendulum(), q, 2 * torque[:, None])

@@ -118,7 +118,7 @@ def test_a_model_of_format_1_keeps_the_rewards_declared_timing(pendulum_definiti
 
 def test_a_transition_that_reads_the_state_it_predicts_is_refused(pendulum_definition, data):
     header = header_of(data)
-    header["outputs"][0]["feature_map"] |= {"after": True, "lead": False}
+    header["outputs"][1]["feature_map"] |= {"after": True}
     with pytest.raises(InvalidInput, match="before the step"):
         from_bytes(pendulum_definition, rewritten(data, header))
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from support.real_steps import answer, join, random_steps
-from surrogym_client.original.classic import cartpole, pendulum
+from support.real_steps import join, random_steps
+from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
 from surrogym_server.gp import sparse
@@ -17,15 +17,6 @@ from surrogym_server.surrogate.samples import Samples
 from surrogym_shared.spec import Design
 
 PAPER = pendulum().model_copy(update={"design": Design(preset="paper")})
-
-
-@pytest.fixture(scope="module")
-def half_saturated() -> Samples:
-    """Pendulum steps close to the speed limit, where half of them end."""
-    rng = torch.Generator().manual_seed(0)
-    angle, side, torque = (2 * torch.rand(20, generator=rng, dtype=torch.float64) - 1 for _ in range(3))
-    q = torch.stack([torch.pi * angle, 7.6 * side.sign()], -1)
-    return answer(pendulum(), q, 2 * torque[:, None])
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -42,6 +33,37 @@ def test_a_reward_of_the_cosine_is_given_cos_and_sin(pendulum_definition):
     steps = random_steps(pendulum(), 24, seed=0)
     reward = learn(pendulum_definition, replace(steps, reward=3 * steps.q[:, 0].cos() - 1)).model.reward
     assert reward.feature_map.state == "cos_sin"
+
+
+@pytest.mark.parametrize("task", [pendulum, cartpole])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_body_that_is_its_own_mirror_image_is_found_to_be_so(task, seed):
+    model = learn(definition_from_spec(task()), random_steps(task(), 12, seed=seed)).model
+    assert {output.feature_map.parity for output in model.transitions} == {"odd"}
+    assert all(output.centre == 0 for output in model.transitions)
+
+
+@pytest.mark.parametrize("task", [pendulum, mountain_car_continuous])
+@pytest.mark.parametrize("seed", range(2))
+def test_what_its_next_speed_alone_moves_is_found_from_six_steps(task, seed):
+    """Both environments move by the speed after the step: no bound has to be met to know how far that goes."""
+    model = learn(definition_from_spec(task()), random_steps(task(), 6, seed=seed)).model
+    angle, speed = model.transitions
+    assert (angle.feature_map.state, angle.feature_map.lead) == ("none", True)
+    assert speed.feature_map.state != "none"
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_reward_that_is_even_is_found_to_be_so(pendulum_definition, seed):
+    assert learn(pendulum_definition, random_steps(pendulum(), 12, seed=seed)).model.reward.feature_map.parity == "even"
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_torque_that_pulls_to_one_side_is_no_mirror_image(pendulum_definition, seed):
+    """The same steps, said to have been taken with a tenth of the largest torque less."""
+    steps = random_steps(pendulum(), 16, seed=seed)
+    _, speed = learn(pendulum_definition, replace(steps, u=steps.u - 0.2)).model.transitions
+    assert speed.feature_map.parity == ""
 
 
 @pytest.mark.parametrize("after", [False, True])
