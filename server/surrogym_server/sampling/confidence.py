@@ -13,6 +13,8 @@ from torch import Tensor
 
 from surrogym_server.surrogate.model import OutputModel, SurrogateModel
 
+SUREST = 1e9  # tolerances over a deviation: what is known better counts as known so well
+
 
 @dataclass(frozen=True)
 class OutputConfidence:
@@ -39,8 +41,8 @@ def certainty(deviation: Tensor, tolerance: Tensor | float) -> Tensor:
 
 
 def log_model_uncertainty(deviation: Tensor, tolerance: Tensor | float) -> Tensor:
-    """log U_m (eq. 10) = log Phi(-tau / sigma)."""
-    log_uncertainty: Tensor = torch.special.log_ndtr(-tolerance / deviation)
+    """log U_m (eq. 10) = log Phi(-tau / sigma), finite where sigma is 0 as well."""
+    log_uncertainty: Tensor = torch.special.log_ndtr(-(tolerance / deviation).clamp_max(SUREST))
     return log_uncertainty
 
 

@@ -3,6 +3,7 @@
 Phi(0.5) = 0.6914624613, Phi(1) = 0.8413447461, Phi(2) = 0.9772498681, Phi(5) = 0.9999997133.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -46,6 +47,7 @@ def test_confidence_of_the_papers_tolerance_is_the_papers(model):
 def test_nothing_known_is_a_half_and_no_deviation_is_certain():
     torch.testing.assert_close(certainty(tensor(1e12, 0.0), 0.1), tensor(0.5, 1.0))
     assert log_model_uncertainty(tensor(0.0), 0.1).exp().item() == 0
+    assert math.isfinite(log_model_uncertainty(tensor(0.0), 0.1).item()), "as JSON has no infinity"
 
 
 def test_model_uncertainty_is_what_certainty_leaves():
