@@ -1,4 +1,4 @@
-"""True one-step error against real queries: adaptive criteria beside a Latin hypercube, in both representations.
+"""True one-step error against real queries: adaptive criteria beside a Latin hypercube, in three representations.
 
 Run by ``make acquisition``. A cell is one task, representation, criterion and seed; its rows go into rows.csv at once,
 and a cell whose rows are there is not run again, so the same command goes on after Ctrl-C. No policy is trained: what
@@ -42,13 +42,19 @@ from surrogym_server.surrogate.samples import Samples
 from surrogym_shared.spec import Design, EnvironmentSpec
 
 TASKS = {"pendulum": "Pendulum-v1", "acrobot": "Acrobot-v1", "mountaincar": "MountainCarContinuous-v0"}
-PRESETS = {"coordinates": "default", "observation": "paper"}
+DESIGNS = {  # by representation
+    "symmetry": {"preset": "default"},
+    "coordinates": {"preset": "default", "symmetry": "none"},
+    "observation": {"preset": "paper"},
+}
 CRITERIA = ("integrated_variance", "variance", "uncertainty_index", "latin_hypercube")
 QUERIES = {  # real queries at which the error is measured; the first are the initial design
+    ("pendulum", "symmetry"): (4, 6, 8, 10, 14),
     ("pendulum", "coordinates"): (6, 8, 10, 14),
     ("pendulum", "observation"): (20, 30, 40, 60),
     ("mountaincar", "coordinates"): (6, 8, 10, 14),
     ("mountaincar", "observation"): (10, 15, 20, 30),
+    ("acrobot", "symmetry"): (40, 60, 80, 100),
     ("acrobot", "coordinates"): (40, 60, 80, 100),
     ("acrobot", "observation"): (40, 60, 80, 100),
 }
@@ -74,9 +80,9 @@ def main() -> None:
     rows = read(out / "rows.csv")
     done = {(row.task, row.representation, row.criterion, row.seed) for row in rows}
     for seed, task, representation, criterion in product(
-        range(options.seeds), options.tasks, options.representations, CRITERIA
+        range(options.seeds), options.tasks, options.representations, options.criteria
     ):
-        if (task, representation, criterion, seed) not in done:
+        if (task, representation) in QUERIES and (task, representation, criterion, seed) not in done:
             rows += list(cell(task, representation, criterion, seed))
             write(out, rows)
             print(rows[-1], flush=True)
@@ -87,7 +93,7 @@ def main() -> None:
 def cell(task: str, representation: str, criterion: str, seed: int) -> Iterator[Row]:
     """One design, with the error of its model each time the queries are as many as ``QUERIES`` says."""
     counts = QUERIES[task, representation]
-    spec = _spec(task, PRESETS[representation], criterion, counts[0], seed)
+    spec = _spec(task, representation, criterion, counts[0], seed)
     test = _unseen(task)
     for model, queries in designed(spec, counts):
         yield Row(task, representation, criterion, seed, queries, float(f"{error(model, test):.4g}"), commit())
@@ -124,9 +130,10 @@ def error(model: SurrogateModel, test: Samples) -> float:
     return float((((said - truth) / spread)[:, varies]).square().mean().sqrt())
 
 
-def _spec(task: str, preset: str, criterion: str, initial: int, seed: int) -> EnvironmentSpec:
+def _spec(task: str, representation: str, criterion: str, initial: int, seed: int) -> EnvironmentSpec:
     spec = make(TASKS[task]).spec()
-    design = Design(preset=preset, acquisition=criterion, initial=initial, seed=seed)  # type: ignore[arg-type]
+    values = {**DESIGNS[representation], "acquisition": criterion, "initial": initial, "seed": seed}
+    design = Design.model_validate(values)
     return spec.model_copy(update={"design": design})
 
 
@@ -158,14 +165,21 @@ def write(out: Path, rows: Sequence[Row]) -> None:
 
 def table(rows: Sequence[Row]) -> str:
     """Interquartile mean over seeds of the error's logarithm, raised again, with its 95 % bootstrap interval; and the
-    hypercube's over it."""
-    lines = ["| task | representation | queries | criterion | seeds | error | error of a Latin hypercube over it |"]
-    lines += ["| --- | --- | --- | --- | --- | --- | --- |"]
+    hypercube's over it, and over that with symmetry the one without."""
+    lines = [
+        "| task | representation | queries | criterion | seeds | error | error of a Latin hypercube over it "
+        "| error without symmetry over it |"
+    ]
+    lines += ["| --- | --- | --- | --- | --- | --- | --- | --- |"]
     for task, representation, queries, criterion in _cases(rows):
         errors, hypercube = (_logs(rows, task, representation, queries, c) for c in (criterion, "latin_hypercube"))
         said = _words(interquartile_mean(errors), bootstrap_interval(errors))
         against = "" if criterion == "latin_hypercube" or not len(hypercube) else _factor(hypercube, errors)
-        lines.append(f"| {task} | {representation} | {queries} | {criterion} | {len(errors)} | {said} | {against} |")
+        without = _logs(rows, task, "coordinates", queries, criterion) if representation == "symmetry" else errors[:0]
+        gained = _factor(without, errors) if len(without) else ""
+        lines.append(
+            f"| {task} | {representation} | {queries} | {criterion} | {len(errors)} | {said} | {against} | {gained} |"
+        )
     return "\n".join(lines) + "\n"
 
 
@@ -221,7 +235,8 @@ def _words(middle: float, interval: tuple[float, float]) -> str:
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
-    parser.add_argument("--representations", nargs="+", choices=PRESETS, default=list(PRESETS))
+    parser.add_argument("--representations", nargs="+", choices=DESIGNS, default=list(DESIGNS))
+    parser.add_argument("--criteria", nargs="+", choices=CRITERIA, default=list(CRITERIA))
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--out", type=Path, default=Path("runs/acquisition"))
     return parser.parse_args()

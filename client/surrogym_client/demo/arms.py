@@ -26,6 +26,7 @@ class Arm:
     acquisition: Acquisition | None = None
     closed_loop: bool = False
     original: bool = False
+    symmetry: Literal["auto", "none"] = "auto"
 
     def design(self, budget: int, dimensions: int) -> dict[str, Any]:
         """Fields of the specification's design.
@@ -37,6 +38,8 @@ class Arm:
         chosen: dict[str, Any] = {"preset": self.preset, "budget": budget}
         if self.acquisition is not None:
             chosen["acquisition"] = self.acquisition
+        if self.symmetry != "auto":
+            chosen["symmetry"] = self.symmetry
         if self.preset == "paper":  # 10 (D + F), section 3.1, would leave nothing to adapt
             chosen["initial"] = max(2, min(10 * dimensions, budget // PAPERS_SHARE))
         return chosen
@@ -48,6 +51,7 @@ class Arm:
 
 ARMS = {
     "default": Arm("as surrogym demo runs it; it may stop early", closed_loop=True),
+    "no_symmetry": Arm("default, not looking for a mirror image", closed_loop=True, symmetry="none"),
     "no_loop": Arm("the whole budget by the design, before training"),
     "variance": Arm("no_loop, each query where the deviation is largest", acquisition="variance"),
     "latin_hypercube": Arm("no_loop, all queries from one Latin hypercube", acquisition="latin_hypercube"),

@@ -25,6 +25,7 @@ CONTRASTS = (  # what a pair of arms tells, at the same budget
     ("adaptive queries, in the paper's representation", "paper", "paper_hypercube"),
     ("representation, on a hypercube", "latin_hypercube", "paper_hypercube"),
     ("acquisition", "no_loop", "variance"),
+    ("symmetry", "default", "no_symmetry"),
     ("closed loop", "default", "no_loop"),
     ("adaptive queries and closed loop", "default", "latin_hypercube"),
     ("the whole of it", "default", "paper"),

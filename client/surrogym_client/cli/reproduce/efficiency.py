@@ -39,7 +39,7 @@ def command(
     """Run the demo over tasks, arms and seeds. rows.csv, efficiency.md and a picture of each task go into a folder.
 
     A run that has its row in rows.csv is not repeated, so that the same command goes on after Ctrl-C. Arms: default,
-    no_loop, variance, latin_hypercube, paper, paper_hypercube, oracle; docs/results.md says what each is.
+    no_symmetry, no_loop, variance, latin_hypercube, paper, paper_hypercube, oracle; docs/results.md says what each is.
 
     Example: surrogym reproduce efficiency --seeds 10 --jobs 2 --out runs/efficiency
 
