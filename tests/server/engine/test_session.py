@@ -45,7 +45,7 @@ def test_lanes_of_two_versions_step_as_two_sessions_would(opened: Open, fitted: 
     for lane, version in enumerate([2, 1, 1, 2]):
         for name in ("observation", "reward", "deviation"):
             ours, theirs = getattr(result, name)[lane], getattr(one[version - 1], name)[lane]
-            np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+            np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-12)
     np.testing.assert_array_equal(mixed.versions, [2, 1, 1, 2])
 
 

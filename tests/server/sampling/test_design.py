@@ -303,6 +303,7 @@ def test_verdicts(preset, confidences, samples, verdict):
 
 @pytest.mark.parametrize("acquisition", ["uncertainty_index", "integrated_variance"])
 def test_queries_go_where_policies_went(acquisition):
+    """Or where those would have gone that are their mirror images, which tells as much."""
     spec = designed(seed=0, initial=6, acquisition=acquisition)
     definition = definition_from_spec(spec)
     samples = answer(spec, *initial_design(definition, 6))
@@ -312,6 +313,7 @@ def test_queries_go_where_policies_went(acquisition):
     wide = advance(definition, samples, NEVER, request())
     near_them = advance(definition, samples, NEVER, request(states=visited))
     assert len(near_them.q) == len(wide.q) == 3
-    distance, anywhere = ((made.q - torch.tensor([2.0, 6.0])).abs().amax(1) for made in (near_them, wide))
+    there = torch.tensor([[[2.0, 6.0]], [[-2.0, -6.0]]])
+    distance, anywhere = ((made.q - there).abs().amax(-1).amin(0) for made in (near_them, wide))
     assert int((distance < 1).sum()) >= 2
     assert int((anywhere < 1).sum()) == 0

@@ -63,13 +63,15 @@ def test_the_next_episode_follows_another_function(model, started):
 
 
 def test_functions_scatter_as_the_posterior_does(model, started):
-    """Mean and deviation of 2,000 lanes' steps; the deviation's tolerance has the 256 frequencies' share in it."""
+    """Mean and deviation of 2,000 lanes' steps; the deviation's tolerance has the 256 frequencies' share in it. The
+    angle is moved by the speed that was drawn, over a step of 0.05 s, and scatters with it."""
     count, point = 2_000, (0.5, 3.0)
     settings, lanes = started(model, count, variant="pathwise")
     _, q = moved(model, settings, lanes, *point)
     one = torch.tensor([point], dtype=torch.float64)
     expected = model.transition(one, torch.full((1, 1), 0.5, dtype=torch.float64), deviations=True)
-    mean, deviation = expected.q_next[0].numpy(), expected.deviation[0].numpy()
+    mean, (angle, speed) = expected.q_next[0].numpy(), expected.deviation[0].tolist()
+    deviation = np.array([np.hypot(angle, 0.05 * speed), speed])
     assert (np.abs(q.mean(0) - mean) < 5 * deviation / np.sqrt(count)).all()
     np.testing.assert_allclose(q.std(0), deviation, rtol=0.25)
 
