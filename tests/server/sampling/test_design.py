@@ -304,9 +304,9 @@ def test_verdicts(preset, confidences, samples, verdict):
 @pytest.mark.parametrize("acquisition", ["uncertainty_index", "integrated_variance"])
 def test_queries_go_where_policies_went(acquisition):
     """Or where those would have gone that are their mirror images, which tells as much."""
-    spec = designed(seed=0, initial=6, acquisition=acquisition)
+    spec = designed(seed=0, initial=5, acquisition=acquisition)
     definition = definition_from_spec(spec)
-    samples = answer(spec, *initial_design(definition, 6))
+    samples = answer(spec, *initial_design(definition, 5))
     visited = torch.tensor([[2.0, 6.0]], dtype=torch.float64) + 0.2 * torch.randn(
         400, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
     )
