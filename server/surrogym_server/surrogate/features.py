@@ -133,18 +133,7 @@ class Feature(NamedTuple):
 
 def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tuple[Feature, ...]:
     """The features of a map, in their order."""
-    made: list[Feature] = []
-    if feature_map.state == "observation":
-        made += _of_observation(definition)
-    elif feature_map.state != "none":
-        for index in range(len(definition.coordinates)):
-            made += _of_coordinate(definition, feature_map, index)
-    for index, weights in zip(definition.angles, feature_map.drift, strict=False):
-        turned = tuple(w + (i == index) for i, w in enumerate(weights))
-        made += [Feature("turned_cos", index, weights=turned), Feature("turned_sin", index, weights=turned)]
-    if feature_map.state != "none":
-        for entry in range(definition.action.size):
-            made += _of_action(definition, feature_map, entry)
+    made = [] if feature_map.state == "none" else _of_point(definition, feature_map)
     if feature_map.lead:
         made += [
             Feature("lead", place, *scaling(definition.coordinates[index].sampling))
@@ -225,6 +214,22 @@ class Encoder:
     def _turned(self, weights: slice | Tensor, raw: Tensor) -> Tensor:
         assert isinstance(weights, Tensor)
         return raw[..., : len(self.definition.coordinates)] @ weights
+
+
+def _of_point(definition: EnvironmentDefinition, feature_map: FeatureMap) -> list[Feature]:
+    """Features of coordinates and action, without the lead's."""
+    made: list[Feature] = []
+    if feature_map.state == "observation":
+        made += _of_observation(definition)
+    else:
+        for index in range(len(definition.coordinates)):
+            made += _of_coordinate(definition, feature_map, index)
+    for index, weights in zip(definition.angles, feature_map.drift, strict=False):
+        turned = tuple(w + (i == index) for i, w in enumerate(weights))
+        made += [Feature("turned_cos", index, weights=turned), Feature("turned_sin", index, weights=turned)]
+    for entry in range(definition.action.size):
+        made += _of_action(definition, feature_map, entry)
+    return made
 
 
 def _of_observation(definition: EnvironmentDefinition) -> list[Feature]:
