@@ -15,6 +15,7 @@ from functools import cache
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 from scipy.optimize import minimize
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
@@ -59,7 +60,7 @@ def fit(
 ) -> Fitted:
     """Fit a process to x (n, d) and y (n,), both standardised, of functions that have the ``reflection`` if given.
 
-    ``warm`` is the theta of an earlier fit. Raises NumericalFailure.
+    On the CPU. ``warm`` is the theta of an earlier fit. Raises NumericalFailure.
     """
     objective = _Objective(x, y, options, reflection)
     with _blas().limit(limits=1):
@@ -96,16 +97,24 @@ def _starts(default: Array, warm: Array | None, points: int) -> Sequence[Array]:
 
 
 class _Objective:
-    """Negative log evidence with priors, and its gradient. Squared differences are computed once."""
+    """Negative log evidence with priors, and its gradient.
+
+    Thousands of evaluations of a few dozen points make a fit, so what is symmetric is kept once: as pairs i >= j of
+    points, (P,) with P = n (n + 1) / 2, and NumPy and LAPACK are called: torch's calls take longer than the work.
+    """
 
     def __init__(self, x: Tensor, y: Tensor, options: FitOptions, reflection: Reflection | None) -> None:
-        self.y, self.options, self.reflection = y, options, reflection
-        self.squared = [(1, _squared(x, x))]  # with the weight of their squared exponential
-        if reflection is not None:
-            self.squared.append((reflection.parity, _squared(x, x * reflection.signs)))
-        self.linear = Polynomial.of(1.0, 0.0, reflection, x)(x, x)
-        self.quadratic = Polynomial.of(0.0, 1.0, reflection, x)(x, x)
+        self.options, self.reflection = options, reflection
         n, d = x.shape
+        self.n, self.d, self.y = n, d, y.numpy()
+        self.rows, self.columns = np.tril_indices(n)
+        self.twice = np.where(self.rows == self.columns, 1.0, 2.0)  # how often a pair stands in a symmetric matrix
+        mirrored = [] if reflection is None else [x * reflection.signs]
+        differences = [other.numpy()[self.columns] - x.numpy()[self.rows] for other in (x, *mirrored)]
+        self.squared = np.ascontiguousarray(np.concatenate(differences).T ** 2)  # (d, P) or (d, 2 P)
+        self.parity = 0 if reflection is None else reflection.parity
+        self.linear = self._pairs(Polynomial.of(1.0, 0.0, reflection, x)(x, x))
+        self.quadratic = self._pairs(Polynomial.of(0.0, 1.0, reflection, x)(x, x))
         lengthscale = (options.lengthscale_prior[0] + 0.5 * math.log(d), options.lengthscale_prior[1])
         priors = [lengthscale] * d + [options.signal_prior]
         priors += [options.linear_prior] * options.linear + [options.quadratic_prior] * options.quadratic
@@ -116,49 +125,58 @@ class _Objective:
         self.lower[-1], self.upper[-1] = math.log(NOISE_FLOOR), math.log(2.0)
         self.default_start = self.prior[:, 0].copy()
         self.default_start[-1] = math.log(1e-4)
-        self.n, self.d = n, d
+        self.constant = 0.5 * n * math.log(2 * math.pi) + float(np.log(self.prior[:, 1]).sum())
 
     def hyper(self, theta: Array) -> Hyperparameters:
-        values = np.exp(theta)
-        lengthscale = torch.as_tensor(values[: self.d], dtype=self.y.dtype, device=self.y.device)
-        linear = float(values[self.d + 1]) if self.options.linear else 0.0
-        quadratic = float(values[-2]) if self.options.quadratic else 0.0
-        signal, noise = float(values[self.d]), float(values[-1])
-        return Hyperparameters(lengthscale, signal, linear, quadratic, noise, self.reflection)
+        lengthscale, signal, linear, quadratic, noise = self._values(theta)
+        return Hyperparameters(torch.from_numpy(lengthscale), signal, linear, quadratic, noise, self.reflection)
 
     def __call__(self, theta: Array) -> tuple[float, Array]:
-        hyper = self.hyper(theta)
-        precision = hyper.lengthscale.square().reciprocal()
-        smooth = [
-            weight * hyper.signal_variance * ((-0.5 * precision) @ squared).exp_().reshape(self.n, self.n)
-            for weight, squared in self.squared
-        ]
-        k = sum(smooth) + hyper.linear_variance * self.linear + hyper.quadratic_variance * self.quadratic
-        k.diagonal().add_(hyper.noise_variance)
-        factor, info = torch.linalg.cholesky_ex(k)
-        if bool(info):  # outside what float64 can factor: a wall for the line search
+        lengthscale, signal, linear, quadratic, noise = self._values(theta)
+        precision = lengthscale**-2
+        smooth = (-0.5 * precision) @ self.squared
+        np.exp(smooth, out=smooth)
+        smooth *= signal
+        smooth = smooth.reshape(-1, len(self.rows))  # of the points, and of their mirror images
+        k = smooth[0] + linear * self.linear + quadratic * self.quadratic
+        if self.parity:
+            smooth[1] *= self.parity
+            k += smooth[1]
+        matrix = np.zeros((self.n, self.n))
+        matrix[self.rows, self.columns] = k
+        matrix.flat[:: self.n + 1] += noise
+        if (solved := self._solve(matrix)) is None:  # outside what float64 can factor: a wall for the line search
             return 1e10, np.zeros_like(theta)
-        weights = torch.cholesky_solve(self.y[:, None], factor)[:, 0]
-        log_evidence = -0.5 * (self.y @ weights) - factor.diagonal().log().sum() - 0.5 * self.n * math.log(2 * math.pi)
-        half = 0.5 * (torch.outer(weights, weights) - torch.cholesky_inverse(factor))
-        gradient = self._gradient(hyper, half, smooth, precision)
+        inverse, weights, log_root = solved
+        half = 0.5 * self.twice * (weights[self.rows] * weights[self.columns] - inverse[self.rows, self.columns])
+        weighted = half * smooth
+        slopes = [precision * (self.squared @ weighted.ravel()), [weighted.sum()]]
+        slopes += [[linear * (half @ self.linear)]] * self.options.linear
+        slopes += [[quadratic * (half @ self.quadratic)]] * self.options.quadratic
+        trace = 0.5 * (weights @ weights - inverse.trace())
         z = (theta - self.prior[:, 0]) / self.prior[:, 1]
-        value = -float(log_evidence) + 0.5 * float(z @ z) + float(np.log(self.prior[:, 1]).sum())
-        return value, z / self.prior[:, 1] - gradient
+        value = 0.5 * (self.y @ weights + z @ z) + log_root + self.constant
+        return float(value), z / self.prior[:, 1] - np.concatenate([*slopes, [noise * trace]])
 
-    def _gradient(self, hyper: Hyperparameters, half: Tensor, smooth: list[Tensor], precision: Tensor) -> Array:
-        weighted = [(half * part).flatten() for part in smooth]
-        slopes = [squared @ part for (_, squared), part in zip(self.squared, weighted, strict=True)]
-        parts = [precision * torch.stack(slopes).sum(0), torch.stack(weighted).sum()[None]]
-        if self.options.linear:
-            parts.append(hyper.linear_variance * torch.vdot(half.flatten(), self.linear.flatten())[None])
-        if self.options.quadratic:
-            parts.append(hyper.quadratic_variance * torch.vdot(half.flatten(), self.quadratic.flatten())[None])
-        parts.append(hyper.noise_variance * half.trace()[None])
-        gradient: Array = torch.cat(parts).cpu().numpy()
-        return gradient
+    def _values(self, theta: Array) -> tuple[Array, float, float, float, float]:
+        """Length scales, the variances of the three parts and of the noise."""
+        values = np.exp(theta)
+        linear = float(values[self.d + 1]) if self.options.linear else 0.0
+        quadratic = float(values[-2]) if self.options.quadratic else 0.0
+        return values[: self.d], float(values[self.d]), linear, quadratic, float(values[-1])
 
+    def _solve(self, matrix: Array) -> tuple[Array, Array, float] | None:
+        """Of a matrix K, given by its lower half: the inverse (its lower half counts), K^-1 y, and half of K's log
+        determinant; None if it has no Cholesky factor."""
+        upper, info = dpotrf(matrix.T, lower=0, overwrite_a=1)  # transposed: the order of memory that LAPACK wants
+        if info:
+            return None
+        weights, _ = dpotrs(upper, self.y, lower=0)
+        root = float(np.log(upper.diagonal()).sum())
+        inverse, _ = dpotri(upper, lower=0, overwrite_c=1)
+        return inverse.T, weights, root
 
-def _squared(a: Tensor, b: Tensor) -> Tensor:
-    """Squared differences of inputs a and b (n, d) in each entry, (d, n n)."""
-    return (b[None] - a[:, None]).square().permute(2, 0, 1).flatten(1)
+    def _pairs(self, symmetric: Tensor) -> Array:
+        """A symmetric matrix (n, n) by its pairs, (P,)."""
+        pairs: Array = symmetric.numpy()[self.rows, self.columns]
+        return pairs

@@ -63,6 +63,15 @@ def test_without_priors_the_objective_is_scikit_learns_evidence(rng, linear):
     assert -(value - constant) == pytest.approx(reference.log_marginal_likelihood_value_, rel=1e-6)
 
 
+def test_what_cannot_be_factored_is_a_wall(rng):
+    x, y = draw(rng, 10, [1.0], 1e-2)
+    objective = _Objective(x, y, FitOptions(linear=False), None)
+    theta = np.array([40.0, 40.0, -80.0])  # all points alike, far outside the bounds
+    value, gradient = objective(theta)
+    assert value == 1e10
+    assert not gradient.any()
+
+
 def test_priors_lower_the_score_by_their_log_density(rng):
     x, y = draw(rng, 10, [1.0], 1e-2)
     vague = _Objective(x, y, FitOptions(linear=False, **WITHOUT_PRIORS), None)
