@@ -13,8 +13,8 @@ from surrogym_shared.wire import NewSample, Query, StepQuery
 
 
 def reset_seed(query: Query, design_seed: int) -> int:
-    """The seed of a rollout's reset: one of its own for each attempt, the same when the same is asked again."""
-    return int(np.random.SeedSequence([design_seed, query.id, query.attempt]).generate_state(1)[0])
+    """The seed of a rollout's reset: one of its own for each attempt, the same on any server that asks the same."""
+    return int(np.random.SeedSequence([design_seed, query.number, query.attempt]).generate_state(1)[0])
 
 
 def sample_of(query: Query, step: RealStep, size: int, number: int = 0) -> NewSample:

@@ -127,6 +127,7 @@ def _check(step: RealStep, start: Array, action: Array) -> None:
     """Raises ``StepFailed`` for a step that no sampler could hand in."""
     query = StepQuery(
         id=1,
+        number=0,
         purpose="manual",
         attempt=1,
         lease_token="none",

@@ -196,6 +196,19 @@ def test_starts_differ_between_attempts_queries_and_designs_and_are_the_same_aga
     assert reset_seed(queries[0], 0) == reset_seed(queries[0].model_copy(update={"lease_token": "other"}), 0)
 
 
+def test_the_same_design_takes_the_same_steps_whatever_else_the_server_was_asked(api):
+    taken = []
+    for number in range(2):
+        name = f"rail-{uuid.uuid4().hex[:8]}"
+        api.create_surrogate(name, SPEC)
+        with IsolatedEnvironment(Rail) as environment:
+            Sampler(api, name, environment, SamplerSettings(until_done=True, time_limit=90.0)).run()
+        taken.append([(s.coordinates, s.action, s.next_coordinates) for s in api.samples(name)])
+        assert api.surrogate(name).queries.answered > 1, number
+        api.delete_surrogate(name)
+    assert taken[0] == taken[1]
+
+
 def test_classic_control_without_teleport_is_learned_from_resets(api):
     name = f"pendulum-{uuid.uuid4().hex[:8]}"
     environment = original.make("Pendulum-v1", teleport=False, budget=24, seed=1)

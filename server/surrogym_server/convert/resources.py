@@ -78,6 +78,7 @@ def claimed(claim: Claim, lease_seconds: float) -> replies.ClaimedQueries:
 def _leased(query: LeasedQuery, lease_seconds: float) -> replies.Query:
     common = {
         "id": query.id,
+        "number": query.number,
         "purpose": query.purpose,
         "attempt": query.attempt,
         "lease_token": query.token,

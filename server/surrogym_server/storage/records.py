@@ -146,6 +146,7 @@ class QueryRecord(Asked):
 @dataclass(frozen=True)
 class LeasedQuery(Asked):
     id: int
+    number: int  # of the surrogate's queries before it
     purpose: Purpose
     attempt: int  # 1 for the first lease of this query
     token: str

@@ -36,6 +36,7 @@ class LeasedQuery(Reply):
     """What every query to answer has."""
 
     id: int
+    number: int = Field(description="how many queries of the surrogate came before it")
     purpose: Purpose
     attempt: int = Field(description="1 for the first lease of this query")
     lease_token: str

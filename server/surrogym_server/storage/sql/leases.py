@@ -33,6 +33,7 @@ def begin(
             coordinates=row.coordinates,
             action=row.action,
             steps=row.steps,
+            number=row.number,
             attempt=row.attempts + 1,
             token=secrets.token_urlsafe(16),
             expires=held.now + seconds,

@@ -61,8 +61,11 @@ class SqlQueries(port.Queries):
             held = leasing.share(connection, name)
             if held.paused:
                 return []
+            earlier = queries.alias()
+            number = sa.select(sa.func.count()).where(earlier.c.surrogate_id == held.id, earlier.c.id < queries.c.id)
+            columns: list[Any] = [*COLUMNS, number.scalar_subquery().label("number")]
             oldest_free = (
-                sa.select(*COLUMNS)
+                sa.select(*columns)
                 .where(queries.c.surrogate_id == held.id, queries.c.status == "pending")
                 .order_by(queries.c.id)
                 .limit(limit)
