@@ -12,12 +12,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+SAME = [f"{name}=={version(name)}" for name in ("numpy", "scipy")]  # arithmetic and search as here
 PACKAGES = {
     "openenv": ["openenv-core==0.3.0"],
     "rlmesh": ["rlmesh[gymnasium,numpy]==0.1.0"],
     "dm_env_rpc": ["dm-env-rpc==1.1.7"],
-    "scikit_learn": ["scikit-learn==1.9.1", f"numpy=={version('numpy')}"],
-    "gpytorch": ["gpytorch==1.15.2", f"torch=={version('torch')}", f"numpy=={version('numpy')}"],  # on the same torch
+    "scikit_learn": ["scikit-learn==1.9.1", *SAME],
+    "gpytorch": ["gpytorch==1.15.2", f"torch=={version('torch')}", *SAME],
 }
 SCRIPT = str(Path(__file__).with_name("peers.py"))
 INSTALLING_SECONDS = 900

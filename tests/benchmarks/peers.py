@@ -1,8 +1,9 @@
-"""Other systems serving a trivial environment, and other libraries predicting; runs where they are installed, owned.py.
+"""Other systems serving a trivial environment, and other libraries predicting and fitting; runs where they are
+installed, owned.py.
 
-``peers.py serve NAME PORT`` serves it. ``peers.py step NAME PORT`` and ``peers.py predict NAME FILE`` answer each line
-of their input, a number, by a line with the seconds of so many calls, as JSON. FILE (NPZ) says what to predict, and
-what was predicted is written beside it.
+``peers.py serve NAME PORT`` serves it. ``peers.py step NAME PORT``, ``peers.py predict NAME FILE`` and ``peers.py fit
+NAME FILE`` answer each line of their input, a number, by a line with the seconds of so many calls, as JSON. FILE (NPZ)
+says what to predict or fit, and what was predicted or fitted is written beside it.
 """
 
 from __future__ import annotations
@@ -129,7 +130,7 @@ def predict_scikit_learn(file: str):  # type: ignore[no-untyped-def]
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
-    told = np.load(file)
+    told = dict(np.load(file))  # read once, not with each prediction
     kernel = ConstantKernel(1.0, "fixed") * RBF(told["lengthscale"], "fixed")
     fitted = [GaussianProcessRegressor(kernel, alpha=float(told["noise"])).fit(told["x"], y) for y in told["y"]]
 
@@ -142,14 +143,14 @@ def predict_scikit_learn(file: str):  # type: ignore[no-untyped-def]
 
 
 def predict_gpytorch(file: str):  # type: ignore[no-untyped-def]
-    return _gpytorch(file, fast_variance=False)
+    return _gpytorch_predicting(file, fast_variance=False)
 
 
 def predict_gpytorch_fast(file: str):  # type: ignore[no-untyped-def]
-    return _gpytorch(file, fast_variance=True)
+    return _gpytorch_predicting(file, fast_variance=True)
 
 
-def _gpytorch(file: str, fast_variance: bool):  # type: ignore[no-untyped-def]
+def _gpytorch_predicting(file: str, fast_variance: bool):  # type: ignore[no-untyped-def]
     """All outputs as one batch of independent processes, as GPyTorch recommends."""
     import gpytorch
     import numpy as np
@@ -157,23 +158,11 @@ def _gpytorch(file: str, fast_variance: bool):  # type: ignore[no-untyped-def]
 
     torch.set_num_threads(1)
     told = {name: torch.from_numpy(array) for name, array in np.load(file).items()}
-    outputs, inputs = len(told["y"]), told["x"].shape[1]
-    batch = torch.Size([outputs])
-    likelihood = gpytorch.likelihoods.GaussianLikelihood(batch_shape=batch)
-    likelihood.noise = float(told["noise"])
-
-    class Processes(gpytorch.models.ExactGP):  # type: ignore[misc]
-        def __init__(self) -> None:
-            super().__init__(told["x"].expand(outputs, -1, -1), told["y"], likelihood)
-            self.mean_module = gpytorch.means.ZeroMean(batch_shape=batch)
-            rbf = gpytorch.kernels.RBFKernel(ard_num_dims=inputs, batch_shape=batch)
-            self.covar_module = gpytorch.kernels.ScaleKernel(rbf, batch_shape=batch)
-            self.covar_module.outputscale, rbf.lengthscale = 1.0, told["lengthscale"]
-
-        def forward(self, x):  # type: ignore[no-untyped-def]
-            return gpytorch.distributions.MultivariateNormal(self.mean_module(x), self.covar_module(x))
-
-    model = Processes().double().eval()
+    outputs = len(told["y"])
+    model = _gpytorch(told["x"].expand(outputs, -1, -1), told["y"])
+    model.covar_module.outputscale, model.covar_module.base_kernel.lengthscale = 1.0, told["lengthscale"]
+    model.likelihood.noise = told["noise"]
+    model.eval()
     repeated = told["at"].expand(outputs, *told["at"].shape)
 
     def predict():  # type: ignore[no-untyped-def]
@@ -184,6 +173,102 @@ def _gpytorch(file: str, fast_variance: bool):  # type: ignore[no-untyped-def]
     mean, variance = predict()
     np.savez(f"{file}.predicted", mean=mean.T.numpy(), deviation=variance.T.sqrt().numpy())
     return predict
+
+
+def _gpytorch(x, y):  # type: ignore[no-untyped-def]
+    """A process of y (n,) or a batch of them (b, n); its parameters are logarithms, as ours."""
+    import gpytorch
+    import torch
+
+    batch, inputs = y.shape[:-1], x.shape[-1]
+    positive = gpytorch.constraints.Positive(transform=torch.exp, inv_transform=torch.log)
+
+    class Process(gpytorch.models.ExactGP):  # type: ignore[misc]
+        def __init__(self) -> None:
+            super().__init__(x, y, gpytorch.likelihoods.GaussianLikelihood(None, positive, batch_shape=batch))
+            self.mean_module = gpytorch.means.ZeroMean(batch_shape=batch)
+            rbf = gpytorch.kernels.RBFKernel(ard_num_dims=inputs, batch_shape=batch, lengthscale_constraint=positive)
+            self.covar_module = gpytorch.kernels.ScaleKernel(rbf, outputscale_constraint=positive, batch_shape=batch)
+
+        def forward(self, x):  # type: ignore[no-untyped-def]
+            return gpytorch.distributions.MultivariateNormal(self.mean_module(x), self.covar_module(x))
+
+    return Process().double()
+
+
+def fit_scikit_learn(file: str):  # type: ignore[no-untyped-def]
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
+    def fit(x, y, told):  # type: ignore[no-untyped-def]
+        found = []
+
+        def optimizer(objective, start, bounds):  # type: ignore[no-untyped-def]
+            found.append(_search(objective, told))
+            return found[0].x, found[0].fun
+
+        *lengthscale, signal, noise = told["start"]
+        *lengthscales, signals, noises = told["bounds"]
+        kernel = RBF(lengthscale, lengthscales) * ConstantKernel(signal, signals) + WhiteKernel(noise, noises)
+        GaussianProcessRegressor(kernel, alpha=0, optimizer=optimizer).fit(x, y)
+        return found[0]
+
+    return _fitting(file, fit)
+
+
+def fit_gpytorch(file: str):  # type: ignore[no-untyped-def]
+    import gpytorch
+    import torch
+    from torch.nn.utils import vector_to_parameters
+
+    torch.set_num_threads(1)
+
+    def fit(x, y, told):  # type: ignore[no-untyped-def]
+        x, y = torch.from_numpy(x), torch.from_numpy(y)
+        model = _gpytorch(x, y)
+        evidence = gpytorch.mlls.ExactMarginalLogLikelihood(model.likelihood, model)  # of one point
+        scaled, noise = model.covar_module, model.likelihood.noise_covar
+        parameters = [scaled.base_kernel.raw_lengthscale, scaled.raw_outputscale, noise.raw_noise]
+
+        def objective(theta):  # type: ignore[no-untyped-def]
+            vector_to_parameters(torch.from_numpy(theta), parameters)
+            value = -len(y) * evidence(model(x), y)
+            slopes = torch.autograd.grad(value, parameters)
+            return value.item(), torch.cat([slope.flatten() for slope in slopes]).numpy()
+
+        with gpytorch.settings.max_cholesky_size(len(y)):  # exact
+            return _search(objective, told)
+
+    return _fitting(file, fit)
+
+
+def _fitting(file: str, fit):  # type: ignore[no-untyped-def]
+    """A fit of each draw, one after the other."""
+    import numpy as np
+
+    told = dict(np.load(file))
+
+    def call():  # type: ignore[no-untyped-def]
+        return [fit(x, y, told) for x, y in zip(told["x"], told["y"], strict=True)]
+
+    found = call()
+    np.savez(f"{file}.fitted", theta=[each.x for each in found], evaluations=[each.nfev for each in found])
+    return call
+
+
+def _search(objective, told):  # type: ignore[no-untyped-def]
+    """The least negative log evidence, searched for as in gp/fit.py; flat priors add a constant to what is compared
+    with the tolerance."""
+    import numpy as np
+    from scipy.optimize import minimize
+
+    def with_constant(theta):  # type: ignore[no-untyped-def]
+        value, slope = objective(theta)
+        return value + told["constant"], slope
+
+    options = {"maxiter": int(told["iterations"]), "ftol": 1e-9, "gtol": 1e-5}
+    start, bounds = np.log(told["start"]), np.log(told["bounds"])
+    return minimize(with_constant, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
 
 
 def answer(call) -> None:  # type: ignore[no-untyped-def]
@@ -199,6 +284,6 @@ def answer(call) -> None:  # type: ignore[no-untyped-def]
 
 if __name__ == "__main__":
     what, name, where = sys.argv[1:]
-    found = globals()[f"{what}_{name}"](where if what == "predict" else int(where))
+    found = globals()[f"{what}_{name}"](where if what in ("predict", "fit") else int(where))
     if what != "serve":
         answer(found)

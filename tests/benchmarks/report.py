@@ -102,6 +102,18 @@ def predict(found: dict[str, Any]) -> Iterator[Line]:
     yield f"one more sample at n = {largest['n']:,}", "", reached, None
 
 
+def evidence(found: dict[str, Any]) -> Iterator[Line]:
+    for n in dict.fromkeys(row["n"] for row in found["fits"]):
+        ours, *others = (row for row in found["fits"] if row["n"] == n)
+        above = max(row["at most above ours"] for row in others)
+        beside = ", ".join(f"{row['by']} {row['a fit'] / ours['a fit']:.1f} x" for row in others)
+        reached = (
+            f"{ours['a fit']:.2f} ms; {beside} as long; theirs at most {max(above, 0.0):.0e} above our log evidence"
+        )
+        held = ours["a fit"] < min(row["a fit"] for row in others) and above < 1e-3
+        yield f"fit of one output, 6 inputs, n = {n}", "faster, no worse", reached, held
+
+
 def growth(found: dict[str, Any]) -> Iterator[Line]:
     most = {int(count): each for count, each in found["sessions"].items()}
     reached = "; ".join(f"{c}: {f['requests/s']:,.0f}/s, p99 {f['p99 us'] / 1e3:.1f} ms" for c, f in most.items())
@@ -120,6 +132,7 @@ PARTS = {
     "train": train,
     "fit": fit,
     "predict": predict,
+    "evidence": evidence,
     "growth": growth,
     "memory": memory,
 }
