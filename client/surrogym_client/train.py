@@ -19,6 +19,7 @@ import stable_baselines3
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
@@ -142,6 +143,8 @@ def _learned(
     """The network that learned last, and whether the training came to its end, and not to an interruption."""
     for attempt in itertools.count():
         learner = network(attempt)
+        if learner.tensorboard_log is None:  # else Stable-Baselines3 makes an empty folder among the temporary files
+            learner.set_logger(Logger(folder=None, output_formats=[]))
         try:
             learner.learn(
                 _whole_rollouts(learner, checks.left), callback=[checks, *callbacks], reset_num_timesteps=True

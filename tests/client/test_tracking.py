@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -39,7 +40,10 @@ def test_tensorboard_has_the_curves_beside_the_policy(surrogate: LocalSurrogate,
     assert {"surrogym/imagined_return", "surrogym/penalty_share", "train/loss"} <= set(curves)
 
 
-def test_no_tracker_writes_nothing_but_the_policy_and_its_settings(surrogate: LocalSurrogate, tmp_path: Path) -> None:
+def test_no_tracker_writes_nothing_but_the_policy_and_its_settings(
+    surrogate: LocalSurrogate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     train(surrogate, tmp_path / "policy.zip", small())
     assert {path.name for path in tmp_path.iterdir()} == {"policy.zip", "policy.json"}
 
