@@ -24,7 +24,7 @@ class Candidates:
     """Points to choose from, how likely they are, and the points that an answer should be good for."""
 
     points: Points  # m
-    log_p: Tensor  # (m,) log P_i
+    log_p: Tensor  # (m,) log P_i; read by ``uncertainty_index``, 0 for the others
     reference: Points  # r; read by ``integrated_variance``
     weights: Tensor  # (r,) add up to 1
 
@@ -46,7 +46,9 @@ def candidates_of(model: SurrogateModel, points: Points, states: Tensor | None, 
             [weights * (1 - OCCUPIED) / len(weights), weights.new_full((REFERENCE,), OCCUPIED / REFERENCE)]
         )
         points, reference = Points.joined([points, visited]), Points.joined([reference, also])
-    return Candidates(points, input_probability(model, points, states), reference, weights / weights.sum())
+    indexed = model.definition.design.acquisition == "uncertainty_index"
+    log_p = input_probability(model, points, states) if indexed else points.q.new_zeros(len(points))
+    return Candidates(points, log_p, reference, weights / weights.sum())
 
 
 def input_probability(model: SurrogateModel, points: Points, states: Tensor | None) -> Tensor:

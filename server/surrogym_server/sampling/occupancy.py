@@ -15,7 +15,7 @@ from surrogym_server.surrogate.definition import CoordinateDefinition, Environme
 from surrogym_server.surrogate.distributions import scaling
 
 FLOOR = 0.1  # share of the uniform density
-BLOCK = 4_096
+BLOCK = 2**17  # kernels at once, which stay in a core's cache
 
 
 def log_occupancy(definition: EnvironmentDefinition, states: Tensor, q: Tensor, floor: float = FLOOR) -> Tensor:
@@ -23,7 +23,7 @@ def log_occupancy(definition: EnvironmentDefinition, states: Tensor, q: Tensor, 
     count, moving = len(states), len(definition.moving)
     bandwidth = count ** (-1 / (moving + 4))
     densities = []
-    for block in torch.split(q, BLOCK):
+    for block in torch.split(q, max(1, BLOCK // count)):
         log_kernel = torch.zeros(len(block), count, dtype=q.dtype, device=q.device)
         for index in definition.moving:
             log_kernel += _log_kernel(definition.coordinates[index], block[:, index], states[:, index], bandwidth)

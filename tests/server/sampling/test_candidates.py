@@ -1,5 +1,7 @@
 """Candidates: where they come from, where their probability comes from, and what a query should be good for."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -39,6 +41,16 @@ def test_the_paper_takes_the_density_of_predicted_next_states(points):
     expected = log_occupancy(model.definition, arrived, arrived, floor=1e-12)
     torch.testing.assert_close(input_probability(model, Points(*points), None), expected)
     assert float(expected.std()) > 0.05
+
+
+@pytest.mark.parametrize("acquisition", ["uncertainty_index", "integrated_variance", "variance"])
+def test_probabilities_are_computed_for_the_criterion_that_reads_them(model, points, unseen, rng, acquisition):
+    design = dataclasses.replace(model.definition.design, acquisition=acquisition)
+    asked = dataclasses.replace(model, definition=dataclasses.replace(model.definition, design=design))
+    made = candidates_of(asked, Points(*points), unseen.q, rng)
+    reads = acquisition == "uncertainty_index"
+    expected = input_probability(asked, made.points, unseen.q) if reads else torch.zeros(len(made.points)).double()
+    torch.testing.assert_close(made.log_p, expected)
 
 
 def test_without_visited_states_a_query_should_be_good_anywhere(model, points, rng):
