@@ -199,7 +199,8 @@ def _plan(
         room = request.budget - len(samples) - sum(len(actions) for actions in request.pending_rollouts)
         steps = min(room, max(SHORTEST_ROUND, len(samples) // 4))
     longest = model.definition.max_rollout or 1
-    aim = Aim(_below(confidences, request.target), tolerances, longest, request.states, ending)
+    ended = bool(samples.terminated.any())
+    aim = Aim(_below(confidences, request.target), tolerances, longest, request.states, ending, ended)
     return tuple(plan_round(model, aim, steps, request.pending_rollouts, rng))
 
 

@@ -40,6 +40,17 @@ def in_doubt(model: SurrogateModel, q_next: Tensor) -> Tensor:
     return probability.minimum(1 - probability)
 
 
+def edge_in_doubt(model: SurrogateModel, q: Tensor, q_next: Tensor) -> Tensor:
+    """Chance that the model errs about the side of a reward's edge, the largest of all edges, for steps from q (m, C)
+    to q_next (m, C), (m,)."""
+    state = q_next if model.reward.feature_map.after else q
+    doubt = q.new_zeros(len(q))
+    for jump in model.jumps:
+        inside = jump.region.probability(state)
+        doubt = doubt.maximum(inside.minimum(1 - inside))
+    return doubt
+
+
 def _edges(model: SurrogateModel, points: Points, q_next: Tensor) -> Tensor | None:
     """Where it is most in doubt on which side of a reward's edge points lie."""
     state = q_next if model.reward.feature_map.after else points.q

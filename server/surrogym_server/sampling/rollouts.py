@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from surrogym_server.sampling.endings import in_doubt
+from surrogym_server.sampling.endings import edge_in_doubt, in_doubt
 from surrogym_server.sampling.occupancy import log_occupancy
 from surrogym_server.sampling.outlook import Points, counts_of, inputs_of
 from surrogym_server.surrogate.definition import EnvironmentDefinition
@@ -46,7 +46,8 @@ class Aim:
     tolerances: Sequence[float]  # of every output
     longest: int  # actions in a sequence
     states: Tensor | None = None  # (v, C) that policies visited: information is weighed by their density
-    ending: bool = False  # look for an end of the episode first, if one is within reach
+    ending: bool = False  # look first for an end of the episode, or a reward's edge, if one is within reach
+    ended: bool = False  # an end was seen: a declared one is not looked for
 
 
 @dataclass(frozen=True)
@@ -178,7 +179,7 @@ def _worth(model: SurrogateModel, aim: Aim, starts: Tensor, sequences: Sequences
     count, lanes = len(sequences), len(starts)
     actions = torch.from_numpy(sequences).repeat_interleave(lanes, 0)
     paths = predict_paths(model, starts.repeat(count, 1), actions)
-    gain = _endings(model, paths) if aim.ending else paths.ended.new_zeros(1)
+    gain = _endings(model, aim, paths) if aim.ending else paths.ended.new_zeros(1)
     if not bool((gain > DOUBTFUL).any()):
         gain = information(model, aim, paths)
     gains, costs = (x.reshape(count, lanes, -1).mean(1) for x in (gain, paths.running.cumsum(1)))
@@ -186,12 +187,13 @@ def _worth(model: SurrogateModel, aim: Aim, starts: Tensor, sequences: Sequences
     return best.values, best.indices + 1
 
 
-def _endings(model: SurrogateModel, paths: Paths) -> Tensor:
-    """Whether paths have ended, (b, T); where that is learned, the chance that the model was wrong about an end."""
-    if not model.definition.learns_termination:
-        return paths.ended
-    doubt = in_doubt(model, paths.q_next.flatten(0, 1)).reshape(paths.running.shape)
-    return (doubt * paths.running).cummax(1).values
+def _endings(model: SurrogateModel, aim: Aim, paths: Paths) -> Tensor:
+    """The chance that the model was wrong about an end or the side of a reward's edge on the way, (b, T); also whether
+    paths have ended, where ends are declared and none was seen."""
+    q, q_next = paths.q.flatten(0, 1), paths.q_next.flatten(0, 1)
+    doubt = in_doubt(model, q_next).maximum(edge_in_doubt(model, q, q_next)).reshape(paths.running.shape)
+    wrong = (doubt * paths.running).cummax(1).values
+    return wrong if aim.ended or model.definition.learns_termination else wrong.maximum(paths.ended)
 
 
 def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tensor:

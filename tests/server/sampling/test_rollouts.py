@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.plane import drifting, plane
 from support.real_steps import join, roll
 from surrogym_client.original.classic import acrobot, cartpole, pendulum
 from surrogym_server.convert import default_budget, definition_from_spec
@@ -29,7 +30,7 @@ from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.learn import learn
 from surrogym_server.surrogate.model import SurrogateModel
 from surrogym_server.surrogate.samples import Samples
-from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.spec import EnvironmentSpec, Uniform
 
 NOTHING = Points(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 1, dtype=torch.float64))
 ALL = (0, 1, 2)
@@ -215,6 +216,20 @@ def test_an_end_of_the_episode_is_looked_for_until_one_was_seen():
 
     assert ends(plan_rollout(learned, aim, rng())) > 0.75
     assert ends(plan_rollout(learned, replace(aim, ending=False), rng())) < 0.5
+    assert ends(plan_rollout(learned, replace(aim, ended=True), rng())) < 0.5, "one was seen"
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_rewards_edge_in_doubt_is_driven_to(side: int):
+    """It pays beyond x = 0.5, or beyond -0.5, which starts around 0 reach by pushing that way for a while."""
+    samples = drifting(lambda q, _: (side * q[:, 0] > 0.5).double(), 12)
+    spec = only_resets(plane(), start={name: Uniform(low=-0.1, high=0.1) for name in "xy"})
+    definition = definition_from_spec(spec)
+    learned = learn(definition, samples).model
+    assert learned.jumps
+    aim = Aim((1,), [0.05] * 3, longest=8, ending=True, ended=True)
+    driven = plan_rollout(learned, aim, rng())
+    assert side * float(driven.mean()) > 0.5
 
 
 def test_a_design_without_teleport_spends_its_budget_in_real_steps(swinging: EnvironmentDefinition, begun: Samples):
