@@ -19,14 +19,13 @@ from surrogym_client.train import (
     planned_steps,
     train,
 )
-from surrogym_client.training import chosen_for
+from surrogym_client.training import SUGGESTED_STEPS, chosen_for
 from surrogym_client.waiting import wait_for_design
 from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import SurrogateView
 
 ROUND_SHARE = 0.25  # of a whole training, in each round before the last
-SUGGESTED_STEPS = 1_000_000  # virtual ones, the most that is suggested for all rounds together; the paper's cap
 VISIT_LANES = 32
 VISIT_STEPS = 1_000  # where the specification has no time limit
 

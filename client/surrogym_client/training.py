@@ -10,6 +10,7 @@ from surrogym_shared.wire import SurrogateView
 
 CHECKS = 12  # of the imagined return in one training; the best policy is kept
 CHECK_EPISODES = 64
+SUGGESTED_STEPS = 1_000_000  # virtual ones, the most that is suggested for all rounds together; the paper's cap
 DRAWS: dict[str, Any] = {"variant": "probabilistic", "particles": 1, "spread": 0.0}  # each step of a lane is a draw
 FUNCTIONS: dict[str, Any] = {"variant": "pathwise"}  # each episode follows one function
 

@@ -26,6 +26,15 @@ def test_arms_have_the_same_budget(task):
         assert settings.judged_by().design.preset == "default"
 
 
+def test_arms_without_rounds_learn_for_as_long_as_those_that_have_some():
+    steps = {name: DemoSettings("swingup", arm=name).virtual_steps for name in ARMS}
+    alone = {name for name, arm in ARMS.items() if not arm.closed_loop and not arm.original}
+    assert steps == {name: 1_000_000 if name in alone else None for name in ARMS}
+    assert {DemoSettings("pendulum", arm=name).virtual_steps for name in ARMS} == {None}
+    assert {DemoSettings("acrobot", arm=name).virtual_steps for name in ARMS} == {1_750_000}
+    assert DemoSettings("swingup", arm="no_loop", steps=9).virtual_steps == 9
+
+
 def test_arms_differ_in_what_they_say():
     designs = {name: DemoSettings("acrobot", arm=name).spec().design for name in ARMS}
     assert designs["variance"].acquisition == "variance"

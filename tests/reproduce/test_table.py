@@ -17,6 +17,7 @@ ROW = Row(
     also_success=0.99,
     reached=True,
     imagined=-140.0,
+    virtual_steps=589_824,
     seconds=50.0,
     commit="abc",
     configuration="c",
@@ -39,7 +40,7 @@ def test_no_seed_is_left_out():
     text = report(DEFAULT)
     assert line(text, "pendulum", "default") == (
         "| pendulum | default | 4 | 10.5 (9 to 12) | -157.5 (-1000.0 to -150.0) | -1000.0 | -400.0 | 20 % | 99 % |"
-        " -140.0 | 2 of 4 | 50 (50) |"
+        " -140.0 | 2 of 4 | 589,824 | 50 (50) |"
     )
     assert line(text, "pendulum", "14").endswith("| 2 of 4 | -1000.0 |")
     oracle = [replace(ROW, arm="oracle", seed=i, real_steps=steps) for i, steps in enumerate((1_008_448, 900_000))]
@@ -66,8 +67,18 @@ def test_pairs_of_arms_answer_questions_with_an_interval():
     assert text.index("| pendulum | no_loop |") < text.index("| pendulum | latin_hypercube |")
 
 
+def test_an_arm_that_closes_no_loop_is_not_said_to():
+    """A budget of 14 is all the design's, one of 60 leaves queries for three rounds."""
+    asked = [*DEFAULT, *[replace(row, arm="no_loop") for row in DEFAULT]]
+    assert line(report(asked), "pendulum", "an early stop", "default, no_loop")
+    with_rounds = [replace(row, task="swingup", budget=60) for row in asked]
+    assert line(report(with_rounds), "swingup", "closed loop", "default, no_loop")
+
+
 def test_rows_that_were_not_made_alike_are_told():
     assert "configurations" not in report(DEFAULT)
+    assert "of 2 commits" not in report(DEFAULT)
+    assert "pendulum, default, budget 14: rows of 2 commits" in report([*DEFAULT, replace(ROW, seed=9, commit="d")])
     assert "pendulum, default, budget 14: rows of 2 configurations" in report(
         [*DEFAULT, replace(ROW, seed=9, configuration="d")]
     )

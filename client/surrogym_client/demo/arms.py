@@ -1,7 +1,8 @@
 """The arms of a comparison: how the same budget of real steps is spent, and on which model.
 
 The default may stop before its budget is spent, with or without symmetry. Every other arm that learns a surrogate
-spends exactly that budget, so that a comparison can only be in its favour. Imports nothing but the standard library.
+spends exactly that budget, and learns for as many virtual steps, so that a comparison can only be in its favour.
+Imports nothing but the standard library.
 """
 
 from __future__ import annotations

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from surrogym_client.demo.arms import ARMS, Arm
-from surrogym_client.demo.tasks import TASKS, DemoTask, design_budget
+from surrogym_client.demo.tasks import TASKS, DemoTask, design_budget, queries_a_round
 from surrogym_client.original import make
 from surrogym_client.original.loading import with_choices
+from surrogym_client.training import SUGGESTED_STEPS
 from surrogym_shared.spec import EnvironmentSpec
 
 
@@ -42,7 +43,9 @@ class DemoSettings:
 
     @property
     def virtual_steps(self) -> int | None:
-        return self.steps or self.demo_task.steps
+        """Where the default has rounds before its last training, those that have none learn for as long as it may."""
+        alone = not self.way.closed_loop and not self.way.original and queries_a_round(self.real_steps) > 0
+        return self.steps or self.demo_task.steps or (SUGGESTED_STEPS if alone else None)
 
     def spec(self) -> EnvironmentSpec:
         """The environment's specification with the design of this arm."""

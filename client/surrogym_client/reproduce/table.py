@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.demo.arms import ARMS
-from surrogym_client.demo.tasks import TASKS
+from surrogym_client.demo.tasks import TASKS, queries_a_round
 from surrogym_client.evaluate import interquartile_mean
 from surrogym_client.reproduce.rows import Row
 from surrogym_client.reproduce.statistics import bootstrap_interval, difference_interval
@@ -17,7 +17,7 @@ from surrogym_client.reproduce.statistics import bootstrap_interval, difference_
 Group = tuple[str, str, int]
 HEADING = (
     *("task", "arm", "seeds", "real steps", "real return", "worst seed", "worst episode"),
-    *("success", "other starts", "imagined", "target reached", "seconds"),
+    *("success", "other starts", "imagined", "target reached", "virtual steps", "seconds"),
 )
 FEW = 3  # seeds; fewer have no interval worth the name
 CONTRASTS = (  # what a pair of arms tells, at the same budget
@@ -31,10 +31,16 @@ CONTRASTS = (  # what a pair of arms tells, at the same budget
     ("the whole of it", "default", "paper"),
     ("surrogate or original", "default", "oracle"),
 )
+WITHOUT_ROUNDS = {  # what the same pairs tell where the design has the whole budget, and may stop early
+    "closed loop": "an early stop",
+    "adaptive queries and closed loop": "adaptive queries and an early stop",
+}
 NOTES = """\
 Real steps: median (smallest to largest). Real return: interquartile mean over seeds of their means; from three seeds
 on with a 95 % bootstrap interval. Worst seed: its mean. Success and other starts: share of the episodes, worst
-seed. Imagined: what the surrogate promised. Target reached: by how many seeds of all. Seconds: median (largest).
+seed. Imagined: what the surrogate promised. Target reached: by how many seeds of all; by the exact 95 % interval 10
+of 10 says that 69 % of all seeds do or more, 9 of 10 55 %, 5 of 5 48 %. Virtual steps, of the training: median.
+Seconds: median (largest). A bootstrap of five seeds is narrower than its name.
 """
 
 
@@ -95,7 +101,7 @@ def _line(group: Group, rows: Sequence[Row]) -> Sequence[str]:
     means = column(rows, "mean")
     if not len(means):
         return task, name, seeds, *["-"] * (len(HEADING) - 3)
-    imagined = column(rows, "imagined")
+    imagined, virtual = column(rows, "imagined"), column(rows, "virtual_steps")
     return (
         task,
         name,
@@ -108,6 +114,7 @@ def _line(group: Group, rows: Sequence[Row]) -> Sequence[str]:
         _share(column(rows, "also_success")),
         _number(interquartile_mean(imagined)) if len(imagined) else "-",
         _reached(rows),
+        f"{np.median(virtual):,.0f}" if len(virtual) and virtual.max() else "-",
         _median(column(rows, "seconds")),
     )
 
@@ -120,10 +127,11 @@ def _contrasts(groups: dict[Group, list[Row]]) -> str:
             if min(map(len, pair)) >= FEW:
                 low, high = difference_interval(*pair)
                 difference = interquartile_mean(pair[0]) - interquartile_mean(pair[1])
+                asked = question if queries_a_round(budget) else WITHOUT_ROUNDS.get(question, question)
                 lines.append(
                     (
                         task if budget == TASKS[task].budget else f"{task}, budget {budget}",
-                        question,
+                        asked,
                         f"{first}, {second}",
                         f"{len(pair[0])}, {len(pair[1])}",
                         _number(difference),
@@ -138,9 +146,10 @@ def _origin(rows: Sequence[Row]) -> str:
     """Commits and machines; and a warning where rows that are compared were not made alike."""
     lines = [f"Commits: {_listed(rows, 'commit')}. Machines: {_listed(rows, 'machine')}."]
     for (task, arm, budget), of in grouped(rows).items():
-        made = {row.configuration for row in of if row.configuration}
-        if len(made) > 1:
-            lines.append(f"{task}, {arm}, budget {budget}: rows of {len(made)} configurations.")
+        for name, plural in (("configuration", "configurations"), ("commit", "commits")):
+            made = {getattr(row, name) for row in of if getattr(row, name)}
+            if len(made) > 1:
+                lines.append(f"{task}, {arm}, budget {budget}: rows of {len(made)} {plural}.")
     return "\n".join(lines) + "\n"
 
 
