@@ -18,7 +18,7 @@ import numpy as np
 from cmaes import CMA, SepCMA
 from numpy.typing import NDArray
 
-from surrogym_client.imagined import LONGEST_EPISODE, imagined_returns, observation_statistics
+from surrogym_client.imagined import LONGEST_EPISODE, Imagined, imagine, imagined_returns, observation_statistics
 from surrogym_client.training import (
     CHECK_EPISODES,
     CHECKS,
@@ -70,17 +70,17 @@ def evolve(
     started, spec = time.perf_counter(), port.spec()
     cost = search.choices.population * search.choices.starts * (spec.time_limit or LONGEST_EPISODE)
     generations = max(total_steps // cost, 1)
-    best, kept, latest, done = -np.inf, None, None, 0
+    best, kept, latest, done, penalty = -np.inf, None, None, 0, None
     with suppress(KeyboardInterrupt):
         for number in range(1, generations + 1):
-            search.generation(number)
-            done = number
+            seen = search.generation(number)
+            done, penalty = number, seen.episode_penalty
             if number * CHECKS // generations > (number - 1) * CHECKS // generations:
                 latest = search.imagined()
                 if latest >= best:
                     best, kept = latest, search.policy
             if progress is not None:
-                progress(TrainProgress(number * cost, generations * cost, latest, 0.0))
+                progress(TrainProgress(number * cost, generations * cost, latest, seen.penalty_share, penalty))
     kept = kept or search.policy
     out.parent.mkdir(parents=True, exist_ok=True)
     kept.save(out)
@@ -90,6 +90,7 @@ def evolve(
         virtual_steps=done * cost,
         seconds=time.perf_counter() - started,
         imagined_return=None if latest is None else best,
+        episode_penalty=penalty,
         lost_episodes=0,
         settings={**asdict(settings), **asdict(search.choices), "total_steps": generations * cost},
     )
@@ -116,7 +117,7 @@ class _Search:
         """The network at the mean of the distribution."""
         return self._network(np.array(self._cma.mean))
 
-    def generation(self, number: int) -> None:
+    def generation(self, number: int) -> Imagined:
         """Draw a population, let each candidate run from the same starts, and learn from their mean returns."""
         choices = self.choices
         drawn = [self._cma.ask() for _ in range(choices.population)]
@@ -129,9 +130,10 @@ class _Search:
         lanes = choices.population * choices.starts
         starts = np.random.default_rng([self._settings.seed, number]).integers(2**62, size=choices.starts)
         seeds = [int(seed) for seed in np.tile(starts, choices.population)]
-        returns = imagined_returns(self._port, predict, lanes, seeds, **self._settings.session)
-        scores = returns.reshape(choices.population, choices.starts).mean(1)
+        seen = imagine(self._port, predict, lanes, seeds, **self._settings.session)
+        scores = seen.returns.reshape(choices.population, choices.starts).mean(1)
         self._cma.tell([(x, -float(score)) for x, score in zip(drawn, scores, strict=True)])
+        return seen
 
     def imagined(self) -> float:
         """Imagined return of the mean."""

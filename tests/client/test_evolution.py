@@ -46,6 +46,17 @@ def test_generations_are_as_many_as_the_steps_allow(surrogate, tmp_path: Path):
     assert not surrogate._sessions
 
 
+def test_a_penalty_is_reported(surrogate, tmp_path: Path):
+    reports, results = [], []
+    for penalty in (0.0, 100.0):
+        settings = small(session={"penalty": penalty}, total_steps=320)
+        results.append(train(surrogate, tmp_path / "policy.zip", settings, reports.append))
+    free, penalised = reports
+    assert (free.penalty_share, free.episode_penalty, results[0].episode_penalty) == (0.0, None, None)
+    assert penalised.penalty_share > 1e-3
+    assert results[1].episode_penalty == penalised.episode_penalty > 0
+
+
 def test_the_same_seed_finds_the_same_policy(surrogate, tmp_path: Path):
     def found(seed: int) -> np.ndarray:
         return Network.load(evolve(surrogate, tmp_path / "p.zip", small(seed=seed), 1_000).path).vector
