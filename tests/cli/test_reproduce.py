@@ -13,7 +13,7 @@ ROW = Row("pendulum", "default", 0, 14, 4, 5, 9, mean=-150.0, min=-400.0, reache
     ("option", "words"),
     [
         ("--tasks=nothing", "unknown task 'nothing': expected all, or some of pendulum, "),
-        ("--arms=default,x", "unknown arm 'x': expected all, or some of default, "),
+        ("--arms=default,x", "unknown arm 'x': expected all, study, or some of default, "),
         ("--shares=half", "expected numbers with commas between, got 'half'"),
         ("--shares=0", "expected numbers above 0"),
     ],

@@ -3,14 +3,17 @@
 import json
 import sys
 import time
+from collections import Counter
 from dataclasses import replace
 
 import pytest
 
 from support.commands import parse
 from support.metrics import METRICS
+from surrogym_client.demo.arms import ARMS
 from surrogym_client.demo.settings import DemoSettings
-from surrogym_client.reproduce.cells import Cell, cells, demo_command, done_already, run_cells
+from surrogym_client.demo.tasks import TASKS
+from surrogym_client.reproduce.cells import Cell, cells, demo_command, done_already, run_cells, study
 from surrogym_client.reproduce.rows import Row, read_rows, row_of
 
 
@@ -63,6 +66,18 @@ def test_a_row_answers_its_own_cell_and_no_other():
         replace(row, error="exit code 1"),
     ):
         assert not done_already(cell, [other])
+
+
+def test_a_study_has_the_default_everywhere_and_the_arms_on_four_tasks():
+    made = Counter((cell.settings.task, cell.settings.arm) for cell in study(list(TASKS), range(10)))
+    assert {made[task, "default"] for task in TASKS} == {10}
+    assert {task for task, arm in made if arm != "default"} == {"pendulum", "cartpole", "mountaincar", "swingup"}
+    assert made["swingup", "latin_hypercube"] == made["pendulum", "paper"] == 10
+    assert {made["swingup", arm] for arm in ARMS} == {5, 10}
+    assert made["cartpole", "oracle"] == 5
+    some = list(study(["acrobot", "pendulum"], range(3, 4), steps=9))
+    assert {cell.settings.task for cell in some} == {"acrobot", "pendulum"}
+    assert {(cell.settings.seed, cell.settings.steps) for cell in some} == {(3, 9)}
 
 
 def test_what_is_asked_has_a_hash_that_the_seed_does_not_change():

@@ -14,14 +14,18 @@ from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from surrogym_client.demo.arms import ARMS
 from surrogym_client.demo.settings import DemoSettings, fingerprint
 from surrogym_client.demo.tasks import TASKS
 from surrogym_client.reproduce.rows import Key, Row, merge, row_of, write_rows
 from surrogym_client.versions import commit, machine
 
+COMPARED = ("pendulum", "cartpole", "mountaincar", "swingup")  # tasks that a study runs every arm on
+EVERY_SEED = ("latin_hypercube", "paper")  # arms that it runs with as many seeds as the default
 LOOK_SECONDS = 0.2
 ENDING_SECONDS = 30.0  # a demo ends its own processes first
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
@@ -93,6 +97,16 @@ def cells(
     for seed, task, arm, share in product(seeds, tasks, arms, shares):
         budget = None if share == 1 else max(2, round(share * TASKS[task].budget))
         yield Cell(DemoSettings(task, seed, arm, budget, steps, episodes, pictures=False))
+
+
+def study(tasks: Sequence[str], seeds: Sequence[int], **chosen: Any) -> Iterator[Cell]:
+    """What docs/results.md shows: the default on every task; on those that are ``COMPARED`` a hypercube and the paper's
+    preset as well, and the other arms on the first half of the seeds. ``chosen`` as for ``cells``."""
+    compared = [task for task in tasks if task in COMPARED]
+    others = [arm for arm in ARMS if arm not in ("default", *EVERY_SEED)]
+    for place, seed in enumerate(seeds):
+        yield from cells(tasks, ["default"], [seed], **chosen)
+        yield from cells(compared, [*EVERY_SEED, *(others if 2 * place < len(seeds) else ())], [seed], **chosen)
 
 
 def done_already(cell: Cell, rows: Iterable[Row]) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from surrogym_client.reproduce.rows import Row
 
 
+STUDY = "study"
+
+
 def register(app: typer.Typer) -> None:
     """Add the command."""
     app.command("efficiency")(command)
@@ -22,7 +25,7 @@ def register(app: typer.Typer) -> None:
 
 def command(
     tasks: Annotated[str, typer.Option(help="Tasks of the demo with commas between, or all.")] = "all",
-    arms: Annotated[str, typer.Option(help="Arms with commas between, or all.")] = "default",
+    arms: Annotated[str, typer.Option(help="Arms with commas between, or all, or study.")] = "default",
     seeds: Annotated[int, typer.Option(min=1, help="How many seeds.")] = 3,
     first_seed: Annotated[int, typer.Option(min=0, help="The first of them.")] = 0,
     jobs: Annotated[int, typer.Option(min=1, help="Runs at once; each takes about one core.")] = 1,
@@ -40,8 +43,12 @@ def command(
 
     A run that has its row in rows.csv is not repeated, so that the same command goes on after Ctrl-C. Arms: default,
     no_symmetry, no_loop, variance, latin_hypercube, paper, paper_hypercube, oracle; docs/results.md says what each is.
+    "study" is what stands there: the default on every task, a hypercube and paper beside it on four, and on the same
+    four the other arms with half of the seeds.
 
     Example: surrogym reproduce efficiency --seeds 10 --jobs 2 --out runs/efficiency
+
+    Example: surrogym reproduce efficiency --arms study --seeds 10 --jobs 2
 
     Example: surrogym reproduce efficiency --tasks pendulum,acrobot --arms default,latin_hypercube --seeds 5
     """
@@ -50,12 +57,16 @@ def command(
     from surrogym_client.demo.arms import ARMS
     from surrogym_client.demo.tasks import TASKS
     from surrogym_client.lifetime import terminations_as_interrupts
-    from surrogym_client.reproduce.cells import cells, done_already, run_cells
+    from surrogym_client.reproduce.cells import cells, done_already, run_cells, study
     from surrogym_client.reproduce.rows import read_rows
     from surrogym_shared.terminal import on_interrupt, progress, say
 
-    chosen = _chosen("task", tasks, TASKS), _chosen("arm", arms, ARMS), range(first_seed, first_seed + seeds)
-    wanted = list(cells(*chosen, shares=_shares(shares), steps=steps, episodes=episodes))
+    named, numbers = _chosen("task", tasks, TASKS), range(first_seed, first_seed + seeds)
+    each: dict[str, Any] = {"shares": _shares(shares), "steps": steps, "episodes": episodes}
+    if arms == STUDY:
+        wanted = list(study(named, numbers, **each))
+    else:
+        wanted = list(cells(named, _chosen("arm", arms, ARMS, STUDY), numbers, **each))
     rows = read_rows(out / "rows.csv")
     todo = wanted if again else [cell for cell in wanted if not done_already(cell, rows)]
     say(f"{len(wanted)} runs, {len(wanted) - len(todo)} of them done already", quiet=quiet)
@@ -73,14 +84,16 @@ def command(
         raise CommandError(f"{len(bad)} runs ended badly, the first with {bad[0].error}; logs: {out / 'logs'}")
 
 
-def _chosen(what: str, given: str, known: Iterable[str]) -> list[str]:
+def _chosen(what: str, given: str, known: Iterable[str], *words: str) -> list[str]:
     from surrogym_client.cli.errors import CommandError
 
     if given == "all":
         return list(known)
     names = list(dict.fromkeys(given.split(",")))
     if unknown := [name for name in names if name not in known]:
-        raise CommandError(f"unknown {what} {unknown[0]!r}: expected all, or some of {', '.join(known)}")
+        raise CommandError(
+            f"unknown {what} {unknown[0]!r}: expected {', '.join(('all', *words))}, or some of {', '.join(known)}"
+        )
     return names
 
 
