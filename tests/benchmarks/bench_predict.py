@@ -79,6 +79,8 @@ def products(serving: Serving, rows: int, wanted: Sequence[int]) -> Call:
         mean = z @ serving.polynomials + k @ serving.weights
         for process in (serving.processes[c] for c in wanted if c in serving.processes):
             covariance = k[:, process.span]
+            if process.mirror is not None:  # the covariances with the mirror images are added to the others
+                covariance, _ = covariance.chunk(2, 1)
             if process.polynomial is not None:
                 covariance.addmm_(z, process.polynomial)
             covariance @ process.factor
