@@ -3,6 +3,8 @@ seen."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from torch import Tensor
 
 from surrogym_server.sampling.outlook import Points
@@ -43,23 +45,26 @@ def in_doubt(model: SurrogateModel, q_next: Tensor) -> Tensor:
 def edge_in_doubt(model: SurrogateModel, q: Tensor, q_next: Tensor) -> Tensor:
     """Chance that the model errs about the side of a reward's edge, the largest of all edges, for steps from q (m, C)
     to q_next (m, C), (m,)."""
-    state = q_next if model.reward.feature_map.after else q
     doubt = q.new_zeros(len(q))
-    for jump in model.jumps:
-        inside = jump.region.probability(state)
-        doubt = doubt.maximum(inside.minimum(1 - inside))
+    for of_one in _edge_doubts(model, q, q_next):
+        doubt = doubt.maximum(of_one)
     return doubt
 
 
 def _edges(model: SurrogateModel, points: Points, q_next: Tensor) -> Tensor | None:
     """Where it is most in doubt on which side of a reward's edge points lie."""
-    state = q_next if model.reward.feature_map.after else points.q
-    for jump in model.jumps:
-        inside = jump.region.probability(state)
-        doubt = inside.minimum(1 - inside)
+    for doubt in _edge_doubts(model, points.q, q_next):
         if float(doubt.mean()) > DOUBT:
             return doubt >= 0.5 * doubt.max()
     return None
+
+
+def _edge_doubts(model: SurrogateModel, q: Tensor, q_next: Tensor) -> Iterator[Tensor]:
+    """For each edge of the reward the chance that the model errs about the side, (m,)."""
+    state = q_next if model.reward.feature_map.after else q
+    for jump in model.jumps:
+        inside = jump.region.probability(state)
+        yield inside.minimum(1 - inside)
 
 
 def _predicted(model: SurrogateModel, points: Points, q_next: Tensor) -> Tensor | None:
