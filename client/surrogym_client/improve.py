@@ -32,7 +32,8 @@ VISIT_STEPS = 1_000  # where the specification has no time limit
 
 @dataclass(frozen=True)
 class ImproveSettings:
-    """How often to close the loop. A design that is ready needs no further round."""
+    """How often to close the loop. No round follows once the design is ready, or once the confidence index where the
+    policy goes has the design's target."""
 
     queries: int  # real steps a round
     rounds: int = 3
@@ -49,10 +50,11 @@ def train_and_improve(
     progress: Callable[[TrainProgress], None] | None = None,
     waiting: Callable[[SurrogateView], None] | None = None,
 ) -> TrainResult:
-    """Learn a policy, with rounds of queries where it goes as long as the design is not ready.
+    """Learn a policy, with rounds of queries where it goes until that is known, or the design is ready.
 
     Each round submits the states that the policy visits from the declared starts, as a checkpoint of its own, so the
-    same seeds ask the same queries. The rounds move lanes by the mean: their policies go where the model promises most.
+    same seeds ask the same queries. Where the model is as sure over these states as the design wants it over the whole
+    range, nothing more is asked. The rounds move lanes by the mean: their policies go where the model promises most.
     The last training is ``chosen_for`` what the design came to; by draws it begins anew, as a network that has learned
     from wrong models stays with what these taught it.
 
@@ -72,12 +74,12 @@ def train_and_improve(
         ValueError, SurrogymClientError: as ``train``.
     """
     rounds: list[TrainResult] = []
-    visited = 0
+    visited, known = 0, list[float | None]()
     whole, part = shares(settings, improve.rounds)
 
     def learn(steps: int, whole: int, settings: TrainSettings = settings) -> None:
         now = replace(settings, total_steps=steps, start_from=out if rounds else settings.start_from)
-        rounds.append(train(port, out, now, _shifted(progress, _steps(rounds) + visited, whole)))
+        rounds.append(train(port, out, now, _shifted(progress, _steps(rounds) + visited, whole, known[-1:])))
 
     try:
         for _ in range(improve.rounds):
@@ -86,7 +88,10 @@ def train_and_improve(
                 break
             learn(part, whole)
             checkpoint = f"seed {settings.seed}, round {view.round}"
-            visited += visit(port, out, settings, checkpoint)
+            steps, index = visit(port, out, settings, checkpoint)
+            visited, known = visited + steps, [*known, index]
+            if index is not None and index >= view.target:
+                break
             api.improve(name, improve.queries, checkpoint=checkpoint)
             wait_for_design(api, name, improve.patience_seconds, waiting, after_round=view.round)
         left = whole - _steps(rounds)
@@ -95,25 +100,26 @@ def train_and_improve(
         last = replace(last, anew=last is not settings and settings.start_from is None)
         learn(left, _steps(rounds) + visited + left, last)
     except TrainingInterrupted as interruption:
-        raise TrainingInterrupted(_together([*rounds, interruption.result], visited)) from None
+        raise TrainingInterrupted(_together([*rounds, interruption.result], visited, known)) from None
     except KeyboardInterrupt:
         if rounds:
-            raise TrainingInterrupted(_together(rounds, visited)) from None
+            raise TrainingInterrupted(_together(rounds, visited, known)) from None
         raise
-    return _together(rounds, visited)
+    return _together(rounds, visited, known)
 
 
 def _steps(rounds: Sequence[TrainResult]) -> int:
     return sum(result.virtual_steps for result in rounds)
 
 
-def _together(rounds: Sequence[TrainResult], visited: int) -> TrainResult:
+def _together(rounds: Sequence[TrainResult], visited: int, known: Sequence[float | None]) -> TrainResult:
     """The last round's result, with what all of them took; ``visited`` are virtual steps beside the trainings."""
     return replace(
         rounds[-1],
         virtual_steps=_steps(rounds) + visited,
         seconds=sum(r.seconds for r in rounds),
         lost_episodes=sum(r.lost_episodes for r in rounds),
+        visited_confidence=tuple(known),
     )
 
 
@@ -130,8 +136,9 @@ def shares(settings: TrainSettings, rounds: int) -> tuple[int, int]:
     return min(planned + rounds * part, SUGGESTED_STEPS), part
 
 
-def visit(port: SurrogatePort, policy: Path, settings: TrainSettings, checkpoint: str) -> int:
-    """Let a policy run from the declared starts and submit where it went; the number of virtual steps that took."""
+def visit(port: SurrogatePort, policy: Path, settings: TrainSettings, checkpoint: str) -> tuple[int, float | None]:
+    """Let a policy run from the declared starts and submit where it went: the number of virtual steps that took, and
+    the confidence index there."""
     spec = port.spec()
     act = explorer(policy, settings.algorithm)
     options = {**settings.session, "occupancy": True}
@@ -141,10 +148,10 @@ def visit(port: SurrogatePort, policy: Path, settings: TrainSettings, checkpoint
         observation: Any = env.reset()
         for _ in range(steps):
             observation, _, _, _ = env.step(act(observation))
-        env.submit_occupancy(checkpoint)
+        submitted = env.submit_occupancy(checkpoint)
     finally:
         env.close()
-    return steps * VISIT_LANES
+    return steps * VISIT_LANES, submitted.confidence_index
 
 
 def explorer(policy: Path, algorithm: str) -> Predict:
@@ -156,8 +163,11 @@ def explorer(policy: Path, algorithm: str) -> Predict:
 
 
 def _shifted(
-    progress: Callable[[TrainProgress], None] | None, done: int, total: int
+    progress: Callable[[TrainProgress], None] | None, done: int, total: int, known: Sequence[float | None]
 ) -> Callable[[TrainProgress], None] | None:
     if progress is None:
         return None
-    return lambda now: progress(replace(now, steps=done + now.steps, total_steps=max(total, done + now.steps)))
+    index = known[0] if known else None
+    return lambda now: progress(
+        replace(now, steps=done + now.steps, total_steps=max(total, done + now.steps), visited_confidence=index)
+    )

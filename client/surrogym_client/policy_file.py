@@ -38,6 +38,7 @@ class PolicyCard(BaseModel):
     virtual_steps: int | None = None
     seconds: float | None = None
     imagined_return: float | None = None
+    visited_confidence: tuple[float | None, ...] = ()
     settings: dict[str, Any] = Field(default_factory=dict)
     versions: dict[str, str] = Field(default_factory=dict)
 

@@ -15,6 +15,7 @@ from surrogym_client.lanes import Lanes, LaneStep, session_request
 from surrogym_client.spaces import space
 from surrogym_client.transport import HttpSurrogate, Retries, Timeouts, Transport
 from surrogym_shared.port import SurrogatePort
+from surrogym_shared.wire import SubmittedOccupancy
 
 
 class SurrogateVecEnv(VecEnv):
@@ -80,8 +81,9 @@ class SurrogateVecEnv(VecEnv):
         """Id of the session; another one after a loss."""
         return self._lanes.view.id
 
-    def submit_occupancy(self, checkpoint: str) -> int:
-        """Store the states visited so far under a name, for the design to weigh its queries by."""
+    def submit_occupancy(self, checkpoint: str) -> SubmittedOccupancy:
+        """Store the states visited so far under a name, for the design to weigh its queries by; says how many, and the
+        confidence index there."""
         return self.port.submit_occupancy(self.session, checkpoint)
 
     def reset(self) -> NDArray[Any]:

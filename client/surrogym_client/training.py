@@ -67,6 +67,7 @@ class TrainProgress:
     imagined_return: float | None  # at the last check: mean over virtual episodes from the declared starts
     penalty_share: float  # of the reward's size, since the last report
     episode_penalty: float | None = None  # what it takes off a training episode's return; mean of the last 100
+    visited_confidence: float | None = None  # the confidence index where the policy went in the last round
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,7 @@ class TrainResult:
     lost_episodes: int  # cut because the server lost the session
     settings: dict[str, Any]
     episode_penalty: float | None = None  # what it takes off a training episode's return; mean of the last 100
+    visited_confidence: tuple[float | None, ...] = ()  # the confidence index where the policy went, of each round
 
 
 class TrainingInterrupted(KeyboardInterrupt):

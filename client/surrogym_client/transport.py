@@ -149,10 +149,10 @@ class HttpSurrogate:
             self.connection.timeouts.rollout,
         )
 
-    def submit_occupancy(self, session: str, checkpoint: str) -> int:
+    def submit_occupancy(self, session: str, checkpoint: str) -> wire.SubmittedOccupancy:
         route = f"{_session(session)}/occupancy"
         body = wire.SubmitOccupancy(checkpoint=checkpoint).model_dump_json().encode()
-        return parse(wire.SubmittedOccupancy, self.connection.send("POST", route, body), route).states
+        return parse(wire.SubmittedOccupancy, self.connection.send("POST", route, body), route)
 
     def close(self, session: str) -> None:
         """End the session; with the last one, the sockets are closed too."""

@@ -27,7 +27,7 @@ from surrogym_server.surrogate.model import SurrogateModel
 from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import SurrogateFile
-from surrogym_shared.wire import OpenSession, SessionView
+from surrogym_shared.wire import OpenSession, SessionView, SubmittedOccupancy
 
 VERSION = 1
 
@@ -124,13 +124,12 @@ class LocalSurrogate:
         self._sessions[session] = live
         return results
 
-    def submit_occupancy(self, session: str, checkpoint: str) -> int:
-        """There is no design here to weigh; says how many states there are. ``checkpoint`` is not kept."""
-        del checkpoint
+    def submit_occupancy(self, session: str, checkpoint: str) -> SubmittedOccupancy:
+        """There is no design here to weigh; says how many states there are, and keeps none."""
         states = len(self.visited(session))
         if not states:
             raise NotReset("this session has visited no state yet: reset and step it first")
-        return states
+        return SubmittedOccupancy(checkpoint=checkpoint, states=states)
 
     def visited(self, session: str) -> NDArray[np.float64]:
         """The states that a session opened with occupancy visited, (v, C)."""

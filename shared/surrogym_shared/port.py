@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire import OpenSession, SessionView
+from surrogym_shared.wire import OpenSession, SessionView, SubmittedOccupancy
 
 Floats = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
@@ -80,8 +80,9 @@ class SurrogatePort(Protocol):
         """Step T times with actions (T, N, F), in one request."""
         ...
 
-    def submit_occupancy(self, session: str, checkpoint: str) -> int:
-        """Store the states this session visited under a name, for the design to weigh its queries by."""
+    def submit_occupancy(self, session: str, checkpoint: str) -> SubmittedOccupancy:
+        """Store the states this session visited under a name, for the design to weigh its queries by, and say how well
+        the model is known there."""
         ...
 
     def close(self, session: str) -> None:

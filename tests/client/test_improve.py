@@ -57,16 +57,18 @@ def sampling(url: str, name: str, spec: EnvironmentSpec) -> Iterator[None]:
 
 
 @pytest.mark.parametrize(
-    ("target", "initial", "real_steps", "rounds"),
-    [(0.9999999, 4, 4 + 2 * 3, 2), (0.501, 4, 6, 0)],
-    ids=["unsure", "ready"],
+    ("tolerance", "budget", "real_steps", "rounds"),
+    [(1e-9, 4, 4 + 2 * 3, 2), (1e3, 4, 4, 1), (1e3, 8, 6, 0)],
+    ids=["unsure", "known where it goes", "ready"],
 )
-def test_rounds_go_on_until_the_design_is_ready(
-    own_server: ServerProcess, tmp_path: Path, target: float, initial: int, real_steps: int, rounds: int
+def test_rounds_go_on_until_the_policys_region_is_known_or_the_design_is_ready(
+    own_server: ServerProcess, tmp_path: Path, tolerance: float, budget: int, real_steps: int, rounds: int
 ) -> None:
-    tight = {"theta": 1e-9, "speed": 1e-9, "reward": 1e-9} if rounds else {"theta": 1e3, "speed": 1e3, "reward": 1e3}
-    design = Design(initial=initial, budget=initial if rounds else 8, target=target, monte_carlo=64)
-    spec = pendulum().model_copy(update={"design": design, "tolerances": tight})
+    """A budget of 4 leaves nothing for the queries that a design needs to be ready, however sure its model is."""
+    initial, unsure, ready = 4, tolerance < 1, budget > 4
+    tolerances = dict.fromkeys(("theta", "speed", "reward"), tolerance)
+    design = Design(initial=initial, budget=budget, target=0.9999999 if unsure else 0.501, monte_carlo=64)
+    spec = pendulum().model_copy(update={"design": design, "tolerances": tolerances})
     name, seen = f"improve-{uuid4().hex[:8]}", []
     with Api(own_server.url) as api:
         api.create_surrogate(name, spec)
@@ -79,7 +81,11 @@ def test_rounds_go_on_until_the_design_is_ready(
     assert view.ledger.initial == initial
     assert result.virtual_steps == 400 + rounds * VISIT, "the steps asked for are those of all trainings"
     assert result.path.exists()
-    assert result.settings["session"] == (DRAWS if rounds else {}), "only an unsure model is trained on by draws"
+    assert result.settings["session"] == ({} if ready else DRAWS), "only an unsure model is trained on by draws"
+    assert len(result.visited_confidence) == rounds
+    assert [index >= design.target for index in result.visited_confidence] == (
+        [False, False] if unsure else [True] * rounds
+    )
     steps = [now.steps for now in seen]
     assert steps == sorted(steps)
     assert all(isinstance(now, TrainProgress) and now.steps <= now.total_steps for now in seen)

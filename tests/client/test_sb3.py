@@ -100,4 +100,4 @@ def test_an_algorithm_learns_on_it(remote: SurrogateVecEnv):
 
 
 def test_occupancy_is_submitted_for_the_session(remote: SurrogateVecEnv):
-    assert remote.submit_occupancy("first") == LANES
+    assert remote.submit_occupancy("first").states == LANES

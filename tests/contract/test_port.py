@@ -386,6 +386,6 @@ def test_visited_states_are_collected_when_asked_for(port: SurrogatePort, opened
         port.submit_occupancy(session, "too early")
     port.reset(session)
     port.rollout(session, actions(4))
-    assert port.submit_occupancy(session, "after four steps") == 5 * N
+    assert port.submit_occupancy(session, "after four steps").states == 5 * N
     with pytest.raises(harness.errors.InvalidInput):
         port.submit_occupancy(opened(), "nothing collected")

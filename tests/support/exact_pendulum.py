@@ -20,7 +20,7 @@ from surrogym_client.original.classic import pendulum
 from surrogym_shared.codes import Code
 from surrogym_shared.port import ResetResult, StepResult
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire import BoxSpace, OpenSession, SessionView
+from surrogym_shared.wire import BoxSpace, OpenSession, SessionView, SubmittedOccupancy
 
 TIME_LIMIT = 12
 SPINNING = 4.0
@@ -183,8 +183,8 @@ class ExactPendulum:
     def rollout(self, session: str, actions: np.ndarray) -> list[StepResult]:
         return [self.step(session, action) for action in actions]
 
-    def submit_occupancy(self, session: str, checkpoint: str) -> int:
-        return len(self._session(session).lanes)
+    def submit_occupancy(self, session: str, checkpoint: str) -> SubmittedOccupancy:
+        return SubmittedOccupancy(checkpoint=checkpoint, states=len(self._session(session).lanes))
 
     def close(self, session: str) -> None:
         self.sessions.pop(session, None)

@@ -97,7 +97,10 @@ def command(
     start_from: Annotated[Path | None, typer.Option(help="Policy file to go on from.")] = None,
     improve: Annotated[
         int,
-        typer.Option(min=0, help="More real queries in each round, where the policy goes, until the design is ready."),
+        typer.Option(
+            min=0,
+            help="More real queries in each round, where the policy goes, until that is known or the design ready.",
+        ),
     ] = 0,
     rounds: Annotated[int, typer.Option(min=1, help="Rounds of --improve, at most.")] = 3,
     log: Annotated[Log, typer.Option(help="Where the curves of the training go.")] = "tensorboard",
@@ -311,6 +314,7 @@ def _write_card(result: TrainResult, surrogate: str, spec: EnvironmentSpec, url:
         virtual_steps=result.virtual_steps,
         seconds=result.seconds,
         imagined_return=result.imagined_return,
+        visited_confidence=result.visited_confidence,
         settings=result.settings,
         versions=versions(),
     )

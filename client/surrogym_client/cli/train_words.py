@@ -21,7 +21,9 @@ def words_of_result(result: TrainResult) -> str:
 def words_of(now: dict[str, Any]) -> str:
     """One look at the training, from the fields of ``TrainProgress``."""
     penalty = f", penalty {now['episode_penalty']:.1f} an episode" if now["episode_penalty"] else ""
-    return f"{now['steps']} of {now['total_steps']} virtual steps{_imagined(now['imagined_return'])}{penalty}"
+    index = now.get("visited_confidence")
+    known = "" if index is None else f", confidence index {index:.4f} where the policy went"
+    return f"{now['steps']} of {now['total_steps']} virtual steps{_imagined(now['imagined_return'])}{penalty}{known}"
 
 
 def _imagined(value: float | None) -> str:

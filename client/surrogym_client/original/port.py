@@ -13,7 +13,15 @@ from surrogym_client.original.protocol import Array
 from surrogym_client.original.terms import observe
 from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
-from surrogym_shared.wire import ActionSpace, BoxSpace, DiscreteSpace, MultiDiscreteSpace, OpenSession, SessionView
+from surrogym_shared.wire import (
+    ActionSpace,
+    BoxSpace,
+    DiscreteSpace,
+    MultiDiscreteSpace,
+    OpenSession,
+    SessionView,
+    SubmittedOccupancy,
+)
 
 SEEDS = (2**20, 2**31)  # of resets: far from those of evaluations
 
@@ -123,10 +131,10 @@ class OriginalPort:
         """Step T times with actions (T, N, F)."""
         return [self.step(session, action) for action in actions]
 
-    def submit_occupancy(self, session: str, checkpoint: str) -> int:  # noqa: ARG002
+    def submit_occupancy(self, session: str, checkpoint: str) -> SubmittedOccupancy:
         """Nothing is stored: no design here weighs queries."""
         self._lanes(session)
-        return 0
+        return SubmittedOccupancy(checkpoint=checkpoint, states=0)
 
     def close(self, session: str) -> None:
         """End the episodes; closing twice is harmless."""

@@ -87,6 +87,7 @@ async def close_session(id: str, use: Use) -> Response:
 async def submit_occupancy(
     id: str, body: Annotated[SubmitOccupancy, example(examples.OCCUPANCY)], use: Use
 ) -> SubmittedOccupancy:
-    """Under a name, for ``improve`` to weigh by. Only a session opened with ``occupancy`` collects them."""
-    states = await use.sessions.submit_occupancy(id, body.checkpoint)
-    return SubmittedOccupancy(checkpoint=body.checkpoint, states=states)
+    """Under a name, for ``improve`` to weigh by; says how well the model is known there. Only a session opened with
+    ``occupancy`` collects them."""
+    states, index = await use.sessions.submit_occupancy(id, body.checkpoint)
+    return SubmittedOccupancy(checkpoint=body.checkpoint, states=states, confidence_index=index)

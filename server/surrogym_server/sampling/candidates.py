@@ -66,6 +66,11 @@ def input_probability(model: SurrogateModel, points: Points, states: Tensor | No
     return points.q.new_zeros(len(points))
 
 
+def under_random_actions(definition: EnvironmentDefinition, states: Tensor, rng: np.random.Generator) -> Points:
+    """States (v, C), each under an action drawn from its space."""
+    return Points(states, random_points(definition, len(states), rng)[1])
+
+
 def _visited(definition: EnvironmentDefinition, states: Tensor, count: int, rng: np.random.Generator) -> Points:
     chosen = torch.from_numpy(rng.integers(len(states), size=count))
-    return Points(states[chosen], random_points(definition, count, rng)[1])
+    return under_random_actions(definition, states[chosen], rng)

@@ -1,15 +1,16 @@
-"""query_uncertainty: everything the design knows about given points, as numpy for the edge."""
+"""What a model knows about given points, and about where policies go, as numpy for the edge."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from surrogym_server.sampling.candidates import input_probability
-from surrogym_server.sampling.confidence import deviations, log_model_uncertainty
+from surrogym_server.sampling.candidates import input_probability, under_random_actions
+from surrogym_server.sampling.confidence import certainty, deviations, log_model_uncertainty
 from surrogym_server.sampling.outlook import Points
 from surrogym_server.surrogate.model import SurrogateModel
 
@@ -38,3 +39,19 @@ def query_uncertainty(
     log_u_m = log_model_uncertainty(deviation, torch.from_numpy(tolerances))
     parts = (mean, deviation, log_u_m.exp(), log_p.exp(), log_u_m + log_p)
     return UncertaintyResult(*(p.numpy() for p in parts))
+
+
+def visited_confidence(model: SurrogateModel, states: Array, tolerances: Sequence[float]) -> float | None:
+    """Confidence index (eq. 8, 9) over visited states (v, C) within the sampling range instead of the Monte Carlo set,
+    the smallest over outputs, under tolerances (O,): how well a policy's own region is known. None: no state is within.
+
+    Each state is taken under one random action, as in the reference of the acquisition: a policy that learns tries
+    others than its own.
+    """
+    definition, visited = model.definition, torch.from_numpy(states)
+    visited = visited[definition.in_range(visited)]
+    if not len(visited):
+        return None
+    points = under_random_actions(definition, visited, np.random.default_rng(definition.design.seed))
+    sure = certainty(deviations(model, points.q, points.u), torch.tensor(tolerances, dtype=torch.float64))
+    return float(sure.mean(0).min())

@@ -30,6 +30,7 @@ from surrogym_server.engine.session import (
 from surrogym_server.engine.sessions import LiveSessions, Work
 from surrogym_server.errors import InvalidInput, NotReset, SurrogymError, TooLarge
 from surrogym_server.gp import CPU
+from surrogym_server.sampling.uncertainty import visited_confidence
 from surrogym_server.services.activity import SessionActivity, Tallies
 from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
@@ -172,8 +173,8 @@ class SessionService:
         request = Fingerprint("rollout", _columns(actions, 3))
         return await self._counted(id, seq, request, work, steps=len(actions))
 
-    async def submit_occupancy(self, id: str, checkpoint: str) -> int:
-        """Store the states that a session visited under a name; returns how many.
+    async def submit_occupancy(self, id: str, checkpoint: str) -> tuple[int, float | None]:
+        """Store the states that a session visited under a name; returns how many, and the confidence index there.
 
         Raises:
             InvalidInput: the session was opened without occupancy.
@@ -186,7 +187,7 @@ class SessionService:
         if not len(states):
             raise NotReset("this session has visited no state yet: reset and step it first")
         await asyncio.to_thread(self._storage.occupancy.put, session.surrogate, checkpoint, states)
-        return len(states)
+        return len(states), await asyncio.to_thread(self._confidence_index, session, states)
 
     def alive(self) -> tuple[int, int]:
         """How many sessions are open, and how many lanes they have."""
@@ -272,6 +273,12 @@ class SessionService:
             lambda version: self._models.get(session.surrogate_id, version).on(self._device),
             self._latest(session),
         )
+
+    def _confidence_index(self, session: Session, states: Array) -> float | None:
+        version = self._latest(session)
+        model = self._models.get(session.surrogate_id, version)
+        fidelity = self._storage.models.get(session.surrogate, version).fidelity
+        return visited_confidence(model, states, [output["tolerance"] for output in fidelity["outputs"]])
 
     def _latest(self, session: Session) -> int:
         return self._models.latest(session.surrogate_id) if session.model == "latest" else session.model

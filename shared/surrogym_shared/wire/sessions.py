@@ -181,3 +181,8 @@ class SubmitOccupancy(Request):
 class SubmittedOccupancy(Reply):
     checkpoint: str
     states: int = Field(description="how many visited coordinates were stored")
+    confidence_index: float | None = Field(
+        default=None,
+        description="smallest over outputs, with tolerances, of the session's model over these states under random "
+        "actions; None: all of them lie outside the sampling range, or there is no design here",
+    )

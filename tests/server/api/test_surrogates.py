@@ -65,7 +65,8 @@ def test_improve_by_the_states_a_policy_visited(client: httpx.Client, name: str)
     for what, body in (("reset", {}), ("step", {"action": [[0.0]] * 4})):
         client.post(f"/v1/sessions/{opened['id']}/{what}", json=body).raise_for_status()
     submitted = client.post(f"/v1/sessions/{opened['id']}/occupancy", json={"checkpoint": "first"}).json()
-    assert submitted == {"checkpoint": "first", "states": 8}
+    assert (submitted["checkpoint"], submitted["states"]) == ("first", 8)
+    assert 0.5 <= submitted["confidence_index"] <= 1
     body = {"queries": 1, "checkpoint": "first"}
     client.post(f"/v1/surrogates/{name}/improve", json=body).raise_for_status()
     assert pendulum.finish(client, name)["samples"] == 7

@@ -22,10 +22,12 @@ from surrogym_server.sampling.confidence import (
     log_model_uncertainty,
 )
 from surrogym_server.sampling.occupancy import log_occupancy
-from surrogym_server.sampling.uncertainty import query_uncertainty
+from surrogym_server.sampling.uncertainty import query_uncertainty, visited_confidence
 from surrogym_server.surrogate.features import FeatureMap
 from surrogym_server.surrogate.learn import learn
 from surrogym_server.surrogate.model import OutputModel
+
+TIGHT = [1e-6, 1e-6, 1e-6]
 
 
 def tensor(*values: float) -> torch.Tensor:
@@ -109,3 +111,20 @@ def test_query_uncertainty_says_all_of_it(model, points, unseen):
     np.testing.assert_allclose(visited.input_probability, np.repeat(p[:, None], 3, 1))
     index = visited.model_uncertainty * visited.input_probability
     np.testing.assert_allclose(np.exp(visited.log_uncertainty_index), index, rtol=1e-9)
+
+
+def test_confidence_where_a_policy_goes_is_the_worst_outputs_over_its_states(model):
+    states = np.array([[0.0, 1.0], [1.0, -2.0], [0.5, 0.5]])
+    alone = [visited_confidence(model, states, [t if i == j else 1e9 for j in range(3)]) for i, t in enumerate(TIGHT)]
+    assert visited_confidence(model, states, TIGHT) == min(alone)
+    assert max(alone) > min(alone)
+    assert visited_confidence(model, states, [1e9] * 3) == 1.0
+    assert visited_confidence(model, states, [1e-15] * 3) == pytest.approx(0.5)
+
+
+def test_states_outside_the_sampling_range_are_none_of_a_policys_region(model):
+    within, outside = [0.5, 0.5], [0.5, 9.0]
+    assert visited_confidence(model, np.array([within, outside]), TIGHT) == pytest.approx(
+        visited_confidence(model, np.array([within]), TIGHT)
+    )
+    assert visited_confidence(model, np.array([outside]), TIGHT) is None
