@@ -82,7 +82,7 @@ async def close_session(id: str, use: Use) -> Response:
     "/sessions/{id}/occupancy",
     summary="Submit the visited states",
     dependencies=[TRAIN],
-    responses=documented(*SESSION_ERRORS, Code.NOT_RESET),
+    responses=documented(*SESSION_ERRORS, Code.NOT_RESET, Code.UNKNOWN_SURROGATE),
 )
 async def submit_occupancy(
     id: str, body: Annotated[SubmitOccupancy, example(examples.OCCUPANCY)], use: Use

@@ -41,17 +41,16 @@ def query_uncertainty(
     return UncertaintyResult(*(p.numpy() for p in parts))
 
 
-def visited_confidence(model: SurrogateModel, states: Array, tolerances: Sequence[float]) -> float | None:
-    """Confidence index (eq. 8, 9) over visited states (v, C) within the sampling range instead of the Monte Carlo set,
-    the smallest over outputs, under tolerances (O,): how well a policy's own region is known. None: no state is within.
+def visited_confidence(model: SurrogateModel, states: Array, tolerances: Sequence[float]) -> float:
+    """Confidence index (eq. 8, 9) over visited states (v, C) instead of the Monte Carlo set, the smallest over outputs,
+    under tolerances (O,): how well a policy's own region is known.
 
+    States outside the sampling range count as well: nothing is asked there, and what is not known there stays unknown.
     Each state is taken under one random action, as in the reference of the acquisition: a policy that learns tries
     others than its own.
     """
-    definition, visited = model.definition, torch.from_numpy(states)
-    visited = visited[definition.in_range(visited)]
-    if not len(visited):
-        return None
-    points = under_random_actions(definition, visited, np.random.default_rng(definition.design.seed))
+    definition = model.definition
+    rng = np.random.default_rng(definition.design.seed)
+    points = under_random_actions(definition, torch.from_numpy(states), rng)
     sure = certainty(deviations(model, points.q, points.u), torch.tensor(tolerances, dtype=torch.float64))
     return float(sure.mean(0).min())

@@ -173,12 +173,13 @@ class SessionService:
         request = Fingerprint("rollout", _columns(actions, 3))
         return await self._counted(id, seq, request, work, steps=len(actions))
 
-    async def submit_occupancy(self, id: str, checkpoint: str) -> tuple[int, float | None]:
+    async def submit_occupancy(self, id: str, checkpoint: str) -> tuple[int, float]:
         """Store the states that a session visited under a name; returns how many, and the confidence index there.
 
         Raises:
             InvalidInput: the session was opened without occupancy.
             NotReset: nothing was visited yet.
+            UnknownSurrogate: it was deleted by another server.
         """
         session = self._live.get(id)
         if session.visited is None:
@@ -186,8 +187,7 @@ class SessionService:
         states = session.visited.states
         if not len(states):
             raise NotReset("this session has visited no state yet: reset and step it first")
-        await asyncio.to_thread(self._storage.occupancy.put, session.surrogate, checkpoint, states)
-        return len(states), await asyncio.to_thread(self._confidence_index, session, states)
+        return len(states), await asyncio.to_thread(self._submit, session, checkpoint, states)
 
     def alive(self) -> tuple[int, int]:
         """How many sessions are open, and how many lanes they have."""
@@ -274,11 +274,13 @@ class SessionService:
             self._latest(session),
         )
 
-    def _confidence_index(self, session: Session, states: Array) -> float | None:
-        version = self._latest(session)
-        model = self._models.get(session.surrogate_id, version)
-        fidelity = self._storage.models.get(session.surrogate, version).fidelity
-        return visited_confidence(model, states, [output["tolerance"] for output in fidelity["outputs"]])
+    def _submit(self, session: Session, checkpoint: str, states: Array) -> float:
+        """Store visited states; the confidence index there. By the id: the name may be another surrogate's by now."""
+        name, version = self._storage.surrogates.name_of(session.surrogate_id), self._latest(session)
+        tolerances = [output["tolerance"] for output in self._storage.models.get(name, version).fidelity["outputs"]]
+        index = visited_confidence(self._models.get(session.surrogate_id, version), states, tolerances)
+        self._storage.occupancy.put(name, checkpoint, states)
+        return index
 
     def _latest(self, session: Session) -> int:
         return self._models.latest(session.surrogate_id) if session.model == "latest" else session.model

@@ -183,6 +183,6 @@ class SubmittedOccupancy(Reply):
     states: int = Field(description="how many visited coordinates were stored")
     confidence_index: float | None = Field(
         default=None,
-        description="smallest over outputs, with tolerances, of the session's model over these states under random "
-        "actions; None: all of them lie outside the sampling range, or there is no design here",
+        description="of the session's model over these states under random actions: the smallest over outputs, with "
+        "tolerances. None: there is no design here",
     )

@@ -122,9 +122,10 @@ def test_confidence_where_a_policy_goes_is_the_worst_outputs_over_its_states(mod
     assert visited_confidence(model, states, [1e-15] * 3) == pytest.approx(0.5)
 
 
-def test_states_outside_the_sampling_range_are_none_of_a_policys_region(model):
-    within, outside = [0.5, 0.5], [0.5, 9.0]
-    assert visited_confidence(model, np.array([within, outside]), TIGHT) == pytest.approx(
-        visited_confidence(model, np.array([within]), TIGHT)
-    )
-    assert visited_confidence(model, np.array([outside]), TIGHT) is None
+def test_a_policy_that_runs_out_of_the_sampling_range_goes_where_nothing_is_known(definition, few, unseen):
+    more = replace(unseen, **{n: getattr(unseen, n)[:10] for n in unseen.__dataclass_fields__})
+    model, within = learn(definition, join(few, more)).model, np.array([[0.5, 0.5]])
+    known = visited_confidence(model, within, [1e-2] * 3)
+    fled = visited_confidence(model, np.concatenate([within, [[0.5, 800.0]]]), [1e-2] * 3)
+    assert known > 0.999
+    assert fled < 0.8
