@@ -62,6 +62,7 @@ ELSEWHERE = {
 ELSEWHERE_WITH = {  # a word anywhere in the line
     "--watch": "tests/cli/test_status.py",
     "--install-completion": "tests/cli/test_completion.py",
+    "--improve": "tests/client/test_improve.py",
     "wandb": "tests/examples/test_trackers.py",
     "mlflow": "tests/examples/test_trackers.py",
 }

@@ -38,6 +38,8 @@ Propagation = Literal["mean", "sample"]
 Weighting = Literal["inverse_variance", "uniform"]
 Log = Literal["tensorboard", "wandb", "mlflow", "none"]
 
+NOTHING_YET = "interrupted before there was a policy; nothing was saved, and the same command begins anew"
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -52,7 +54,11 @@ def command(
     ] = "PPO",
     steps: Annotated[
         int | None,
-        typer.Option(min=1, help="Virtual steps, all rounds of --improve included. [default: from the algorithm]"),
+        typer.Option(
+            min=1,
+            help="Virtual steps, those of all rounds of --improve included; seeing where a round's policy goes comes "
+            "on top. [default: from the algorithm]",
+        ),
     ] = None,
     num_envs: Annotated[
         int | None, typer.Option(min=1, help="Lanes of the session. [default: from the specification]")
@@ -99,7 +105,8 @@ def command(
         int,
         typer.Option(
             min=0,
-            help="More real queries in each round, where the policy goes, until that is known or the design ready.",
+            help="More real queries in each round, where the policy goes, until that is known or the design ready. A "
+            "sampler has to be running.",
         ),
     ] = 0,
     rounds: Annotated[int, typer.Option(min=1, help="Rounds of --improve, at most.")] = 3,
@@ -124,7 +131,7 @@ def command(
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.cli.train_words import words_of_result
     from surrogym_client.lifetime import exit_with_parent as watch_parent
-    from surrogym_shared.terminal import give, progress
+    from surrogym_shared.terminal import give, on_interrupt, progress
 
     if exit_with_parent:
         watch_parent()
@@ -142,7 +149,7 @@ def command(
         penalty=penalty,
     )
     spec, url = _trainable(surrogate, server, token, wait, quiet=quiet)
-    with progress("prepare", quiet=quiet) as update:
+    with on_interrupt(lambda: NOTHING_YET), progress("prepare", quiet=quiet) as update:
         update(None, "importing Stable-Baselines3")
         from surrogym_client.train import TrainSettings  # torch; imported once there is something to train on
 
@@ -159,12 +166,12 @@ def command(
         session=session,
     )
     card = partial(_write_card, surrogate=surrogate, spec=spec, url=url, seed=seed)
-    with _keeping(card, surrogate):
+    with _keeping(card, f"{surrogate} --improve {improve} --rounds {rounds}" if improve else surrogate):
         result = _train(
             url, token, surrogate, out, settings, (improve, rounds) if improve else None, progress_file, quiet=quiet
         )
     summary = card(result)
-    give(summary, lambda: words_of_result(result), as_json=as_json, quiet=quiet)
+    give(summary, lambda: words_of_result(result, closed_loop=improve > 0), as_json=as_json, quiet=quiet)
 
 
 def _hyperparameters(chosen: list[str]) -> dict[str, Any]:
@@ -189,8 +196,9 @@ def _given(**options: Any) -> dict[str, Any]:
 
 
 @contextmanager
-def _keeping(write_card: Callable[[TrainResult], object], surrogate: str) -> Iterator[None]:
+def _keeping(write_card: Callable[[TrainResult], object], asked: str) -> Iterator[None]:
     """Say after Ctrl-C what there is to go on with; a policy that was saved gets its card."""
+    from surrogym_client.cli.train_words import words_of_interruption
     from surrogym_client.training import TrainingInterrupted
     from surrogym_shared.terminal import say
 
@@ -199,13 +207,10 @@ def _keeping(write_card: Callable[[TrainResult], object], surrogate: str) -> Ite
     except TrainingInterrupted as interruption:
         result = interruption.result
         write_card(result)
-        say(
-            f"interrupted after {result.virtual_steps} virtual steps; the policy so far is in {result.path}; to go on: "
-            f"surrogym train {surrogate} --start-from {result.path} --out {result.path}"
-        )
+        say(words_of_interruption(result, asked))
         raise
     except KeyboardInterrupt:
-        say("interrupted before there was a policy; nothing was saved, and the same command begins anew")
+        say(NOTHING_YET)
         raise
 
 
@@ -297,7 +302,7 @@ def _waiting(update: Update) -> Callable[[SurrogateView], None]:
     """Shows a round's real steps while a sampler takes them; the bar stays where the training left it."""
     from surrogym_client.waiting import words_of_design
 
-    return lambda view: update(None, f"waiting for a sampler: {words_of_design(view)}")
+    return lambda view: update(None, f"waiting for a sampler (surrogym sample {view.name}): {words_of_design(view)}")
 
 
 def _write_card(result: TrainResult, surrogate: str, spec: EnvironmentSpec, url: str, seed: int) -> dict[str, Any]:

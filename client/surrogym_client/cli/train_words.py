@@ -2,28 +2,48 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from surrogym_client.training import TrainResult
 
 
-def words_of_result(result: TrainResult) -> str:
+def words_of_result(result: TrainResult, *, closed_loop: bool = False) -> str:
     """What a training gave, and what is next."""
     lost = result.lost_episodes
     cut = f"; {lost} episode{'s' * (lost > 1)} cut short, lost with the server's sessions" if lost else ""
     return (
         f"{result.path}: {result.virtual_steps} virtual steps in {result.seconds:.1f} s"
-        f"{_imagined(result.imagined_return)}{cut}; next: surrogym evaluate {result.path}"
+        f"{_imagined(result.imagined_return)}{cut}{_loop(result.visited_confidence) if closed_loop else ''}"
+        f"; next: surrogym evaluate {result.path}"
+    )
+
+
+def words_of_interruption(result: TrainResult, asked: str) -> str:
+    """What Ctrl-C left, and how to go on; ``asked`` is the surrogate, with the options of the closed loop if any."""
+    return (
+        f"interrupted after {result.virtual_steps} virtual steps; the policy so far is in {result.path}; to go on: "
+        f"surrogym train {asked} --start-from {result.path} --out {result.path}"
     )
 
 
 def words_of(now: dict[str, Any]) -> str:
     """One look at the training, from the fields of ``TrainProgress``."""
     penalty = f", penalty {now['episode_penalty']:.1f} an episode" if now["episode_penalty"] else ""
-    index = now.get("visited_confidence")
-    known = "" if index is None else f", confidence index {index:.4f} where the policy went"
+    known = _known(now.get("visited_confidence"))
     return f"{now['steps']} of {now['total_steps']} virtual steps{_imagined(now['imagined_return'])}{penalty}{known}"
+
+
+def _loop(rounds: Sequence[float | None]) -> str:
+    """How the closed loop went, from the confidence index of each round."""
+    if not rounds:
+        return "; the design was ready, no round was needed"
+    return f"; {len(rounds)} round{'s' * (len(rounds) > 1)}{_known(rounds[-1])}"
+
+
+def _known(index: float | None) -> str:
+    return "" if index is None else f", confidence index {index:.4f} where the policy went"
 
 
 def _imagined(value: float | None) -> str:

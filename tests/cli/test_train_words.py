@@ -1,0 +1,30 @@
+"""What ``surrogym train`` says at its end: how the closed loop went, and after Ctrl-C how to go on with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from surrogym_client.cli.train_words import words_of, words_of_interruption, words_of_result
+from surrogym_client.training import TrainProgress, TrainResult
+
+RESULT = TrainResult(Path("p.zip"), "PPO", 512, 1.0, -150.0, 0, {})
+
+
+def test_a_training_without_rounds_says_nothing_of_them():
+    assert words_of_result(RESULT) == (
+        "p.zip: 512 virtual steps in 1.0 s, imagined return -150.0 (in the surrogate); next: surrogym evaluate p.zip"
+    )
+
+
+def test_the_closed_loop_says_how_well_the_policys_region_is_known():
+    assert "; the design was ready, no round was needed; next" in words_of_result(RESULT, closed_loop=True)
+    after = replace(RESULT, visited_confidence=(0.9, 0.99914))
+    assert "; 2 rounds, confidence index 0.9991 where the policy went; next" in words_of_result(after, closed_loop=True)
+    now = TrainProgress(100, 512, None, 0.0, visited_confidence=0.9)
+    assert words_of(vars(now)) == "100 of 512 virtual steps, confidence index 0.9000 where the policy went"
+
+
+def test_after_an_interruption_the_closed_loop_is_asked_for_again():
+    words = words_of_interruption(RESULT, "cart --improve 5 --rounds 3")
+    assert words.endswith("to go on: surrogym train cart --improve 5 --rounds 3 --start-from p.zip --out p.zip")
