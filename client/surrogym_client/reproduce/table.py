@@ -47,13 +47,18 @@ Seconds: median (largest). A bootstrap of five seeds is narrower than its name.
 def report(rows: Sequence[Row]) -> str:
     """Targets, the main table, the questions that pairs of arms answer, and where the rows come from."""
     groups = grouped(rows)
-    parts = [_targets(groups), markdown([HEADING, *(_line(group, of) for group, of in groups.items())]), NOTES]
+    parts = [_targets(groups), summary(rows), NOTES]
     if contrasts := _contrasts(groups):
         parts += [
             "Difference of interquartile means, first arm minus second, with a 95 % bootstrap interval:\n",
             contrasts,
         ]
     return "\n".join([*parts, _origin(rows)])
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """The main table: a line for each task, arm and budget."""
+    return markdown([HEADING, *(_line(group, of) for group, of in grouped(rows).items())])
 
 
 def grouped(rows: Sequence[Row]) -> dict[Group, list[Row]]:
