@@ -93,17 +93,20 @@ def condition(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
 
 
 def factorise(k: Tensor) -> tuple[Tensor, float]:
-    """Lower Cholesky factor of k (n, n) and its jitter: 0, else 1e-10 of the mean diagonal, times ten each try."""
+    """Lower Cholesky factor of k (n, n) and its jitter: 0, else 1e-10 of the mean diagonal, times ten each try.
+
+    It lies in rows, as a stored one does: LAPACK's columns would give a fresh model other last bits than a loaded one.
+    """
     factor, info = torch.linalg.cholesky_ex(k)
     if not bool(info):
-        return factor, 0.0
+        return factor.contiguous(), 0.0
     scale, relative = float(k.diagonal().mean()), 1e-10
     while relative <= MAX_JITTER:
         factor, info = torch.linalg.cholesky_ex(
             k + relative * scale * torch.eye(len(k), dtype=k.dtype, device=k.device)
         )
         if not bool(info):
-            return factor, relative * scale
+            return factor.contiguous(), relative * scale
         relative *= 10
     raise NumericalFailure(f"covariance of {len(k)} points is singular: no jitter up to {MAX_JITTER:g} repairs it")
 
