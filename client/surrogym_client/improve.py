@@ -79,7 +79,9 @@ def train_and_improve(
 
     def learn(steps: int, whole: int, settings: TrainSettings = settings) -> None:
         now = replace(settings, total_steps=steps, start_from=out if rounds else settings.start_from)
-        rounds.append(train(port, out, now, _shifted(progress, _steps(rounds) + visited, whole, known[-1:])))
+        rounds.append(
+            train(port, out, now, _shifted(progress, _steps(rounds) + visited, whole, known[-1] if known else None))
+        )
 
     try:
         for _ in range(improve.rounds):
@@ -163,11 +165,10 @@ def explorer(policy: Path, algorithm: str) -> Predict:
 
 
 def _shifted(
-    progress: Callable[[TrainProgress], None] | None, done: int, total: int, known: Sequence[float | None]
+    progress: Callable[[TrainProgress], None] | None, done: int, total: int, known: float | None
 ) -> Callable[[TrainProgress], None] | None:
     if progress is None:
         return None
-    index = known[0] if known else None
     return lambda now: progress(
-        replace(now, steps=done + now.steps, total_steps=max(total, done + now.steps), visited_confidence=index)
+        replace(now, steps=done + now.steps, total_steps=max(total, done + now.steps), visited_confidence=known)
     )

@@ -96,8 +96,7 @@ class ModelService:
         """Uncertainty at q (n, C) under u (n, F), weighted by the latest occupancy; raises as ``predict``."""
         version, model = self._model(name, version)
         q, u = check_points(model.definition, q, u)
-        fidelity = self._storage.models.get(name, version).fidelity
-        tolerances = np.array([output["tolerance"] for output in fidelity["outputs"]])
+        tolerances = np.array(self._storage.models.get(name, version).tolerances)
         occupancy = self._storage.occupancy.latest(name)
         states = None if occupancy is None else occupancy.states
         return Said(version, model.definition.outputs, query_uncertainty(model, q, u, tolerances, states))

@@ -277,7 +277,7 @@ class SessionService:
     def _submit(self, session: Session, checkpoint: str, states: Array) -> float:
         """Store visited states; the confidence index there. By the id: the name may be another surrogate's by now."""
         name, version = self._storage.surrogates.name_of(session.surrogate_id), self._latest(session)
-        tolerances = [output["tolerance"] for output in self._storage.models.get(name, version).fidelity["outputs"]]
+        tolerances = self._storage.models.get(name, version).tolerances
         index = visited_confidence(self._models.get(session.surrogate_id, version), states, tolerances)
         self._storage.occupancy.put(name, checkpoint, states)
         return index

@@ -100,6 +100,11 @@ class ModelRecord:
     description: JSON
     fit_seconds: float
 
+    @property
+    def tolerances(self) -> list[float]:
+        """Of each output, in its units."""
+        return [output["tolerance"] for output in self.fidelity["outputs"]]
+
 
 @dataclass(frozen=True)
 class NewDesign:
