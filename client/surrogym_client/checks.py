@@ -1,4 +1,5 @@
-"""Checks of a training by imagined return: the best policy is kept, a network that learns nothing is given up."""
+"""Checks of a training by imagined return: the best policy is kept, a network that learns nothing is given up, and a
+training goes on while it gains."""
 
 from __future__ import annotations
 
@@ -16,6 +17,8 @@ from surrogym_client.training import CHECKS, TrainProgress
 PATIENCE = 0.25  # of the steps, in which a network has to earn more than it did untrained
 PROOF = 0.5  # of the steps, in which it has to earn half of what the saved policy earns beyond that
 PATIENT_ROLLOUTS = 8  # at least
+LATELY = 0.25  # of the steps, the last of them
+GAIN = 0.01  # of what the best policy earns beyond an untrained one: a training that gained more lately is not done
 
 
 class Checks(BaseCallback):
@@ -24,6 +27,8 @@ class Checks(BaseCallback):
     A network that earns no more than an untrained one after a quarter of the steps is given up, while there is as much
     left for another: rewards that come at the end alone leave some networks without a first success, and they stop
     exploring before they have one. Where a saved policy waits, a network has half of the steps to come half as far.
+
+    A training that still gained in its last quarter can take as many steps again, once.
 
     Args:
         total: virtual steps of the training.
@@ -42,6 +47,7 @@ class Checks(BaseCallback):
         saved: BaseAlgorithm | None = None,
     ) -> None:
         super().__init__()
+        self._planned = total
         self._total = total
         self._progress = progress
         self._imagine = imagine
@@ -50,6 +56,7 @@ class Checks(BaseCallback):
         self._spent = 0  # by the networks before
         self._rollouts = 0  # of this one
         self._checked = 0  # checks made
+        self._bests: list[tuple[int, float]] = []  # steps, and the best imagined return by then
         self._latest: float | None = None
         self._kept: dict[str, Any] = {}
         self._penalty = self._size = 0.0
@@ -66,6 +73,25 @@ class Checks(BaseCallback):
     @property
     def left(self) -> int:
         return self._total - self.steps
+
+    @property
+    def prolonged(self) -> bool:
+        return self._total > self._planned
+
+    def prolong(self) -> bool:
+        """Take as many steps again, if that was not done yet and the training still gains."""
+        if self.prolonged or not self.gaining:
+            return False
+        self._total += self._planned
+        return True
+
+    @property
+    def gaining(self) -> bool:
+        """Whether the best policy gained in the last quarter of the steps, more than a hundredth of what it earns."""
+        if self.best is None or self.best <= self._floor:
+            return False
+        before = [best for steps, best in self._bests if steps <= self._total - LATELY * self._planned]
+        return self.best - (before[-1] if before else self._floor) > GAIN * (self.best - self._floor)
 
     @property
     def episode_penalty(self) -> float | None:
@@ -104,7 +130,7 @@ class Checks(BaseCallback):
         self._penalty = self._size = 0.0
         self._rollouts += 1
         self.logger.record("surrogym/penalty_share", share)
-        if self.steps * CHECKS >= (self._checked + 1) * self._total:
+        if self.steps * CHECKS >= (self._checked + 1) * self._planned:
             self._check()
             self.given_up = self._hopeless()
         if self._progress is not None:
@@ -118,11 +144,13 @@ class Checks(BaseCallback):
             self._check()
 
     def _check(self) -> None:
-        self._checked = int(self.steps * CHECKS / self._total)
+        self._checked = int(self.steps * CHECKS / self._planned)
         self._latest = self._imagine(self.model)
         self.logger.record("surrogym/imagined_return", self._latest)
         if self.best is None or self._latest >= self.best:
             self._keep(self._latest, self.model)
+        assert self.best is not None
+        self._bests.append((self.steps, self.best))
 
     def _keep(self, earned: float, learner: BaseAlgorithm) -> None:
         self.best = earned
@@ -130,6 +158,6 @@ class Checks(BaseCallback):
 
     def _hopeless(self) -> bool:
         assert self.best is not None
-        tried = self._rollouts >= PATIENT_ROLLOUTS and self.num_timesteps >= PATIENCE * self._total
-        bar = self._half_way if self.num_timesteps >= PROOF * self._total else self._floor
-        return tried and self.best <= bar and self.left >= PATIENCE * self._total
+        tried = self._rollouts >= PATIENT_ROLLOUTS and self.num_timesteps >= PATIENCE * self._planned
+        bar = self._half_way if self.num_timesteps >= PROOF * self._planned else self._floor
+        return tried and self.best <= bar and self._planned - self.steps >= PATIENCE * self._planned

@@ -19,7 +19,7 @@ from surrogym_client.train import (
     planned_steps,
     train,
 )
-from surrogym_client.training import SUGGESTED_STEPS, chosen_for
+from surrogym_client.training import SUGGESTED_STEPS, chosen_for, prolongs
 from surrogym_client.waiting import wait_for_design
 from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
@@ -56,7 +56,7 @@ def train_and_improve(
     same seeds ask the same queries. Where the model is as sure over these states as the design wants it over the whole
     range, nothing more is asked. The rounds move lanes by the mean: their policies go where the model promises most.
     The last training is ``chosen_for`` what the design came to; by draws it begins anew, as a network that has learned
-    from wrong models stays with what these taught it.
+    from wrong models stays with what these taught it. It alone is prolonged: what a round's policy lacks, the next has.
 
     Args:
         api: the server.
@@ -77,7 +77,7 @@ def train_and_improve(
     visited, known = 0, list[float | None]()
     whole, part = shares(settings, improve.rounds)
 
-    def learn(steps: int, whole: int, settings: TrainSettings = settings) -> None:
+    def learn(steps: int, whole: int, settings: TrainSettings) -> None:
         now = replace(settings, total_steps=steps, start_from=out if rounds else settings.start_from)
         rounds.append(
             train(port, out, now, _shifted(progress, _steps(rounds) + visited, whole, known[-1] if known else None))
@@ -88,7 +88,7 @@ def train_and_improve(
             view = api.surrogate(name)
             if view.phase == "ready":
                 break
-            learn(part, whole)
+            learn(part, whole, replace(settings, prolong=False))
             checkpoint = f"seed {settings.seed}, round {view.round}"
             steps, index = visit(port, out, settings, checkpoint)
             visited, known = visited + steps, [*known, index]
@@ -98,8 +98,10 @@ def train_and_improve(
             wait_for_design(api, name, improve.patience_seconds, waiting, after_round=view.round)
         left = whole - _steps(rounds)
         left = max(left if settings.total_steps else min(planned_steps(settings), left), 1)
-        last = chosen_for(api.surrogate(name), settings)
-        last = replace(last, anew=last is not settings and settings.start_from is None)
+        view = api.surrogate(name)
+        last = chosen_for(view, settings)
+        anew = last is not settings and settings.start_from is None
+        last = replace(last, anew=anew, prolong=prolongs(settings, view.spec))
         learn(left, _steps(rounds) + visited + left, last)
     except TrainingInterrupted as interruption:
         raise TrainingInterrupted(_together([*rounds, interruption.result], visited, known)) from None
@@ -170,5 +172,5 @@ def _shifted(
     if progress is None:
         return None
     return lambda now: progress(
-        replace(now, steps=done + now.steps, total_steps=max(total, done + now.steps), visited_confidence=known)
+        replace(now, steps=done + now.steps, total_steps=max(total, done + now.total_steps), visited_confidence=known)
     )

@@ -35,6 +35,7 @@ from surrogym_client.training import (
     TrainProgress,
     TrainResult,
     TrainSettings,
+    prolongs,
 )
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import EnvironmentSpec
@@ -115,7 +116,7 @@ def train(
             return made(attempt) if attempt else untrained
 
         with tracking(settings, out) as callbacks:
-            learner, whole = _learned(network, checks, callbacks)
+            learner, whole = _learned(network, checks, callbacks, prolong=prolongs(settings, spec))
         checks.restore_best()
         out.parent.mkdir(parents=True, exist_ok=True)
         learner.save(out)
@@ -129,6 +130,7 @@ def train(
         imagined_return=checks.best,
         episode_penalty=checks.episode_penalty,
         lost_episodes=checks.lost,
+        gaining=checks.gaining,
         settings={**asdict(settings), "num_envs": num_envs, "total_steps": total, **effective(learner)},
     )
     out.with_suffix(".json").write_text(json.dumps(asdict(result), indent=2, default=str) + "\n")
@@ -138,7 +140,7 @@ def train(
 
 
 def _learned(
-    network: Callable[[int], BaseAlgorithm], checks: Checks, callbacks: Sequence[BaseCallback]
+    network: Callable[[int], BaseAlgorithm], checks: Checks, callbacks: Sequence[BaseCallback], *, prolong: bool
 ) -> tuple[BaseAlgorithm, bool]:
     """The network that learned last, and whether the training came to its end, and not to an interruption."""
     for attempt in itertools.count():
@@ -146,14 +148,20 @@ def _learned(
         if learner.tensorboard_log is None:  # else Stable-Baselines3 makes an empty folder among the temporary files
             learner.set_logger(Logger(folder=None, output_formats=[]))
         try:
-            learner.learn(
-                _whole_rollouts(learner, checks.left), callback=[checks, *callbacks], reset_num_timesteps=True
-            )
+            _learn(learner, checks, callbacks)
+            if prolong and not checks.given_up and checks.prolong():
+                _learn(learner, checks, callbacks)
         except KeyboardInterrupt:
             return learner, False
         if not checks.given_up:
             return learner, True
     raise AssertionError("unreachable")
+
+
+def _learn(learner: BaseAlgorithm, checks: Checks, callbacks: Sequence[BaseCallback]) -> None:
+    """What is left of the steps. A training that is prolonged goes on with its learning rate from the middle."""
+    steps = _whole_rollouts(learner, checks.left)
+    learner.learn(steps, callback=[checks, *callbacks], reset_num_timesteps=not checks.prolonged)
 
 
 def algorithm_by_name(name: str) -> type[BaseAlgorithm]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import SurrogateView
 
 CHECKS = 12  # of the imagined return in one training; the best policy is kept
@@ -32,6 +33,7 @@ class TrainSettings:
     start_box: float = 0.5
     start_from: Path | None = None  # go on from a saved policy
     anew: bool = False  # begin with a new network, and go on from the saved policy only where that falls short
+    prolong: bool | None = None  # as many steps again while it still gains; None: as ``prolongs``
     threads: int = 1
     tracker: Tracker | None = None  # of Stable-Baselines3's algorithms; CMA-ES has none
     tensorboard: Path | None = (
@@ -60,6 +62,14 @@ def chosen_for(view: SurrogateView, settings: TrainSettings) -> TrainSettings:
     return replace(settings, session=DRAWS | settings.session, judge=FUNCTIONS | other)
 
 
+def prolongs(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
+    """Whether a training that still gains at its end takes as many steps again: where nobody said so, if no number of
+    steps was asked for either. Preset ``paper`` has its cap."""
+    if settings.prolong is not None:
+        return settings.prolong
+    return settings.total_steps is None and spec.design.preset != "paper"
+
+
 @dataclass(frozen=True)
 class TrainProgress:
     steps: int
@@ -80,6 +90,7 @@ class TrainResult:
     lost_episodes: int  # cut because the server lost the session
     settings: dict[str, Any]
     episode_penalty: float | None = None  # what it takes off a training episode's return; mean of the last 100
+    gaining: bool = False  # the best policy was still getting better when the training ended
     visited_confidence: tuple[float | None, ...] = ()  # the confidence index where the policy went, of each round
 
 

@@ -25,6 +25,11 @@ def test_the_closed_loop_says_how_well_the_policys_region_is_known():
     assert words_of(vars(now)) == "100 of 512 virtual steps, confidence index 0.9000 where the policy went"
 
 
+def test_a_training_that_still_got_better_says_how_it_goes_on():
+    words = words_of_result(replace(RESULT, gaining=True))
+    assert "; it still got better at the end, --start-from p.zip goes on; next: surrogym evaluate" in words
+
+
 def test_after_an_interruption_the_closed_loop_is_asked_for_again():
     words = words_of_interruption(RESULT, "cart --improve 5 --rounds 3")
     assert words.endswith("to go on: surrogym train cart --improve 5 --rounds 3 --start-from p.zip --out p.zip")

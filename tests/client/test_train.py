@@ -29,6 +29,7 @@ from surrogym_client.train import (
     suggested_lanes,
     train,
 )
+from surrogym_client.training import prolongs
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.surrogate.learn import learn
@@ -239,6 +240,33 @@ def test_a_network_that_learns_nothing_is_given_up_for_another(surrogate, tmp_pa
     kept = PPO.load(result.path, device="cpu")
     again = imagined_return(surrogate, kept, small(session=session))
     assert again == pytest.approx(result.imagined_return)
+
+
+RISING, AT_ITS_BEST = itertools.count(), itertools.chain([0, 50], itertools.repeat(100))
+
+
+@pytest.mark.parametrize(
+    ("returns", "prolong", "taken"),
+    [(RISING, True, 2), (AT_ITS_BEST, True, 1), (RISING, False, 1), (RISING, None, 1)],
+    ids=["it gains", "it gained before", "it may not", "steps were asked for"],
+)
+def test_a_training_that_gained_in_its_last_quarter_takes_as_many_steps_again(
+    surrogate, tmp_path: Path, monkeypatch, returns, prolong, taken
+):
+    seen = []
+    monkeypatch.setattr(training, "imagined_return", lambda *_: float(next(returns)))
+    result = train(surrogate, tmp_path / "policy.zip", small(total_steps=1_536, prolong=prolong), seen.append)
+    assert result.virtual_steps == taken * 1_536 == seen[-1].total_steps
+    assert result.gaining == (returns is RISING)
+    assert len({now.imagined_return for now in seen} - {None}) <= 12 * taken, "checks come as often as before"
+
+
+def test_nobody_asked_for_a_number_of_steps_so_a_training_may_be_prolonged_but_not_the_papers():
+    default, paper = pendulum(), make("Pendulum-v1", preset="paper").spec()
+    assert prolongs(TrainSettings(), default)
+    assert not prolongs(TrainSettings(total_steps=1_000), default)
+    assert not prolongs(TrainSettings(), paper)
+    assert prolongs(TrainSettings(total_steps=1_000, prolong=True), paper)
 
 
 @pytest.mark.parametrize(

@@ -35,6 +35,12 @@ def test_arms_without_rounds_learn_for_as_long_as_those_that_have_some():
     assert DemoSettings("swingup", arm="no_loop", steps=9).virtual_steps == 9
 
 
+def test_a_training_is_prolonged_unless_its_steps_are_chosen_or_real_or_the_papers():
+    prolonged = {name for name in ARMS if DemoSettings("acrobot", arm=name).prolong}
+    assert prolonged == set(ARMS) - {"paper", "paper_hypercube", "oracle"}
+    assert not DemoSettings("acrobot", steps=1_750_000).prolong
+
+
 def test_arms_differ_in_what_they_say():
     designs = {name: DemoSettings("acrobot", arm=name).spec().design for name in ARMS}
     assert designs["variance"].acquisition == "variance"

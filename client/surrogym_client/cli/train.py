@@ -101,6 +101,15 @@ def command(
         float | None, typer.Option(min=0, help="Deviations taken off the reward. [default: the specification's]")
     ] = None,
     start_from: Annotated[Path | None, typer.Option(help="Policy file to go on from.")] = None,
+    prolong: Annotated[
+        bool | None,
+        typer.Option(
+            "--prolong/--no-prolong",
+            help="As many virtual steps again, once, where the imagined return still rises at the end; not for cmaes. "
+            "[default: where --steps is not given]",
+            show_default=False,
+        ),
+    ] = None,
     improve: Annotated[
         int,
         typer.Option(
@@ -160,6 +169,7 @@ def command(
         seed=seed,
         start_box=start_box,
         start_from=start_from,
+        prolong=prolong,
         tracker=None if log == "none" else log,
         tensorboard=tensorboard,
         hyperparameters=hyperparameters,

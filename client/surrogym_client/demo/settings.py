@@ -47,6 +47,12 @@ class DemoSettings:
         alone = not self.way.closed_loop and not self.way.original and queries_a_round(self.real_steps) > 0
         return self.steps or self.demo_task.steps or (SUGGESTED_STEPS if alone else None)
 
+    @property
+    def prolong(self) -> bool:
+        """Whether a training that still gains takes as many virtual steps again: not where somebody chose their number,
+        not in the paper's preset, which has a cap, and not where each is a real one."""
+        return self.steps is None and self.way.preset != "paper" and not self.way.original
+
     def spec(self) -> EnvironmentSpec:
         """The environment's specification with the design of this arm."""
         plain = make(self.demo_task.environment, preset=self.way.preset, seed=self.seed).spec()
@@ -62,7 +68,7 @@ class DemoSettings:
         """All that a result depends on and that is known before the run, but the seed; JSON-able."""
         spec = self.spec().model_dump(mode="json")
         spec["design"].pop("seed")
-        names = ("task", "real_steps", "virtual_steps", "episodes")
+        names = ("task", "real_steps", "virtual_steps", "prolong", "episodes")
         return {"spec": spec, "arm": self.way.fields(), **{name: getattr(self, name) for name in names}}
 
 
