@@ -55,8 +55,9 @@ def train_and_improve(
     Each round submits the states that the policy visits from the declared starts, as a checkpoint of its own, so the
     same seeds ask the same queries. Where the model is as sure over these states as the design wants it over the whole
     range, nothing more is asked. The rounds move lanes by the mean: their policies go where the model promises most.
-    The last training is ``chosen_for`` what the design came to; by draws it begins anew, as a network that has learned
-    from wrong models stays with what these taught it. It alone is prolonged: what a round's policy lacks, the next has.
+    The last training is ``chosen_for`` what the design came to, and goes on from the policy whose region is known.
+    Where none is, it begins anew by draws, as a network that has learned from wrong models stays with what these taught
+    it. It alone is prolonged: what a round's policy lacks, the next has.
 
     Args:
         api: the server.
@@ -74,7 +75,7 @@ def train_and_improve(
         ValueError, SurrogymClientError: as ``train``.
     """
     rounds: list[TrainResult] = []
-    visited, known = 0, list[float | None]()
+    visited, known, region_known = 0, list[float | None](), False
     whole, part = shares(settings, improve.rounds)
 
     def learn(steps: int, whole: int, settings: TrainSettings) -> None:
@@ -92,7 +93,8 @@ def train_and_improve(
             checkpoint = f"seed {settings.seed}, round {view.round}"
             steps, index = visit(port, out, settings, checkpoint)
             visited, known = visited + steps, [*known, index]
-            if index is not None and index >= view.target:
+            region_known = index is not None and index >= view.target
+            if region_known:
                 break
             api.improve(name, improve.queries, checkpoint=checkpoint)
             wait_for_design(api, name, improve.patience_seconds, waiting, after_round=view.round)
@@ -100,7 +102,7 @@ def train_and_improve(
         left = max(left if settings.total_steps else min(planned_steps(settings), left), 1)
         view = api.surrogate(name)
         last = chosen_for(view, settings)
-        anew = last is not settings and settings.start_from is None
+        anew = last is not settings and settings.start_from is None and not region_known
         last = replace(last, anew=anew, prolong=prolongs(settings, view.spec))
         learn(left, _steps(rounds) + visited + left, last)
     except TrainingInterrupted as interruption:

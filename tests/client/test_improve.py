@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 import pytest
@@ -17,10 +18,11 @@ from surrogym_client.api import Api
 from surrogym_client.improve import ImproveSettings, shares, train_and_improve
 from surrogym_client.original.classic import pendulum
 from surrogym_client.original.gymnasium import GymnasiumEnvironment
-from surrogym_client.train import TrainProgress, TrainSettings
+from surrogym_client.train import TrainProgress, TrainResult, TrainSettings, train
 from surrogym_client.training import DRAWS, chosen_for
 from surrogym_client.transport import HttpSurrogate
 from surrogym_client.waiting import wait_for_design
+from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import Design, EnvironmentSpec
 
 SETTINGS = TrainSettings(total_steps=400, num_envs=8, hyperparameters={"n_steps": 10, "batch_size": 40, "n_epochs": 1})
@@ -62,9 +64,23 @@ def sampling(url: str, name: str, spec: EnvironmentSpec) -> Iterator[None]:
     ids=["unsure", "known where it goes", "ready"],
 )
 def test_rounds_go_on_until_the_policys_region_is_known_or_the_design_is_ready(
-    own_server: ServerProcess, tmp_path: Path, tolerance: float, budget: int, real_steps: int, rounds: int
+    own_server: ServerProcess,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    tolerance: float,
+    budget: int,
+    real_steps: int,
+    rounds: int,
 ) -> None:
     """A budget of 4 leaves nothing for the queries that a design needs to be ready, however sure its model is."""
+    asked: list[tuple[bool, bool | None]] = []
+
+    def trained(port: SurrogatePort, out: Path, settings: TrainSettings, progress: Any) -> TrainResult:
+        asked.append((settings.anew, settings.prolong))
+        return train(port, out, replace(settings, prolong=False), progress)
+
+    monkeypatch.setattr("surrogym_client.improve.train", trained)
+    settings = replace(SETTINGS, prolong=True)
     initial, unsure, ready = 4, tolerance < 1, budget > 4
     tolerances = dict.fromkeys(("theta", "speed", "reward"), tolerance)
     design = Design(initial=initial, budget=budget, target=0.9999999 if unsure else 0.501, monte_carlo=64)
@@ -75,13 +91,16 @@ def test_rounds_go_on_until_the_policys_region_is_known_or_the_design_is_ready(
         with sampling(own_server.url, name, spec), HttpSurrogate(own_server.url, name) as port:
             wait_for_design(api, name, 60)
             improve = ImproveSettings(queries=3, rounds=2, patience_seconds=60)
-            result = train_and_improve(api, name, port, tmp_path / "p.zip", SETTINGS, improve, seen.append)
+            result = train_and_improve(api, name, port, tmp_path / "p.zip", settings, improve, seen.append)
         view = api.surrogate(name)
     assert view.ledger.total == real_steps
     assert view.ledger.initial == initial
     assert result.virtual_steps == 400 + rounds * VISIT, "the steps asked for are those of all trainings"
     assert result.path.exists()
     assert result.settings["session"] == ({} if ready else DRAWS), "only an unsure model is trained on by draws"
+    assert asked == [(False, False)] * rounds + [(unsure, True)], (
+        "a round is short, and a policy whose region is known is kept"
+    )
     assert len(result.visited_confidence) == rounds
     assert [index >= design.target for index in result.visited_confidence] == (
         [False, False] if unsure else [True] * rounds
