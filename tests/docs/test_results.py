@@ -2,9 +2,11 @@
 
 from pathlib import Path
 
+import pytest
+
 from surrogym_client.reproduce.page import present_section, section
 from surrogym_client.reproduce.rows import merge, read_rows
-from surrogym_client.reproduce.table import summary, tasks_with_results
+from surrogym_client.reproduce.table import contrasts, summary, tasks_with_results
 
 DOCS = Path(__file__).parents[2] / "docs"
 ROWS = read_rows(DOCS / "results" / "efficiency.csv")
@@ -15,9 +17,12 @@ def test_the_tables_are_those_of_the_rows():
     assert present_section(DOCS / "results.md") == section(ROWS, "results"), again
 
 
-def test_the_table_from_before_mirror_images_is_that_of_its_rows():
-    again = "surrogym reproduce table --rows docs/results/efficiency-before.csv"
-    assert summary(read_rows(DOCS / "results" / "efficiency-before.csv")) in (DOCS / "results.md").read_text(), again
+@pytest.mark.parametrize("name", ["before", "before-loop-end", "before-prolonging"])
+def test_tables_from_before_a_change_are_those_of_their_rows(name):
+    rows = read_rows(DOCS / "results" / f"efficiency-{name}.csv")
+    again = f"surrogym reproduce table --rows docs/results/efficiency-{name}.csv"
+    assert summary(rows) in (DOCS / "results.md").read_text(), again
+    assert contrasts(rows) in (DOCS / "results.md").read_text(), again
 
 
 def test_each_cell_has_one_row_and_each_task_its_picture():

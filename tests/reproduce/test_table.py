@@ -71,6 +71,9 @@ def test_an_arm_that_closes_no_loop_is_not_said_to():
     """A budget of 14 is all the design's, one of 60 leaves queries for three rounds."""
     asked = [*DEFAULT, *[replace(row, arm="no_loop") for row in DEFAULT]]
     assert line(report(asked), "pendulum", "an early stop", "default, no_loop")
+    to_the_end = report([replace(row, real_steps=14) for row in [*asked, *HYPERCUBE]])
+    assert "default, no_loop" not in to_the_end, "the same design twice compares nothing"
+    assert line(to_the_end, "pendulum", "adaptive queries", "default, latin_hypercube")
     with_rounds = [replace(row, task="swingup", budget=60) for row in asked]
     assert line(report(with_rounds), "swingup", "closed loop", "default, no_loop")
 

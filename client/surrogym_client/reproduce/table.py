@@ -23,7 +23,7 @@ FEW = 3  # seeds; fewer have no interval worth the name
 CONTRASTS = (  # what a pair of arms tells, at the same budget
     ("adaptive queries", "no_loop", "latin_hypercube"),
     ("adaptive queries, in the paper's representation", "paper", "paper_hypercube"),
-    ("representation, on a hypercube", "latin_hypercube", "paper_hypercube"),
+    ("default's or paper's preset, on a hypercube", "latin_hypercube", "paper_hypercube"),
     ("acquisition", "no_loop", "variance"),
     ("symmetry", "default", "no_symmetry"),
     ("closed loop", "default", "no_loop"),
@@ -31,27 +31,26 @@ CONTRASTS = (  # what a pair of arms tells, at the same budget
     ("the whole of it", "default", "paper"),
     ("surrogate or original", "default", "oracle"),
 )
-WITHOUT_ROUNDS = {  # what the same pairs tell where the design has the whole budget, and may stop early
-    "closed loop": "an early stop",
-    "adaptive queries and closed loop": "adaptive queries and an early stop",
+WITHOUT_ROUNDS = {  # what the same pairs tell where the design has the whole budget: did a run stop early, or none
+    "closed loop": ("an early stop", None),
+    "adaptive queries and closed loop": ("adaptive queries and an early stop", "adaptive queries"),
 }
 NOTES = """\
 Real steps: median (smallest to largest). Real return: interquartile mean over seeds of their means; from three seeds
 on with a 95 % bootstrap interval. Worst seed: its mean. Success and other starts: share of the episodes, worst
 seed. Imagined: what the surrogate promised. Target reached: by how many seeds of all; by the exact 95 % interval 10
-of 10 says that 69 % of all seeds do or more, 9 of 10 55 %, 5 of 5 48 %. Virtual steps, of the training: median.
-Seconds: median (largest). A bootstrap of five seeds is narrower than its name.
+of 10 fresh seeds would say that 69 % of all seeds do or more, 9 of 10 55 %, 5 of 5 48 %. Virtual steps, of the
+training: median. Seconds: median (largest). A bootstrap of five seeds is narrower than its name.
 """
 
 
 def report(rows: Sequence[Row]) -> str:
     """Targets, the main table, the questions that pairs of arms answer, and where the rows come from."""
-    groups = grouped(rows)
-    parts = [_targets(groups), summary(rows), NOTES]
-    if contrasts := _contrasts(groups):
+    parts = [_targets(grouped(rows)), summary(rows), NOTES]
+    if pairs := contrasts(rows):
         parts += [
             "Difference of interquartile means, first arm minus second, with a 95 % bootstrap interval:\n",
-            contrasts,
+            pairs,
         ]
     return "\n".join([*parts, _origin(rows)])
 
@@ -59,6 +58,31 @@ def report(rows: Sequence[Row]) -> str:
 def summary(rows: Sequence[Row]) -> str:
     """The main table: a line for each task, arm and budget."""
     return markdown([HEADING, *(_line(group, of) for group, of in grouped(rows).items())])
+
+
+def contrasts(rows: Sequence[Row]) -> str:
+    """A line for each question that two arms with the same budget answer; empty where there is none."""
+    groups = grouped(rows)
+    lines = [("task", "question", "arms", "seeds", "difference", "interval", "better")]
+    for task, budget in dict.fromkeys((task, budget) for task, _, budget in groups):
+        for question, first, second in CONTRASTS:
+            pair = [groups.get((task, arm, budget), []) for arm in (first, second)]
+            means = [column(of, "mean") for of in pair]
+            asked = _asked(question, budget, [*pair[0], *pair[1]])
+            if asked is not None and min(map(len, means)) >= FEW:
+                low, high = difference_interval(*means)
+                lines.append(
+                    (
+                        task if budget == TASKS[task].budget else f"{task}, budget {budget}",
+                        asked,
+                        f"{first}, {second}",
+                        f"{len(means[0])}, {len(means[1])}",
+                        _number(interquartile_mean(means[0]) - interquartile_mean(means[1])),
+                        f"{_number(low)} to {_number(high)}",
+                        first if low > 0 else second if high < 0 else "undecided",
+                    )
+                )
+    return markdown(lines) if len(lines) > 1 else ""
 
 
 def grouped(rows: Sequence[Row]) -> dict[Group, list[Row]]:
@@ -124,27 +148,12 @@ def _line(group: Group, rows: Sequence[Row]) -> Sequence[str]:
     )
 
 
-def _contrasts(groups: dict[Group, list[Row]]) -> str:
-    lines = [("task", "question", "arms", "seeds", "difference", "interval", "better")]
-    for task, budget in dict.fromkeys((task, budget) for task, _, budget in groups):
-        for question, first, second in CONTRASTS:
-            pair = [column(groups.get((task, arm, budget), []), "mean") for arm in (first, second)]
-            if min(map(len, pair)) >= FEW:
-                low, high = difference_interval(*pair)
-                difference = interquartile_mean(pair[0]) - interquartile_mean(pair[1])
-                asked = question if queries_a_round(budget) else WITHOUT_ROUNDS.get(question, question)
-                lines.append(
-                    (
-                        task if budget == TASKS[task].budget else f"{task}, budget {budget}",
-                        asked,
-                        f"{first}, {second}",
-                        f"{len(pair[0])}, {len(pair[1])}",
-                        _number(difference),
-                        f"{_number(low)} to {_number(high)}",
-                        first if low > 0 else second if high < 0 else "undecided",
-                    )
-                )
-    return markdown(lines) if len(lines) > 1 else ""
+def _asked(question: str, budget: int, rows: Sequence[Row]) -> str | None:
+    """What a pair tells where a budget leaves no rounds; None where both of its arms are the same design."""
+    if queries_a_round(budget) or question not in WITHOUT_ROUNDS:
+        return question
+    early, whole = WITHOUT_ROUNDS[question]
+    return early if column(rows, "real_steps").min(initial=budget) < budget else whole
 
 
 def _origin(rows: Sequence[Row]) -> str:
