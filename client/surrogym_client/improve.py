@@ -55,9 +55,8 @@ def train_and_improve(
     Each round submits the states that the policy visits from the declared starts, as a checkpoint of its own, so the
     same seeds ask the same queries. Where the model is as sure over these states as the design wants it over the whole
     range, nothing more is asked. The rounds move lanes by the mean: their policies go where the model promises most.
-    The last training is ``chosen_for`` what the design came to, and goes on from the policy whose region is known.
-    Where none is, it begins anew by draws, as a network that has learned from wrong models stays with what these taught
-    it. It alone is prolonged: what a round's policy lacks, the next has.
+    The last training is ``chosen_for`` what the design came to. It alone is prolonged: what a round's policy lacks, the
+    next has.
 
     Args:
         api: the server.
@@ -100,10 +99,7 @@ def train_and_improve(
             wait_for_design(api, name, improve.patience_seconds, waiting, after_round=view.round)
         left = whole - _steps(rounds)
         left = max(left if settings.total_steps else min(planned_steps(settings), left), 1)
-        view = api.surrogate(name)
-        last = chosen_for(view, settings)
-        anew = last is not settings and settings.start_from is None and not region_known
-        last = replace(last, anew=anew, prolong=prolongs(settings, view.spec))
+        last = _for_use(api.surrogate(name), settings, region_known=region_known)
         learn(left, _steps(rounds) + visited + left, last)
     except TrainingInterrupted as interruption:
         raise TrainingInterrupted(_together([*rounds, interruption.result], visited, known)) from None
@@ -112,6 +108,14 @@ def train_and_improve(
             raise TrainingInterrupted(_together(rounds, visited, known)) from None
         raise
     return _together(rounds, visited, known)
+
+
+def _for_use(view: SurrogateView, settings: TrainSettings, *, region_known: bool) -> TrainSettings:
+    """Settings of the last training, whose policy is used. It goes on from the policy whose region is known; where none
+    is, it begins anew by draws, as a network that has learned from wrong models stays with what these taught it."""
+    last = chosen_for(view, settings)
+    anew = last is not settings and settings.start_from is None and not region_known
+    return replace(last, anew=anew, prolong=prolongs(settings, view.spec))
 
 
 def _steps(rounds: Sequence[TrainResult]) -> int:

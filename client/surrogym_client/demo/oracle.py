@@ -25,7 +25,8 @@ class OriginalRun:
 
     def learn(self) -> Learned:
         """Train, and count the steps of the original environment."""
-        chosen = TrainSettings(total_steps=self._settings.virtual_steps, seed=self._settings.seed, prolong=False)
+        asked = self._settings
+        chosen = TrainSettings(total_steps=asked.virtual_steps, seed=asked.seed, prolong=asked.prolong)
         port = OriginalPort(self._settings.judged_by(), episodes_of(self._settings))
         with progress("train", quiet=self._quiet) as update:
 

@@ -11,7 +11,7 @@ from surrogym_client.demo.arms import ARMS, Arm
 from surrogym_client.demo.tasks import TASKS, DemoTask, design_budget, queries_a_round
 from surrogym_client.original import make
 from surrogym_client.original.loading import with_choices
-from surrogym_client.training import SUGGESTED_STEPS
+from surrogym_client.training import SUGGESTED_STEPS, TrainSettings, prolongs
 from surrogym_shared.spec import EnvironmentSpec
 
 
@@ -49,9 +49,9 @@ class DemoSettings:
 
     @property
     def prolong(self) -> bool:
-        """Whether a training that still gains takes as many virtual steps again: not where somebody chose their number,
-        not in the paper's preset, which has a cap, and not where each is a real one."""
-        return self.steps is None and self.way.preset != "paper" and not self.way.original
+        """Whether a training that still gains takes as many virtual steps again: as ``prolongs`` where a task or an arm
+        chose their number, and not where each is a real one."""
+        return not self.way.original and prolongs(TrainSettings(total_steps=self.steps), self.spec())
 
     def spec(self) -> EnvironmentSpec:
         """The environment's specification with the design of this arm."""
