@@ -84,6 +84,8 @@ def train(
     if settings.algorithm.upper() == EVOLUTION:
         if settings.tracker in ("wandb", "mlflow"):
             raise ValueError(f"{EVOLUTION} logs to no tracker: expected none, got {settings.tracker}")
+        if settings.prolong:
+            raise ValueError(f"{EVOLUTION} takes the steps it is given: expected no prolonging, or another algorithm")
         return evolve(port, out, settings, planned_steps(settings), progress)
     torch.set_num_threads(settings.threads)
     settings = with_folder(settings, out)
@@ -215,7 +217,8 @@ def _learner(
     gamma: float,
 ) -> BaseAlgorithm:
     if settings.start_from is not None:
-        learner = algorithm.load(settings.start_from, env=env, device="cpu", seed=settings.seed)
+        asked = settings.hyperparameters  # over those that it was saved with
+        learner = algorithm.load(settings.start_from, env=env, device="cpu", seed=settings.seed, **asked)
         learner.tensorboard_log = None if settings.tensorboard is None else str(settings.tensorboard)
         return learner
     extractor = {"mean": statistics[0], "deviation": statistics[1]}

@@ -87,6 +87,12 @@ def test_unknown_hyperparameters_are_refused(surrogate, tmp_path: Path):
         train(surrogate, tmp_path / "policy.zip", small(hyperparameters={"gamma": 0.9}))
 
 
+def test_it_is_not_prolonged(surrogate, tmp_path: Path):
+    with pytest.raises(ValueError, match="expected no prolonging, or another algorithm"):
+        train(surrogate, tmp_path / "policy.zip", small(prolong=True))
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_goal_far_from_the_start_is_found(tmp_path: Path):
     """Whole policies explore: noise on each action leads nowhere here."""
     surrogate = local(mountain_car_continuous())

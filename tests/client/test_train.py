@@ -95,6 +95,16 @@ def test_training_goes_on_from_a_saved_policy(surrogate, tmp_path: Path):
     assert distance(one, two) < 0.3 * distance(one, fresh)
 
 
+def test_what_is_asked_for_goes_over_what_the_policy_was_saved_with(surrogate, tmp_path: Path):
+    first, second = tmp_path / "first.zip", tmp_path / "second.zip"
+    train(surrogate, first, small(total_steps=128))
+    asked = SMALL | {"learning_rate": 1e-5, "n_steps": 32, "ent_coef": 0.01}
+    result = train(surrogate, second, small(total_steps=256, start_from=first, hyperparameters=asked))
+    after = PPO.load(second, device="cpu")
+    assert (after.learning_rate, after.n_steps, after.ent_coef, after.n_epochs) == (1e-5, 32, 0.01, 2)
+    assert {name: result.settings[name] for name in asked} == asked
+
+
 def distance(a: PaperPolicy, b: PaperPolicy) -> float:
     pairs = zip(a.parameters(), b.parameters(), strict=True)
     return sum(float((p - q).detach().square().sum()) for p, q in pairs) ** 0.5

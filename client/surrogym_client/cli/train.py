@@ -105,7 +105,7 @@ def command(
         bool | None,
         typer.Option(
             "--prolong/--no-prolong",
-            help="As many virtual steps again, once, where the imagined return still rises at the end; not for cmaes. "
+            help="As many virtual steps again, once, where the imagined return still rises at the end. Not with cmaes. "
             "[default: where --steps is not given]",
             show_default=False,
         ),
