@@ -49,6 +49,12 @@ def test_arms_differ_in_what_they_say():
     assert designs["no_loop"].acquisition is designs["default"].acquisition is None
 
 
+def test_an_arm_is_told_by_what_it_alone_chooses():
+    assert ARMS["declared_starts"].fields() == {"closed_loop": True, "start_box": 0}
+    assert ARMS["no_loop"].fields() == {}
+    assert len({str(arm.fields()) for arm in ARMS.values()}) == len(ARMS)
+
+
 def test_the_paper_learns_its_own_cart_pole_and_is_judged_by_gymnasiums():
     settings = DemoSettings("cartpole", arm="paper")
     assert settings.spec().time_limit == 200

@@ -1,8 +1,8 @@
 """The arms of a comparison: how the same budget of real steps is spent, and on which model.
 
-The default may stop before its budget is spent, with or without symmetry. Every other arm that learns a surrogate
-spends exactly that budget, and learns for as many virtual steps, so that a comparison can only be in its favour.
-Imports nothing but the standard library.
+The default may stop before its budget is spent, also without symmetry or with other starts. Every other arm that learns
+a surrogate spends exactly that budget, and learns for as many virtual steps, so that a comparison can only be in its
+favour. Imports nothing but the standard library.
 """
 
 from __future__ import annotations
@@ -19,13 +19,15 @@ class Arm:
     """One way to spend a budget.
 
     ``closed_loop``: queries where policies have been, between trainings; without it the whole budget is the design's,
-    before training. ``original``: no surrogate at all, the policy search runs in the original environment.
+    before training. ``start_box``: share of virtual episodes that start anywhere in the range. ``original``: no
+    surrogate at all, the policy search runs in the original environment.
     """
 
     words: str
     preset: Literal["default", "paper"] = "default"
     acquisition: Acquisition | None = None
     closed_loop: bool = False
+    start_box: float | None = None  # None: a training's own
     original: bool = False
     symmetry: Literal["auto", "none"] = "auto"
 
@@ -46,13 +48,15 @@ class Arm:
         return chosen
 
     def fields(self) -> dict[str, Any]:
-        """What distinguishes the arm, JSON-able."""
-        return {name: value for name, value in asdict(self).items() if name != "words"}
+        """What distinguishes the arm, JSON-able: a choice that only another arm makes is not among it."""
+        plain = asdict(Arm(self.words))
+        return {name: value for name, value in asdict(self).items() if value != plain[name]}
 
 
 ARMS = {
     "default": Arm("as surrogym demo runs it; it may stop early", closed_loop=True),
     "no_symmetry": Arm("default, not looking for a mirror image", closed_loop=True, symmetry="none"),
+    "declared_starts": Arm("default, no virtual episode starts elsewhere", closed_loop=True, start_box=0.0),
     "no_loop": Arm("the whole budget by the design, before training"),
     "variance": Arm("no_loop, each query where the deviation is largest", acquisition="variance"),
     "latin_hypercube": Arm("no_loop, all queries from one Latin hypercube", acquisition="latin_hypercube"),

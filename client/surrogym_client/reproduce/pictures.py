@@ -17,9 +17,8 @@ from surrogym_client.reproduce.rows import Row
 from surrogym_client.reproduce.statistics import bootstrap_interval
 from surrogym_client.reproduce.table import Group, column, grouped, tasks_with_results
 
-COLOURS = dict(
-    zip(ARMS, ("#dd8452", "#da8bc3", "#4c72b0", "#55a868", "#8172b3", "#937860", "#c9a66b", "#555555"), strict=True)
-)
+OF_ARMS = ("#dd8452", "#da8bc3", "#64b5cd", "#4c72b0", "#55a868", "#8172b3", "#937860", "#c9a66b", "#555555")
+COLOURS = dict(zip(ARMS, OF_ARMS, strict=True))
 SIZE = (6.0, 3.6)  # inches
 BESIDE = 0.05  # dots of single seeds stand so far from their arm, as a share of its real steps
 

@@ -26,6 +26,7 @@ CONTRASTS = (  # what a pair of arms tells, at the same budget
     ("default's or paper's preset, on a hypercube", "latin_hypercube", "paper_hypercube"),
     ("acquisition", "no_loop", "variance"),
     ("symmetry", "default", "no_symmetry"),
+    ("starts anywhere", "default", "declared_starts"),
     ("closed loop", "default", "no_loop"),
     ("adaptive queries and closed loop", "default", "latin_hypercube"),
     ("the whole of it", "default", "paper"),
