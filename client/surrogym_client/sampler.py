@@ -33,6 +33,7 @@ from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, StepQu
 
 FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "failed")
 PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)  # with a server or a storage that is away
+LAST_SECONDS = 5.0  # a sampler that was stopped asks on for so long, with a real step that is not handed in yet
 AWAY = (ServerUnreachable, Unavailable)
 STOPPED = "the sampler was stopped"
 
@@ -113,7 +114,8 @@ class Sampler:
         self._stopping = threading.Event()
 
     def stop(self) -> None:
-        """End ``run`` after the step that is under way; for another thread, or a signal handler."""
+        """End ``run`` after the step that is under way; for another thread, or a signal handler. A server that is away
+        is waited for no longer, but some seconds with a real step that it has not got yet."""
         self._stopping.set()
 
     def run(self) -> SamplerReport:
@@ -128,7 +130,12 @@ class Sampler:
         self._check()
         with Heartbeat(self._api, self._surrogate, self._settings.lease_seconds) as heartbeat:
             while not self._stopping.is_set() and (limit := self._limit()) > 0:
-                claimed = _patiently(partial(self._claim, limit))
+                try:
+                    claimed = self._patiently(partial(self._claim, limit))
+                except AWAY:
+                    if self._stopping.is_set():
+                        break
+                    raise
                 self._phase = claimed.phase
                 self._work(claimed.queries, heartbeat)
                 if self._enough(claimed):
@@ -218,12 +225,33 @@ class Sampler:
 
     def _hand_in(self, samples: list[NewSample]) -> None:
         if samples:
-            _patiently(lambda: self._api.add_samples(self._surrogate, self._settings.name, samples))
+            self._patiently(lambda: self._api.add_samples(self._surrogate, self._settings.name, samples), LAST_SECONDS)
             self._steps += len(samples)
 
     def _fail(self, query: Query, error: str, *, begun: bool) -> None:
-        _patiently(lambda: self._give_back(query, error, begun=begun))
+        self._patiently(lambda: self._give_back(query, error, begun=begun), LAST_SECONDS)
         self._count(query, "failed", error)
+
+    def _patiently(self, request: Callable[[], T], once_stopped: float = 0.0) -> T:
+        """Ask until the server and its storage are back; every request here may be repeated.
+
+        Raises:
+            ServerUnreachable, Unavailable: they stayed away for longer than ``PATIENCE``, or than ``once_stopped``
+                seconds after ``stop``.
+        """
+        delays, stopped = PATIENCE.delays(), None
+        while True:
+            try:
+                return request()
+            except AWAY:
+                pause = next(delays, None)
+                if pause is None:
+                    raise
+                if self._stopping.wait(pause):
+                    stopped = stopped or time.monotonic()
+                    if time.monotonic() - stopped >= once_stopped:
+                        raise
+                    time.sleep(pause)
 
     def _give_back(self, query: Query, error: str, *, begun: bool) -> None:
         try:
@@ -301,20 +329,3 @@ class Heartbeat:
 def _shape(spec: EnvironmentSpec) -> str:
     names = ", ".join(spec.coordinate_names)
     return f"coordinates ({names}), a {spec.action.kind} action of {spec.action.size}, and {spec.query} queries"
-
-
-def _patiently(request: Callable[[], T]) -> T:
-    """Ask until the server and its storage are back; every request here may be repeated.
-
-    Raises:
-        ServerUnreachable, Unavailable: they stayed away for longer than ``PATIENCE``.
-    """
-    delays = PATIENCE.delays()
-    while True:
-        try:
-            return request()
-        except AWAY:
-            pause = next(delays, None)
-            if pause is None:
-                raise
-            time.sleep(pause)

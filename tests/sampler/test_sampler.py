@@ -15,7 +15,7 @@ from surrogym_client.connection import Retries
 from surrogym_client.errors import ServerUnreachable, Unavailable, UnknownSurrogate
 from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.isolated import IsolatedEnvironment
-from surrogym_client.sampler import Sampler, SamplerSettings
+from surrogym_client.sampler import Sampler, SamplerReport, SamplerSettings
 from surrogym_shared.codes import Code, Problem
 
 ONE_ROUND = SamplerSettings(name="worker", max_queries=6, wait_seconds=5.0, time_limit=60.0)
@@ -75,6 +75,53 @@ def test_a_storage_that_is_away_is_waited_for_and_no_step_is_taken_twice(server_
         assert len(api.refused) == 7
         ledger = api.surrogate(line).ledger
     assert (report.answered, report.failed, ledger.total, ledger.unresolved) == (6, 0, 6, 0)
+
+
+class Away(Api):
+    """A server that stays away, for one kind of request."""
+
+    def __init__(self, url: str, request: str) -> None:
+        super().__init__(url)
+        self.asked = threading.Event()
+        setattr(self, request, self._refuse)
+
+    def _refuse(self, *_, **__):
+        self.asked.set()
+        raise ServerUnreachable("nobody answers")
+
+
+def stopped(api: Away, line: str) -> tuple[list[SamplerReport], list[Exception]]:
+    """What a sampler gave, or raised, that was stopped while it waited for a server."""
+    reports, errors = [], []
+    sampler = Sampler(api, line, Line(), ONE_ROUND)
+
+    def run():
+        try:
+            reports.append(sampler.run())
+        except ServerUnreachable as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    assert api.asked.wait(30)
+    sampler.stop()
+    thread.join(30)
+    assert not thread.is_alive()
+    return reports, errors
+
+
+def test_a_server_that_is_away_keeps_no_stopped_worker_waiting(server_process, line):
+    with Away(server_process.url, "claim") as api:
+        [report], errors = stopped(api, line)
+    assert (report.answered, errors) == (0, [])
+
+
+def test_a_real_step_that_can_not_be_handed_in_is_told(server_process, line, monkeypatch):
+    monkeypatch.setattr("surrogym_client.sampler.LAST_SECONDS", 0.2)
+    with Away(server_process.url, "add_samples") as api:
+        reports, [error] = stopped(api, line)
+    assert reports == []
+    assert "nobody answers" in str(error)
 
 
 def test_once_stops_after_the_first_claim(api, line):
