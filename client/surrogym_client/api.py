@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, Self, TypeVar
 from urllib.parse import quote
 from uuid import uuid4
@@ -127,10 +127,12 @@ class Api:
         paused: bool | None = None,
         budget: int | None = None,
         target: float | None = None,
-        tolerances: dict[str, float] | None = None,
+        tolerances: Mapping[str, float | None] | None = None,
     ) -> wire.SurrogateView:
-        """Pause or resume the design, or change its budget, target or tolerances; None leaves a field as it is."""
-        body = wire.PatchSurrogate(paused=paused, budget=budget, target=target, tolerances=tolerances)
+        """Pause or resume the design, or change its budget, target or tolerances; None leaves a field as it is, and in
+        ``tolerances`` it takes back what was set."""
+        given = None if tolerances is None else dict(tolerances)
+        body = wire.PatchSurrogate(paused=paused, budget=budget, target=target, tolerances=given)
         return self._post(wire.SurrogateView, _surrogate(name), body, method="PATCH")
 
     def delete_surrogate(self, name: str) -> None:

@@ -8,6 +8,8 @@ import typer
 
 from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, Tolerances, connect, read_tolerances
 
+USUAL = "=usual"  # takes a tolerance back
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -27,13 +29,20 @@ def command(
 ) -> None:
     """Change a living surrogate. Its model is judged anew, and what is left out stays.
 
+    Queries that the design had chosen before, and that no sampler has begun, are withdrawn and chosen anew.
+
     Example: surrogym change pendulum --tolerance theta=0.01 --budget 30
+
+    Example: surrogym change pendulum --tolerance theta=usual
     """
     from surrogym_shared.terminal import give
 
-    tolerances = read_tolerances(tolerance) if tolerance else None
+    back = {text.removesuffix(USUAL): None for text in tolerance or () if text.endswith(USUAL)}
+    tolerances = read_tolerances([text for text in tolerance or () if not text.endswith(USUAL)]) | back
     with connect(server, token) as api:
-        view = api.patch_surrogate(surrogate, paused=paused, budget=budget, target=target, tolerances=tolerances)
+        view = api.patch_surrogate(
+            surrogate, paused=paused, budget=budget, target=target, tolerances=tolerances or None
+        )
     set_by_hand = "".join(f", {name} to {value:g}" for name, value in view.tolerances.items())
     state = "paused" if view.paused else view.phase
     words = f"{view.name}: {state}, budget of {view.budget} real steps, target {view.target:g}{set_by_hand}"

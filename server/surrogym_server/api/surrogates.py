@@ -60,7 +60,8 @@ def get(name: str, use: Use) -> SurrogateView:
 )
 def patch(name: str, body: Annotated[PatchSurrogate, example(examples.PATCH)], use: Use) -> SurrogateView:
     """What is left out stays. A raised budget or target sets a finished design going again, a tolerance has the
-    model judged anew, and resuming a failed one tries it again."""
+    model judged anew, and resuming a failed one tries it again. What the design had chosen by another target or
+    tolerance, or a larger budget, is withdrawn as far as no sampler has begun it, and chosen anew."""
     return convert.surrogate_view(use.surrogates.change(name, **dict(body)))
 
 

@@ -83,7 +83,7 @@ def run_design_job(job: DesignJob) -> DesignResult:
     return DesignResult(
         model=to_bytes(decision.model),
         description=decision.model.description,
-        fidelity=fidelity_fields(decision.model, decision.confidences, decision.state.tolerances, job.target),
+        fidelity=fidelity_fields(decision.model, decision.confidences, decision.tolerances, job.target),
         data_hash=samples.digest,
         state=decision.state.to_json(),
         verdict=decision.verdict,

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from surrogym_server.sampling.confidence import OutputConfidence, confidence, deviations
-from surrogym_server.sampling.design import monte_carlo, resolved_tolerances
+from surrogym_server.sampling.design import monte_carlo, usual_tolerances
 from surrogym_server.surrogate.model import OutputModel, SurrogateModel
 
 
@@ -28,17 +28,18 @@ def fidelity_fields(
     }
 
 
-def fidelity_of(model: SurrogateModel, tolerances: Sequence[float], target: float) -> dict[str, Any]:
+def fidelity_of(model: SurrogateModel, usual: Sequence[float], target: float) -> dict[str, Any]:
     """The fields of ``wire.Fidelity`` of any model of the surrogate.
 
     Args:
         model: what to judge.
-        tolerances: (O,) frozen by the design; empty before its first round, and then taken from the specification and
-            the model's own scales.
+        usual: (O,) tolerances frozen by the design, over which those of the definition go; empty before its first
+            round, and then taken from the model's own scales.
         target: confidence index the design aims at.
     """
     outputs = _outputs(model)
-    tolerances = tolerances or resolved_tolerances(model.definition, [output.scale for output in outputs])
+    usual = usual or usual_tolerances(model.definition, [output.scale for output in outputs])
+    tolerances = model.definition.tolerances_over(usual)
     deviation = deviations(model, *monte_carlo(model.definition))
     confidences = [confidence(o, deviation[:, i], t) for i, (o, t) in enumerate(zip(outputs, tolerances, strict=True))]
     return fidelity_fields(model, confidences, tolerances, target)

@@ -36,7 +36,7 @@ class DesignState:
     """What one round leaves for the next; JSON-able."""
 
     round: int = 0
-    tolerances: tuple[float, ...] = ()  # per output; frozen after the first round
+    tolerances: tuple[float, ...] = ()  # usual ones, per output; frozen after the first round
     thetas: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
@@ -69,6 +69,7 @@ class Request:
 class Decision:
     model: SurrogateModel
     confidences: tuple[OutputConfidence, ...]  # per output
+    tolerances: tuple[float, ...]  # per output, those that it was judged by
     state: DesignState
     verdict: Verdict
     q: Tensor  # (m, C) next queries
@@ -97,9 +98,8 @@ def initial_rollouts(definition: EnvironmentDefinition, budget: int) -> list[Ten
 def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignState, request: Request) -> Decision:
     """One round. Raises InvalidInput or NumericalFailure as ``learn`` does."""
     learned = learn(definition, samples, state.thetas)
-    frozen = state.tolerances or default_tolerances(definition, samples)
-    declared = dict(definition.tolerances)  # a person may have set them since
-    tolerances = tuple(declared.get(name, usual) for name, usual in zip(definition.outputs, frozen, strict=True))
+    usual = state.tolerances or usual_tolerances(definition, sizes_of(definition, samples))
+    tolerances = definition.tolerances_over(usual)
     points = Points(*monte_carlo(definition))
     deviation = deviations(learned.model, points.q, points.u)
     outputs = (*learned.model.transitions, learned.model.reward)
@@ -117,8 +117,8 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         rollouts = _plan(learned.model, samples, confidences, tolerances, verdict, request, rng, reserved is not None)
     if verdict == "continue" and not len(chosen) and not rollouts:
         verdict = "over_budget"  # the rest of the budget is pending, or nothing distinct is left to ask
-    new_state = DesignState(state.round + 1, tolerances, learned.thetas)
-    return Decision(learned.model, confidences, new_state, verdict, chosen.q, chosen.u, rollouts)
+    new_state = DesignState(state.round + 1, usual, learned.thetas)
+    return Decision(learned.model, confidences, tolerances, new_state, verdict, chosen.q, chosen.u, rollouts)
 
 
 def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
@@ -127,19 +127,16 @@ def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
     return going_on(definition, *random_points(definition, definition.design.monte_carlo, rng), rng)
 
 
-def default_tolerances(definition: EnvironmentDefinition, samples: Samples) -> tuple[float, ...]:
-    """Tolerance of each output, whose size is its deviation over the samples at hand: that of its mean, if it never
-    varied."""
+def sizes_of(definition: EnvironmentDefinition, samples: Samples) -> list[float]:
+    """Size of each output (O,): its deviation over the samples at hand, or that of its mean, if it never varied."""
     targets = torch.cat([increments(definition, samples), samples.reward[:, None]], -1)
     spread, mean = targets.std(0, correction=0), targets.mean(0).abs()
-    return resolved_tolerances(definition, torch.where(spread > 0, spread, torch.where(mean > 0, mean, 1.0)).tolist())
+    return torch.where(spread > 0, spread, torch.where(mean > 0, mean, 1.0)).tolist()
 
 
-def resolved_tolerances(definition: EnvironmentDefinition, sizes: Sequence[float]) -> tuple[float, ...]:
-    """Tolerance of each output, of sizes (O,): the declared one, else 5 % of its size, or as printed 1 in its unit."""
-    raw = definition.design.tolerance == "raw"
-    usual = {name: 1.0 if raw else TOLERANCE * size for name, size in zip(definition.outputs, sizes, strict=True)}
-    return tuple((usual | dict(definition.tolerances)).values())
+def usual_tolerances(definition: EnvironmentDefinition, sizes: Sequence[float]) -> tuple[float, ...]:
+    """Tolerance of each output, of sizes (O,), that nobody set: 5 % of its size, or as printed 1 in its unit."""
+    return tuple(1.0 if definition.design.tolerance == "raw" else TOLERANCE * size for size in sizes)
 
 
 def judge(

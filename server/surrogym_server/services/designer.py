@@ -11,7 +11,7 @@ import numpy as np
 
 from surrogym_server.engine.design_job import DesignJob, DesignResult
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.errors import InvalidInput, SurrogymError, Unavailable, UnknownSurrogate
+from surrogym_server.errors import InvalidInput, LeaseExpired, SurrogymError, Unavailable, UnknownSurrogate
 from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.notices import Notices
@@ -123,6 +123,8 @@ class Designer:
         except asyncio.CancelledError:
             self._abort(lease, None)
             raise
+        except LeaseExpired:
+            logger.info("the fit of %s is made again: it was changed, or another server fits it", name)
         except Exception as error:
             self._counts.failed_fits += 1
             logger.warning("the fit of %s failed: %s", name, error, exc_info=not isinstance(error, SurrogymError))

@@ -119,9 +119,9 @@ class SurrogateService:
         paused: bool | None = None,
         budget: int | None = None,
         target: float | None = None,
-        tolerances: dict[str, float] | None = None,
+        tolerances: dict[str, float | None] | None = None,
     ) -> SurrogateStatus:
-        """Change what is not None.
+        """Change what is not None; None in ``tolerances`` takes back what was set.
 
         Raises:
             UnknownSurrogate: there is none of this name.

@@ -72,10 +72,14 @@ class Surrogates(ABC):
         paused: bool | None = None,
         budget: int | None = None,
         target: float | None = None,
-        tolerances: dict[str, float] | None = None,
+        tolerances: dict[str, float | None] | None = None,
     ) -> SurrogateRecord:
-        """Change what is not None; of ``tolerances`` those of the outputs named. Another budget, target or tolerance,
-        or resuming a failed design, makes a fit due."""
+        """Change what is not None; of ``tolerances`` those of the outputs named, of which None takes one back. Another
+        budget, target or tolerance, or resuming a failed design, makes a fit due.
+
+        What the design chose by another target or tolerance, or by a larger budget, is withdrawn as far as no sampler
+        has begun it, and a fit that is running loses its right: the next one judges and chooses anew.
+        """
 
     @abstractmethod
     def set_phase(self, name: str, phase: Phase, error: str | None = None) -> None: ...

@@ -104,6 +104,11 @@ class EnvironmentDefinition:
         """The same for states on another device."""
         return self if device == self.device else placed(self, device)
 
+    def tolerances_over(self, usual: Sequence[float]) -> tuple[float, ...]:
+        """Tolerance of each output: the declared one, else the usual one of these (O,)."""
+        declared = dict(self.tolerances)
+        return tuple(declared.get(name, value) for name, value in zip(self.outputs, usual, strict=True))
+
     def with_tolerances(self, tolerances: Mapping[str, float]) -> EnvironmentDefinition:
         """The same with these tolerances, by output, in the place of its own."""
         return replace(self, tolerances=tuple((dict(self.tolerances) | dict(tolerances)).items()))

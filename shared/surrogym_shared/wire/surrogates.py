@@ -24,8 +24,9 @@ class PatchSurrogate(Request):
     paused: bool | None = None
     budget: Annotated[int, Field(ge=2, le=100_000)] | None = None
     target: Annotated[float, Field(gt=0.5, lt=1)] | None = None
-    tolerances: dict[str, Positive] | None = Field(
-        default=None, description="by output, in its own unit; those of other outputs stay as they are"
+    tolerances: dict[str, Positive | None] | None = Field(
+        default=None,
+        description="by output, in its own unit; null takes back what was set, those of other outputs stay as they are",
     )
 
 

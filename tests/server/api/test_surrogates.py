@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from support import pendulum
+from support.noting import until
 from surrogym_shared import wire
 
 
@@ -93,6 +94,28 @@ def test_a_tolerance_has_a_finished_design_judged_anew(client: httpx.Client, nam
         assert problem.status_code == 422
         assert words in problem.text
     assert view(client, name).tolerances == {"theta_dot": 0.25}
+    back = client.patch(f"/v1/surrogates/{name}", json={"tolerances": {"theta_dot": None}})
+    assert back.raise_for_status().json()["tolerances"] == {}
+    judged = pendulum.finish(client, name)["fidelity"]["outputs"]
+    assert next(output for output in judged if output["name"] == "theta_dot")["tolerance"] != 0.25
+
+
+def test_a_tolerance_typed_wrong_costs_no_real_step(client: httpx.Client, name: str):
+    """What it made the design ask is withdrawn with it, though nobody answers it."""
+    taken = pendulum.teach(client, name, budget=9)["ledger"]["total"]
+    for value, waiting in ((1e-12, True), (10.0, False)):
+        body = {"tolerances": dict.fromkeys(("theta", "theta_dot", "reward"), value), "budget": 12}
+        client.patch(f"/v1/surrogates/{name}", json=body).raise_for_status()
+        assert until(lambda: tolerance_of_theta(client, name) == value)  # noqa: B023
+        assert (view(client, name).queries.pending > 0) == waiting
+    after = view(client, name)
+    assert (after.phase, after.ledger.total) == ("ready", taken)
+
+
+def tolerance_of_theta(client: httpx.Client, name: str) -> float:
+    fidelity = view(client, name).fidelity
+    assert fidelity is not None
+    return next(output.tolerance for output in fidelity.outputs if output.name == "theta")
 
 
 def test_a_paused_design_hands_out_nothing(client: httpx.Client, fresh: str):

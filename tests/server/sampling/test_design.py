@@ -19,10 +19,11 @@ from surrogym_server.sampling.design import (
     DesignState,
     Request,
     advance,
-    default_tolerances,
     initial_design,
     judge,
     monte_carlo,
+    sizes_of,
+    usual_tolerances,
 )
 from surrogym_server.sampling.outlook import Points
 from surrogym_server.surrogate.definition import EnvironmentDefinition, wrap
@@ -39,6 +40,10 @@ def designed(**design: object) -> EnvironmentSpec:
 def request(budget: int = 20, pending: Samples | None = None, **options: object) -> Request:
     none = Points(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 1, dtype=torch.float64))
     return Request(budget, 0.999, none if pending is None else Points(pending.q, pending.u), **options)
+
+
+def usual_of(definition: EnvironmentDefinition, samples: Samples) -> tuple[float, ...]:
+    return usual_tolerances(definition, sizes_of(definition, samples))
 
 
 def first(samples: Samples, count: int) -> Samples:
@@ -187,7 +192,7 @@ def test_the_paper_starts_with_ten_points_a_dimension_and_tolerance_one():
     q, u = initial_design(definition, 125)
     assert len(q) == len(u) == 10 * (3 + 1)
     samples = answer(pendulum(), q, u)
-    assert default_tolerances(definition, samples) == (1.0,) * 4
+    assert usual_of(definition, samples) == (1.0,) * 4
     made = advance(definition, samples, DesignState(), request(125))
     assert [c.confidence_index for c in made.confidences] == [c.confidence_index_paper for c in made.confidences]
 
@@ -197,9 +202,9 @@ def test_the_papers_tolerance_can_be_relative_to_what_its_outputs_do():
     samples = random_steps(pendulum(), 40, seed=0)
     change = definition.observe(samples.q_next) - definition.observe(samples.q)
     spread = torch.cat([change, samples.reward[:, None]], -1).std(0, correction=0)
-    assert default_tolerances(definition, samples) == pytest.approx((0.05 * spread).tolist())
+    assert usual_of(definition, samples) == pytest.approx((0.05 * spread).tolist())
     default = definition_from_spec(designed(tolerance="raw"))
-    assert default_tolerances(default, samples) == (1.0,) * 3
+    assert usual_of(default, samples) == (1.0,) * 3
 
 
 def test_a_latin_hypercube_design_asks_for_its_whole_budget_at_once():
@@ -230,19 +235,26 @@ def test_more_extra_queries_than_there_are_distinct_points_end_soon(definition, 
 
 
 def test_declared_tolerances_hold(few):
-    spec = pendulum().model_copy(update={"tolerances": {"speed": 0.5}})
-    tolerances = default_tolerances(definition_from_spec(spec), few)
-    assert tolerances[1] == 0.5
-    assert tolerances[0] != 0.5
+    definition = definition_from_spec(pendulum().model_copy(update={"tolerances": {"speed": 0.5}}))
+    usual = usual_of(definition, few)
+    assert definition.tolerances_over(usual) == (usual[0], 0.5, usual[2])
+    assert usual[1] != 0.5
+    assert advance(definition, few, DesignState(), request()).tolerances == definition.tolerances_over(usual)
+
+
+def test_an_output_that_never_varied_has_the_size_of_its_mean(definition, few):
     still = replace(few, reward=torch.ones_like(few.reward))
-    assert default_tolerances(definition_from_spec(spec), still)[2] == pytest.approx(0.05)
+    assert usual_of(definition, still)[2] == pytest.approx(0.05)
 
 
-def test_a_tolerance_set_later_takes_the_place_of_the_frozen_one(definition, few):
+def test_a_tolerance_set_later_takes_the_place_of_the_frozen_one_until_it_is_taken_back(definition, few):
     frozen = DesignState(1, (0.5, 0.5, 0.5))
     made = advance(definition.with_tolerances({"speed": 1e-12}), few, frozen, request())
-    assert made.state.tolerances == (0.5, 1e-12, 0.5)
+    assert made.tolerances == (0.5, 1e-12, 0.5)
     assert made.confidences[1].confidence_index < 0.999
+    back = advance(definition, few, made.state, request())
+    assert back.tolerances == (0.5, 0.5, 0.5)
+    assert back.confidences[1].confidence_index > 0.999
 
 
 def test_a_tolerance_is_declared_for_what_the_preset_learns():
@@ -250,7 +262,7 @@ def test_a_tolerance_is_declared_for_what_the_preset_learns():
     design = Design(preset="paper", initial=10)
     spec = EnvironmentSpec.model_validate(pendulum().model_dump() | {"tolerances": {"cos": 0.02}, "design": design})
     definition = definition_from_spec(spec)
-    assert default_tolerances(definition, random_steps(spec, 10, seed=0)) == (0.02, 1.0, 1.0, 1.0)
+    assert definition.tolerances_over(usual_of(definition, random_steps(spec, 10, seed=0))) == (0.02, 1.0, 1.0, 1.0)
     with pytest.raises(ValueError, match=r"'theta'.*\['cos', 'sin', 'speed', 'reward'\]"):
         EnvironmentSpec.model_validate(pendulum().model_dump() | {"tolerances": {"theta": 0.02}, "design": design})
 

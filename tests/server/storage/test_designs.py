@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
+import numpy as np
 import pytest
 
 from surrogym_server.errors import (
@@ -143,6 +145,45 @@ def test_another_budget_or_target_wakes_a_finished_design(
     assert storage.designs.due() == [], "resuming what was not paused is nothing new"
     storage.surrogates.change(due, **change)  # type: ignore[arg-type]
     assert storage.designs.due() == [due]
+
+
+ASKED_ANEW = ({"tolerances": {"theta": 0.5}}, {"target": 0.9}, {"budget": 3})
+
+
+@pytest.mark.parametrize("change", ASKED_ANEW)
+def test_what_was_chosen_by_what_was_asked_before_is_withdrawn_unless_it_is_begun(
+    storage: Storage, due: str, design: Callable[..., NewDesign], change: dict[str, Any]
+) -> None:
+    """A tolerance typed wrong costs no real step; a step that may have been taken stays in the ledger."""
+    storage.designs.commit(begun(storage, due), design(queries=3))
+    [lost] = storage.queries.claim(due, "a", 1, LONG)
+    storage.queries.fail(due, lost.id, lost.token, "unreachable")
+    by_hand = storage.queries.enqueue(due, np.ones((1, 2)), np.ones((1, 1)))
+    storage.surrogates.change(due, budget=60)
+    assert len(storage.queries.list(due, ("pending",))) == 4, "more room is no reason to choose anew"
+    storage.surrogates.change(due, **change)
+    assert [query.id for query in storage.queries.list(due, ("pending",))] == [lost.id, *by_hand]
+    assert storage.ledger.read(due).unresolved == 1
+
+
+def test_what_nobody_has_begun_does_not_keep_a_change_waiting(
+    storage: Storage, due: str, design: Callable[..., NewDesign]
+) -> None:
+    storage.designs.commit(begun(storage, due), design(queries=2))
+    storage.surrogates.change(due, tolerances={"theta": 0.5})
+    assert storage.designs.due() == [due]
+
+
+@pytest.mark.parametrize("change", ASKED_ANEW)
+def test_a_fit_that_runs_while_something_else_is_asked_is_made_again(
+    storage: Storage, due: str, design: Callable[..., NewDesign], change: dict[str, Any]
+) -> None:
+    lease = begun(storage, due)
+    assert storage.surrogates.change(due, **change).phase == "collecting"
+    with pytest.raises(LeaseExpired):
+        storage.designs.commit(lease, design(queries=3))
+    assert storage.designs.due() == [due]
+    assert storage.queries.list(due, ("pending",)) == []
 
 
 def test_a_paused_design_is_not_fitted(storage: Storage, due: str) -> None:

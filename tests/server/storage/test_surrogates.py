@@ -77,6 +77,8 @@ def test_tolerances_are_set_one_by_one(storage: Storage, make: Callable[..., str
     storage.surrogates.change(name, tolerances={"theta": 0.1, "reward": 2.0})
     storage.surrogates.change(name, tolerances={"theta": 0.01})
     assert storage.surrogates.get(name).tolerances == {"theta": 0.01, "reward": 2.0}
+    storage.surrogates.change(name, tolerances={"reward": None, "theta_dot": None})
+    assert storage.surrogates.get(name).tolerances == {"theta": 0.01}
 
 
 def test_set_phase_keeps_the_error(storage: Storage, make: Callable[..., str]) -> None:

@@ -25,8 +25,6 @@ from surrogym_server.storage.sql.models import insert_model
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, recall, remember, touch
 from surrogym_server.storage.sql.tables import queries, samples, surrogates
 
-NO_RIGHT = {"fit_token": None, "fit_owner": None, "fit_expires": None}
-
 
 class SqlDesigns(port.Designs):
     def __init__(self, database: Database) -> None:
@@ -87,7 +85,7 @@ class SqlDesigns(port.Designs):
             except (LeaseExpired, UnknownSurrogate):
                 return
             seen = {} if error is None else {"fitted_revision": lease.revision}
-            _update(connection, held, **NO_RIGHT, **seen)
+            _update(connection, held, **stored.NO_RIGHT, **seen)
             stored.update_phase(connection, held, _phase_after(held, error), error)
 
 
@@ -120,7 +118,7 @@ def _finish(connection: Connection, held: Row[Any], lease: FitLease, design: New
     _update(
         connection,
         held,
-        **NO_RIGHT,
+        **stored.NO_RIGHT,
         state=design.state,
         phase=design.phase,
         error=None,

@@ -12,8 +12,9 @@ from surrogym_server.storage import port
 from surrogym_server.storage.records import NewSurrogate, Phase, SurrogateRecord
 from surrogym_server.storage.sql.database import Database, clock, conflict_insert
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, touch, unknown_surrogate
-from surrogym_server.storage.sql.tables import surrogates
+from surrogym_server.storage.sql.tables import queries, surrogates
 
+NO_RIGHT = {"fit_token": None, "fit_owner": None, "fit_expires": None}
 COLUMNS = [
     getattr(surrogates.c, name)
     for name in (
@@ -59,12 +60,12 @@ class SqlSurrogates(port.Surrogates):
         paused: bool | None = None,
         budget: int | None = None,
         target: float | None = None,
-        tolerances: dict[str, float] | None = None,
+        tolerances: dict[str, float | None] | None = None,
     ) -> SurrogateRecord:
         with self._database.write() as connection:
             held = hold(connection, name)
             before = read(connection, name)
-            merged = None if tolerances is None else before.tolerances | tolerances
+            merged = None if tolerances is None else _set_or_taken_back(before.tolerances, tolerances)
             asked = {"paused": paused, "budget": budget, "target": target, "tolerances": merged}
             changes: dict[str, Any] = {
                 field: value for field, value in asked.items() if value is not None and value != getattr(before, field)
@@ -73,6 +74,8 @@ class SqlSurrogates(port.Surrogates):
                 changes |= {"phase": resting_phase(before.round), "error": None}
             if not changes:
                 return before
+            if changes.keys() & {"target", "tolerances"} or changes.get("budget", before.budget) < before.budget:
+                changes |= _ask_anew(connection, held)
             _apply(connection, held, changes)
             append_event(connection, held, "phase", **{"phase": before.phase, **changes})
             return read(connection, name)
@@ -129,6 +132,26 @@ def _insert(connection: Connection, new: NewSurrogate) -> bool:
     )
     free = insert.on_conflict_do_nothing(index_elements=["name"]).returning(surrogates.c.id)
     return connection.execute(free).scalar() is not None
+
+
+def _set_or_taken_back(before: dict[str, float], changes: dict[str, float | None]) -> dict[str, float]:
+    kept = {name: value for name, value in before.items() if name not in changes}
+    return kept | {name: value for name, value in changes.items() if value is not None}
+
+
+def _ask_anew(connection: Connection, held: Row[Any]) -> dict[str, Any]:
+    """Withdraw what the design chose by what was asked of it before, as far as no sampler has begun it, and the right
+    of a fit that is running. Gives the phase, where that ends with it."""
+    connection.execute(
+        sa.delete(queries).where(
+            queries.c.surrogate_id == held.id,
+            queries.c.purpose == "adaptive",
+            queries.c.status == "pending",
+            queries.c.attempts == 0,
+        )
+    )
+    connection.execute(sa.update(surrogates).where(surrogates.c.id == held.id).values(**NO_RIGHT))
+    return {"phase": resting_phase(held.round)} if held.phase == "fitting" else {}
 
 
 def _apply(connection: Connection, held: Row[Any], changes: dict[str, Any]) -> None:
