@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import shlex
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -52,6 +53,7 @@ Tolerances = Annotated[
 ]
 StepLimit = Annotated[float, typer.Option(min=0.001, help="Seconds one real step, or a reset, may take.")]
 Preset = Literal["default", "paper"]
+Acquisition = Literal["integrated_variance", "variance", "uncertainty_index", "latin_hypercube"]
 
 
 def connect(server: str | None, token: str | None, wait: float = 0.0, *, quiet: bool = False) -> Api:
@@ -99,6 +101,25 @@ def _waiting(words: str, *, quiet: bool) -> Iterator[None]:
     with on_interrupt(lambda: "interrupted; the same command waits again"), progress("wait", quiet=quiet) as update:
         update(None, words)
         yield
+
+
+def typed(context: typer.Context, without: Sequence[str] = ()) -> str:
+    """The arguments and options that were given on the command line, but some, as they are typed."""
+    words: list[str] = []
+    for parameter in context.command.params:
+        name = str(parameter.name)
+        source = context.get_parameter_source(name)
+        if name in without or source is None or source.name != "COMMANDLINE":
+            continue
+        value = context.params[name]
+        if parameter.param_type_name == "argument":
+            words.append(str(value))
+        elif isinstance(value, bool):
+            words.append((parameter.opts if value else parameter.secondary_opts)[0])
+        else:
+            for one in value if isinstance(value, list | tuple) else [value]:
+                words += [parameter.opts[0], str(one)]
+    return shlex.join(words)
 
 
 def read_spec(path: Path | None) -> EnvironmentSpec | None:

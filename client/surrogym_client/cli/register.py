@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from surrogym_client.cli.options import (
+    Acquisition,
     AsJson,
     Preset,
     Quiet,
@@ -42,6 +43,10 @@ def command(
     initial: Annotated[int | None, typer.Option(min=2, help="Real steps before the first model.")] = None,
     target: Annotated[float | None, typer.Option(help="Confidence index to reach.")] = None,
     tolerance: Tolerances = None,
+    acquisition: Annotated[
+        Acquisition | None,
+        typer.Option(help="What chooses queries after the first model. [default: integrated_variance]"),
+    ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the design.")] = None,
     bins: Annotated[int | None, typer.Option(min=2, help="Offer a continuous action as so many values.")] = None,
     teleport: Annotated[
@@ -72,6 +77,7 @@ def command(
         budget=budget,
         initial=initial,
         target=target,
+        acquisition=acquisition,
         seed=seed,
         bins=bins,
         teleport=teleport,

@@ -15,6 +15,7 @@ from surrogym_client.original.rollouts import answering
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 
 Preset = Literal["default", "paper"]
+Acquisition = Literal["integrated_variance", "variance", "uncertainty_index", "latin_hypercube"]
 Choose = Callable[[EnvironmentSpec], EnvironmentSpec]
 METHODS = ("step_from", "reset", "step", "coordinates", "begin", "act", "picture", "close")
 
@@ -27,6 +28,7 @@ def make(
     budget: int | None = None,
     initial: int | None = None,
     target: float | None = None,
+    acquisition: Acquisition | None = None,
     seed: int | None = None,
     bins: int | None = None,
     teleport: bool = True,
@@ -37,7 +39,7 @@ def make(
     Args:
         name: a Gymnasium id with a built-in adapter, or ``package.module:factory``.
         spec: a specification that replaces the adapter's own.
-        preset, budget, initial, target, seed: choices of the design; None keeps the specification's.
+        preset, budget, initial, target, acquisition, seed: choices of the design; None keeps the specification's.
         bins: offer a continuous action to policies as so many discrete values a dimension.
         teleport: False asks for rollouts from resets, as if no state could be set.
         max_rollout: the longest of them.
@@ -50,8 +52,8 @@ def make(
         >>> make("CartPole-v1", preset="paper").spec().time_limit
         200
     """
-    design = {"preset": preset, "budget": budget, "initial": initial, "target": target, "seed": seed}
-    chosen = {key: value for key, value in design.items() if value is not None}
+    asked = {"budget": budget, "initial": initial, "target": target, "acquisition": acquisition, "seed": seed}
+    chosen = {key: value for key, value in {"preset": preset, **asked}.items() if value is not None}
     choose = partial(with_choices, design=chosen, bins=bins, teleport=teleport, max_rollout=max_rollout)
     if ":" in name:
         return _own(load_factory(name)(), spec, choose)

@@ -24,7 +24,11 @@ class Design(Frozen):
     eq. 9 divides by the deviation where none is declared: ``relative``, 5 % of the output's deviation over the initial
     design, or ``raw``, 1 in the output's own unit, as printed. ``symmetry``: ``auto`` looks whether the environment is
     its own mirror image, every coordinate and the action with their signs changed, ``none`` does not; preset ``paper``
-    never does.
+    never does. ``initial`` of the budget are a Latin hypercube, before the first model. ``acquisition`` is what chooses
+    the others: ``integrated_variance``, the default's, the query that lowers the variance most over the range and where
+    policies went; ``variance``, where the deviation is largest; ``uncertainty_index``, the paper's (eq. 12); or
+    ``latin_hypercube``: none is chosen, the whole budget is one. ``monte_carlo`` points estimate the confidence index
+    (eq. 8).
     """
 
     preset: Literal["default", "paper"] = "default"
