@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire import SurrogateView
+from surrogym_shared.wire import OF_PARTICLES, SurrogateView
 
 CHECKS = 12  # of the imagined return in one training; the best policy is kept
 CHECK_EPISODES = 64
@@ -58,7 +58,7 @@ def chosen_for(view: SurrogateView, settings: TrainSettings) -> TrainSettings:
     """
     if "variant" in settings.session or view.phase == "ready" or view.spec.design.preset == "paper":
         return settings
-    other = {name: value for name, value in settings.session.items() if name not in DRAWS}
+    other = {name: value for name, value in settings.session.items() if name not in OF_PARTICLES}
     return replace(settings, session=DRAWS | settings.session, judge=FUNCTIONS | other)
 
 

@@ -56,6 +56,8 @@ def test_an_address_that_is_none(surrogym):
         (("register", "--spec", "broken.json"), "broken.json is no specification: "),
         (("register", "--spec", "crossed.json"), "uniform range crosses: expected low < high, got [1.0, -1.0]"),
         (("train", "pendulum", "--start-from", "missing.zip"), "missing.zip: no such policy file"),
+        (("train", "pendulum", "--spread", "0"), "--spread is variant probabilistic's: give --variant probabilistic"),
+        (("change", "pendulum", "--tolerance", "theta=small"), "expected output=number, such as theta=0.01"),
         (("evaluate", "missing.zip", "--env", "Pendulum-v1"), "missing.zip: no such policy file"),
         (("evaluate", "junk.zip", "--env", "Pendulum-v1", "--quiet"), "junk.zip is no policy of PPO"),
         (("evaluate", "junk.zip"), "expected --env with the original environment, got none"),

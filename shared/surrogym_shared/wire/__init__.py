@@ -64,6 +64,7 @@ from surrogym_shared.wire.queries import (
 )
 from surrogym_shared.wire.service import Access, Event, Health, Ready
 from surrogym_shared.wire.sessions import (
+    OF_PARTICLES,
     ActionRow,
     Actions,
     ActionSpace,
@@ -104,6 +105,7 @@ __all__ = [
     "MAX_MEASURED",
     "MAX_PARTICLES",
     "MAX_ROLLOUT",
+    "OF_PARTICLES",
     "PROTOCOL",
     "Access",
     "ActionRow",

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, FiniteFloat
+from pydantic import Field, FiniteFloat, model_validator
 
 from surrogym_shared.spec import MAX_DIMENSIONS
 from surrogym_shared.wire.base import (
@@ -20,6 +20,8 @@ from surrogym_shared.wire.base import (
     Seq,
     Variant,
 )
+
+OF_PARTICLES = ("particles", "propagation", "weighting", "spread")
 
 
 class OpenSession(Request):
@@ -55,6 +57,14 @@ class OpenSession(Request):
     )
     occupancy: bool = Field(default=False, description="collect visited coordinates, to be submitted at checkpoints")
     idempotency_key: Key | None = None
+
+    @model_validator(mode="after")
+    def _particles_are_the_probabilistic_variants(self) -> Self:
+        """What another variant would ignore is refused."""
+        for name in () if self.variant == "probabilistic" else OF_PARTICLES:
+            if getattr(self, name) != type(self).model_fields[name].default:
+                raise ValueError(f"{name}: expected with variant probabilistic alone, got with {self.variant}")
+        return self
 
 
 class BoxSpace(Reply):

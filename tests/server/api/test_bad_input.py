@@ -320,6 +320,8 @@ def test_a_rollout_is_made_whole_or_not_at_all(client: httpx.Client, session: st
         ({"trust": -1.0}, Code.INVALID_REQUEST),
         ({"process_noise": 1}, Code.INVALID_REQUEST),
         ({"weighting": "variance"}, Code.INVALID_REQUEST),
+        ({"particles": 5}, Code.INVALID_REQUEST),
+        ({"variant": "pathwise", "spread": 0.0}, Code.INVALID_REQUEST),
         ({"propagation": "median"}, Code.INVALID_REQUEST),
         ({"model": 99}, Code.UNKNOWN_MODEL),
         ({"penalty": float("nan")}, Code.INVALID_REQUEST),
