@@ -98,8 +98,13 @@ def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM) -> Predict:
     return predict
 
 
-def load_learner(path: Path, algorithm: str = DEFAULT_ALGORITHM) -> BaseAlgorithm:
+def load_learner(path: Path, algorithm: str = DEFAULT_ALGORITHM, **changes: Any) -> BaseAlgorithm:
     """What ``save`` of a Stable-Baselines3 algorithm wrote. It is unpickled: load only what you trust.
+
+    Args:
+        path: the file.
+        algorithm: name of its class.
+        changes: environment, seed and hyperparameters, in the place of those that it was saved with.
 
     Raises:
         UnusablePolicy: no such algorithm, or the file is none of its policies.
@@ -110,7 +115,7 @@ def load_learner(path: Path, algorithm: str = DEFAULT_ALGORITHM) -> BaseAlgorith
     if kind is None or not hasattr(kind, "load"):
         raise UnusablePolicy(f"Stable-Baselines3 has no algorithm {algorithm!r}: expected for instance PPO, SAC or DQN")
     try:
-        learner: BaseAlgorithm = kind.load(path, device="cpu")
+        learner: BaseAlgorithm = kind.load(path, device="cpu", **changes)
     except Exception as error:  # unpickling somebody's file can raise anything
         raise UnusablePolicy(f"{path} is no policy of {algorithm}: {error}") from error
     return learner

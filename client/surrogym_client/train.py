@@ -27,6 +27,7 @@ from surrogym_client.checks import Checks
 from surrogym_client.evolution import EVOLUTION, EVOLUTION_STEPS, evolve
 from surrogym_client.imagined import imagined_returns, observation_statistics
 from surrogym_client.policies import WIDER, PaperPolicy, Standardise
+from surrogym_client.policy_file import load_learner
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.tracking import tracking, with_folder
 from surrogym_client.training import (
@@ -77,7 +78,8 @@ def train(
 
     Raises:
         ValueError: an unknown algorithm, one that can't take the action space, or too many steps.
-        SurrogymClientError: the surrogate can't be reached, or has no model yet.
+        SurrogymClientError: the surrogate can't be reached, or has no model yet; or the file to go on from is no policy
+            of the algorithm.
         TrainingInterrupted: Ctrl-C came; the policy with the best imagined return so far is saved.
     """
     settings = settings or TrainSettings()
@@ -217,8 +219,8 @@ def _learner(
     gamma: float,
 ) -> BaseAlgorithm:
     if settings.start_from is not None:
-        asked = settings.hyperparameters  # over those that it was saved with
-        learner = algorithm.load(settings.start_from, env=env, device="cpu", seed=settings.seed, **asked)
+        changes = {"env": env, "seed": settings.seed, **settings.hyperparameters}
+        learner = load_learner(settings.start_from, algorithm.__name__, **changes)
         learner.tensorboard_log = None if settings.tensorboard is None else str(settings.tensorboard)
         return learner
     extractor = {"mean": statistics[0], "deviation": statistics[1]}

@@ -46,7 +46,9 @@ def test_training_saves_its_policy(pendulum_server: ServerProcess, surrogym_on_t
     with surrogym_on_terminal("train", "pendulum", *options, "--out", "policy.zip") as terminal:
         terminal.await_text("of 899072 virtual steps")
         assert terminal.interrupt() == INTERRUPTED
-    assert "to go on: surrogym train pendulum --start-from policy.zip --out policy.zip" in said(terminal)
+    given = " ".join([*options, "--server", pendulum_server.url])
+    again = f"surrogym train pendulum {given} --start-from policy.zip --out policy.zip"
+    assert f"to go on: {again}" in said(terminal)
     load_policy(tmp_path / "policy.zip")
     card = json.loads((tmp_path / "policy.json").read_text())
     assert 0 < card["virtual_steps"] < 899_072

@@ -15,7 +15,7 @@ from surrogym_client.imagined import imagined_returns
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_client.original.loading import make
 from surrogym_client.policies import WIDER, PaperPolicy
-from surrogym_client.policy_file import load_policy
+from surrogym_client.policy_file import UnusablePolicy, load_policy
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.train import (
     MAX_STEPS,
@@ -103,6 +103,17 @@ def test_what_is_asked_for_goes_over_what_the_policy_was_saved_with(surrogate, t
     after = PPO.load(second, device="cpu")
     assert (after.learning_rate, after.n_steps, after.ent_coef, after.n_epochs) == (1e-5, 32, 0.01, 2)
     assert {name: result.settings[name] for name in asked} == asked
+
+
+def test_a_file_of_another_algorithm_is_not_gone_on_from(surrogate, tmp_path: Path):
+    a_search = tmp_path / "search.zip"
+    few = {"population": 4, "starts": 2, "units": 2}
+    train(surrogate, a_search, TrainSettings(algorithm="cmaes", total_steps=1, hyperparameters=few))
+    (tmp_path / "a.txt").write_text("text")
+    for path in (a_search, tmp_path / "a.txt"):
+        with pytest.raises(UnusablePolicy, match=f"{path.name} is no policy of PPO"):
+            train(surrogate, tmp_path / "policy.zip", small(start_from=path))
+    assert not (tmp_path / "policy.zip").exists()
 
 
 def distance(a: PaperPolicy, b: PaperPolicy) -> float:

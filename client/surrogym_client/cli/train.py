@@ -23,6 +23,7 @@ from surrogym_client.cli.options import (
     Wait,
     awaited_surrogate,
     connect,
+    typed,
 )
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
+    context: typer.Context,
     surrogate: Surrogate,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write the policy to.")] = Path("policy.zip"),
     algorithm: Annotated[
@@ -144,6 +146,9 @@ def command(
 
     if exit_with_parent:
         watch_parent()
+    for given in ("particles", "propagation", "weighting", "spread"):
+        if context.params[given] is not None and variant != "probabilistic":
+            raise CommandError(f"--{given} is variant probabilistic's: give --variant probabilistic with it")
     if start_from is not None and not start_from.exists():
         raise CommandError(f"{start_from}: no such policy file")
     hyperparameters = _hyperparameters(chosen or [])
@@ -176,7 +181,7 @@ def command(
         session=session,
     )
     card = partial(_write_card, surrogate=surrogate, spec=spec, url=url, seed=seed)
-    with _keeping(card, f"{surrogate} --improve {improve} --rounds {rounds}" if improve else surrogate):
+    with _keeping(card, typed(context, without=("out", "start_from", "token"))):
         result = _train(
             url, token, surrogate, out, settings, (improve, rounds) if improve else None, progress_file, quiet=quiet
         )

@@ -21,7 +21,7 @@ def words_of_result(result: TrainResult, *, closed_loop: bool = False) -> str:
 
 
 def words_of_interruption(result: TrainResult, asked: str) -> str:
-    """What Ctrl-C left, and how to go on; ``asked`` is the surrogate, with the options of the closed loop if any."""
+    """What Ctrl-C left, and how to go on; ``asked`` is the surrogate, with the options that were given."""
     return (
         f"interrupted after {result.virtual_steps} virtual steps; the policy so far is in {result.path}; to go on: "
         f"surrogym train {asked} --start-from {result.path} --out {result.path}"

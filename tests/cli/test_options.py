@@ -1,0 +1,42 @@
+"""What a hint repeats of a command line: all that was typed, but what it says otherwise and what is secret."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from surrogym_client.cli.options import Quiet, Token, typed
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("pendulum", "pendulum"),
+        ("--steps 9 pendulum -q --no-loud", "pendulum --steps 9 --no-loud --quiet"),
+        ("pendulum --set a=1 --set 'b=x y' --token secret -o p.zip", "pendulum --set a=1 --set 'b=x y'"),
+    ],
+)
+def test_a_command_line_is_told_again(line: str, said: str):
+    app = typer.Typer()
+
+    @app.command()
+    def command(
+        context: typer.Context,
+        name: str,
+        out: Annotated[Path, typer.Option("--out", "-o")] = Path("policy.zip"),
+        chosen: Annotated[list[str] | None, typer.Option("--set")] = None,
+        steps: int | None = None,
+        loud: Annotated[bool | None, typer.Option("--loud/--no-loud")] = None,
+        token: Token = None,
+        quiet: Quiet = False,
+    ) -> None:
+        assert (name, out.suffix, quiet) == ("pendulum", ".zip", "-q" in line)
+        typer.echo(typed(context, without=("out", "token")))
+
+    again = CliRunner().invoke(app, line)
+    assert again.exception is None
+    assert again.output == said + "\n"
