@@ -36,17 +36,17 @@ class DesignState:
     """What one round leaves for the next; JSON-able."""
 
     round: int = 0
-    tolerances: tuple[float, ...] = ()  # usual ones, per output; frozen after the first round
+    usual: tuple[float, ...] = ()  # tolerances, per output, where nobody set one; frozen after the first round
     thetas: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         thetas = {key: theta.tolist() for key, theta in self.thetas.items()}
-        return {"round": self.round, "tolerances": list(self.tolerances), "thetas": thetas}
+        return {"round": self.round, "usual": list(self.usual), "thetas": thetas}
 
     @classmethod
     def from_json(cls, state: dict[str, Any]) -> DesignState:
         thetas = {key: np.array(theta) for key, theta in state.get("thetas", {}).items()}
-        return cls(state.get("round", 0), tuple(state.get("tolerances", ())), thetas)
+        return cls(state.get("round", 0), tuple(state.get("usual", ())), thetas)
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def initial_rollouts(definition: EnvironmentDefinition, budget: int) -> list[Ten
 def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignState, request: Request) -> Decision:
     """One round. Raises InvalidInput or NumericalFailure as ``learn`` does."""
     learned = learn(definition, samples, state.thetas)
-    usual = state.tolerances or usual_tolerances(definition, sizes_of(definition, samples))
+    usual = state.usual or usual_tolerances(definition, sizes_of(definition, samples))
     tolerances = definition.tolerances_over(usual)
     points = Points(*monte_carlo(definition))
     deviation = deviations(learned.model, points.q, points.u)

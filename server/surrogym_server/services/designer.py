@@ -187,6 +187,7 @@ class Designer:
             query_coordinates=result.query_coordinates,
             query_action=result.query_action,
             query_rollouts=result.query_rollouts,
+            extra=result.verdict != "continue",
         )
         surrogate = self._storage.surrogates.get(lease.surrogate).id
         version = self._storage.designs.commit(lease, design)

@@ -71,7 +71,7 @@ class ModelService:
         new = NewModel(
             samples=model.samples,
             data_hash=model.digest,
-            fidelity=fidelity_of(model, record.state.get("tolerances", ()), record.target),
+            fidelity=fidelity_of(model, record.state.get("usual", ()), record.target),
             description=model.description,
             fit_seconds=0.0,
             blob=data,

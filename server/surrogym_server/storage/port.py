@@ -78,7 +78,8 @@ class Surrogates(ABC):
         budget, target or tolerance, or resuming a failed design, makes a fit due.
 
         What the design chose by another target or tolerance, or by a larger budget, is withdrawn as far as no sampler
-        has begun it, and a fit that is running loses its right: the next one judges and chooses anew.
+        has begun it, and a fit that is running loses its right: the next one judges and chooses anew. What ``ask``
+        asked for is asked for again, unless the budget is smaller; initial queries go only where they are beyond that.
         """
 
     @abstractmethod

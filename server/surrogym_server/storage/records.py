@@ -116,6 +116,7 @@ class NewDesign:
     query_coordinates: Array = field(default_factory=no_rows)  # (m, C)
     query_action: Array = field(default_factory=no_rows)  # (m, F)
     query_rollouts: tuple[Array, ...] = ()  # action sequences from a reset, each (T, F)
+    extra: bool = False  # the queries are those of ``Designs.ask``, which the design itself would not have chosen
 
 
 # Queries and samples

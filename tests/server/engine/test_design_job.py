@@ -63,7 +63,7 @@ def test_queries_are_inside_the_sampling_range(job):
 
 
 def test_pending_queries_and_occupancy_are_passed_on(job):
-    hungry = replace(job, budget=len(job.coordinates) + 2, state={"round": 1, "tolerances": [1e-12] * 3})
+    hungry = replace(job, budget=len(job.coordinates) + 2, state={"round": 1, "usual": [1e-12] * 3})
     assert len(run_design_job(hungry).query_coordinates) == 2
     pending = replace(hungry, pending_coordinates=np.array([[1.0, 1.0]]), pending_action=np.array([[0.0]]))
     assert len(run_design_job(pending).query_coordinates) == 1

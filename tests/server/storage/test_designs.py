@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -156,14 +157,39 @@ def test_what_was_chosen_by_what_was_asked_before_is_withdrawn_unless_it_is_begu
 ) -> None:
     """A tolerance typed wrong costs no real step; a step that may have been taken stays in the ledger."""
     storage.designs.commit(begun(storage, due), design(queries=3))
-    [lost] = storage.queries.claim(due, "a", 1, LONG)
+    lost, behind = storage.queries.claim(due, "a", 2, LONG)
     storage.queries.fail(due, lost.id, lost.token, "unreachable")
+    storage.queries.fail(due, behind.id, behind.token, "the sampler was stopped", begun=False)
     by_hand = storage.queries.enqueue(due, np.ones((1, 2)), np.ones((1, 1)))
     storage.surrogates.change(due, budget=60)
     assert len(storage.queries.list(due, ("pending",))) == 4, "more room is no reason to choose anew"
     storage.surrogates.change(due, **change)
     assert [query.id for query in storage.queries.list(due, ("pending",))] == [lost.id, *by_hand]
     assert storage.ledger.read(due).unresolved == 1
+
+
+@pytest.mark.parametrize(("change", "again"), [({"tolerances": {"theta": 0.5}}, 2), ({"budget": 7}, 0)])
+def test_what_somebody_asked_for_is_asked_for_again_unless_there_is_less_to_spend(
+    storage: Storage, due: str, design: Callable[..., NewDesign], change: dict[str, Any], again: int
+) -> None:
+    storage.designs.commit(begun(storage, due), design(phase="ready"))
+    storage.designs.ask(due, 3)
+    storage.designs.commit(begun(storage, due), replace(design(queries=3), extra=True))
+    assert storage.surrogates.get(due).extra_queries == 0
+    storage.queries.claim(due, "a", 1, LONG)
+    assert storage.surrogates.change(due, **change).extra_queries == again
+
+
+def test_a_smaller_budget_leaves_as_many_initial_queries_as_it_holds(
+    storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None]
+) -> None:
+    name = make(queries=6)
+    first = [query.id for query in storage.queries.list(name)][:4]
+    storage.queries.claim(name, "a", 1, LONG)
+    storage.surrogates.change(name, tolerances={"theta": 0.5})
+    assert len(storage.queries.list(name)) == 6
+    storage.surrogates.change(name, budget=4)
+    assert [query.id for query in storage.queries.list(name)] == first
 
 
 def test_what_nobody_has_begun_does_not_keep_a_change_waiting(

@@ -36,7 +36,7 @@ class SqlDesigns(port.Designs):
             held = hold(connection, name, surrogates.c.budget, surrogates.c.extra_queries)
             if recall(connection, held, "ask", key, body) is None:
                 extra = held.extra_queries + queries
-                budget = max(held.budget, _spoken_for(connection, held.id) + extra)
+                budget = max(held.budget, stored.spoken_for(connection, held.id) + extra)
                 touch(connection, held, extra_queries=extra, budget=budget, checkpoint=checkpoint)
                 remember(connection, held, "ask", key, body, True)
             return stored.read(connection, name)
@@ -74,7 +74,7 @@ class SqlDesigns(port.Designs):
             version = insert_model(connection, held, design.model)
             _finish(connection, held, lease, design)
             chosen = (design.query_coordinates, design.query_action, design.query_rollouts)
-            insert_queries(connection, held, "adaptive", held.round + 1, *chosen)
+            insert_queries(connection, held, "adaptive", held.round + 1, *chosen, extra=design.extra)
             append_event(connection, held, "phase", phase=design.phase, error=None)
             return version
 
@@ -130,12 +130,3 @@ def _finish(connection: Connection, held: Row[Any], lease: FitLease, design: New
 
 def _phase_after(held: Row[Any], error: str | None) -> Phase:
     return "failed" if error is not None else stored.resting_phase(held.round)
-
-
-def _spoken_for(connection: Connection, surrogate_id: int) -> int:
-    """Samples there are, and those that open queries may become."""
-    taken = sa.select(sa.func.count()).where(samples.c.surrogate_id == surrogate_id)
-    awaited = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0)).where(
-        queries.c.surrogate_id == surrogate_id, queries.c.status.in_(OPEN_STATUSES)
-    )
-    return int(connection.execute(sa.select(taken.scalar_subquery() + awaited.scalar_subquery())).scalar_one())

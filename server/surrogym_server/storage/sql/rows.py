@@ -90,6 +90,8 @@ def insert_queries(
     coordinates: Array,
     action: Array,
     rollouts: Sequence[Array] = (),
+    *,
+    extra: bool = False,
 ) -> list[int]:
     """Queue coordinates (m, C) with action (m, F), then action sequences, each (T, F); returns the ids in order.
 
@@ -109,6 +111,7 @@ def insert_queries(
     if not asked:
         return []
     common = {"surrogate_id": held.id, "purpose": purpose, "round": round, "status": "pending", "attempts": 0}
+    common["extra"] = extra
     rows = [common | query for query in asked]
     insert = sa.insert(queries).returning(queries.c.id, sort_by_parameter_order=True)
     ids = [int(id) for id in connection.execute(insert, rows).scalars()]

@@ -9,10 +9,10 @@ from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage import port
-from surrogym_server.storage.records import NewSurrogate, Phase, SurrogateRecord
+from surrogym_server.storage.records import OPEN_STATUSES, NewSurrogate, Phase, SurrogateRecord
 from surrogym_server.storage.sql.database import Database, clock, conflict_insert
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, touch, unknown_surrogate
-from surrogym_server.storage.sql.tables import queries, surrogates
+from surrogym_server.storage.sql.tables import leases, queries, samples, surrogates
 
 NO_RIGHT = {"fit_token": None, "fit_owner": None, "fit_expires": None}
 COLUMNS = [
@@ -63,7 +63,7 @@ class SqlSurrogates(port.Surrogates):
         tolerances: dict[str, float | None] | None = None,
     ) -> SurrogateRecord:
         with self._database.write() as connection:
-            held = hold(connection, name)
+            held = hold(connection, name, surrogates.c.extra_queries)
             before = read(connection, name)
             merged = None if tolerances is None else _set_or_taken_back(before.tolerances, tolerances)
             asked = {"paused": paused, "budget": budget, "target": target, "tolerances": merged}
@@ -74,8 +74,9 @@ class SqlSurrogates(port.Surrogates):
                 changes |= {"phase": resting_phase(before.round), "error": None}
             if not changes:
                 return before
-            if changes.keys() & {"target", "tolerances"} or changes.get("budget", before.budget) < before.budget:
-                changes |= _ask_anew(connection, held)
+            smaller = budget if budget is not None and budget < before.budget else None
+            if smaller is not None or changes.keys() & {"target", "tolerances"}:
+                changes |= _ask_anew(connection, held, smaller)
             _apply(connection, held, changes)
             append_event(connection, held, "phase", **{"phase": before.phase, **changes})
             return read(connection, name)
@@ -139,19 +140,37 @@ def _set_or_taken_back(before: dict[str, float], changes: dict[str, float | None
     return kept | {name: value for name, value in changes.items() if value is not None}
 
 
-def _ask_anew(connection: Connection, held: Row[Any]) -> dict[str, Any]:
+def _ask_anew(connection: Connection, held: Row[Any], budget: int | None) -> dict[str, Any]:
     """Withdraw what the design chose by what was asked of it before, as far as no sampler has begun it, and the right
-    of a fit that is running. Gives the phase, where that ends with it."""
-    connection.execute(
-        sa.delete(queries).where(
-            queries.c.surrogate_id == held.id,
-            queries.c.purpose == "adaptive",
-            queries.c.status == "pending",
-            queries.c.attempts == 0,
-        )
-    )
+    of a fit that is running. What was asked for beyond the design is asked for again, unless there is a smaller
+    ``budget``, beyond which initial queries are withdrawn too. Gives the changes of the surrogate that follow."""
+    begun = sa.select(leases.c.id).where(leases.c.query_id == queries.c.id, leases.c.outcome != "unbegun")
+    unbegun = (queries.c.surrogate_id == held.id) & (queries.c.status == "pending") & ~sa.exists(begun)
+    chosen = sa.delete(queries).where(unbegun, queries.c.purpose == "adaptive")
+    withdrawn = connection.execute(chosen.returning(queries.c.steps, queries.c.extra)).all()
     connection.execute(sa.update(surrogates).where(surrogates.c.id == held.id).values(**NO_RIGHT))
-    return {"phase": resting_phase(held.round)} if held.phase == "fitting" else {}
+    changes = {"phase": resting_phase(held.round)} if held.phase == "fitting" else {}
+    if budget is None:
+        again = sum(row.steps for row in withdrawn if row.extra)
+        return {**changes, "extra_queries": held.extra_queries + again} if again else changes
+    initial = sa.select(queries.c.id, queries.c.steps).where(unbegun, queries.c.purpose == "initial")
+    beyond, gone = spoken_for(connection, held.id) - budget, []
+    for row in connection.execute(initial.order_by(queries.c.id.desc())):
+        if beyond < row.steps:
+            break
+        beyond -= row.steps
+        gone.append(row.id)
+    connection.execute(sa.delete(queries).where(queries.c.id.in_(gone)))
+    return changes
+
+
+def spoken_for(connection: Connection, surrogate_id: int) -> int:
+    """Samples there are, and those that open queries may become."""
+    taken = sa.select(sa.func.count()).where(samples.c.surrogate_id == surrogate_id)
+    awaited = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0)).where(
+        queries.c.surrogate_id == surrogate_id, queries.c.status.in_(OPEN_STATUSES)
+    )
+    return int(connection.execute(sa.select(taken.scalar_subquery() + awaited.scalar_subquery())).scalar_one())
 
 
 def _apply(connection: Connection, held: Row[Any], changes: dict[str, Any]) -> None:

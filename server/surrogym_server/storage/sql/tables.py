@@ -102,6 +102,7 @@ queries = sa.Table(
     sa.Column("coordinates", Floats, nullable=False),  # empty for a rollout
     sa.Column("action", Floats, nullable=False),  # for a rollout one after the other
     sa.Column("steps", sa.Integer, nullable=False, server_default="1"),
+    sa.Column("extra", sa.Boolean, nullable=False, server_default=sa.false()),  # asked for, whatever the verdict
     sa.Column("attempts", sa.Integer, nullable=False),
     sa.Column("sampler", sa.Text),
     sa.Column("error", sa.Text),
