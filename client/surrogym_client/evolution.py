@@ -22,6 +22,7 @@ from surrogym_client.imagined import LONGEST_EPISODE, Imagined, imagine, imagine
 from surrogym_client.training import (
     CHECK_EPISODES,
     CHECKS,
+    EVOLUTION,
     TrainingInterrupted,
     TrainProgress,
     TrainResult,
@@ -30,7 +31,6 @@ from surrogym_client.training import (
 from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
 
-EVOLUTION = "CMAES"
 EVOLUTION_STEPS = 10_000_000
 FULL_COVARIANCE = 200  # parameters; beyond, the covariance is diagonal (separable CMA-ES)
 

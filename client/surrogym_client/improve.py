@@ -76,6 +76,7 @@ def train_and_improve(
     rounds: list[TrainResult] = []
     visited, known, region_known = 0, list[float | None](), False
     whole, part = shares(settings, improve.rounds)
+    prolong = prolongs(settings, port.spec())
 
     def learn(steps: int, whole: int, settings: TrainSettings) -> None:
         now = replace(settings, total_steps=steps, start_from=out if rounds else settings.start_from)
@@ -99,7 +100,7 @@ def train_and_improve(
             wait_for_design(api, name, improve.patience_seconds, waiting, after_round=view.round)
         left = whole - _steps(rounds)
         left = max(left if settings.total_steps else min(planned_steps(settings), left), 1)
-        last = _for_use(api.surrogate(name), settings, region_known=region_known)
+        last = replace(_for_use(api.surrogate(name), settings, region_known=region_known), prolong=prolong)
         learn(left, _steps(rounds) + visited + left, last)
     except TrainingInterrupted as interruption:
         raise TrainingInterrupted(_together([*rounds, interruption.result], visited, known)) from None
@@ -115,7 +116,7 @@ def _for_use(view: SurrogateView, settings: TrainSettings, *, region_known: bool
     is, it begins anew by draws, as a network that has learned from wrong models stays with what these taught it."""
     last = chosen_for(view, settings)
     anew = last is not settings and settings.start_from is None and not region_known
-    return replace(last, anew=anew, prolong=prolongs(settings, view.spec))
+    return replace(last, anew=anew)
 
 
 def _steps(rounds: Sequence[TrainResult]) -> int:

@@ -54,7 +54,8 @@ def session_request(num_envs: int, mode: AutoresetMode, options: dict[str, Any])
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
-        raise ValueError(f"session option {name!r}: {first['msg']}, got {first['input']!r}") from error
+        said = f"session option {name!r}: {first['msg']}, got {first['input']!r}" if name else first["msg"]
+        raise ValueError(said) from error
 
 
 class Lanes:

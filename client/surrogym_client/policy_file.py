@@ -98,7 +98,7 @@ def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM) -> Predict:
     return predict
 
 
-def load_learner(path: Path, algorithm: str = DEFAULT_ALGORITHM, **changes: Any) -> BaseAlgorithm:
+def load_learner(path: Path, algorithm: str = DEFAULT_ALGORITHM, /, **changes: Any) -> BaseAlgorithm:
     """What ``save`` of a Stable-Baselines3 algorithm wrote. It is unpickled: load only what you trust.
 
     Args:
@@ -117,6 +117,10 @@ def load_learner(path: Path, algorithm: str = DEFAULT_ALGORITHM, **changes: Any)
     try:
         learner: BaseAlgorithm = kind.load(path, device="cpu", **changes)
     except Exception as error:  # unpickling somebody's file can raise anything
+        if changes:
+            load_learner(path, algorithm)
+            given = [f"{name}={value!r}" for name, value in changes.items() if name not in ("env", "seed")]
+            raise UnusablePolicy(f"{path} does not go with {', '.join([*given, 'this surrogate'])}: {error}") from error
         raise UnusablePolicy(f"{path} is no policy of {algorithm}: {error}") from error
     return learner
 

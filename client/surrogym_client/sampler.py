@@ -33,6 +33,7 @@ from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, StepQu
 
 FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "failed")
 PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)  # with a server or a storage that is away
+LOOK_SECONDS = 0.1  # how often a worker that waits looks whether it was stopped
 LAST_SECONDS = 5.0  # a sampler that was stopped asks on for so long, with a real step that is not handed in yet
 AWAY = (ServerUnreachable, Unavailable)
 STOPPED = "the sampler was stopped"
@@ -111,12 +112,13 @@ class Sampler:
         self._phase: Phase | None = None
         self._spec: EnvironmentSpec
         self._started = time.monotonic()
-        self._stopping = threading.Event()
+        self._stopping = False  # no Event: a signal handler that sets one may wait for itself
 
     def stop(self) -> None:
         """End ``run`` after the step that is under way; for another thread, or a signal handler. A server that is away
-        is waited for no longer, but some seconds with a real step that it has not got yet."""
-        self._stopping.set()
+        is waited for no longer, but some seconds with a real step that it has not got yet; what ``api`` itself repeats
+        of one request (``Retries``) comes on top."""
+        self._stopping = True
 
     def run(self) -> SamplerReport:
         """Work until a setting says stop, ``stop`` is called, or Ctrl-C comes.
@@ -129,11 +131,11 @@ class Sampler:
         self._started = time.monotonic()
         self._check()
         with Heartbeat(self._api, self._surrogate, self._settings.lease_seconds) as heartbeat:
-            while not self._stopping.is_set() and (limit := self._limit()) > 0:
+            while not self._stopped() and (limit := self._limit()) > 0:
                 try:
                     claimed = self._patiently(partial(self._claim, limit))
                 except AWAY:
-                    if self._stopping.is_set():
+                    if self._stopped():
                         break
                     raise
                 self._phase = claimed.phase
@@ -175,7 +177,7 @@ class Sampler:
         left, begun = list(queries), None
         heartbeat.hold(left)
         try:
-            while left and not self._stopping.is_set():
+            while left and not self._stopped():
                 begun = left[0]
                 self._answer(begun)
                 heartbeat.release(left.pop(0))
@@ -216,7 +218,7 @@ class Sampler:
         assert isinstance(environment, RolloutEnvironment)
         environment.begin(reset_seed(query, self._spec.design.seed))
         for number, action in enumerate(query.actions):
-            if self._stopping.is_set():
+            if self._stopped():
                 return
             step = environment.act(np.array(action))
             taken.append(sample_of(query, step, size, number))
@@ -247,11 +249,21 @@ class Sampler:
                 pause = next(delays, None)
                 if pause is None:
                     raise
-                if self._stopping.wait(pause):
+                self._pause(pause)
+                if self._stopped():
                     stopped = stopped or time.monotonic()
                     if time.monotonic() - stopped >= once_stopped:
                         raise
                     time.sleep(pause)
+
+    def _stopped(self) -> bool:
+        return self._stopping
+
+    def _pause(self, seconds: float) -> None:
+        """Wait for so long, or until this worker is stopped."""
+        until = time.monotonic() + seconds
+        while not self._stopped() and (left := until - time.monotonic()) > 0:
+            time.sleep(min(left, LOOK_SECONDS))
 
     def _give_back(self, query: Query, error: str, *, begun: bool) -> None:
         try:

@@ -24,7 +24,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from surrogym_client.checks import Checks
-from surrogym_client.evolution import EVOLUTION, EVOLUTION_STEPS, evolve
+from surrogym_client.evolution import EVOLUTION_STEPS, evolve
 from surrogym_client.imagined import imagined_returns, observation_statistics
 from surrogym_client.policies import WIDER, PaperPolicy, Standardise
 from surrogym_client.policy_file import load_learner
@@ -32,6 +32,7 @@ from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.tracking import tracking, with_folder
 from surrogym_client.training import (
     CHECK_EPISODES,
+    EVOLUTION,
     TrainingInterrupted,
     TrainProgress,
     TrainResult,
@@ -82,16 +83,15 @@ def train(
             of the algorithm.
         TrainingInterrupted: Ctrl-C came; the policy with the best imagined return so far is saved.
     """
-    settings = settings or TrainSettings()
+    settings, spec = settings or TrainSettings(), port.spec()
+    prolonged = prolongs(settings, spec)
     if settings.algorithm.upper() == EVOLUTION:
         if settings.tracker in ("wandb", "mlflow"):
             raise ValueError(f"{EVOLUTION} logs to no tracker: expected none, got {settings.tracker}")
-        if settings.prolong:
-            raise ValueError(f"{EVOLUTION} takes the steps it is given: expected no prolonging, or another algorithm")
         return evolve(port, out, settings, planned_steps(settings), progress)
     torch.set_num_threads(settings.threads)
     settings = with_folder(settings, out)
-    spec, algorithm = port.spec(), algorithm_by_name(settings.algorithm)
+    algorithm = algorithm_by_name(settings.algorithm)
     total = planned_steps(settings)
     num_envs = settings.num_envs or suggested_lanes(algorithm)
     gamma = settings.hyperparameters.get("gamma", suggested_gamma(spec))
@@ -120,7 +120,7 @@ def train(
             return made(attempt) if attempt else untrained
 
         with tracking(settings, out) as callbacks:
-            learner, whole = _learned(network, checks, callbacks, prolong=prolongs(settings, spec))
+            learner, whole = _learned(network, checks, callbacks, prolong=prolonged)
         checks.restore_best()
         out.parent.mkdir(parents=True, exist_ok=True)
         learner.save(out)
@@ -219,7 +219,7 @@ def _learner(
     gamma: float,
 ) -> BaseAlgorithm:
     if settings.start_from is not None:
-        changes = {"env": env, "seed": settings.seed, **settings.hyperparameters}
+        changes = {**settings.hyperparameters, "env": env, "seed": settings.seed}
         learner = load_learner(settings.start_from, algorithm.__name__, **changes)
         learner.tensorboard_log = None if settings.tensorboard is None else str(settings.tensorboard)
         return learner

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import OF_PARTICLES, SurrogateView
 
+EVOLUTION = "CMAES"  # CMA-ES, beside the algorithms of Stable-Baselines3
 CHECKS = 12  # of the imagined return in one training; the best policy is kept
 CHECK_EPISODES = 64
 SUGGESTED_STEPS = 1_000_000  # virtual ones, the most that is suggested for all rounds together; the paper's cap
@@ -64,7 +65,15 @@ def chosen_for(view: SurrogateView, settings: TrainSettings) -> TrainSettings:
 
 def prolongs(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
     """Whether a training that still gains at its end takes as many steps again: where nobody said so, if no number of
-    steps was asked for either. Preset ``paper`` has its cap."""
+    steps was asked for either. Preset ``paper`` has its cap, and CMA-ES takes the steps that it is given.
+
+    Raises:
+        ValueError: CMA-ES was asked to.
+    """
+    if settings.algorithm.upper() == EVOLUTION:
+        if settings.prolong:
+            raise ValueError(f"{EVOLUTION} takes the steps it is given: expected no prolonging, or another algorithm")
+        return False
     if settings.prolong is not None:
         return settings.prolong
     return settings.total_steps is None and spec.design.preset != "paper"

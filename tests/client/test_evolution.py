@@ -11,7 +11,7 @@ from surrogym_client.imagined import imagined_returns
 from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
 from surrogym_client.policy_file import load_policy
 from surrogym_client.train import TrainSettings, train
-from surrogym_client.training import TrainingInterrupted
+from surrogym_client.training import TrainingInterrupted, prolongs
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.surrogate.learn import learn
@@ -91,6 +91,7 @@ def test_it_is_not_prolonged(surrogate, tmp_path: Path):
     with pytest.raises(ValueError, match="expected no prolonging, or another algorithm"):
         train(surrogate, tmp_path / "policy.zip", small(prolong=True))
     assert not list(tmp_path.iterdir())
+    assert not prolongs(small(total_steps=None), pendulum())
 
 
 def test_a_goal_far_from_the_start_is_found(tmp_path: Path):

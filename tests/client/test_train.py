@@ -105,6 +105,16 @@ def test_what_is_asked_for_goes_over_what_the_policy_was_saved_with(surrogate, t
     assert {name: result.settings[name] for name in asked} == asked
 
 
+def test_what_a_policy_does_not_go_with_is_told(surrogate, tmp_path: Path):
+    first = tmp_path / "first.zip"
+    train(surrogate, first, small(total_steps=128))
+    for changes in ({"n_steps": "many"}, {"device": "moon"}):
+        with pytest.raises(UnusablePolicy, match=f"first.zip does not go with {next(iter(changes))}="):
+            train(surrogate, tmp_path / "policy.zip", small(start_from=first, hyperparameters=changes))
+    with pytest.raises(UnusablePolicy, match=r"first.zip does not go with .*this surrogate: .*spaces do not match"):
+        train(local(cartpole()), tmp_path / "policy.zip", small(start_from=first))
+
+
 def test_a_file_of_another_algorithm_is_not_gone_on_from(surrogate, tmp_path: Path):
     a_search = tmp_path / "search.zip"
     few = {"population": 4, "starts": 2, "units": 2}

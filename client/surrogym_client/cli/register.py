@@ -45,7 +45,10 @@ def command(
     tolerance: Tolerances = None,
     acquisition: Annotated[
         Acquisition | None,
-        typer.Option(help="What chooses queries after the first model. [default: integrated_variance]"),
+        typer.Option(
+            help="What chooses queries after the first model. Without teleport only latin_hypercube is read: it plans "
+            "nothing. [default: the preset's]"
+        ),
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the design.")] = None,
     bins: Annotated[int | None, typer.Option(min=2, help="Offer a continuous action as so many values.")] = None,

@@ -27,8 +27,9 @@ class Design(Frozen):
     never does. ``initial`` of the budget are a Latin hypercube, before the first model. ``acquisition`` is what chooses
     the others: ``integrated_variance``, the default's, the query that lowers the variance most over the range and where
     policies went; ``variance``, where the deviation is largest; ``uncertainty_index``, the paper's (eq. 12); or
-    ``latin_hypercube``: none is chosen, the whole budget is one. ``monte_carlo`` points estimate the confidence index
-    (eq. 8).
+    ``latin_hypercube``: the whole budget is one, whatever ``initial`` says, and only what is asked for beyond it is
+    chosen, by the paper's. Where rollouts are planned only the last is read: none is planned then. ``monte_carlo``
+    points estimate the confidence index (eq. 8).
     """
 
     preset: Literal["default", "paper"] = "default"
