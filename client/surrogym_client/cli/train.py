@@ -143,10 +143,11 @@ def command(
     from surrogym_client.cli.train_words import words_of_result
     from surrogym_client.lifetime import exit_with_parent as watch_parent
     from surrogym_shared.terminal import give, on_interrupt, progress
+    from surrogym_shared.wire import OF_PARTICLES
 
     if exit_with_parent:
         watch_parent()
-    for given in ("particles", "propagation", "weighting", "spread"):
+    for given in OF_PARTICLES:
         if context.params[given] is not None and variant != "probabilistic":
             raise CommandError(f"--{given} is variant probabilistic's: give --variant probabilistic with it")
     if start_from is not None and not start_from.exists():

@@ -63,7 +63,7 @@ class SqlSurrogates(port.Surrogates):
         tolerances: dict[str, float | None] | None = None,
     ) -> SurrogateRecord:
         with self._database.write() as connection:
-            held = hold(connection, name, surrogates.c.extra_queries)
+            held = hold(connection, name)
             before = read(connection, name)
             merged = None if tolerances is None else _set_or_taken_back(before.tolerances, tolerances)
             asked = {"paused": paused, "budget": budget, "target": target, "tolerances": merged}
@@ -76,7 +76,7 @@ class SqlSurrogates(port.Surrogates):
                 return before
             smaller = budget if budget is not None and budget < before.budget else None
             if smaller is not None or changes.keys() & {"target", "tolerances"}:
-                changes |= _ask_anew(connection, held, smaller)
+                changes |= _ask_anew(connection, held, before, smaller)
             _apply(connection, held, changes)
             append_event(connection, held, "phase", **{"phase": before.phase, **changes})
             return read(connection, name)
@@ -140,7 +140,7 @@ def _set_or_taken_back(before: dict[str, float], changes: dict[str, float | None
     return kept | {name: value for name, value in changes.items() if value is not None}
 
 
-def _ask_anew(connection: Connection, held: Row[Any], budget: int | None) -> dict[str, Any]:
+def _ask_anew(connection: Connection, held: Row[Any], before: SurrogateRecord, budget: int | None) -> dict[str, Any]:
     """Withdraw what the design chose by what was asked of it before, as far as no sampler has begun it, and the right
     of a fit that is running. What was asked for beyond the design is asked for again, unless there is a smaller
     ``budget``, beyond which initial queries are withdrawn too. Gives the changes of the surrogate that follow."""
@@ -152,7 +152,7 @@ def _ask_anew(connection: Connection, held: Row[Any], budget: int | None) -> dic
     changes = {"phase": resting_phase(held.round)} if held.phase == "fitting" else {}
     if budget is None:
         again = sum(row.steps for row in withdrawn if row.extra)
-        return {**changes, "extra_queries": held.extra_queries + again} if again else changes
+        return {**changes, "extra_queries": before.extra_queries + again} if again else changes
     initial = sa.select(queries.c.id, queries.c.steps).where(unbegun, queries.c.purpose == "initial")
     beyond, gone = spoken_for(connection, held.id) - budget, []
     for row in connection.execute(initial.order_by(queries.c.id.desc())):
