@@ -14,19 +14,21 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from surrogym_client.training import CHECKS, TrainProgress
 
-PATIENCE = 0.25  # of the steps, in which a network has to earn more than it did untrained
+PATIENCE = 0.25  # of the steps, in which a network has to learn something
 PROOF = 0.5  # of the steps, in which it has to earn half of what the saved policy earns beyond that
 PATIENT_ROLLOUTS = 8  # at least
 LATELY = 0.25  # of the steps, the last of them
 GAIN = 0.01  # of what the best policy earns beyond an untrained one: a training that gained more lately is not done
+LEARNED = 0.01  # of what the best virtual episode earned beyond an untrained network: who earns less learned nothing
 
 
 class Checks(BaseCallback):
     """Measures the imagined return of what is learned, reports progress, and what the penalty took of the reward.
 
-    A network that earns no more than an untrained one after a quarter of the steps is given up, while there is as much
-    left for another: rewards that come at the end alone leave some networks without a first success, and they stop
-    exploring before they have one. Where a saved policy waits, a network has half of the steps to come half as far.
+    A network that after a quarter of the steps earns no more than an untrained one, but for a hundredth of what some
+    episode did, is given up while there is as much left for another: rewards that come at the end alone leave some
+    networks without a first success, and they stop exploring before they have one. Where a saved policy waits, a
+    network has half of the steps to come half as far.
 
     A training that still gained in its last quarter can take as many steps again, once.
 
@@ -52,17 +54,19 @@ class Checks(BaseCallback):
         self._progress = progress
         self._imagine = imagine
         self._floor = imagine(untrained)
-        self._half_way = self._floor if saved is None else max((self._floor + imagine(saved)) / 2, self._floor)
+        self._half_way = self._floor if saved is None else (self._floor + imagine(saved)) / 2
+        self._seen = self._floor  # the most that an episode earned, from any start
         self._spent = 0  # by the networks before
         self._rollouts = 0  # of this one
         self._checked = 0  # checks made
         self._bests: list[tuple[int, float]] = []  # steps, and the best imagined return by then
         self._latest: float | None = None
-        self._kept: dict[str, Any] = {}
+        self._kept: tuple[BaseAlgorithm, dict[str, Any]] | None = None  # whose, and its parameters then
         self._penalty = self._size = 0.0
         self._penalties: deque[float] = deque(maxlen=100)  # of the last episodes
         self.best: float | None = None
         self.given_up = False
+        self.networks = 1  # that learned, one after another
         self.lost = 0
 
     @property
@@ -88,7 +92,7 @@ class Checks(BaseCallback):
     @property
     def gaining(self) -> bool:
         """Whether the best policy gained in the last quarter of the steps, more than a hundredth of what it earns."""
-        if self.best is None or self.best <= self._floor:
+        if self.best is None or self.best <= self._nothing:
             return False
         before = [best for steps, best in self._bests if steps <= self._total - LATELY * self._planned]
         return self.best - (before[-1] if before else self._floor) > GAIN * (self.best - self._floor)
@@ -98,21 +102,31 @@ class Checks(BaseCallback):
         return float(np.mean(self._penalties)) if self._penalties else None
 
     def worth_keeping(self, known: BaseAlgorithm) -> bool:
-        """Whether a policy from before earns more than an untrained one; if so it is the best so far."""
+        """Whether a policy from before learned anything; if so it is the best so far."""
         earned = self._imagine(known)
-        if earned <= self._floor:
+        if earned <= self._nothing:
             return False
         self._keep(earned, known)
         return True
 
-    def restore_best(self) -> None:
-        """Give the learner the policy with the best imagined return of all checks; without any it keeps its own."""
-        if self._kept:
-            self.model.policy.load_state_dict(self._kept)
+    def restore_best(self) -> BaseAlgorithm:
+        """The learner that had the best imagined return of all checks, with its policy of then; without any check the
+        last one."""
+        if self._kept is None:
+            return self.model
+        learner, parameters = self._kept
+        learner.policy.load_state_dict(parameters)
+        return learner
+
+    @property
+    def _nothing(self) -> float:
+        """The imagined return up to which nothing was learned."""
+        return self._floor + LEARNED * (self._seen - self._floor)
 
     def _on_training_start(self) -> None:
         if self.given_up:
             self.given_up, self._rollouts = False, 0
+            self.networks += 1
 
     def _on_step(self) -> bool:
         infos, env = self.locals["infos"], self.training_env
@@ -122,6 +136,7 @@ class Checks(BaseCallback):
         self._penalty += float(np.abs(mean - reward).sum())
         self._size += float(np.abs(mean).sum())
         self._penalties.extend(info["penalty"] for info in infos if "penalty" in info)
+        self._seen = max([self._seen, *(info["episode"]["r"] for info in infos if "episode" in info)])
         self.lost += sum("surrogym_session_lost" in info for info in infos)
         return not self.given_up
 
@@ -154,10 +169,10 @@ class Checks(BaseCallback):
 
     def _keep(self, earned: float, learner: BaseAlgorithm) -> None:
         self.best = earned
-        self._kept = {name: tensor.clone() for name, tensor in learner.policy.state_dict().items()}
+        self._kept = learner, {name: tensor.clone() for name, tensor in learner.policy.state_dict().items()}
 
     def _hopeless(self) -> bool:
         assert self.best is not None
         tried = self._rollouts >= PATIENT_ROLLOUTS and self.num_timesteps >= PATIENCE * self._planned
-        bar = self._half_way if self.num_timesteps >= PROOF * self._planned else self._floor
-        return tried and self.best <= bar and self._planned - self.steps >= PATIENCE * self._planned
+        bar = self._half_way if self.num_timesteps >= PROOF * self._planned else self._nothing
+        return tried and self.best <= max(bar, self._nothing) and self._planned - self.steps >= PATIENCE * self._planned

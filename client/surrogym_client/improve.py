@@ -170,6 +170,9 @@ def explorer(policy: Path, algorithm: str) -> Predict:
     if Network.is_at(policy):
         return Network.load(policy)
     learner = algorithm_by_name(algorithm).load(policy, device="cpu")
+    if learner.use_sde:
+        noisy: Any = learner.policy
+        noisy.reset_noise(VISIT_LANES)  # each lane explores its own way
     return lambda observation: learner.predict(observation, deterministic=False)[0]
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import stable_baselines3
 import torch
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
@@ -105,6 +106,8 @@ def train(
 
         def made(attempt: int, start_from: Path | None = None) -> BaseAlgorithm:
             asked = replace(settings, seed=settings.seed + ATTEMPT_SEED * attempt, start_from=start_from)
+            if attempt and start_from is None:
+                asked = _exploring_by_state(asked, algorithm, wrapped, spec)
             return _learner(algorithm, wrapped, asked, spec, statistics, gamma)
 
         saved = None if settings.start_from is None else made(0, settings.start_from)
@@ -120,8 +123,8 @@ def train(
             return made(attempt) if attempt else untrained
 
         with tracking(settings, out) as callbacks:
-            learner, whole = _learned(network, checks, callbacks, prolong=prolonged)
-        checks.restore_best()
+            whole = _learned(network, checks, callbacks, prolong=prolonged)
+        learner = checks.restore_best()
         out.parent.mkdir(parents=True, exist_ok=True)
         learner.save(out)
     finally:
@@ -134,6 +137,7 @@ def train(
         imagined_return=checks.best,
         episode_penalty=checks.episode_penalty,
         lost_episodes=checks.lost,
+        networks=checks.networks,
         gaining=checks.gaining,
         settings={**asdict(settings), "num_envs": num_envs, "total_steps": total, **effective(learner)},
     )
@@ -145,8 +149,9 @@ def train(
 
 def _learned(
     network: Callable[[int], BaseAlgorithm], checks: Checks, callbacks: Sequence[BaseCallback], *, prolong: bool
-) -> tuple[BaseAlgorithm, bool]:
-    """The network that learned last, and whether the training came to its end, and not to an interruption."""
+) -> bool:
+    """Let networks learn, one after another where one is given up: whether the training came to its end, and not to an
+    interruption."""
     for attempt in itertools.count():
         learner = network(attempt)
         if learner.tensorboard_log is None:  # else Stable-Baselines3 makes an empty folder among the temporary files
@@ -156,9 +161,9 @@ def _learned(
             if prolong and not checks.given_up and checks.prolong():
                 _learn(learner, checks, callbacks)
         except KeyboardInterrupt:
-            return learner, False
+            return False
         if not checks.given_up:
-            return learner, True
+            return True
     raise AssertionError("unreachable")
 
 
@@ -245,6 +250,20 @@ def _learner(
         )
     except (AssertionError, TypeError) as error:
         raise ValueError(f"{settings.algorithm} can't be trained here: {error}") from error
+
+
+def _exploring_by_state(
+    settings: TrainSettings, algorithm: type[BaseAlgorithm], env: VecNormalize, spec: EnvironmentSpec
+) -> TrainSettings:
+    """Settings of a network that follows one which was given up.
+
+    Noise drawn anew at every step may never reach what takes many steps in one direction; noise that is a function of
+    the state, and stays for a rollout, pushes a lane its own way (gSDE, Raffin et al. 2022). For continuous actions.
+    """
+    able = "use_sde" in inspect.signature(algorithm.__init__).parameters and isinstance(env.action_space, spaces.Box)
+    if not able or spec.design.preset == "paper":
+        return settings
+    return replace(settings, hyperparameters={"use_sde": True} | settings.hyperparameters)
 
 
 def planned_steps(settings: TrainSettings) -> int:

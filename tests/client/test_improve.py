@@ -10,18 +10,23 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+import numpy as np
 import pytest
 
+from support.real_steps import random_steps
 from support.server import ServerProcess, running_server
 from support.teaching import answer
 from surrogym_client.api import Api
-from surrogym_client.improve import ImproveSettings, shares, train_and_improve
+from surrogym_client.improve import VISIT_LANES, ImproveSettings, explorer, shares, train_and_improve
 from surrogym_client.original.classic import pendulum
 from surrogym_client.original.gymnasium import GymnasiumEnvironment
 from surrogym_client.train import TrainProgress, TrainResult, TrainSettings, train
 from surrogym_client.training import DRAWS, chosen_for
 from surrogym_client.transport import HttpSurrogate
 from surrogym_client.waiting import wait_for_design
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.local import LocalSurrogate
+from surrogym_server.surrogate.learn import learn
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import Design, EnvironmentSpec
 
@@ -123,6 +128,19 @@ def test_who_names_a_variant_and_preset_paper_keep_it(pendulum_server: ServerPro
     assert chosen.session == {**DRAWS, "penalty": 1.0, "particles": 2}
     assert chosen.judging == {"variant": "pathwise", "penalty": 1.0}, "particles are none of a function's"
     assert SETTINGS.judging == SETTINGS.session, "who learns by the mean is compared by it"
+
+
+def test_a_policy_that_explores_by_state_visits_each_lanes_own_way_and_the_same_each_time(tmp_path: Path) -> None:
+    out, spec = tmp_path / "policy.zip", pendulum()
+    port = LocalSurrogate(spec, learn(definition_from_spec(spec), random_steps(spec, 8, seed=0)).model)
+    hyperparameters = {"n_steps": 16, "use_sde": True}
+    train(port, out, TrainSettings(total_steps=128, num_envs=8, hyperparameters=hyperparameters))
+    same = np.tile(np.float32([[1.0, 0.0, 0.5]]), (VISIT_LANES, 1))
+    first, again = (explorer(out, "PPO") for _ in range(2))
+    actions = np.asarray(first(same))
+    assert len(np.unique(actions)) > VISIT_LANES / 2  # the rest are clipped to the bounds
+    assert np.array_equal(actions, first(same)), "until the next visit"
+    assert np.array_equal(actions, again(same))
 
 
 def test_rounds_share_the_steps_that_were_asked_for() -> None:

@@ -256,21 +256,62 @@ def test_statistics_are_of_the_sampling_range(surrogate):
 IDLE = SMALL | {"learning_rate": 0.0, "n_steps": 4}  # learns nothing
 
 
-def test_a_network_that_learns_nothing_is_given_up_for_another(surrogate, tmp_path: Path, monkeypatch):
+@pytest.fixture
+def made(monkeypatch):
+    """The settings of every network that training makes."""
     made, plain = [], training._learner
 
     def seen(algorithm, env, settings, *rest):
-        made.append(settings.seed)
+        made.append(settings)
         return plain(algorithm, env, settings, *rest)
 
     monkeypatch.setattr(training, "_learner", seen)
-    session = {"time_limit": 4}
-    result = train(surrogate, tmp_path / "policy.zip", small(total_steps=2_000, hyperparameters=IDLE, session=session))
-    assert 2 <= len(made) == len(set(made)) <= 4, "at most one for each quarter of the steps"
+    return made
+
+
+def idle(**settings) -> TrainSettings:
+    return small(**{"total_steps": 2_000, "hyperparameters": IDLE, "session": {"time_limit": 4}} | settings)
+
+
+def test_a_network_that_learns_nothing_is_given_up_for_another(surrogate, tmp_path: Path, made):
+    result = train(surrogate, tmp_path / "policy.zip", idle())
+    seeds = {settings.seed for settings in made}
+    assert 2 <= result.networks == len(made) == len(seeds) <= 4, "at most one for each quarter of the steps"
     assert 1_900 <= result.virtual_steps <= 2_000
     kept = PPO.load(result.path, device="cpu")
-    again = imagined_return(surrogate, kept, small(session=session))
-    assert again == pytest.approx(result.imagined_return)
+    assert imagined_return(surrogate, kept, idle()) == pytest.approx(result.imagined_return)
+
+
+def test_a_hundredth_of_what_an_episode_earned_is_to_be_learned(surrogate, tmp_path: Path, made, monkeypatch):
+    """An untrained network earns -40, the best episodes of four steps about 0."""
+    for earned, networks in ((-39.9, {3, 4}), (-39.0, {1})):
+        returns = itertools.chain([-40.0], itertools.repeat(earned))
+        monkeypatch.setattr(training, "imagined_return", lambda *_, returns=returns: next(returns))
+        assert train(surrogate, tmp_path / "policy.zip", idle()).networks in networks
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "own", "later"),
+    [("PPO", {}, {True}), ("PPO", {"use_sde": False}, {False}), ("A2C", {"n_steps": 4}, {True}), ("TD3", {}, {None})],
+    ids=["by state", "as asked", "any algorithm that can", "one that can't"],
+)
+def test_after_a_network_that_was_given_up_the_next_explores_by_state(
+    surrogate, tmp_path: Path, made, monkeypatch, algorithm, own, later
+):
+    monkeypatch.setattr(training, "imagined_return", lambda *_: 0.0)
+    hyperparameters = (IDLE if algorithm == "PPO" else {"learning_rate": 0.0}) | own
+    train(surrogate, tmp_path / "policy.zip", idle(algorithm=algorithm, hyperparameters=hyperparameters))
+    explores = [settings.hyperparameters.get("use_sde") for settings in made]
+    assert len(explores) > 1
+    assert explores[0] == own.get("use_sde")
+    assert set(explores[1:]) == later
+
+
+def test_discrete_actions_and_the_papers_networks_do_not_explore_by_state(tmp_path: Path, made, monkeypatch):
+    monkeypatch.setattr(training, "imagined_return", lambda *_: 0.0)
+    for spec in (cartpole(), make("Pendulum-v1", preset="paper").spec()):
+        assert train(local(spec), tmp_path / "policy.zip", idle()).networks > 1
+    assert not [settings for settings in made if "use_sde" in settings.hyperparameters]
 
 
 RISING, AT_ITS_BEST = itertools.count(), itertools.chain([0, 50], itertools.repeat(100))
