@@ -39,6 +39,7 @@ class PolicyCard(BaseModel):
     seconds: float | None = None
     imagined_return: float | None = None
     visited_confidence: tuple[float | None, ...] = ()
+    networks: int = 1  # that learned in the last training
     settings: dict[str, Any] = Field(default_factory=dict)
     versions: dict[str, str] = Field(default_factory=dict)
 

@@ -99,7 +99,7 @@ class TrainResult:
     lost_episodes: int  # cut because the server lost the session
     settings: dict[str, Any]
     episode_penalty: float | None = None  # what it takes off a training episode's return; mean of the last 100
-    networks: int = 1  # that learned, one after another where one was given up
+    networks: int = 1  # that learned in the last training, one after another where one was given up
     gaining: bool = False  # the best policy was still getting better when the training ended
     visited_confidence: tuple[float | None, ...] = ()  # the confidence index where the policy went, of each round
 

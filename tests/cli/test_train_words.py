@@ -30,6 +30,11 @@ def test_a_training_that_still_got_better_says_how_it_goes_on():
     assert "; it still got better at the end, --start-from p.zip goes on; next: surrogym evaluate" in words
 
 
+def test_networks_that_were_given_up_are_told():
+    assert "; 1 network that learned too little given up; next" in words_of_result(replace(RESULT, networks=2))
+    assert "; 2 networks that learned too little given up; next" in words_of_result(replace(RESULT, networks=3))
+
+
 def test_after_an_interruption_the_closed_loop_is_asked_for_again():
     words = words_of_interruption(RESULT, "cart --improve 5 --rounds 3")
     assert words.endswith("to go on: surrogym train cart --improve 5 --rounds 3 --start-from p.zip --out p.zip")

@@ -336,6 +336,7 @@ def _write_card(result: TrainResult, surrogate: str, spec: EnvironmentSpec, url:
         seconds=result.seconds,
         imagined_return=result.imagined_return,
         visited_confidence=result.visited_confidence,
+        networks=result.networks,
         settings=result.settings,
         versions=versions(),
     )

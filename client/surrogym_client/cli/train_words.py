@@ -16,7 +16,7 @@ def words_of_result(result: TrainResult, *, closed_loop: bool = False) -> str:
     return (
         f"{result.path}: {result.virtual_steps} virtual steps in {result.seconds:.1f} s"
         f"{_imagined(result.imagined_return)}{cut}{_loop(result.visited_confidence) if closed_loop else ''}"
-        f"{_gaining(result)}; next: surrogym evaluate {result.path}"
+        f"{_given_up(result.networks - 1)}{_gaining(result)}; next: surrogym evaluate {result.path}"
     )
 
 
@@ -33,6 +33,10 @@ def words_of(now: dict[str, Any]) -> str:
     penalty = f", penalty {now['episode_penalty']:.1f} an episode" if now["episode_penalty"] else ""
     known = _known(now.get("visited_confidence"))
     return f"{now['steps']} of {now['total_steps']} virtual steps{_imagined(now['imagined_return'])}{penalty}{known}"
+
+
+def _given_up(networks: int) -> str:
+    return f"; {networks} network{'s' * (networks > 1)} that learned too little given up" if networks else ""
 
 
 def _gaining(result: TrainResult) -> str:

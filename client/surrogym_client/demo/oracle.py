@@ -42,6 +42,7 @@ class OriginalRun:
                 seed=chosen.seed,
                 virtual_steps=0,
                 imagined_return=None,
+                networks=result.networks,
                 settings=result.settings,
             ),
         )
