@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -25,6 +26,7 @@ STATISTICS = {"mean": [1.0, 0.0, -2.0], "deviation": [2.0, 1.0, 4.0]}
 OBSERVATIONS = (3 * np.random.default_rng(1).standard_normal((200, 3))).astype(np.float32)
 CASES = {
     "PPO, continuous": ("PPO", PaperPolicy, TORQUES),
+    "PPO, noise by the state": ("PPO", PaperPolicy, TORQUES),
     "PPO, discrete": ("PPO", PaperPolicy, spaces.Discrete(3)),
     "PPO, several discrete": ("PPO", PaperPolicy, spaces.MultiDiscrete([2, 3])),
     "SAC": ("SAC", "MlpPolicy", TORQUES),
@@ -52,7 +54,10 @@ class Idle(gymnasium.Env):
 def saved(folder: Path, case: str) -> Path:
     """A policy whose weights differ from a fresh one's, so that each of them counts."""
     algorithm, policy, action_space = CASES[case]
-    options = {} if policy == "MlpPolicy" else {"policy_kwargs": {"features_extractor_kwargs": STATISTICS}}
+    options: dict[str, Any] = (
+        {} if policy == "MlpPolicy" else {"policy_kwargs": {"features_extractor_kwargs": STATISTICS}}
+    )
+    options |= {"use_sde": True} if "by the state" in case else {}
     learner = getattr(stable_baselines3, algorithm)(policy, Idle(action_space), device="cpu", seed=0, **options)
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
@@ -82,7 +87,7 @@ def test_a_program_of_torch_gives_the_policys_actions(tmp_path: Path, case: str)
     same(expected(OBSERVATIONS), program(torch.as_tensor(OBSERVATIONS)).detach().numpy())
 
 
-@pytest.mark.parametrize("case", ["PPO, continuous", "PPO, several discrete", "SAC"])
+@pytest.mark.parametrize("case", ["PPO, continuous", "PPO, noise by the state", "PPO, several discrete", "SAC"])
 def test_onnx_gives_the_policys_actions(tmp_path: Path, case: str):
     policy = saved(tmp_path, case)
     export_policy(policy, tmp_path / "policy.onnx", CASES[case][0])
