@@ -109,11 +109,11 @@ class Checks(BaseCallback):
         self._keep(earned, known)
         return True
 
-    def restore_best(self) -> BaseAlgorithm:
+    def best_of(self, last: BaseAlgorithm) -> BaseAlgorithm:
         """The learner that had the best imagined return of all checks, with its policy of then; without any check the
         last one."""
         if self._kept is None:
-            return self.model
+            return last
         learner, parameters = self._kept
         learner.policy.load_state_dict(parameters)
         return learner

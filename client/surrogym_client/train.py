@@ -123,8 +123,8 @@ def train(
             return made(attempt) if attempt else untrained
 
         with tracking(settings, out) as callbacks:
-            whole = _learned(network, checks, callbacks, prolong=prolonged)
-        learner = checks.restore_best()
+            last, whole = _learned(network, checks, callbacks, prolong=prolonged)
+        learner = checks.best_of(last)
         out.parent.mkdir(parents=True, exist_ok=True)
         learner.save(out)
     finally:
@@ -149,9 +149,8 @@ def train(
 
 def _learned(
     network: Callable[[int], BaseAlgorithm], checks: Checks, callbacks: Sequence[BaseCallback], *, prolong: bool
-) -> bool:
-    """Let networks learn, one after another where one is given up: whether the training came to its end, and not to an
-    interruption."""
+) -> tuple[BaseAlgorithm, bool]:
+    """The network that learned last, and whether the training came to its end, and not to an interruption."""
     for attempt in itertools.count():
         learner = network(attempt)
         if learner.tensorboard_log is None:  # else Stable-Baselines3 makes an empty folder among the temporary files
@@ -161,9 +160,9 @@ def _learned(
             if prolong and not checks.given_up and checks.prolong():
                 _learn(learner, checks, callbacks)
         except KeyboardInterrupt:
-            return False
+            return learner, False
         if not checks.given_up:
-            return True
+            return learner, True
     raise AssertionError("unreachable")
 
 

@@ -19,6 +19,7 @@ from surrogym_client.policy_file import UnusablePolicy, load_policy
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.train import (
     MAX_STEPS,
+    TrainingInterrupted,
     TrainProgress,
     TrainSettings,
     algorithm_by_name,
@@ -312,6 +313,17 @@ def test_discrete_actions_and_the_papers_networks_do_not_explore_by_state(tmp_pa
     for spec in (cartpole(), make("Pendulum-v1", preset="paper").spec()):
         assert train(local(spec), tmp_path / "policy.zip", idle()).networks > 1
     assert not [settings for settings in made if "use_sde" in settings.hyperparameters]
+
+
+def test_ctrl_c_before_the_first_rollout_leaves_an_untrained_policy(surrogate, tmp_path: Path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(SurrogateVecEnv, "reset", interrupted)
+    with pytest.raises(TrainingInterrupted) as interruption:
+        train(surrogate, tmp_path / "policy.zip", small())
+    assert interruption.value.result.virtual_steps == 0
+    assert load_policy(tmp_path / "policy.zip")(np.zeros((1, 3), np.float32)).shape == (1, 1)
 
 
 RISING, AT_ITS_BEST = itertools.count(), itertools.chain([0, 50], itertools.repeat(100))
