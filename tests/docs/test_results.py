@@ -17,7 +17,7 @@ def test_the_tables_are_those_of_the_rows():
     assert present_section(DOCS / "results.md") == section(ROWS, "results"), again
 
 
-@pytest.mark.parametrize("name", ["before", "before-loop-end", "before-prolonging", "fresh"])
+@pytest.mark.parametrize("name", ["before", "before-loop-end", "before-prolonging", "before-noise", "fresh"])
 def test_tables_from_before_a_change_or_of_fresh_seeds_are_those_of_their_rows(name):
     rows = read_rows(DOCS / "results" / f"efficiency-{name}.csv")
     again = f"surrogym reproduce table --rows docs/results/efficiency-{name}.csv"
