@@ -102,12 +102,11 @@ class Checks(BaseCallback):
         return float(np.mean(self._penalties)) if self._penalties else None
 
     def worth_keeping(self, known: BaseAlgorithm) -> bool:
-        """Whether a policy from before learned anything; if so it is the best so far."""
+        """Whether a policy from before learned anything; it is kept as the best so far if it is."""
         earned = self._imagine(known)
-        if earned <= self._nothing:
-            return False
-        self._keep(earned, known)
-        return True
+        if earned > max(self._floor, self._floor if self.best is None else self.best):
+            self._keep(earned, known)
+        return earned > self._nothing
 
     def best_of(self, last: BaseAlgorithm) -> BaseAlgorithm:
         """The learner that had the best imagined return of all checks, with its policy of then; without any check the
@@ -136,8 +135,9 @@ class Checks(BaseCallback):
         self._penalty += float(np.abs(mean - reward).sum())
         self._size += float(np.abs(mean).sum())
         self._penalties.extend(info["penalty"] for info in infos if "penalty" in info)
-        self._seen = max([self._seen, *(info["episode"]["r"] for info in infos if "episode" in info)])
-        self.lost += sum("surrogym_session_lost" in info for info in infos)
+        whole = [info for info in infos if "surrogym_session_lost" not in info]
+        self._seen = max([self._seen, *(info["episode"]["r"] for info in whole if "episode" in info)])
+        self.lost += len(infos) - len(whole)
         return not self.given_up
 
     def _on_rollout_end(self) -> None:

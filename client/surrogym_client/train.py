@@ -151,15 +151,18 @@ def _learned(
     network: Callable[[int], BaseAlgorithm], checks: Checks, callbacks: Sequence[BaseCallback], *, prolong: bool
 ) -> tuple[BaseAlgorithm, bool]:
     """The network that learned last, and whether the training came to its end, and not to an interruption."""
+    learner: BaseAlgorithm | None = None
     for attempt in itertools.count():
-        learner = network(attempt)
-        if learner.tensorboard_log is None:  # else Stable-Baselines3 makes an empty folder among the temporary files
-            learner.set_logger(Logger(folder=None, output_formats=[]))
         try:
+            learner = network(attempt)
+            if learner.tensorboard_log is None:  # Stable-Baselines3 would make an empty folder among temporary files
+                learner.set_logger(Logger(folder=None, output_formats=[]))
             _learn(learner, checks, callbacks)
             if prolong and not checks.given_up and checks.prolong():
                 _learn(learner, checks, callbacks)
         except KeyboardInterrupt:
+            if learner is None:
+                raise
             return learner, False
         if not checks.given_up:
             return learner, True
@@ -257,9 +260,10 @@ def _exploring_by_state(
     """Settings of a network that follows one which was given up.
 
     Noise drawn anew at every step may never reach what takes many steps in one direction; noise that is a function of
-    the state, and stays for a rollout, pushes a lane its own way (gSDE, Raffin et al. 2022). For continuous actions.
+    the state, and stays for a rollout, pushes a lane its own way (gSDE, Raffin et al. 2022). For PPO with continuous
+    actions: the rollouts of the other algorithms are too short.
     """
-    able = "use_sde" in inspect.signature(algorithm.__init__).parameters and isinstance(env.action_space, spaces.Box)
+    able = algorithm is stable_baselines3.PPO and isinstance(env.action_space, spaces.Box)
     if not able or spec.design.preset == "paper":
         return settings
     return replace(settings, hyperparameters={"use_sde": True} | settings.hyperparameters)

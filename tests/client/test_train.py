@@ -283,6 +283,22 @@ def test_a_network_that_learns_nothing_is_given_up_for_another(surrogate, tmp_pa
     assert imagined_return(surrogate, kept, idle()) == pytest.approx(result.imagined_return)
 
 
+def test_ctrl_c_while_the_next_network_is_made_keeps_what_was_learned(surrogate, tmp_path: Path, made, monkeypatch):
+    plain = training._learner
+
+    def interrupted(*args):
+        if made:
+            raise KeyboardInterrupt
+        return plain(*args)
+
+    monkeypatch.setattr(training, "_learner", interrupted)
+    monkeypatch.setattr(training, "imagined_return", lambda *_: 0.0)
+    with pytest.raises(TrainingInterrupted) as interruption:
+        train(surrogate, tmp_path / "policy.zip", idle())
+    assert 0 < interruption.value.result.virtual_steps < 2_000
+    assert PPO.load(tmp_path / "policy.zip", device="cpu").seed == 0
+
+
 def test_a_hundredth_of_what_an_episode_earned_is_to_be_learned(surrogate, tmp_path: Path, made, monkeypatch):
     """An untrained network earns -40, the best episodes of four steps about 0."""
     for earned, networks in ((-39.9, {3, 4}), (-39.0, {1})):
@@ -293,8 +309,8 @@ def test_a_hundredth_of_what_an_episode_earned_is_to_be_learned(surrogate, tmp_p
 
 @pytest.mark.parametrize(
     ("algorithm", "own", "later"),
-    [("PPO", {}, {True}), ("PPO", {"use_sde": False}, {False}), ("A2C", {"n_steps": 4}, {True}), ("TD3", {}, {None})],
-    ids=["by state", "as asked", "any algorithm that can", "one that can't"],
+    [("PPO", {}, {True}), ("PPO", {"use_sde": False}, {False}), ("A2C", {"n_steps": 4}, {None}), ("TD3", {}, {None})],
+    ids=["by state", "as asked", "short rollouts", "none of its own"],
 )
 def test_after_a_network_that_was_given_up_the_next_explores_by_state(
     surrogate, tmp_path: Path, made, monkeypatch, algorithm, own, later
