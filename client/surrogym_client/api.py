@@ -17,8 +17,13 @@ from surrogym_shared.codes import STATUS, Code, Problem
 from surrogym_shared.spec import EnvironmentSpec
 
 R = TypeVar("R", bound=wire.Reply)
+P = TypeVar("P", wire.Uncertainty, wire.Prediction)
 
 _EVENT_SILENCE_SECONDS = 60.0
+_NUMBERS = 2_000  # in one request about points: each has up to 25 characters, and the server takes 64 KiB of JSON
+_OF_ALL_POINTS = ("model_version", "outputs")
+_MODEL_FILE = "application/octet-stream"
+_BATCH_BYTES = 96 * 1024  # of samples in one request; the server takes 128 KiB of JSON
 
 
 class Api:
@@ -216,9 +221,27 @@ class Api:
         *,
         idempotency_key: str | None = None,
     ) -> wire.AddedSamples:
-        """Hand in real steps; the answer comes after they are stored for good."""
-        body = wire.AddSamples(sampler=sampler, samples=list(samples), idempotency_key=idempotency_key or new_key())
-        return self._post(wire.AddedSamples, f"{_surrogate(name)}/add_sample", body)
+        """Hand in real steps; the answer comes after they are stored for good.
+
+        A batch of up to about 300 samples is stored whole or not at all. A larger one is sent in several requests, so
+        that an error may leave its first part stored; the same call with the same key then adds the rest.
+        """
+        key = idempotency_key or new_key()
+        batches = _batches(samples)
+        keys = [key] if len(batches) == 1 else [f"{key}/{number}" for number in range(len(batches))]
+        added = [
+            self._post(
+                wire.AddedSamples,
+                f"{_surrogate(name)}/add_sample",
+                wire.AddSamples(sampler=sampler, samples=batch, idempotency_key=key),
+            )
+            for key, batch in zip(keys, batches, strict=True)
+        ]
+        return wire.AddedSamples(
+            sample_ids=[id for one in added for id in one.sample_ids],
+            duplicates=sum(one.duplicates for one in added),
+            ledger=added[-1].ledger,
+        )
 
     def samples(self, name: str) -> Iterator[wire.SampleView]:
         """All samples in order of arrival, page by page."""
@@ -257,9 +280,7 @@ class Api:
         model: int | None = None,
     ) -> wire.Uncertainty:
         """Mean, deviation and uncertainty index at coordinates (n, C) and action (n, F)."""
-        return self._post(
-            wire.Uncertainty, f"{_surrogate(name)}/query_uncertainty", _points(coordinates, action, model)
-        )
+        return self._of_points(wire.Uncertainty, f"{_surrogate(name)}/query_uncertainty", coordinates, action, model)
 
     def predict(
         self,
@@ -270,7 +291,7 @@ class Api:
         model: int | None = None,
     ) -> wire.Prediction:
         """One transition each from coordinates (n, C) under action (n, F)."""
-        return self._post(wire.Prediction, f"{_surrogate(name)}/predict", _points(coordinates, action, model))
+        return self._of_points(wire.Prediction, f"{_surrogate(name)}/predict", coordinates, action, model)
 
     def models(self, name: str) -> list[wire.ModelView]:
         """Every fit with its structure, hyperparameters and fidelity, oldest first."""
@@ -292,7 +313,8 @@ class Api:
     def import_model(self, name: str, data: bytes) -> wire.ModelView:
         """Make an exported model the newest version of a surrogate with the same outputs."""
         route = f"{_surrogate(name)}/models"
-        return parse(wire.ModelView, self.connection.send("POST", route, data, repeatable=False), route)
+        reply = self.connection.send("POST", route, data, media_type=_MODEL_FILE, repeatable=False)
+        return parse(wire.ModelView, reply, route)
 
     # Events
 
@@ -335,6 +357,34 @@ class Api:
                     yield None
         raise ServerUnreachable(f"the server at {self.url} ended the stream of events")
 
+    def _of_points(
+        self,
+        reply: type[P],
+        path: str,
+        coordinates: Sequence[Sequence[float]],
+        action: Sequence[Sequence[float]],
+        model: int | None,
+    ) -> P:
+        """What one model says of any number of points, in requests of a size that the server takes."""
+        if len(coordinates) != len(action):
+            raise ValueError(f"expected an action for each of {len(coordinates)} points, got {len(action)}")
+        parts: list[P] = []
+        size = max(1, _NUMBERS // max(1, len([*coordinates[0], *action[0]]))) if coordinates else 1
+        for start in range(0, len(coordinates), size) or [0]:
+            rows = slice(start, start + size)
+            body = wire.Points(
+                coordinates=[list(row) for row in coordinates[rows]],
+                action=[list(row) for row in action[rows]],
+                model=parts[0].model_version if parts else model,
+            )
+            parts.append(self._post(reply, path, body))
+        by_point = {
+            field: [row for part in parts for row in getattr(part, field)]
+            for field in reply.model_fields
+            if field not in _OF_ALL_POINTS
+        }
+        return parts[0].model_copy(update=by_point)
+
     def _get(self, reply: type[R], path: str, **params: str | int) -> R:
         return parse(reply, self.connection.send("GET", path, params=params or None), path)
 
@@ -374,9 +424,15 @@ def _surrogate(name: str) -> str:
     return f"/v1/surrogates/{quote(name, safe='')}"
 
 
-def _points(
-    coordinates: Sequence[Sequence[float]], action: Sequence[Sequence[float]], model: int | None
-) -> wire.Points:
-    return wire.Points(
-        coordinates=[list(row) for row in coordinates], action=[list(row) for row in action], model=model
-    )
+def _batches(samples: Sequence[wire.NewSample]) -> list[list[wire.NewSample]]:
+    """The samples in requests of at most ``_BATCH_BYTES``; one batch, perhaps an empty one, at least."""
+    batches: list[list[wire.NewSample]] = [[]]
+    room = _BATCH_BYTES
+    for sample in samples:
+        size = len(sample.model_dump_json()) + 1
+        if size > room and batches[-1]:
+            batches.append([])
+            room = _BATCH_BYTES
+        batches[-1].append(sample)
+        room -= size
+    return batches

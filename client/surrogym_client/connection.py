@@ -123,6 +123,7 @@ class Connection:
         *,
         params: Mapping[str, str | int] | None = None,
         timeout: float | None = None,
+        media_type: str = JSON,
         repeatable: bool = True,
         retries: Retries | None = None,
     ) -> bytes:
@@ -131,9 +132,10 @@ class Connection:
         Args:
             method: HTTP method.
             path: route, with its leading slash.
-            body: JSON bytes.
+            body: bytes of the media type.
             params: query parameters.
             timeout: seconds to wait for the answer; None takes ``timeouts.request``.
+            media_type: of the body.
             repeatable: carrying it out twice does no harm, so that it may be sent again after a lost reply.
             retries: another retry budget than the connection's.
 
@@ -143,9 +145,8 @@ class Connection:
             ProtocolMismatch: what answered is no Surrogym server.
             ProblemError: the server refused; its subclass says why.
         """
-        return self.persist(
-            self.attempt(method, path, body, params=params, timeout=timeout), repeatable=repeatable, retries=retries
-        )
+        attempt = self.attempt(method, path, body, params=params, timeout=timeout, media_type=media_type)
+        return self.persist(attempt, repeatable=repeatable, retries=retries)
 
     def attempt(
         self,

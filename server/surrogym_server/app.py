@@ -31,7 +31,7 @@ from surrogym_server.api import (
     surrogates,
 )
 from surrogym_server.api.auth import Gate
-from surrogym_server.api.guards import BodyLimit, KnownHosts
+from surrogym_server.api.guards import BodyLimit, KnownHosts, OwnPages
 from surrogym_server.api.observe import Observed
 from surrogym_server.api.state import Services
 from surrogym_server.convert import definition_from_spec
@@ -109,14 +109,17 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
         telemetry={"tracing": False, "metrics": False, "logs": False},  # /metrics is ours; asking each time costs 5 us
     )
     app.state.gate = Gate(settings.tokens)
+    app.state.max_body_bytes = settings.max_body_bytes
+    app.state.parsing = asyncio.Lock()
     app.state.notices = None
     app.state.counts = Counts()
     problems.install(app)
     openapi.install(app)
     app.add_middleware(steps.StepDoor)
-    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, max_together=settings.max_bodies_bytes)
+    app.add_middleware(BodyLimit, max_together=settings.max_bodies_bytes)
+    app.add_middleware(OwnPages, public_url=settings.public_url)
     if settings.loopback and not settings.tokens:
-        app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", settings.host}))
+        app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", *settings.host_names}))
     app.add_middleware(Observed, counts=app.state.counts)
     app.router.routes.extend(steps.router.routes)  # tried first, and directly: an included router is another search
     for room in (sessions, service, metrics, surrogates, queries, samples, models, events):

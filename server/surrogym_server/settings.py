@@ -6,6 +6,7 @@ import ipaddress
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
+from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, FilePath, ValidationError, model_validator
 
@@ -33,6 +34,9 @@ class Settings(BaseModel):
     synchronous: Annotated[
         Synchronous, Field(description="of a SQLite file: full survives a loss of power, normal a crash alone")
     ] = "full"
+    public_url: Annotated[
+        str | None, Field(pattern=r"^https?://[^/@?#]+/?$", description="address that browsers know, behind a proxy")
+    ] = None
     tokens: dict[str, Role] = Field(default_factory=dict, description="role of each bearer token")
     insecure: bool = Field(default=False, description="allow another address than loopback without a token")
     tls_certificate: FilePath | None = Field(default=None, description="chain of certificates, as PEM")
@@ -77,6 +81,12 @@ class Settings(BaseModel):
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:
             return False
+
+    @property
+    def host_names(self) -> tuple[str, ...]:
+        """The names that this server is called by: its own, and the public one where a proxy stands before it."""
+        public = None if self.public_url is None else urlsplit(self.public_url).hostname
+        return (self.host,) if public is None else (self.host, public)
 
     @property
     def database_url(self) -> str:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import hmac
 from collections.abc import Mapping
-from typing import Annotated, Any
 
-from fastapi import Depends, Request
-from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
-from starlette.datastructures import Headers
+from fastapi import Depends
+from fastapi.security import HTTPBearer
+from starlette.types import Scope
 
+from surrogym_server.api.headers import raw_header
 from surrogym_server.errors import Forbidden, Unauthenticated
 from surrogym_shared.wire import Role
 
-bearer = HTTPBearer(auto_error=False, description="A token of this server; not needed on loopback without tokens.")
+DESCRIPTION = "A token of this server; not needed on loopback without tokens."
 
 
 class Gate:
@@ -49,26 +49,30 @@ class Gate:
             raise Forbidden(f"expected a token with role {' or '.join((*allowed, 'admin'))}, got {role}")
 
 
-def bearer_token(headers: Headers) -> str | None:
-    """The token of a request, for routes that read theirs themselves."""
-    scheme, _, token = headers.get("authorization", "").partition(" ")
+def bearer_token(scope: Scope) -> str | None:
+    """The token that the headers of a request carry, if any."""
+    scheme, _, token = raw_header(scope, b"authorization").decode("latin-1").partition(" ")
     return token.strip() if scheme.lower() == "bearer" else None
 
 
-def allow(*roles: Role) -> Any:
-    """Dependency of a route: tokens of these roles, and admin, may call it."""
+class Access(HTTPBearer):
+    """The roles that may call a route, beside admin: declared among its dependencies.
 
-    async def check(
-        request: Request, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]
-    ) -> None:
-        gate: Gate = request.app.state.gate
-        gate.check(None if credentials is None else credentials.credentials, roles)
+    The route's door enforces it (``api.door``); as a dependency it only describes the route in OpenAPI.
+    """
 
-    return Depends(check)
+    def __init__(self, *roles: Role) -> None:
+        super().__init__(scheme_name="HTTPBearer", description=DESCRIPTION, auto_error=False)
+        self.roles = roles
 
 
-READ = allow("read", "train", "sample")
-TRAIN = allow("train")
-SAMPLE = allow("sample")
-TRAIN_OR_SAMPLE = allow("train", "sample")
-ADMIN = allow()
+def everybody() -> None:
+    """Declared by a route that needs no token."""
+
+
+PUBLIC = Depends(everybody)
+READ = Depends(Access("read", "train", "sample"))
+TRAIN = Depends(Access("train"))
+SAMPLE = Depends(Access("sample"))
+TRAIN_OR_SAMPLE = Depends(Access("train", "sample"))
+ADMIN = Depends(Access())

@@ -11,12 +11,13 @@ from fastapi.responses import StreamingResponse
 
 from surrogym_server import convert
 from surrogym_server.api.auth import READ
+from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.storage.records import EventRecord
 from surrogym_shared.codes import Code
 
-router = APIRouter(prefix="/v1", tags=["events"])
+router = APIRouter(prefix="/v1", tags=["events"], route_class=DoorRoute)
 
 STREAM = "text/event-stream"
 CONNECTED, SILENCE = ": connected\n\n", ": still here\n\n"

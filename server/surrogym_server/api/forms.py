@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable
 import msgspec
 
 from surrogym_server import convert
-from surrogym_server.api.body import JSON, parse_json
+from surrogym_server.api.json_body import JSON, parse_as
 from surrogym_server.engine.session import Answer
 from surrogym_server.services.sessions import SessionService
 from surrogym_shared import frames
@@ -22,20 +22,20 @@ _JSON = msgspec.json.Encoder()
 
 
 async def reset_json(sessions: SessionService, id: str, content: bytes) -> bytes:
-    body = parse_json(ResetSession, content)
+    body = parse_as(ResetSession, content)
     answer = await sessions.reset(id, body.seq, body.seed, convert.lane_mask(body.mask))
     return _JSON.encode(convert.reset_reply(answer))
 
 
 async def step_json(sessions: SessionService, id: str, content: bytes) -> bytes:
-    body = parse_json(StepSession, content)
+    body = parse_as(StepSession, content)
     action = convert.numbers("action", body.action)
     answer = await sessions.step(id, body.seq, action, convert.lane_mask(body.mask), body.deviations)
     return _JSON.encode(convert.step_reply(answer))
 
 
 async def rollout_json(sessions: SessionService, id: str, content: bytes) -> bytes:
-    body = parse_json(RolloutSession, content)
+    body = parse_as(RolloutSession, content)
     answer = await sessions.rollout(id, body.seq, convert.numbers("actions", body.actions))
     return await _rollout_written(_rollout_in_json, answer)
 

@@ -1,6 +1,8 @@
-"""Guards before the routes: the size of a body, and the name this server was called by."""
+"""Guards before the routes: the bytes of bodies, the name this server was called by, and the page that called."""
 
 from __future__ import annotations
+
+from urllib.parse import urlsplit
 
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -9,24 +11,22 @@ from surrogym_server.api.headers import raw_header
 from surrogym_server.api.problems import RETRY_AFTER_SECONDS, problem_response
 from surrogym_shared.codes import Code
 
+BODY_LIMIT = "surrogym.body_limit"  # in the scope: the most bytes of this body, as the route's door says
+SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
+OWN_SITE = (b"", b"same-origin", b"none")  # Sec-Fetch-Site of a program, an own page, an address typed by a person
+
 
 class BodyLimit:
-    """Refuses bodies of more than ``max_bytes``, announced or chunked, and of more in all requests at once."""
+    """Refuses bodies beyond the limit of their route, and beyond ``max_together`` bytes in all requests at once."""
 
-    def __init__(self, app: ASGIApp, max_bytes: int, max_together: int) -> None:
+    def __init__(self, app: ASGIApp, max_together: int) -> None:
         self._app = app
-        self._max_bytes = max_bytes
         self._max_together = max_together
         self._together = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
-            return
-        announced = raw_header(scope, b"content-length")
-        if announced.isdigit() and int(announced) > self._max_bytes:
-            response = problem_response(Code.TOO_LARGE, self._detail(f"{announced.decode()} bytes"))
-            await response(scope, receive, send)
             return
         received = 0
 
@@ -36,8 +36,9 @@ class BodyLimit:
             size = len(message.get("body", b""))
             received += size
             self._together += size
-            if received > self._max_bytes:
-                raise HTTPException(413, self._detail("more"))
+            limit = scope.get(BODY_LIMIT, 0)
+            if received > limit:
+                raise HTTPException(413, f"expected a body of at most {limit} bytes, got more")
             if self._together > self._max_together:
                 detail = f"expected bodies of at most {self._max_together} bytes in all requests at once, got more"
                 raise HTTPException(429, detail, {"retry-after": RETRY_AFTER_SECONDS})
@@ -47,9 +48,6 @@ class BodyLimit:
             await self._app(scope, counted, send)
         finally:
             self._together -= received
-
-    def _detail(self, got: str) -> str:
-        return f"expected a body of at most {self._max_bytes} bytes, got {got}"
 
 
 class KnownHosts:
@@ -65,6 +63,51 @@ class KnownHosts:
             return
         detail = f"expected the host name to be one of {sorted(self._hosts)}, got {host!r}"
         await problem_response(Code.FORBIDDEN, detail)(scope, receive, send)
+
+
+class OwnPages:
+    """Refuses what a page of another site has a browser send, where it could change something or open a stream.
+
+    A browser names the page in ``Origin`` and its relation to this server in ``Sec-Fetch-Site``; programs send neither.
+    """
+
+    def __init__(self, app: ASGIApp, public_url: str | None) -> None:
+        """``public_url`` is the address of this server as browsers see it, where a proxy stands between."""
+        self._app = app
+        self._public = None if public_url is None else origin_of(public_url)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        kind = scope["type"]
+        changes = kind == "websocket" or (kind == "http" and scope["method"] not in SAFE_METHODS)
+        if changes and (page := self._foreign_page(scope)):
+            detail = f"expected a page of this server, got {page}; behind a proxy set SURROGYM_PUBLIC_URL"
+            await problem_response(Code.FORBIDDEN, detail)(scope, receive, send)
+            return
+        await self._app(scope, receive, send)
+
+    def _foreign_page(self, scope: Scope) -> str | None:
+        """Which page sent this, where it is none of this server's own."""
+        origin = raw_header(scope, b"origin").decode("latin-1").lower()
+        if origin and origin not in (_called(scope), self._public):
+            return f"one of {origin!r}"
+        site = raw_header(scope, b"sec-fetch-site")
+        if site not in OWN_SITE:
+            return f"one of another site ({site.decode('latin-1')!r})"
+        return None
+
+
+def origin_of(url: str) -> str:
+    """Scheme, host and port of an address, as browsers write them in ``Origin``."""
+    parts = urlsplit(url.lower())
+    default = {"http": 80, "https": 443}.get(parts.scheme)
+    host = f"[{parts.hostname}]" if ":" in (parts.hostname or "") else parts.hostname
+    return f"{parts.scheme}://{host}" + ("" if parts.port in (None, default) else f":{parts.port}")
+
+
+def _called(scope: Scope) -> str:
+    """The origin under which this server was called."""
+    scheme = {"ws": "http", "wss": "https"}.get(scope["scheme"], scope["scheme"])
+    return f"{scheme}://{raw_header(scope, b'host').decode('latin-1').lower()}"
 
 
 def _host(scope: Scope) -> str:

@@ -17,13 +17,14 @@ from prometheus_client.core import (
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
 from surrogym_server.api.auth import READ
+from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Services, Use
 from surrogym_server.services.counts import Counts, Durations
 from surrogym_server.services.surrogates import SurrogateStatus
 from surrogym_shared.codes import Code
 
-router = APIRouter(tags=["service"])
+router = APIRouter(tags=["service"], route_class=DoorRoute)
 
 BY_SURROGATE = ("surrogate",)
 

@@ -12,12 +12,13 @@ from surrogym_server import convert
 from surrogym_server.api import examples
 from surrogym_server.api.auth import ADMIN, READ
 from surrogym_server.api.body import example
+from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import Imagine, Imagined, ModelList, ModelView, Points, Prediction, Uncertainty
 
-router = APIRouter(prefix="/v1/surrogates/{name}", tags=["models"])
+router = APIRouter(prefix="/v1/surrogates/{name}", tags=["models"], route_class=DoorRoute)
 
 SAFETENSORS = "application/octet-stream"
 FILE: dict[str, Any] = {SAFETENSORS: {"schema": {"type": "string", "format": "binary"}}}

@@ -189,10 +189,7 @@ async def _request_invalid(_: Request, error: Exception) -> Response:
 async def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     code = HTTP_CODES[error.status_code]
-    detail = {
-        Code.NOT_FOUND: f"no route {request.url.path!r}: see /docs",
-        Code.INVALID_REQUEST: "the body: expected JSON in UTF-8, got bytes that are none",
-    }.get(code, str(error.detail))
+    detail = f"no route {request.url.path!r}: see /docs" if code is Code.NOT_FOUND else str(error.detail)
     return problem_response(code, detail, headers=error.headers)
 
 

@@ -11,6 +11,7 @@ from surrogym_server import convert
 from surrogym_server.api import examples
 from surrogym_server.api.auth import READ, SAMPLE
 from surrogym_server.api.body import example
+from surrogym_server.api.door import DoorRoute, json_up_to
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_shared.codes import Code
@@ -25,7 +26,7 @@ from surrogym_shared.wire import (
     RenewLease,
 )
 
-router = APIRouter(prefix="/v1/surrogates/{name}", tags=["queries"])
+router = APIRouter(prefix="/v1/surrogates/{name}", tags=["queries"], route_class=DoorRoute)
 
 LEASE_ERRORS = documented(
     Code.UNKNOWN_SURROGATE,
@@ -73,6 +74,7 @@ def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.F
     status_code=201,
     summary="Ask for queries by hand",
     dependencies=[SAMPLE],
+    openapi_extra=json_up_to(128),
     responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.INVALID_REQUEST),
 )
 def ask(name: str, body: Annotated[AskQueries, example(examples.ASK)], use: Use) -> QueryList:

@@ -11,13 +11,14 @@ from surrogym_server import convert
 from surrogym_server.api import examples
 from surrogym_server.api.auth import READ, SAMPLE, TRAIN_OR_SAMPLE
 from surrogym_server.api.body import example
+from surrogym_server.api.door import DoorRoute, json_up_to
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.api.tables import CSV, NPZ, as_csv, as_npz
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import AddedSamples, AddSamples, Ledger, ReportSteps, SamplePage
 
-router = APIRouter(prefix="/v1/surrogates/{name}", tags=["samples"])
+router = APIRouter(prefix="/v1/surrogates/{name}", tags=["samples"], route_class=DoorRoute)
 
 MAX_PAGE = 10_000
 
@@ -26,6 +27,7 @@ MAX_PAGE = 10_000
     "/add_sample",
     summary="Hand in real steps",
     dependencies=[SAMPLE],
+    openapi_extra=json_up_to(128),
     responses=documented(
         Code.UNKNOWN_SURROGATE,
         Code.UNKNOWN_QUERY,

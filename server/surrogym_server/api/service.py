@@ -6,25 +6,26 @@ from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, JSONResponse
 
 from surrogym_server.api import reference
-from surrogym_server.api.auth import READ, Gate, bearer_token
+from surrogym_server.api.auth import PUBLIC, READ, Gate, bearer_token
+from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.openapi import describe
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import Access, Health, Ready
 
-router = APIRouter(tags=["service"])
+router = APIRouter(tags=["service"], route_class=DoorRoute)
 
 
-@router.head("/healthz", include_in_schema=False)
-@router.get("/healthz", summary="That the process lives")
+@router.head("/healthz", include_in_schema=False, dependencies=[PUBLIC])
+@router.get("/healthz", summary="That the process lives", dependencies=[PUBLIC])
 async def healthz(request: Request) -> Health:
     """Needs no token and no database."""
     return Health(version=request.app.version)
 
 
-@router.head("/readyz", include_in_schema=False)
-@router.get("/readyz", summary="That it can work", responses=documented(Code.UNAVAILABLE))
+@router.head("/readyz", include_in_schema=False, dependencies=[PUBLIC])
+@router.get("/readyz", summary="That it can work", dependencies=[PUBLIC], responses=documented(Code.UNAVAILABLE))
 def readyz(use: Use) -> Ready:
     """Whether the database answers. Needs no token."""
     use.storage.ping()
@@ -35,7 +36,7 @@ def readyz(use: Use) -> Ready:
 async def access(request: Request) -> Access:
     """The role of the token that came with the request."""
     gate: Gate = request.app.state.gate
-    token = bearer_token(request.headers)
+    token = bearer_token(request.scope)
     return Access(role="admin" if gate.open or token is None else gate.role_of(token), tokens=not gate.open)
 
 

@@ -11,6 +11,7 @@ from surrogym_server import convert
 from surrogym_server.api import examples
 from surrogym_server.api.auth import READ, TRAIN
 from surrogym_server.api.body import example
+from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_shared.codes import Code
@@ -22,7 +23,7 @@ from surrogym_shared.wire import (
     SubmittedOccupancy,
 )
 
-router = APIRouter(prefix="/v1", tags=["sessions"])
+router = APIRouter(prefix="/v1", tags=["sessions"], route_class=DoorRoute)
 
 SESSION_ERRORS = (Code.UNKNOWN_SESSION, Code.SESSION_EXPIRED, Code.INVALID_REQUEST)
 

@@ -9,7 +9,6 @@ from fastapi import APIRouter, Request
 from fastapi.responses import Response
 from fastapi.routing import APIRoute
 from pydantic import BaseModel
-from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -18,6 +17,8 @@ from surrogym_server.api import examples, forms
 from surrogym_server.api.auth import TRAIN
 from surrogym_server.api.body import BINARY, LeanRoute, described
 from surrogym_server.api.deadline import PARAMETER, seconds_left
+from surrogym_server.api.door import MEDIA_TYPE
+from surrogym_server.api.json_body import JSON, take_turn
 from surrogym_server.api.problems import answer_to, documented
 from surrogym_server.api.stream import StepStream
 from surrogym_shared.codes import Code
@@ -79,14 +80,13 @@ async def rollout(id: str, request: Request) -> Response:
 
 
 async def _carried(by_type: Mapping[str, forms.Carry], id: str, request: Request) -> Response:
-    """The reply comes in the form of the request. Raises ``HTTPException`` 415 for a form there is none of."""
-    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    carry = by_type.get(media_type)
-    if carry is None:
-        raise HTTPException(415, f"expected content type {' or '.join(by_type)}, got {media_type or 'none'}")
+    """The reply, in the form of the request."""
+    media_type: str = request.scope[MEDIA_TYPE]
     sessions = request.state.services.sessions.within(seconds_left(request.headers))
-    content = await carry(sessions, id, await _body(request))
-    return Response(content, media_type=media_type)
+    body = await _body(request)
+    if media_type == JSON:
+        await take_turn(request.scope, body)
+    return Response(await by_type[media_type](sessions, id, body), media_type=media_type)
 
 
 async def _body(request: Request) -> bytes:

@@ -11,12 +11,13 @@ from surrogym_server import convert
 from surrogym_server.api import examples
 from surrogym_server.api.auth import ADMIN, READ, TRAIN
 from surrogym_server.api.body import example
+from surrogym_server.api.door import DoorRoute, json_up_to
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import CreateSurrogate, Improve, PatchSurrogate, SurrogateList, SurrogateView
 
-router = APIRouter(prefix="/v1/surrogates", tags=["surrogates"])
+router = APIRouter(prefix="/v1/surrogates", tags=["surrogates"], route_class=DoorRoute)
 
 
 @router.post(
@@ -24,6 +25,7 @@ router = APIRouter(prefix="/v1/surrogates", tags=["surrogates"])
     status_code=201,
     summary="Register an original environment",
     dependencies=[ADMIN],
+    openapi_extra=json_up_to(128),
     responses=documented(Code.INVALID_REQUEST, Code.INVALID_SPEC, Code.SPEC_CONFLICT),
 )
 def create(body: Annotated[CreateSurrogate, example(examples.CREATE)], use: Use) -> SurrogateView:

@@ -36,6 +36,9 @@ def serve(
     insecure: Annotated[
         bool | None, typer.Option("--insecure", help="Allow another address than loopback without a token.")
     ] = None,
+    public_url: Annotated[
+        str | None, typer.Option(help="Address that browsers know the server by, where a proxy stands before it.")
+    ] = None,
     tls_certificate: Annotated[Path | None, typer.Option(help="PEM file; the server then speaks HTTPS alone.")] = None,
     tls_key: Annotated[Path | None, typer.Option(help="PEM file with the certificate's private key.")] = None,
     device: Annotated[
@@ -78,6 +81,7 @@ def serve(
             synchronous=synchronous,
             token_file=token_file,
             insecure=insecure,
+            public_url=public_url,
             tls_certificate=tls_certificate,
             tls_key=tls_key,
             device=device,

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
+
+from surrogym_shared.bounded import FailFast
 
 MAX_DIMENSIONS = 64
 MAX_TERM_PARTS = 64
@@ -17,7 +19,7 @@ REWARD = "reward"
 Name = Annotated[str, Field(min_length=1, max_length=64)]
 
 
-class Frozen(BaseModel):
+class Frozen(FailFast):
     """Base of every model here: immutable, and unknown fields are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="null")

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from surrogym_shared.bounded import FailFast
 from surrogym_shared.spec import MAX_DIMENSIONS, NAME_PATTERN
 
 PROTOCOL = 1
@@ -35,7 +36,7 @@ Vector = Annotated[list[Measured], Field(min_length=1, max_length=MAX_DIMENSIONS
 Matrix = Annotated[list[Vector], Field(min_length=1, max_length=MAX_BATCH)]
 
 
-class Request(BaseModel):
+class Request(FailFast):
     """Base of what a client sends: unknown fields are refused, booleans and strings are not numbers."""
 
     model_config = ConfigDict(extra="forbid", strict=True)

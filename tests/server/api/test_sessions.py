@@ -145,7 +145,8 @@ def test_a_lane_keeps_its_model_to_the_end_of_its_episode(client: httpx.Client, 
         send(client, id, "reset")
     send(client, opened["latest"], "step", action=ACTIONS, mask=[True, False])
     export = client.get(f"/v1/surrogates/{name}/models/1", params={"format": "safetensors"}).content
-    client.post(f"/v1/surrogates/{name}/models", content=export).raise_for_status()
+    file = {"content-type": "application/octet-stream"}
+    client.post(f"/v1/surrogates/{name}/models", content=export, headers=file).raise_for_status()
     versions = [send(client, opened["latest"], "step", action=ACTIONS).json()["model_version"] for _ in range(3)]
     assert versions == [[1, 1], [2, 1], [2, 2]]
     fixed = [send(client, opened[1], "step", action=ACTIONS).json()["model_version"] for _ in range(4)]

@@ -214,7 +214,13 @@ def test_models_are_kept_exported_and_imported(client: httpx.Client, taught: str
     assert [model["version"] for model in models] == list(range(1, latest + 1))
     assert client.get(f"/v1/surrogates/{taught}/models/2").json() == models[1]
     export = client.get(f"/v1/surrogates/{taught}/models/{latest}", params={"format": "safetensors"}).content
-    imported = client.post(f"/v1/surrogates/{fresh}/models", content=export).raise_for_status().json()
+    imported = (
+        client.post(
+            f"/v1/surrogates/{fresh}/models", content=export, headers={"content-type": "application/octet-stream"}
+        )
+        .raise_for_status()
+        .json()
+    )
     assert (imported["version"], imported["data_hash"]) == (1, models[-1]["data_hash"])
     points = {"coordinates": [[0.3, -1.0]], "action": [[0.7]]}
     said = [client.post(f"/v1/surrogates/{name}/predict", json=points).json() for name in (taught, fresh)]

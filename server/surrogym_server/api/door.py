@@ -1,0 +1,107 @@
+"""The door of a route: who may call it, and with which body.
+
+Settled from the headers, before a byte of the body is read. A route declares its roles among its dependencies
+(``api.auth``), the media types of its body by what it reads, and the size of a JSON body by ``json_up_to``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from fastapi import Request
+from fastapi.responses import Response
+from fastapi.routing import APIRoute
+from starlette.exceptions import HTTPException
+from starlette.types import Scope
+
+from surrogym_server.api.auth import Access, Gate, bearer_token, everybody
+from surrogym_server.api.guards import BODY_LIMIT
+from surrogym_server.api.headers import raw_header
+from surrogym_server.api.json_body import JSON, JsonRequest
+from surrogym_shared.wire import Role
+
+MEDIA_TYPE = "surrogym.media_type"  # in the scope: of the body, where the route reads one
+JSON_LIMIT = "x-max-json-bytes"  # in OpenAPI
+KIBIBYTE = 1024
+DEFAULT_JSON_BYTES = 64 * KIBIBYTE
+
+
+def json_up_to(kibibytes: int) -> dict[str, Any]:
+    """``openapi_extra`` of a route whose JSON bodies may be larger than the default of 64 KiB."""
+    return {JSON_LIMIT: kibibytes * KIBIBYTE}
+
+
+@dataclass(frozen=True)
+class Door:
+    """What a request must show before its body is read.
+
+    Attributes:
+        roles: that may enter, beside admin; None lets everybody in.
+        bodies: the most bytes of each media type that is accepted, None for the server's own limit; empty where the
+            route reads no body.
+    """
+
+    roles: tuple[Role, ...] | None
+    bodies: Mapping[str, int | None]
+
+    def admit(self, scope: Scope) -> None:
+        """Let a request pass; its scope then has the media type and the limit of its body.
+
+        Raises:
+            Unauthenticated: no token, or an unknown one.
+            Forbidden: a token of another role.
+            HTTPException: 415 for another media type or an encoded body, 413 for one that is announced as too large.
+        """
+        state = scope["app"].state
+        gate: Gate = state.gate
+        if self.roles is not None:
+            gate.check(bearer_token(scope), self.roles)
+        if not self.bodies:
+            return
+        scope[MEDIA_TYPE] = media_type = self._media_type(scope)
+        own, most = self.bodies[media_type], state.max_body_bytes
+        scope[BODY_LIMIT] = limit = most if own is None else min(own, most)
+        announced = raw_header(scope, b"content-length")
+        if announced.isdigit() and int(announced) > limit:
+            expected = f"expected a body of at most {limit} bytes as {media_type}"
+            larger = [name for name, size in self.bodies.items() if size is None and name != media_type]
+            instead = f"; larger ones come as {larger[0]}" if larger else ""
+            raise HTTPException(413, f"{expected}, got {announced.decode()} bytes{instead}")
+
+    def _media_type(self, scope: Scope) -> str:
+        given = raw_header(scope, b"content-type").decode("latin-1").partition(";")[0].strip().lower()
+        if given not in self.bodies:
+            raise HTTPException(415, f"expected content type {' or '.join(self.bodies)}, got {given or 'none'}")
+        encoding = raw_header(scope, b"content-encoding").decode("latin-1").strip().lower()
+        if encoding not in ("", "identity"):
+            raise HTTPException(415, f"expected a body without content encoding, got one of {encoding!r}")
+        return given
+
+
+def door_of(route: APIRoute) -> Door:
+    """The door that a route declares. Raises ``TypeError`` where it does not say who may call it."""
+    declared = [depends.dependency for depends in route.dependencies]
+    access = [one for one in declared if isinstance(one, Access)]
+    if len(access) + (everybody in declared) != 1:
+        raise TypeError(f"route {route.path}: expected one declaration of who may call it, got {len(access)}")
+    extra = route.openapi_extra or {}
+    content = extra.get("requestBody", {}).get("content", {JSON: {}} if route.body_field else {})
+    limits: dict[str, int | None] = dict.fromkeys(content)
+    if JSON in limits:
+        limits[JSON] = extra.get(JSON_LIMIT, DEFAULT_JSON_BYTES)
+    return Door(access[0].roles if access else None, limits)
+
+
+class DoorRoute(APIRoute):
+    """A route of FastAPI behind its door."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        door, handle = door_of(self), super().get_route_handler()
+
+        async def admitted(request: Request) -> Response:
+            door.admit(request.scope)
+            return await handle(JsonRequest(request.scope, request.receive))
+
+        return admitted
