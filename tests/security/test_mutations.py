@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import socket
 from collections.abc import Callable, Iterator
 
 import httpx
@@ -14,13 +15,14 @@ from websockets.sync.client import connect
 
 from support import pendulum
 from support.chaos import SEED, times
-from support.hostile import mutated, resident_mib
+from support.hostile import connected, mutated, resident_mib
 from support.server import ServerProcess
 from surrogym_shared import frames
 from surrogym_shared.codes import PROBLEM_MEDIA_TYPE, Problem
 
 MUTATIONS = times(short=250, full=17_000)  # of each of six kinds
 WARM, GROWTH_MIB = 50, 24.0
+KEY = "c3Vycm9neW0tZnJhbWVzLg=="  # of a handshake: any 16 bytes
 ACTION = np.array([[0.5], [-1.5]])
 
 pytestmark = pytest.mark.timeout(3_600)
@@ -119,3 +121,39 @@ def test_the_stream(server: ServerProcess, client: httpx.Client, session: str):
             raise AssertionError("the stream was closed") from closed
         stream.send(good)
         assert isinstance(frames.read_reply(bytes(stream.recv(timeout=60))), frames.StepReply)
+
+
+def websocket_frames(source: random.Random) -> bytes:
+    """Frames with any opcode, whole or not, or bytes that are none."""
+    if source.random() < 0.4:
+        return source.randbytes(source.randint(1, 60))
+    content = source.randbytes(source.randint(0, 50))
+    head = bytes([source.randrange(2) << 7 | source.randrange(16), 0x80 | len(content)])
+    return (head + bytes(4) + content) * source.randint(1, 4)
+
+
+def upgraded(server: ServerProcess, session: str) -> socket.socket:
+    """A stream of a session, as a bare connection."""
+    opened = connected(server.url, seconds=10.0)
+    lines = ("Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13", f"Sec-WebSocket-Key: {KEY}")
+    head = [f"GET /v1/sessions/{session}/stream HTTP/1.1", "Host: 127.0.0.1", *lines, "", ""]
+    opened.sendall("\r\n".join(head).encode())
+    assert opened.recv(65_536).startswith(b"HTTP/1.1 101")
+    return opened
+
+
+def test_random_websocket_frames_leave_no_error_in_the_log(server: ServerProcess, session: str):
+    source, stream = random.Random(SEED), upgraded(server, session)
+    for _ in range(MUTATIONS):
+        try:
+            stream.sendall(websocket_frames(source))
+            if source.random() < 0.3:
+                stream.settimeout(0.005)
+                stream.recv(65_536)
+        except OSError:
+            stream.close()
+            stream = upgraded(server, session)
+    stream.close()
+    assert server.process.poll() is None
+    assert "Traceback" not in server.log
+    assert "ERROR" not in server.log

@@ -7,6 +7,7 @@ import resource
 from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.utils import ClientDisconnected
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from surrogym_server.api.problems import problem_response
@@ -14,6 +15,9 @@ from surrogym_server.api.stream import EXTENSION, Prompt
 from surrogym_shared.codes import Code
 from surrogym_shared.messages import MASKED, WHOLE_BINARY, Extent, FrameSplitter, apply_mask, header
 
+MAX_HEADERS = 100
+MAX_HEAD_BYTES = 64 * 1024
+HEAD_TOO_LARGE = 431
 SPARE_FILES = 128  # for the database, pipes and whatever else is open beside connections
 
 
@@ -24,11 +28,25 @@ def connections_within(most: int) -> int:
     return most if hard == resource.RLIM_INFINITY else max(min(most, hard - SPARE_FILES), 1)
 
 
+class HeadTooLarge(Exception):
+    """Raised inside the parser, which then stops: the headers, the target or the trailers are beyond their limits."""
+
+
 def patient(seconds: float, most: int) -> type[HttpToolsProtocol]:
-    """uvicorn's protocol, with a limit of seconds for a request to arrive whole, and of connections."""
+    """uvicorn's protocol, with a limit of seconds for a request to arrive whole, of connections, and of its head."""
 
     class Patient(HttpToolsProtocol):
         _timer: asyncio.TimerHandle | None = None
+        _head_bytes = 0  # of target, headers and trailers of this request
+        _head_lines = 0
+        _head_complete = False
+        _unparsed = 0  # bytes since the parser last came to the end of something
+
+        def data_received(self, data: bytes) -> None:
+            self._unparsed += len(data)
+            super().data_received(data)
+            if self._unparsed > MAX_HEAD_BYTES and not self.transport.is_closing():
+                self._refuse_head()
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
@@ -43,15 +61,51 @@ def patient(seconds: float, most: int) -> type[HttpToolsProtocol]:
 
         def on_message_begin(self) -> None:
             super().on_message_begin()
+            self._head_bytes = self._head_lines = self._unparsed = 0
+            self._head_complete = False
             self._arrived()
             self._wait()
 
+        def on_url(self, url: bytes) -> None:
+            self._count(len(url))
+            super().on_url(url)
+
+        def on_header(self, name: bytes, value: bytes) -> None:
+            self._head_lines += 1
+            self._count(len(name) + len(value))
+            if not self._head_complete:  # a trailer is counted, and nobody reads it
+                super().on_header(name, value)
+
+        def on_headers_complete(self) -> None:
+            self._head_complete, self._unparsed = True, 0
+            super().on_headers_complete()
+
+        def on_body(self, body: bytes) -> None:
+            self._unparsed = 0
+            super().on_body(body)
+
+        def on_chunk_header(self) -> None:
+            self._unparsed = 0
+
         def on_message_complete(self) -> None:
+            self._unparsed = 0
             self._arrived()
             super().on_message_complete()
 
         def send_400_response(self, msg: str) -> None:
+            if self._head_bytes > MAX_HEAD_BYTES or self._head_lines > MAX_HEADERS:
+                self._refuse_head()
+                return
             self._refuse(Code.INVALID_REQUEST, f"expected a request of HTTP/1.1, got none: {msg}", status=400)
+
+        def _count(self, size: int) -> None:
+            self._head_bytes += size
+            if self._head_bytes > MAX_HEAD_BYTES or self._head_lines > MAX_HEADERS:
+                raise HeadTooLarge
+
+        def _refuse_head(self) -> None:
+            bounds = f"at most {MAX_HEADERS} headers and {MAX_HEAD_BYTES} bytes of target, headers and trailers"
+            self._refuse(Code.TOO_LARGE, f"expected {bounds}, got more", status=HEAD_TOO_LARGE)
 
         def _wait(self) -> None:
             self._timer = asyncio.get_running_loop().call_later(seconds, self._late)
@@ -111,6 +165,11 @@ class PromptMessages(WebSocketsSansIOProtocol):
             if len(whole) > 1 or extent is None or not self._answered(self._answer, frame, extent):
                 super().data_received(frame)
 
+    def send_receive_event_to_app(self) -> None:
+        if self.curr_msg_data_type == "text":  # refused by the app, and uvicorn logs an error for what is no UTF-8
+            self.frames = [b"".join(self.frames).decode(errors="replace").encode()]
+        super().send_receive_event_to_app()
+
     async def receive(self) -> Any:
         self._waiting = True
         try:
@@ -119,6 +178,8 @@ class PromptMessages(WebSocketsSansIOProtocol):
             self._waiting = False
 
     async def send(self, message: Any) -> None:
+        if self.close_sent:  # for a frame that is none, while the app answered the message before it
+            raise ClientDisconnected
         await super().send(message)
         self.handshake_complete |= self.close_sent  # by a refusal; uvicorn would call it none, and log an error
 
