@@ -12,6 +12,7 @@ from surrogym_shared import spec as wire
 
 PENALTY = {"default": 0.0, "paper": 3.0}  # k of eq. 14
 MONTE_CARLO = 1024
+HYPERCUBE_TRIES = 50
 LONGEST_ROLLOUT = 200  # where the specification names none
 
 
@@ -34,12 +35,13 @@ def definition_from_spec(spec: wire.EnvironmentSpec) -> core.EnvironmentDefiniti
         reward_timing=spec.reward.timing,
         penalty=_penalty(spec),
         tolerances=tuple(spec.tolerances.items()),
+        learning=_learning(spec),
         design=_design(spec),
         learns_termination=spec.termination == "learned",
         declared_reward=_declared_reward(spec),
         max_rollout=_max_rollout(spec) if spec.query == "rollout" else None,
     )
-    if definition.design.preset == "paper":
+    if definition.moves_observation:
         ObservationInverse.of(definition)
     return definition
 
@@ -70,13 +72,25 @@ def _design(spec: wire.EnvironmentSpec) -> core.DesignDefinition:
     if design.budget is not None:
         initial = min(initial, design.budget)
     return core.DesignDefinition(
-        preset=design.preset,
         initial=initial,
+        hypercube_tries=1 if paper else HYPERCUBE_TRIES,
         acquisition=design.acquisition or ("uncertainty_index" if paper else "integrated_variance"),
         tolerance=design.tolerance or ("raw" if paper else "relative"),
         monte_carlo=design.monte_carlo or MONTE_CARLO,
-        symmetry=design.symmetry,
+        visited_candidates=not paper,
+        input_probability="predicted" if paper else "uniform",
+        stopping="confidence" if paper else "tested_confidence",
         seed=design.seed,
+    )
+
+
+def _learning(spec: wire.EnvironmentSpec) -> core.LearningDefinition:
+    paper = spec.design.preset == "paper"
+    return core.LearningDefinition(
+        moves="observation" if paper else "coordinates",
+        kernel="squared_exponential" if paper else "composite",
+        reward_jumps=not paper,
+        symmetry=spec.design.symmetry,
     )
 
 

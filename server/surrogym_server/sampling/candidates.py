@@ -39,7 +39,7 @@ def candidates_of(model: SurrogateModel, points: Points, states: Tensor | None, 
     states = None if states is None else states[model.definition.in_range(states)]
     points = points[:MAX_CANDIDATES]
     reference, weights = points[:REFERENCE], points.q.new_ones(min(len(points), REFERENCE))
-    if states is not None and len(states) and model.definition.design.preset == "default":
+    if states is not None and len(states) and model.definition.design.visited_candidates:
         visited = _visited(model.definition, states, len(points), rng)
         also = _visited(model.definition, states, REFERENCE, rng)
         weights = torch.cat(
@@ -54,13 +54,12 @@ def candidates_of(model: SurrogateModel, points: Points, states: Tensor | None, 
 def input_probability(model: SurrogateModel, points: Points, states: Tensor | None) -> Tensor:
     """log P_i (eq. 11) at m points from visited states (v, C): (m,).
 
-    Without any, preset ``paper`` takes the density of the predicted next states at each point's own, and the default
-    calls every state equally likely.
+    Without any, every state is equally likely, or as likely as the predicted next states are dense at it.
     """
     definition = model.definition
     if states is not None and len(states):
         return log_occupancy(definition, states, points.q)
-    if definition.design.preset == "paper":
+    if definition.design.input_probability == "predicted":
         arrived = model.transition(points.q, points.u).q_next
         return log_occupancy(definition, arrived, arrived, floor=1e-12)
     return points.q.new_zeros(len(points))

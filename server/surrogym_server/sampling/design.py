@@ -27,7 +27,6 @@ from surrogym_server.surrogate.samples import Samples, increments
 Verdict = Literal["continue", "ready", "over_budget"]
 SHORTEST_ROUND = 4  # real steps
 TOLERANCE = 0.05  # of the output's deviation over the initial design
-HYPERCUBE_TRIES = 50
 FEW_POINTS = 500  # more of them leave no gap worth a comparison of all pairs, whose memory grows with their square
 
 
@@ -79,11 +78,10 @@ class Decision:
 
 def initial_design(definition: EnvironmentDefinition, budget: int) -> tuple[Tensor, Tensor]:
     """The Latin hypercube that everything starts from: coordinates (n, C), actions (n, F), n at most the budget."""
-    paper = definition.design.preset == "paper"
     count = min(definition.design.initial, budget)
     if definition.design.acquisition == "latin_hypercube":
         count = budget
-    tries = 1 if paper or count > FEW_POINTS else HYPERCUBE_TRIES
+    tries = 1 if count > FEW_POINTS else definition.design.hypercube_tries
     rng = _rng(definition, "initial")
     return going_on(definition, *latin_hypercube(definition, count, rng, tries), rng)
 
@@ -147,11 +145,10 @@ def judge(
     request: Request,
     settled: bool = True,
 ) -> Verdict:
-    """Whether to go on. The default trusts a confidence only when leave-one-out errors agree, it is settled where
-    episodes end, and adaptive queries, half as many as the initial design had, have tried to disprove it; the paper
-    trusts the index alone."""
+    """Whether to continue. A ``tested_confidence`` counts only when leave-one-out errors agree, it is settled where
+    episodes end, and adaptive queries, half as many as the initial design had, have tried to disprove it."""
     sure = all(c.confidence_index >= request.target for c in confidences)
-    if definition.design.preset == "default":
+    if definition.design.stopping == "tested_confidence":
         sure = sure and all(c.leave_one_out_error <= t for c, t in zip(confidences, tolerances, strict=True))
         sure = sure and settled and samples >= math.ceil(1.5 * definition.design.initial)
     if sure:

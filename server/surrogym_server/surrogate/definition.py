@@ -22,7 +22,6 @@ REWARD = "reward"
 REACH = 1e6
 SCALING_POINTS = 4_096
 Array = NDArray[np.float64]
-Preset = Literal["default", "paper"]
 Kind = Literal["linear", "angle", "constant"]
 
 
@@ -67,15 +66,49 @@ class ActionDefinition:
 
 
 @dataclass(frozen=True)
-class DesignDefinition:
-    """Settings of the adaptive design, every default resolved."""
+class LearningDefinition:
+    """What a model is made of, every default resolved.
 
-    preset: Preset
+    Attributes:
+        moves: what the transition outputs are increments of; under ``observation`` the coordinates are read back from
+            the observation, as the paper has it.
+        kernel: of every process; ``composite`` adds a linear part, and for the reward a quadratic one.
+        reward_jumps: whether the reward may jump where a learned region begins.
+        symmetry: ``auto`` compares feature maps that are their own mirror image with the others.
+    """
+
+    moves: Literal["coordinates", "observation"]
+    kernel: Literal["composite", "squared_exponential"]
+    reward_jumps: bool
+    symmetry: Literal["auto", "none"]
+
+
+@dataclass(frozen=True)
+class DesignDefinition:
+    """Settings of the adaptive design, every default resolved.
+
+    Attributes:
+        initial: queries of the initial design.
+        hypercube_tries: Latin hypercubes to choose the most spread one from.
+        acquisition: criterion of the adaptive queries.
+        tolerance: ``relative`` to an output's deviation over the initial design, or ``raw``: 1 in the output's unit.
+        monte_carlo: points that estimate the confidence index (eq. 8).
+        visited_candidates: whether visited states join the candidates and the reference.
+        input_probability: P_i (eq. 11) while no policy has visited anything: ``uniform``, or the density of the
+            ``predicted`` next states, as printed.
+        stopping: ``confidence`` stops at the target of the index, as printed; ``tested_confidence`` also asks
+            leave-one-out errors within the tolerances and adaptive queries that tried to disprove it.
+        seed: of all random choices of the design.
+    """
+
     initial: int
+    hypercube_tries: int
     acquisition: Literal["uncertainty_index", "variance", "integrated_variance", "latin_hypercube"]
     tolerance: Literal["relative", "raw"]
     monte_carlo: int
-    symmetry: Literal["auto", "none"]
+    visited_candidates: bool
+    input_probability: Literal["uniform", "predicted"]
+    stopping: Literal["confidence", "tested_confidence"]
     seed: int
 
 
@@ -94,6 +127,7 @@ class EnvironmentDefinition:
     reward_timing: Literal["before", "after", "auto"]
     penalty: float
     tolerances: tuple[tuple[str, float], ...]
+    learning: LearningDefinition
     design: DesignDefinition
     learns_termination: bool = False  # from samples; no groups are declared then
     declared_reward: DeclaredReward | None = None
@@ -113,6 +147,11 @@ class EnvironmentDefinition:
         """The same with these tolerances, by output, in the place of its own."""
         return replace(self, tolerances=tuple((dict(self.tolerances) | dict(tolerances)).items()))
 
+    @property
+    def moves_observation(self) -> bool:
+        """Whether the transition outputs are increments of the observation, not of the coordinates."""
+        return self.learning.moves == "observation"
+
     @cached_property
     def coordinate_names(self) -> tuple[str, ...]:
         return tuple(c.name for c in self.coordinates)
@@ -124,8 +163,8 @@ class EnvironmentDefinition:
 
     @cached_property
     def outputs(self) -> tuple[str, ...]:
-        """Modelled outputs by name: moving coordinates (preset ``paper``: observation entries), then the reward."""
-        if self.design.preset == "paper":
+        """Modelled outputs by name: the moving coordinates or the observation entries, then the reward."""
+        if self.moves_observation:
             return (*self.observation_names, REWARD)
         return (*(self.coordinates[i].name for i in self.moving), REWARD)
 

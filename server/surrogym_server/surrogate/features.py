@@ -67,7 +67,7 @@ def reward_candidates(definition: EnvironmentDefinition) -> tuple[FeatureMap, ..
     """
     timings = {"before": (False,), "after": (True,), "auto": (False, True)}[definition.reward_timing]
     maps = candidates(definition, follows=False, parity="even")
-    if definition.observation_combines and definition.design.preset == "default":
+    if definition.observation_combines and not definition.moves_observation:
         maps += tuple(FeatureMap("observation", action) for action in dict.fromkeys(m.action for m in maps))
     return tuple(replace(m, after=after) for after in timings for m in maps)
 
@@ -77,7 +77,7 @@ def candidates(
 ) -> tuple[FeatureMap, ...]:
     """Maps worth comparing for one output; ``follows`` says that it may read the lead, ``drift`` how angles turn,
     ``parity`` which one it has if the environment is its own mirror image."""
-    if definition.design.preset == "paper":
+    if definition.moves_observation:
         return (FeatureMap(state="observation"),)
     states: list[State] = ["cos_sin"]
     if definition.angles:
@@ -89,7 +89,7 @@ def candidates(
     maps = tuple(FeatureMap(s, a, lead) for s, a, lead in product(states, actions, leads))
     maps += tuple(replace(m, drift=drift) for m in maps if drift and m.state == "cos_sin")
     maps += (FeatureMap("none", lead=True),) if any(leads) else ()
-    if definition.design.symmetry == "none":
+    if definition.learning.symmetry == "none":
         return maps
     mirrored = (replace(m, parity=parity) for m in maps)
     return maps + tuple(m for m in mirrored if reflection(definition, m) is not None)
@@ -233,7 +233,7 @@ def _of_point(definition: EnvironmentDefinition, feature_map: FeatureMap) -> lis
 
 
 def _of_observation(definition: EnvironmentDefinition) -> list[Feature]:
-    if definition.design.preset == "paper":
+    if definition.moves_observation:
         return [Feature("observed", entry) for entry in range(len(definition.observation_names))]
     centres, scales = (values.tolist() for values in definition.observation_scaling)
     return [Feature("observed", entry, *scaling) for entry, scaling in enumerate(zip(centres, scales, strict=True))]

@@ -51,7 +51,7 @@ def learn(definition: EnvironmentDefinition, samples: Samples, warm: Thetas | No
 def _transitions(learner: Learner, samples: Samples) -> tuple[OutputModel, ...]:
     definition = learner.definition
     everything, change = torch.ones(len(samples), dtype=torch.bool), increments(definition, samples)
-    if definition.design.preset == "paper":
+    if definition.moves_observation:
         (feature_map,) = candidates(definition, follows=False)
         inputs = {feature_map: encode(definition, feature_map, samples.q, samples.u)}
         return tuple(
@@ -73,7 +73,7 @@ def _transitions(learner: Learner, samples: Samples) -> tuple[OutputModel, ...]:
 
 def usable(definition: EnvironmentDefinition, column: int, q_next: Tensor, feature_map: FeatureMap) -> Tensor:
     """Which samples that end at q_next (m, C) the transition output ``column`` learns from under a map, (m,) bool."""
-    if definition.design.preset == "paper":
+    if definition.moves_observation:
         return torch.ones(len(q_next), dtype=torch.bool)
     if feature_map.lead:
         return ~_saturates(definition, definition.moving[column], q_next)

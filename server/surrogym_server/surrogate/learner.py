@@ -64,8 +64,8 @@ class Learner:
         return replace(fitted, score=fitted.score * len(y) / len(rows))
 
     def _options(self, name: str) -> FitOptions:
-        """Dynamics tend to be near linear, costs to be quadratic; the paper has the squared exponential alone."""
-        if self.definition.design.preset == "paper":
+        """Dynamics tend to be near linear, costs to be quadratic."""
+        if self.definition.learning.kernel == "squared_exponential":
             return FitOptions(linear=False)
         return FitOptions(quadratic=name == REWARD)
 

@@ -1,7 +1,7 @@
 """SurrogateModel: one fit of one environment, ready to predict. Immutable; complete in itself when stored.
 
 The state moves in coordinates: q' = q + f(q, u), angles wrapped, saturated coordinates clipped (eq. 1 with zero mean).
-Preset ``paper`` moves the observation instead, o' = o + f(o, u), and reads the coordinates back from it.
+Where the outputs move the observation instead, o' = o + f(o, u), the coordinates are read back from it.
 """
 
 from __future__ import annotations
@@ -198,7 +198,7 @@ class SurrogateModel:
         return mean + added, variance
 
     def _moved(self, q: Tensor, change: Tensor) -> Tensor:
-        if self.definition.design.preset == "paper":
+        if self.definition.moves_observation:
             return settle(self.definition, self._inverse(self.definition.observe(q) + change, q))
         return settle(self.definition, q + change)
 
@@ -211,14 +211,13 @@ class SurrogateModel:
 
     @cached_property
     def _columns(self) -> tuple[int, ...]:
-        """Where each transition output stands: at its coordinate; preset ``paper``: at its observation entry."""
-        paper = self.definition.design.preset == "paper"
-        return tuple(range(len(self.transitions))) if paper else self.definition.moving
+        """Where each transition output stands: at its coordinate, or at its observation entry."""
+        return tuple(range(len(self.transitions))) if self.definition.moves_observation else self.definition.moving
 
     @cached_property
     def _reward_column(self) -> int:
-        paper = self.definition.design.preset == "paper"
-        return len(self.transitions) if paper else len(self.definition.coordinates)
+        moved = self.transitions if self.definition.moves_observation else self.definition.coordinates
+        return len(moved)
 
     @kept
     def _stages(self) -> tuple[Stage, Stage | None, Stage | None]:

@@ -1,4 +1,4 @@
-"""Coordinates read back from an observation, for preset ``paper``, which moves the observation itself.
+"""Coordinates read back from an observation, where the outputs move the observation itself.
 
 An angle needs both its cosine and its sine among the entries (their mean leaves the circle, the angle does not);
 a linear coordinate needs an entry that is the coordinate itself.

@@ -17,10 +17,7 @@ FEW = 2  # steps that go on: fewer tell nothing without those that end
 
 
 def reward(learner: Learner, samples: Samples) -> tuple[OutputModel, float, tuple[Jump, ...]]:
-    """The reward process of steps that go on, what a step that ends the episode pays beyond it, and its jumps.
-
-    Preset ``paper`` learns one process, as printed.
-    """
+    """The reward process of steps that go on, what a step that ends the episode pays beyond it, and its jumps."""
     definition = learner.definition
     if (known := definition.declared_reward) is not None:
         return _declared(known, samples), known.terminal, ()
@@ -31,7 +28,7 @@ def reward(learner: Learner, samples: Samples) -> tuple[OutputModel, float, tupl
     going = ~samples.terminated if int((~samples.terminated).sum()) >= FEW else torch.ones_like(samples.terminated)
     output = learner.output(REWARD, samples.reward, inputs, going, going)
     jumps: tuple[Jump, ...] = ()
-    if definition.design.preset == "default":
+    if definition.learning.reward_jumps:
         output, jumps = with_jumps(learner, samples, inputs, going, output)
     ended = ~going
     if not bool(ended.any()):

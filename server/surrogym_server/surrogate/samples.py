@@ -35,9 +35,9 @@ class Samples:
 
 
 def increments(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
-    """Targets of the transition outputs, (n, M): q' - q of the moving coordinates, angles by what they turned;
-    preset ``paper``: o' - o of the observation."""
-    if definition.design.preset == "paper":
+    """Targets of the transition outputs, (n, M): q' - q of the moving coordinates, angles by what they turned; or
+    o' - o where the outputs move the observation."""
+    if definition.moves_observation:
         return definition.observe(samples.q_next) - definition.observe(samples.q)
     change = samples.q_next - samples.q
     change[:, definition.angles] = turning(definition, samples.q, samples.q_next)
