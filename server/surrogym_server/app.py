@@ -40,6 +40,7 @@ from surrogym_server.engine.fits import Fits
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import MEBIBYTE, Limits, LiveSessions, Threads
 from surrogym_server.errors import InvalidInput
+from surrogym_server.sampling.acquisition import ACQUISITIONS
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
@@ -97,6 +98,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
         Unavailable: the database is taken, or does not answer.
     """
     _check_device(settings.device)
+    logger.info("acquisitions: %s", ", ".join(ACQUISITIONS.names))
     storage = open_storage(settings.database_url, settings.synchronous)
     app = FastAPI(
         title="Surrogym",

@@ -102,7 +102,7 @@ def cell(task: str, representation: str, criterion: str, seed: int) -> Iterator[
 def designed(spec: EnvironmentSpec, counts: Sequence[int]) -> Iterator[tuple[SurrogateModel, int]]:
     """Models of ever more queries. A hypercube is made anew for each number: it can't be added to."""
     definition = definition_from_spec(spec)
-    if definition.design.acquisition == "latin_hypercube":
+    if definition.design.acquisition.name == "latin_hypercube":
         for count in counts:
             yield learn(definition, answer(spec, *initial_design(definition, count))).model, count
         return

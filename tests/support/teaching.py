@@ -14,9 +14,11 @@ from surrogym_shared.spec import EnvironmentSpec
 FINISHED = ("ready", "over_budget")
 
 
-def teach(api: Api, name: str, spec: EnvironmentSpec, queries: int, seconds: float = 120.0) -> wire.SurrogateView:
-    """Register a surrogate and answer ``queries`` initial queries: one fit, and no adaptive ones."""
-    design = spec.design.model_copy(update={"initial": queries, "budget": queries})
+def teach(
+    api: Api, name: str, spec: EnvironmentSpec, queries: int, initial: int | None = None, seconds: float = 120.0
+) -> wire.SurrogateView:
+    """Register a surrogate and answer ``queries``, of which ``initial`` come before the first fit (None: all)."""
+    design = spec.design.model_copy(update={"initial": queries if initial is None else initial, "budget": queries})
     api.create_surrogate(name, spec.model_copy(update={"design": design}))
     original, deadline = GymnasiumEnvironment(spec), time.monotonic() + seconds
     while time.monotonic() < deadline:

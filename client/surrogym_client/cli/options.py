@@ -53,7 +53,6 @@ Tolerances = Annotated[
 ]
 StepLimit = Annotated[float, typer.Option(min=0.001, help="Seconds one real step, or a reset, may take.")]
 Preset = Literal["default", "paper"]
-Acquisition = Literal["integrated_variance", "variance", "uncertainty_index", "latin_hypercube"]
 
 
 def connect(server: str | None, token: str | None, wait: float = 0.0, *, quiet: bool = False) -> Api:

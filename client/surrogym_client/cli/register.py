@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from surrogym_client.cli.options import (
-    Acquisition,
     AsJson,
     Preset,
     Quiet,
@@ -44,10 +43,10 @@ def command(
     target: Annotated[float | None, typer.Option(help="Confidence index to reach.")] = None,
     tolerance: Tolerances = None,
     acquisition: Annotated[
-        Acquisition | None,
+        str | None,
         typer.Option(
-            help="What chooses queries after the first model. Without teleport only latin_hypercube is read: it plans "
-            "nothing. [default: the preset's]"
+            help="Criterion of the queries after the first model: integrated_variance, variance, uncertainty_index, "
+            "latin_hypercube, or one that is installed beside the server. [default: the preset's]"
         ),
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the design.")] = None,

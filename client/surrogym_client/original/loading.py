@@ -15,7 +15,6 @@ from surrogym_client.original.rollouts import answering
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 
 Preset = Literal["default", "paper"]
-Acquisition = Literal["integrated_variance", "variance", "uncertainty_index", "latin_hypercube"]
 Choose = Callable[[EnvironmentSpec], EnvironmentSpec]
 METHODS = ("step_from", "reset", "step", "coordinates", "begin", "act", "picture", "close")
 
@@ -28,7 +27,7 @@ def make(
     budget: int | None = None,
     initial: int | None = None,
     target: float | None = None,
-    acquisition: Acquisition | None = None,
+    acquisition: str | None = None,
     seed: int | None = None,
     bins: int | None = None,
     teleport: bool = True,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from surrogym_server.errors import InvalidSpec
+from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.surrogate import conditions, declared, distributions, terms
 from surrogym_server.surrogate import definition as core
 from surrogym_server.surrogate.recover import ObservationInverse
@@ -20,7 +21,7 @@ def definition_from_spec(spec: wire.EnvironmentSpec) -> core.EnvironmentDefiniti
     """The core's view of a specification, every default of its preset resolved.
 
     Raises:
-        InvalidSpec: the preset can't represent this environment.
+        InvalidSpec: the preset can't represent this environment, or an acquisition that is not installed.
     """
     names = spec.coordinate_names
     definition = core.EnvironmentDefinition(
@@ -74,7 +75,7 @@ def _design(spec: wire.EnvironmentSpec) -> core.DesignDefinition:
     return core.DesignDefinition(
         initial=initial,
         hypercube_tries=1 if paper else HYPERCUBE_TRIES,
-        acquisition=design.acquisition or ("uncertainty_index" if paper else "integrated_variance"),
+        acquisition=_acquisition(design, "uncertainty_index" if paper else "integrated_variance"),
         tolerance=design.tolerance or ("raw" if paper else "relative"),
         monte_carlo=design.monte_carlo or MONTE_CARLO,
         visited_candidates=not paper,
@@ -82,6 +83,16 @@ def _design(spec: wire.EnvironmentSpec) -> core.DesignDefinition:
         stopping="confidence" if paper else "tested_confidence",
         seed=design.seed,
     )
+
+
+def _acquisition(design: wire.Design, usual: str) -> core.AcquisitionChoice:
+    given = design.acquisition
+    if isinstance(given, wire.AcquisitionChoice):
+        choice = core.AcquisitionChoice(given.name, tuple(given.settings.items()))
+    else:
+        choice = core.AcquisitionChoice(given or usual)
+    acquisition_of(choice)
+    return choice
 
 
 def _learning(spec: wire.EnvironmentSpec) -> core.LearningDefinition:

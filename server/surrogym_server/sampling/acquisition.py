@@ -1,89 +1,166 @@
-"""Which points to query next (eq. 12 and 13), over a candidate set: criteria, and greedy batches of them."""
+"""Acquisitions: what a query is worth (eq. 12 and 13). One class a criterion; packages may add their own.
+
+An acquisition values candidates, or predicted paths, for the sake of one output of the model. Its laws:
+
+- it is a pure function of its arguments and its settings: no state, no random numbers of its own;
+- it returns one value for each candidate (m,), or for each beginning of each path (b, T); only their order counts;
+- more is better, and no value is NaN;
+- it changes nothing that it was given.
+
+Its settings are the fields of a frozen dataclass: numbers, booleans and strings, as the specification carries them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
 
-import torch
 from torch import Tensor
 
-from surrogym_server.sampling.candidates import Candidates
+from surrogym_server.errors import InvalidSpec
+from surrogym_server.plugins import Registry
 from surrogym_server.sampling.confidence import log_model_uncertainty
-from surrogym_server.sampling.outlook import Outlook, OutputOutlook, Points
-from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.surrogate.features import FeatureMap, encode
+from surrogym_server.sampling.outlook import Points
+from surrogym_server.surrogate.definition import AcquisitionChoice
 from surrogym_server.surrogate.model import SurrogateModel
 
-NEAR = 0.02  # queries closer than this, in deviations of the sampling range, are near-duplicates
+GROUP = "surrogym.acquisitions"
 
 
-def choose(
-    model: SurrogateModel,
-    candidates: Candidates,
-    taken: Points,
-    assumed: Points,
-    wanted: Sequence[int],
-    tolerances: Sequence[float],
-    reserved: Tensor | None = None,
-) -> list[int]:
-    """A greedy batch: for each output in ``wanted`` the best candidate, as if those before it had been answered.
+@dataclass(frozen=True)
+class CandidateView:
+    """What an acquisition may know of m candidates, for the sake of one output."""
 
-    Args:
-        model: its deviations are what is to be lowered.
-        candidates: what to choose from.
-        taken: queries so far, answered or not: none of them is all but repeated.
-        assumed: queries asked and not answered, which count as if they had been.
-        wanted: for the sake of which output each query is, by number.
-        tolerances: (O,) in each output's unit.
-        reserved: (m,) bool, candidates that the first query is taken from.
+    model: SurrogateModel
+    points: Points  # m states and actions
+    output: int  # number of the output, in the order of the definition
+    tolerance: float  # of the output, in its unit
+    deviation: Tensor  # (m,) latent, in the output's unit, as if all pending queries had been answered
+    distance: Tensor  # (m,) to the nearest query so far, in deviations of the sampling range
+    log_probability: Tensor  # (m,) log P_i (eq. 11); 0 unless the acquisition reads it
+    _reduction: Callable[[], Tensor]
 
-    Returns:
-        Indices of candidates; fewer than wanted where nothing distinct is left.
+    @cached_property
+    def variance_reduction(self) -> Tensor:
+        """By how much each answer lowers the weighted variance over the reference, (m,); see ``reads_reference``."""
+        return self._reduction()
+
+
+@dataclass(frozen=True)
+class PathView:
+    """What an acquisition may know of b predicted paths of T steps, for the sake of one output."""
+
+    tolerance: float  # of the output, in its unit
+    weight: Tensor  # (b, T) how much each step counts, from 0: by where it lies and how well it can be predicted
+    _deviation: Callable[[], Tensor]
+    _information: Callable[[], Tensor]
+
+    @cached_property
+    def deviation(self) -> Tensor:
+        """Latent deviation at each step, in the output's unit, (b, T)."""
+        return self._deviation()
+
+    @cached_property
+    def information(self) -> Tensor:
+        """What the beginning of each path up to each step tells of the output, in nats, (b, T)."""
+        return self._information()
+
+
+class Acquisition(ABC):
+    """One criterion. The laws are those of the module."""
+
+    adaptive: ClassVar[bool] = True  # False: the whole budget is asked before the first fit
+    reads_reference: ClassVar[bool] = False  # whether ``variance_reduction`` is asked for
+    reads_probability: ClassVar[bool] = False  # whether ``log_probability`` is asked for
+
+    @abstractmethod
+    def value(self, candidates: CandidateView) -> Tensor:
+        """Value of asking each candidate, (m,)."""
+
+    def path_value(self, paths: PathView) -> Tensor:
+        """Value of following each path up to each step, (b, T). Not less with each step.
+
+        The default adds up what each step tells after those before it, whatever the criterion of candidates is.
+        """
+        return paths.information
+
+
+@dataclass(frozen=True)
+class IntegratedVariance(Acquisition):
+    """How much an answer lowers the variance over the range and the visited states.
+
+    Reference: D. Cohn (1993), NIPS 6.
     """
-    definition, points = model.definition, candidates.points
-    integrates = definition.design.acquisition == "integrated_variance"
-    reference = candidates.reference if integrates else candidates.reference[:0]  # its covariances cost the most
-    outlook = Outlook.of(model, points, reference, assumed)
-    distance = nearest(definition, points, taken)
-    picks: list[int] = []
-    for column in wanted:
-        output, allowed = outlook.outputs[column], distance >= NEAR
-        if not bool(allowed.any()):
-            break
-        value = distance if output is None else acquisition(definition, output, candidates, tolerances[column])
-        if reserved is not None and not picks and bool((allowed & reserved).any()):
-            allowed &= reserved
-        elif output is not None:
-            allowed &= output.counts
-        pick = int(torch.where(allowed, value, -torch.inf).argmax())
-        if allowed[pick]:
-            picks.append(pick)
-            outlook = outlook.observe(pick)
-            distance = torch.minimum(distance, nearest(definition, points, points[pick : pick + 1]))
-    return picks
+
+    reads_reference: ClassVar[bool] = True
+
+    def value(self, candidates: CandidateView) -> Tensor:
+        return candidates.variance_reduction
 
 
-def acquisition(
-    definition: EnvironmentDefinition, output: OutputOutlook, candidates: Candidates, tolerance: float
-) -> Tensor:
-    """Value of querying each candidate for the sake of one output, (m,); only its order counts.
+@dataclass(frozen=True)
+class Variance(Acquisition):
+    """The deviation at the candidate."""
 
-    ``uncertainty_index``: log U = log Phi(-tau / sigma) + log P (eq. 12). ``variance``: sigma.
-    ``integrated_variance``: by how much the answer lowers the variance over the reference.
+    def value(self, candidates: CandidateView) -> Tensor:
+        return candidates.deviation
+
+    def path_value(self, paths: PathView) -> Tensor:
+        return (paths.weight * paths.deviation).cumsum(-1)
+
+
+@dataclass(frozen=True)
+class UncertaintyIndex(Acquisition):
+    """The uncertainty index of the paper, log U = log U_m + log P_i (eq. 12)."""
+
+    reads_probability: ClassVar[bool] = True
+
+    def value(self, candidates: CandidateView) -> Tensor:
+        return log_model_uncertainty(candidates.deviation, candidates.tolerance) + candidates.log_probability  # eq. 12
+
+    def path_value(self, paths: PathView) -> Tensor:
+        return (paths.weight * log_model_uncertainty(paths.deviation, paths.tolerance).exp()).cumsum(-1)
+
+
+@dataclass(frozen=True)
+class LatinHypercube(Acquisition):
+    """No criterion: the whole budget is one Latin hypercube. What is asked for beyond it fills the largest gaps."""
+
+    adaptive: ClassVar[bool] = False
+
+    def value(self, candidates: CandidateView) -> Tensor:
+        return candidates.distance
+
+
+ACQUISITIONS: Registry[Acquisition] = Registry(
+    "acquisition",
+    GROUP,
+    Acquisition,  # type: ignore[type-abstract]
+    {
+        "integrated_variance": IntegratedVariance,
+        "variance": Variance,
+        "uncertainty_index": UncertaintyIndex,
+        "latin_hypercube": LatinHypercube,
+    },
+)
+
+
+def acquisition_of(choice: AcquisitionChoice) -> Acquisition:
+    """The acquisition of a name and settings.
+
+    Raises:
+        InvalidSpec: an unknown name, or settings that it does not have or take.
     """
-    match definition.design.acquisition:
-        case "integrated_variance":
-            return output.reduction(candidates.weights)
-        case "variance":
-            return output.deviation
-        case _:
-            return log_model_uncertainty(output.deviation, tolerance) + candidates.log_p
-
-
-def nearest(definition: EnvironmentDefinition, points: Points, taken: Points) -> Tensor:
-    """Distance of m points to the nearest of those taken, in deviations of the sampling range, (m,)."""
-    if not len(taken):
-        return points.q.new_full((len(points),), torch.inf)
-    plain = FeatureMap()
-    a, b = (encode(definition, plain, p.q, p.u) for p in (points, taken))
-    return torch.cdist(a, b).amin(1)
+    kind, settings = ACQUISITIONS.get(choice.name), dict(choice.settings)
+    known: list[str] = [field.name for field in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else []
+    if unknown := sorted(set(settings) - set(known)):
+        expected = f"one of {', '.join(known)}" if known else "none"
+        raise InvalidSpec(f"acquisition {choice.name}: expected as settings {expected}, got {unknown[0]!r}")
+    try:
+        return kind(**settings)
+    except (TypeError, ValueError) as error:
+        raise InvalidSpec(f"acquisition {choice.name}: {error}") from None

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.latin_hypercube import random_points
 from surrogym_server.sampling.occupancy import log_occupancy
 from surrogym_server.sampling.outlook import Points
@@ -24,8 +25,8 @@ class Candidates:
     """Points to choose from, how likely they are, and the points that an answer should be good for."""
 
     points: Points  # m
-    log_p: Tensor  # (m,) log P_i; read by ``uncertainty_index``, 0 for the others
-    reference: Points  # r; read by ``integrated_variance``
+    log_p: Tensor  # (m,) log P_i; 0 unless the acquisition reads it
+    reference: Points  # r
     weights: Tensor  # (r,) add up to 1
 
 
@@ -46,8 +47,8 @@ def candidates_of(model: SurrogateModel, points: Points, states: Tensor | None, 
             [weights * (1 - OCCUPIED) / len(weights), weights.new_full((REFERENCE,), OCCUPIED / REFERENCE)]
         )
         points, reference = Points.joined([points, visited]), Points.joined([reference, also])
-    indexed = model.definition.design.acquisition == "uncertainty_index"
-    log_p = input_probability(model, points, states) if indexed else points.q.new_zeros(len(points))
+    reads = acquisition_of(model.definition.design.acquisition).reads_probability
+    log_p = input_probability(model, points, states) if reads else points.q.new_zeros(len(points))
     return Candidates(points, log_p, reference, weights / weights.sum())
 
 

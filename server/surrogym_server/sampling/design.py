@@ -12,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from surrogym_server.sampling.acquisition import choose
+from surrogym_server.sampling.acquisition import acquisition_of
+from surrogym_server.sampling.batch import choose
 from surrogym_server.sampling.candidates import Candidates, candidates_of
 from surrogym_server.sampling.confidence import OutputConfidence, confidence, deviations
 from surrogym_server.sampling.endings import ending
@@ -79,7 +80,7 @@ class Decision:
 def initial_design(definition: EnvironmentDefinition, budget: int) -> tuple[Tensor, Tensor]:
     """The Latin hypercube that everything starts from: coordinates (n, C), actions (n, F), n at most the budget."""
     count = min(definition.design.initial, budget)
-    if definition.design.acquisition == "latin_hypercube":
+    if not acquisition_of(definition.design.acquisition).adaptive:
         count = budget
     tries = 1 if count > FEW_POINTS else definition.design.hypercube_tries
     rng = _rng(definition, "initial")
@@ -88,8 +89,8 @@ def initial_design(definition: EnvironmentDefinition, budget: int) -> tuple[Tens
 
 def initial_rollouts(definition: EnvironmentDefinition, budget: int) -> list[Tensor]:
     """What everything starts from where no state can be set: action sequences (T, F), in all at most the budget."""
-    random = definition.design.acquisition == "latin_hypercube"  # nothing is ever planned
-    steps = budget if random else min(definition.design.initial, budget)
+    planned = acquisition_of(definition.design.acquisition).adaptive
+    steps = min(definition.design.initial, budget) if planned else budget
     return first_rollouts(definition, steps, _rng(definition, "initial"))
 
 

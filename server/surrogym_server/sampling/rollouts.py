@@ -1,6 +1,7 @@
 """Action sequences for an environment that can only be reset and act: random ones first, then planned in the model.
 
-A sequence is worth the information that it gives per real step. Of output j the first t points of a predicted path give
+A sequence is worth what its acquisition gives per real step: with most of them, information. Of output j the first t
+points of a predicted path give
 
     I_j(t) = 1/2 log det(1 + W S_j W / tau_j^2),
 
@@ -21,6 +22,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from surrogym_server.sampling.acquisition import PathView, acquisition_of
 from surrogym_server.sampling.endings import edge_in_doubt, in_doubt
 from surrogym_server.sampling.occupancy import log_occupancy
 from surrogym_server.sampling.outlook import Points, counts_of, inputs_of
@@ -154,20 +156,36 @@ def predict_paths(model: SurrogateModel, starts: Tensor, actions: Tensor) -> Pat
     return Paths(*(torch.stack(column, 1) for column in zip(*steps, strict=True)))
 
 
-def information(model: SurrogateModel, aim: Aim, paths: Paths) -> Tensor:
-    """I(t) summed over the outputs asked for, after each step of paths (b, T): (b, T)."""
+def path_values(model: SurrogateModel, aim: Aim, paths: Paths) -> Tensor:
+    """What the acquisition gives for each beginning of paths (b, T), summed over the outputs of the aim: (b, T)."""
+    acquisition = acquisition_of(model.definition.design.acquisition)
     weight = _weights(model.definition, aim, paths)
     total = torch.zeros_like(weight)
     for column in aim.columns:
         output = output_of(model, column)
-        if output.posterior is None:
-            continue
-        x, learns = _inputs(model, column, paths)
-        room = max(1, BLOCK // (x.shape[1] * (x.shape[1] + len(output.posterior.y))))
-        blocks = zip(torch.split(x, room), torch.split(weight * learns, room), strict=True)
-        ratio = (output.scale / aim.tolerances[column]) ** 2
-        total += torch.cat([_log_determinants(ratio * output.posterior.joint_covariance(b), w) for b, w in blocks])
+        if output.posterior is not None:
+            x, learns = _inputs(model, column, paths)
+            total += acquisition.path_value(_view(output, x, weight * learns, aim.tolerances[column]))
     return total
+
+
+def _view(output: OutputModel, x: Tensor, weight: Tensor, tolerance: float) -> PathView:
+    """One output along paths with inputs x (b, T, d)."""
+    return PathView(
+        tolerance,
+        weight,
+        lambda: output.mean_and_deviation(x.flatten(0, 1))[1].reshape(weight.shape),
+        lambda: _information(output, x, weight, tolerance),
+    )
+
+
+def _information(output: OutputModel, x: Tensor, weight: Tensor, tolerance: float) -> Tensor:
+    """I(t) of one output after each step, (b, T)."""
+    assert output.posterior is not None
+    room = max(1, BLOCK // (x.shape[1] * (x.shape[1] + len(output.posterior.y))))
+    blocks = zip(torch.split(x, room), torch.split(weight, room), strict=True)
+    ratio = (output.scale / tolerance) ** 2
+    return torch.cat([_log_determinants(ratio * output.posterior.joint_covariance(b), w) for b, w in blocks])
 
 
 def output_of(model: SurrogateModel, column: int) -> OutputModel:
@@ -181,7 +199,7 @@ def _worth(model: SurrogateModel, aim: Aim, starts: Tensor, sequences: Sequences
     paths = predict_paths(model, starts.repeat(count, 1), actions)
     gain = _endings(model, aim, paths) if aim.ending else paths.ended.new_zeros(1)
     if not bool((gain > DOUBTFUL).any()):
-        gain = information(model, aim, paths)
+        gain = path_values(model, aim, paths)
     gains, costs = (x.reshape(count, lanes, -1).mean(1) for x in (gain, paths.running.cumsum(1)))
     best = (gains / costs).max(1)
     return best.values, best.indices + 1

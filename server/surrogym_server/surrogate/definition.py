@@ -84,6 +84,14 @@ class LearningDefinition:
 
 
 @dataclass(frozen=True)
+class AcquisitionChoice:
+    """An acquisition by its name in the registry, and its settings."""
+
+    name: str
+    settings: tuple[tuple[str, float | bool | str], ...] = ()
+
+
+@dataclass(frozen=True)
 class DesignDefinition:
     """Settings of the adaptive design, every default resolved.
 
@@ -103,7 +111,7 @@ class DesignDefinition:
 
     initial: int
     hypercube_tries: int
-    acquisition: Literal["uncertainty_index", "variance", "integrated_variance", "latin_hypercube"]
+    acquisition: AcquisitionChoice
     tolerance: Literal["relative", "raw"]
     monte_carlo: int
     visited_candidates: bool

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, StrictBool, StrictFloat, StrictInt, StrictStr, model_validator
 
 from surrogym_shared.checks import Positive, require, require_known, require_unique
 from surrogym_shared.spec.actions import Action
@@ -14,6 +14,13 @@ from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, REWARD,
 from surrogym_shared.spec.coordinates import Coordinate, StartDistribution, limits
 from surrogym_shared.spec.rewards import AnyReward, DeclaredReward, Reward, Success
 from surrogym_shared.spec.terms import AllOf, ObservationEntry, Term, Termination
+
+
+class AcquisitionChoice(Frozen):
+    """An acquisition with settings of its own."""
+
+    name: Name
+    settings: dict[Name, StrictBool | StrictInt | StrictFloat | StrictStr] = Field(default_factory=dict, max_length=64)
 
 
 class Design(Frozen):
@@ -24,19 +31,19 @@ class Design(Frozen):
     eq. 9 divides by the deviation where none is declared: ``relative``, 5 % of the output's deviation over the initial
     design, or ``raw``, 1 in the output's own unit, as printed. ``symmetry``: ``auto`` looks whether the environment is
     its own mirror image, every coordinate and the action with their signs changed, ``none`` does not; preset ``paper``
-    never does. ``initial`` of the budget are a Latin hypercube, before the first model. ``acquisition`` is what chooses
-    the others: ``integrated_variance``, the default's, the query that lowers the variance most over the range and where
-    policies went; ``variance``, where the deviation is largest; ``uncertainty_index``, the paper's (eq. 12); or
-    ``latin_hypercube``: the whole budget is one, whatever ``initial`` says, and only what is asked for beyond it is
-    chosen, by the paper's. Where rollouts are planned only the last is read: none is planned then. ``monte_carlo``
-    points estimate the confidence index (eq. 8).
+    never does. ``initial`` of the budget are a Latin hypercube, before the first model. ``acquisition`` chooses the
+    others, by its name or with settings of its own: ``integrated_variance``, the default's, the query that lowers the
+    variance most over the range and where policies went; ``variance``, where the deviation is largest;
+    ``uncertainty_index``, the paper's (eq. 12); ``latin_hypercube``: the whole budget is one, whatever ``initial``
+    says, and only what is asked for beyond it is chosen, in the largest gaps; or one of a package that is installed
+    beside the server. ``monte_carlo`` points estimate the confidence index (eq. 8).
     """
 
     preset: Literal["default", "paper"] = "default"
     budget: Annotated[int, Field(ge=2, le=100_000, strict=True)] | None = None
     initial: Annotated[int, Field(ge=2, le=100_000, strict=True)] | None = None
     target: Annotated[float, Field(gt=0.5, lt=1, strict=True)] = 0.999
-    acquisition: Literal["uncertainty_index", "variance", "integrated_variance", "latin_hypercube"] | None = None
+    acquisition: Name | AcquisitionChoice | None = None
     tolerance: Literal["relative", "raw"] | None = None
     monte_carlo: Annotated[int, Field(ge=16, le=100_000, strict=True)] | None = None
     symmetry: Literal["auto", "none"] = "auto"

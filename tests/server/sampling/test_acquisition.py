@@ -9,10 +9,12 @@ from scipy.stats import norm
 
 from surrogym_client.original.classic import cartpole
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.sampling.acquisition import NEAR, acquisition, choose, nearest
+from surrogym_server.sampling.acquisition import acquisition_of
+from surrogym_server.sampling.batch import NEAR, candidate_view, choose, nearest
 from surrogym_server.sampling.candidates import Candidates
 from surrogym_server.sampling.confidence import deviations
 from surrogym_server.sampling.outlook import Outlook, Points
+from surrogym_server.surrogate.definition import AcquisitionChoice
 from surrogym_server.surrogate.model import SurrogateModel
 
 TOLERANCES = (0.01, 0.02, 0.1)
@@ -20,7 +22,7 @@ CRITERIA = ("uncertainty_index", "variance", "integrated_variance")
 
 
 def by(model: SurrogateModel, criterion: str) -> SurrogateModel:
-    design = replace(model.definition.design, acquisition=criterion)
+    design = replace(model.definition.design, acquisition=AcquisitionChoice(criterion))
     return replace(model, definition=replace(model.definition, design=design))
 
 
@@ -34,7 +36,10 @@ def candidates(points) -> Candidates:
 def value(model: SurrogateModel, candidates: Candidates, criterion: str, column: int) -> torch.Tensor:
     points = candidates.points
     outlook = Outlook.of(model, points, candidates.reference, points[:0])
-    return acquisition(by(model, criterion).definition, outlook.outputs[column], candidates, TOLERANCES[column])
+    output, distance = outlook.outputs[column], torch.ones(len(points), dtype=torch.float64)
+    assert output is not None
+    view = candidate_view(model, candidates, column, output, TOLERANCES[column], distance)
+    return acquisition_of(AcquisitionChoice(criterion)).value(view)
 
 
 def test_the_index_is_uncertainty_times_probability(model, candidates):

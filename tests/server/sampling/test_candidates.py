@@ -14,6 +14,7 @@ from surrogym_server.sampling.candidates import OCCUPIED, candidates_of, input_p
 from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.occupancy import log_occupancy
 from surrogym_server.sampling.outlook import Points
+from surrogym_server.surrogate.definition import AcquisitionChoice
 from surrogym_server.surrogate.learn import learn
 from surrogym_server.surrogate.samples import Samples
 from surrogym_shared.spec import Design
@@ -45,7 +46,7 @@ def test_the_paper_takes_the_density_of_predicted_next_states(points):
 
 @pytest.mark.parametrize("acquisition", ["uncertainty_index", "integrated_variance", "variance"])
 def test_probabilities_are_computed_for_the_criterion_that_reads_them(model, points, unseen, rng, acquisition):
-    design = dataclasses.replace(model.definition.design, acquisition=acquisition)
+    design = dataclasses.replace(model.definition.design, acquisition=AcquisitionChoice(acquisition))
     asked = dataclasses.replace(model, definition=dataclasses.replace(model.definition, design=design))
     made = candidates_of(asked, Points(*points), unseen.q, rng)
     reads = acquisition == "uncertainty_index"

@@ -11,8 +11,8 @@ import torch
 from support.real_steps import answer, join, random_steps
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.sampling import acquisition
-from surrogym_server.sampling.acquisition import NEAR, nearest
+from surrogym_server.sampling import batch
+from surrogym_server.sampling.batch import NEAR, nearest
 from surrogym_server.sampling.confidence import OutputConfidence
 from surrogym_server.sampling.design import (
     Decision,
@@ -227,8 +227,8 @@ def test_more_extra_queries_than_there_are_distinct_points_end_soon(definition, 
         calls.append(1)
         return judged(*arguments)
 
-    judged = acquisition.acquisition
-    monkeypatch.setattr(acquisition, "acquisition", counted)
+    judged = batch.candidate_view
+    monkeypatch.setattr(batch, "candidate_view", counted)
     small = replace(definition, design=replace(definition.design, monte_carlo=64))
     decision = advance(small, few, DesignState(), request(budget=len(few), extra=10_000))
     assert len(decision.q) <= len(calls) <= 64

@@ -19,7 +19,7 @@ from surrogym_server.sampling.rollouts import (
     Aim,
     as_if_done,
     first_rollouts,
-    information,
+    path_values,
     plan_rollout,
     plan_round,
     predict_paths,
@@ -117,7 +117,7 @@ def test_information_is_that_of_points_each_after_those_before_it(model: Surroga
         left = own - joint[t, :t] @ torch.linalg.solve(before, joint[:t, t]) if t else own
         known += 0.5 * float(torch.log1p(left / tolerance**2))
         expected.append(known)
-    got = information(model, replace(aim, columns=(2,)), paths)
+    got = path_values(model, replace(aim, columns=(2,)), paths)
     torch.testing.assert_close(got[0], torch.tensor(expected, dtype=torch.float64), rtol=1e-6, atol=1e-9)
 
 
@@ -130,7 +130,7 @@ def _reward_inputs(model, q, u, q_next):
 def test_a_point_seen_twice_on_a_path_gives_almost_nothing_the_second_time(model: SurrogateModel, aim: Aim):
     paths = predict_paths(model, start_points(model.definition, 1, rng()), torch.ones(1, 4, 1, dtype=torch.float64))
     stuck = {name: getattr(paths, name)[:, :1].expand(-1, 4, -1) for name in ("q", "u", "q_next")}
-    gain = information(model, aim, replace(paths, **stuck, drift=torch.zeros_like(paths.drift)))[0]
+    gain = path_values(model, aim, replace(paths, **stuck, drift=torch.zeros_like(paths.drift)))[0]
     first, *later = torch.cat([gain[:1], gain.diff()]).tolist()
     assert max(later) < 0.35 * first
 
@@ -141,7 +141,7 @@ def test_what_lies_outside_the_sampling_range_or_after_an_end_counts_nothing(mod
     outside = replace(paths, q=torch.cat([paths.q[:, :2], (paths.q + away)[:, 2:]], 1))
     ended = replace(paths, running=torch.tensor([[1.0, 1.0, 0.0, 0.0]], dtype=torch.float64))
     for cut in (outside, ended):
-        gain = information(model, aim, cut)[0]
+        gain = path_values(model, aim, cut)[0]
         assert gain[1] > 0
         torch.testing.assert_close(gain[2:], gain[1].expand(2))
 
@@ -149,13 +149,13 @@ def test_what_lies_outside_the_sampling_range_or_after_an_end_counts_nothing(mod
 def test_a_step_counts_less_the_worse_it_can_be_predicted(model: SurrogateModel, aim: Aim):
     paths = predict_paths(model, start_points(model.definition, 3, rng()), torch.ones(3, 4, 1, dtype=torch.float64))
     known, lost = (replace(paths, drift=torch.full_like(paths.drift, d)) for d in (0.0, 20.0))
-    assert bool((information(model, aim, lost) < 0.01 * information(model, aim, known)).all())
+    assert bool((path_values(model, aim, lost) < 0.01 * path_values(model, aim, known)).all())
 
 
 def test_occupancy_draws_the_plan_to_where_policies_go(model: SurrogateModel, aim: Aim):
     paths = predict_paths(model, start_points(model.definition, 8, rng()), torch.ones(8, 2, 1, dtype=torch.float64))
     near = 0.1 * torch.randn(200, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + paths.q[5, 0]
-    plain, drawn = (information(model, replace(aim, states=states), paths)[:, 0] for states in (None, near))
+    plain, drawn = (path_values(model, replace(aim, states=states), paths)[:, 0] for states in (None, near))
     assert int((drawn / plain).argmax()) == 5
 
 
@@ -172,7 +172,7 @@ def test_a_planned_rollout_gives_more_per_step_than_random_ones():
 
     def worth(sequence: torch.Tensor) -> float:
         paths = predict_paths(model, starts, sequence.expand(32, -1, -1))
-        return float(information(model, aim, paths)[:, -1].mean()) / len(sequence)
+        return float(path_values(model, aim, paths)[:, -1].mean()) / len(sequence)
 
     others = [worth(torch.from_numpy(s)[: len(actions)]) for s in random_sequences(definition, 20, 12, rng(1))]
     assert worth(actions) > 0.98 * max(others)
@@ -187,7 +187,7 @@ def test_a_rollout_that_is_pending_leaves_less_to_learn(model: SurrogateModel, a
     actions = torch.full((6, 1), 2.0, dtype=torch.float64)
     done = as_if_done(model, actions, rng())
     paths = predict_paths(model, start_points(model.definition, 1, rng()), actions[None])
-    again, first = (float(information(m, aim, paths)[0, -1]) for m in (done, model))
+    again, first = (float(path_values(m, aim, paths)[0, -1]) for m in (done, model))
     assert again < 0.1 * first
     q, u = start_points(model.definition, 50, rng(2)), torch.full((50, 1), 2.0, dtype=torch.float64)
     before, after = deviations(model, q, u), deviations(done, q, u)

@@ -1,0 +1,96 @@
+"""Which points to query next (eq. 13): greedy batches over a candidate set, by an acquisition."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from surrogym_server.sampling.acquisition import CandidateView, acquisition_of
+from surrogym_server.sampling.candidates import Candidates
+from surrogym_server.sampling.outlook import Outlook, OutputOutlook, Points
+from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.surrogate.features import FeatureMap, encode
+from surrogym_server.surrogate.model import SurrogateModel
+
+NEAR = 0.02  # queries closer than this, in deviations of the sampling range, are near-duplicates
+
+
+def choose(
+    model: SurrogateModel,
+    candidates: Candidates,
+    taken: Points,
+    assumed: Points,
+    wanted: Sequence[int],
+    tolerances: Sequence[float],
+    reserved: Tensor | None = None,
+) -> list[int]:
+    """A greedy batch: for each output in ``wanted`` the best candidate, as if those before it had been answered.
+
+    Args:
+        model: its deviations are what is to be lowered.
+        candidates: what to choose from.
+        taken: queries so far, answered or not: none of them is all but repeated.
+        assumed: queries asked and not answered, which count as if they had been.
+        wanted: for the sake of which output each query is, by number.
+        tolerances: (O,) in each output's unit.
+        reserved: (m,) bool, candidates that the first query is taken from.
+
+    Returns:
+        Indices of candidates; fewer than wanted where nothing distinct is left.
+    """
+    definition, points = model.definition, candidates.points
+    acquisition = acquisition_of(definition.design.acquisition)
+    # The covariances of the reference cost the most.
+    reference = candidates.reference if acquisition.reads_reference else candidates.reference[:0]
+    outlook = Outlook.of(model, points, reference, assumed)
+    distance = nearest(definition, points, taken)
+    picks: list[int] = []
+    for column in wanted:
+        output, allowed = outlook.outputs[column], distance >= NEAR
+        if not bool(allowed.any()):
+            break
+        value = distance
+        if output is not None:
+            value = acquisition.value(candidate_view(model, candidates, column, output, tolerances[column], distance))
+        if reserved is not None and not picks and bool((allowed & reserved).any()):
+            allowed &= reserved
+        elif output is not None:
+            allowed &= output.counts
+        pick = int(torch.where(allowed, value, -torch.inf).argmax())
+        if allowed[pick]:
+            picks.append(pick)
+            outlook = outlook.observe(pick)
+            distance = torch.minimum(distance, nearest(definition, points, points[pick : pick + 1]))
+    return picks
+
+
+def candidate_view(
+    model: SurrogateModel,
+    candidates: Candidates,
+    column: int,
+    output: OutputOutlook,
+    tolerance: float,
+    distance: Tensor,
+) -> CandidateView:
+    """What an acquisition may know, from an output's outlook and distances (m,) to the queries so far."""
+    return CandidateView(
+        model=model,
+        points=candidates.points,
+        output=column,
+        tolerance=tolerance,
+        deviation=output.deviation,
+        distance=distance,
+        log_probability=candidates.log_p,
+        _reduction=lambda: output.reduction(candidates.weights),
+    )
+
+
+def nearest(definition: EnvironmentDefinition, points: Points, taken: Points) -> Tensor:
+    """Distance of m points to the nearest of those taken, in deviations of the sampling range, (m,)."""
+    if not len(taken):
+        return points.q.new_full((len(points),), torch.inf)
+    plain = FeatureMap()
+    a, b = (encode(definition, plain, p.q, p.u) for p in (points, taken))
+    return torch.cdist(a, b).amin(1)
