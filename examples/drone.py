@@ -41,6 +41,8 @@ def sides(name: str, value: float, relations: str) -> tuple[Is, Is]:
 class Drone:
     """Each of the two actions adds to what one rotor carries, 30 % of it at most."""
 
+    parallel = True  # a simulation: several instances may be open at once
+
     def spec(self) -> EnvironmentSpec:
         return EnvironmentSpec(
             environment="drone",

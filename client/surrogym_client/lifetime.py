@@ -6,12 +6,14 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 LOOK_SECONDS = 0.5
 ORPHANED = 1
+TERMINATIONS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+ENDING = (signal.SIGINT, *TERMINATIONS)
 
 
 def exit_with_parent() -> None:
@@ -34,9 +36,45 @@ def terminations_as_interrupts() -> Iterator[None]:
         del number, frame
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
+    ours = [number for number in TERMINATIONS if signal.getsignal(number) is not signal.SIG_IGN]  # as nohup asks
+    before = {number: signal.signal(number, interrupt) for number in ours}
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def signals_between_steps() -> Iterator[Callable[[], None]]:
+    """Hold back Ctrl-C, and the other signals that ask this process to end, while a machine moves. The second signal in
+    a row is not held back. What is ignored, ends the process at once, or comes outside the main thread stays as it is.
+
+    Yields:
+        what to call between two steps: it does what a signal that was held back asks for.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: None
+        return
+    handlers = {number: handler for number in ENDING if callable(handler := signal.getsignal(number))}
+    held: list[int] = []
+
+    def hold(number: int, frame: FrameType | None) -> None:
+        held.append(number)
+        if len(held) > 1:
+            heed(frame)
+
+    def heed(frame: FrameType | None = None) -> None:
+        if held:
+            number = held[-1]
+            held.clear()
+            handlers[number](number, frame)
+
+    for number in handlers:
+        signal.signal(number, hold)
+    try:
+        yield heed
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    heed()

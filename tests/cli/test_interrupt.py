@@ -11,6 +11,7 @@ from support.server import ServerProcess
 from support.terminal import Terminal, on_terminal
 from surrogym_client.api import Api
 from surrogym_client.evaluate import EvaluationInterrupted
+from surrogym_client.original.errors import EvaluationFailed
 from surrogym_client.policy_file import load_policy
 
 INTERRUPTED = 130
@@ -55,20 +56,27 @@ def test_training_saves_its_policy(pendulum_server: ServerProcess, surrogym_on_t
     assert card["spec"]["environment"] == "Pendulum-v1"
 
 
-def test_an_evaluation_that_is_interrupted_enters_its_real_steps(
-    on_server, server_process, name, monkeypatch, tmp_path
+@pytest.mark.parametrize(
+    ("ending", "code", "words"),
+    [
+        (EvaluationInterrupted(7), INTERRUPTED, "interrupted after 7 real steps"),
+        (EvaluationFailed(7, RuntimeError("no motor")), 1, "failed after 7 real steps: RuntimeError: no motor"),
+    ],
+)
+def test_an_evaluation_that_does_not_end_enters_its_real_steps(
+    on_server, server_process, name, monkeypatch, tmp_path, ending, code, words
 ):
     assert on_server("register", "Pendulum-v1", "--name", name).code == 0
     (tmp_path / "policy.zip").write_bytes(b"")
     (tmp_path / "policy.json").write_text(json.dumps({"surrogate": name}))
 
-    def interrupted(*_):
-        raise EvaluationInterrupted(7)
+    def ends(*_):
+        raise ending
 
     monkeypatch.setattr("surrogym_client.policy_file.load_policy", lambda *_: None)
-    monkeypatch.setattr("surrogym_client.evaluate.evaluate", interrupted)
+    monkeypatch.setattr("surrogym_client.evaluate.evaluate", ends)
     ended = on_server("evaluate", "policy.zip", "--env", "Pendulum-v1")
     with Api(server_process.url) as api:
         assert api.surrogate(name).ledger.evaluation == 7
-    assert (ended.code, ended.out) == (INTERRUPTED, "")
-    assert "interrupted after 7 real steps" in ended.err
+    assert (ended.code, ended.out) == (code, "")
+    assert words in ended.err

@@ -13,10 +13,11 @@ from surrogym_client.cli.options import AsJson, Quiet, Server, SpecFile, Token, 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from surrogym_client.evaluate import Evaluation, EvaluationSettings
+    from surrogym_client.evaluate import Evaluation, EvaluationSettings, Progress
     from surrogym_client.original.episodes import Episode
     from surrogym_client.policy_file import PolicyCard
     from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.terminal import Update
 
 
 def register(app: typer.Typer) -> None:
@@ -39,6 +40,14 @@ def command(
     perturb: Annotated[
         float, typer.Option(min=0, help="Deviation of random factors on masses, lengths and limits.")
     ] = 0.0,
+    parallel: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Instances of the environment that are open at once. [default: 1; one for each episode where the "
+            "environment declares that it runs in parallel, as Gymnasium's do]",
+        ),
+    ] = None,
     algorithm: Annotated[
         str | None, typer.Option(help="Stable-Baselines3 algorithm of the file. [default: as noted beside it, or PPO]")
     ] = None,
@@ -56,27 +65,25 @@ def command(
     """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.evaluate import EvaluationInterrupted, EvaluationSettings, evaluate
+    from surrogym_client.lifetime import terminations_as_interrupts
+    from surrogym_client.original.errors import EvaluationFailed
     from surrogym_client.policy_file import load_policy, read_card
     from surrogym_shared.terminal import give, progress, say
 
     card = read_card(policy)
     if wide and start_scale != 1:
         raise CommandError("expected --wide or --start-scale, got both")
-    settings = EvaluationSettings(episodes, first_seed, wide, start_scale, perturb)
+    settings = EvaluationSettings(episodes, first_seed, wide, start_scale, perturb, parallel)
     opener = _opener(env, read_spec(spec), card)
     enter = partial(_enter, surrogate or card.surrogate, server or card.server, token, quiet=quiet)
     try:
-        with progress("evaluate", quiet=quiet) as update:
+        with terminations_as_interrupts(), progress("evaluate", quiet=quiet) as update:
             update(0.0, f"reading {policy}")
             predict = load_policy(policy, algorithm or card.algorithm)
-            result = _checked(
-                lambda: evaluate(
-                    predict,
-                    opener,
-                    settings,
-                    lambda share, ended: update(share, f"{episodes} real episodes, {ended} terminated"),
-                )
-            )
+            result = evaluate(predict, opener, settings, _telling(update, episodes))
+    except EvaluationFailed as failure:
+        enter(failure.steps, 0, "failed")
+        raise
     except EvaluationInterrupted as interruption:
         say(f"interrupted after {interruption.steps} real steps; no result was kept, the same command begins anew")
         enter(interruption.steps, 0, "interrupted")
@@ -103,13 +110,8 @@ def _opener(env: str | None, given: EnvironmentSpec | None, card: PolicyCard) ->
     return lambda: open_episode(name, spec, lambda: make(name, spec=spec))
 
 
-def _checked(run: Callable[[], Evaluation]) -> Evaluation:
-    from surrogym_client.cli.errors import CommandError
-
-    try:
-        return run()
-    except ValueError as error:
-        raise CommandError(f"the policy does not fit the environment: {error}") from error
+def _telling(update: Update, episodes: int) -> Progress:
+    return lambda share, terminated: update(share, f"{episodes} real episodes, {terminated} terminated")
 
 
 def _enter(

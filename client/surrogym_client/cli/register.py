@@ -109,8 +109,10 @@ def _specification(environment: str | None, spec: EnvironmentSpec | None, **choi
     try:
         if environment is not None:
             original = make(environment, spec=spec, **given)  # type: ignore[arg-type]
-            original.close()
-            return original.spec()
+            try:
+                return original.spec()
+            finally:
+                original.close()
         if spec is not None:
             others = {name: given.pop(name) for name in ("bins", "teleport", "max_rollout") if name in given}
             return with_choices(spec, given, **others)  # type: ignore[arg-type]

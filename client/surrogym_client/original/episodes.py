@@ -1,4 +1,4 @@
-"""Whole episodes in an original environment, for evaluation. Each episode has an environment of its own.
+"""Whole episodes in an original environment, for evaluation.
 
 Shapes: C coordinates, D observation entries, F action entries.
 """
@@ -12,11 +12,19 @@ from typing import Any
 import numpy as np
 
 from surrogym_client.original.classic import TASKS
-from surrogym_client.original.errors import NotPerturbable, NotSettable
+from surrogym_client.original.errors import NotPerturbable, NotSettable, StepFailed
 from surrogym_client.original.gymnasium import native_action, task_for, wrapped
 from surrogym_client.original.mujoco import Joints, is_known, open_mujoco
 from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
-from surrogym_client.original.protocol import Array, Factory, OriginalEnvironment, RealStep, RolloutEnvironment
+from surrogym_client.original.protocol import (
+    Array,
+    Environment,
+    Factory,
+    OriginalEnvironment,
+    RealStep,
+    RolloutEnvironment,
+    runs_in_parallel,
+)
 from surrogym_client.original.rollouts import answering
 from surrogym_client.original.terms import observe
 from surrogym_shared.spec import EnvironmentSpec, Fixed, Normal, Uniform, limits
@@ -32,10 +40,14 @@ class Moment:
     reward: float
     terminated: bool
     coordinates: Array  # (C,)
+    truncated: bool = False  # by the environment itself: it takes no further step
 
 
 class Episode(ABC):
-    """One episode. ``perturb`` comes first if at all, then ``reset`` or ``place``, then steps."""
+    """The running episode of one instance of an environment. The next one begins where this is called again in the same
+    order: ``perturb`` if at all, then ``reset`` or ``place``, then steps."""
+
+    parallel = False  # whether several instances may be open at once
 
     def __init__(self, spec: EnvironmentSpec) -> None:
         self.spec = spec
@@ -54,7 +66,7 @@ class Episode(ABC):
 
     @abstractmethod
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
-        """Change physical attributes by normal factors of mean 1 and deviation sigma."""
+        """Multiply the original's physical attributes by normal factors of mean 1 and deviation sigma."""
 
     @abstractmethod
     def close(self) -> None:
@@ -69,9 +81,12 @@ class Episode(ABC):
 class GymnasiumEpisode(Episode):
     """An episode of a Gymnasium environment that has a built-in adapter; its observation is the environment's own."""
 
+    parallel = True
+
     def __init__(self, spec: EnvironmentSpec) -> None:
         super().__init__(spec)
         self._env = self._open()
+        self._physics = self._read_physics()
         self._own_observation = _shows_the_same(spec)
 
     def _open(self) -> Any:
@@ -79,6 +94,10 @@ class GymnasiumEpisode(Episode):
 
         self._task = task_for(self.spec.environment, "default")
         return gymnasium.make(self.spec.environment).unwrapped
+
+    def _read_physics(self) -> Any:
+        """The attributes that ``perturb`` changes, as they are in the original."""
+        return {name: getattr(self._env, name) for name in self._task.perturbable}
 
     def _read(self) -> Array:
         coordinates: Array = self._task.read(self._env)
@@ -101,8 +120,8 @@ class GymnasiumEpisode(Episode):
         return self._moment(observation, float(reward), terminated=bool(terminated))
 
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
-        for name in self._task.perturbable:
-            setattr(self._env, name, getattr(self._env, name) * _factor(rng, sigma))
+        for name, value in self._physics.items():
+            setattr(self._env, name, value * _factor(rng, sigma))
         if self._task.settle is not None:
             self._task.settle(self._env)
 
@@ -124,6 +143,9 @@ class MujocoEpisode(GymnasiumEpisode):
         self._columns = self._joints.columns(self.spec.coordinate_names)
         return env
 
+    def _read_physics(self) -> Any:
+        return self._env.model.body_mass.copy()
+
     def _read(self) -> Array:
         return self._joints.read(self._columns)
 
@@ -131,12 +153,16 @@ class MujocoEpisode(GymnasiumEpisode):
         self._joints.write(self._columns, coordinates)
 
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
-        for body in range(self._env.model.nbody):
-            self._env.model.body_mass[body] *= _factor(rng, sigma)
+        for body, mass in enumerate(self._physics):
+            self._env.model.body_mass[body] = mass * _factor(rng, sigma)
 
 
 class OwnEpisode(Episode):
     """An episode of one's own environment."""
+
+    def __init__(self, environment: Environment) -> None:
+        super().__init__(environment.spec())
+        self.parallel = runs_in_parallel(environment)
 
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
         del rng, sigma
@@ -146,15 +172,19 @@ class OwnEpisode(Episode):
         return Moment(self._shown(coordinates), 0.0, False, coordinates)
 
     def _stepped(self, step: RealStep) -> Moment:
-        reached = np.asarray(step.next_coordinates, dtype=np.float64)
-        return Moment(self._shown(reached), float(step.reward), bool(step.terminated), reached)
+        reached, reward = np.asarray(step.next_coordinates, dtype=np.float64), float(step.reward)
+        if reached.shape != (size := len(self.spec.coordinates),) or not np.isfinite([*reached, reward]).all():
+            raise StepFailed(
+                f"expected {size} finite coordinates and a finite reward of a step, got {reached.tolist()} and {reward}"
+            )
+        return Moment(self._shown(reached), reward, bool(step.terminated), reached, bool(step.truncated))
 
 
 class RolloutEpisode(OwnEpisode):
     """One of an environment that can only be reset and acted on."""
 
     def __init__(self, environment: RolloutEnvironment) -> None:
-        super().__init__(environment.spec())
+        super().__init__(environment)
         self._environment = environment
 
     def reset(self, seed: int) -> Moment:
@@ -174,7 +204,7 @@ class SteppedEpisode(OwnEpisode):
     """One made of real steps, each from where the last one ended."""
 
     def __init__(self, environment: OriginalEnvironment) -> None:
-        super().__init__(environment.spec())
+        super().__init__(environment)
         self._environment = environment
         self._at = np.zeros(0)
 

@@ -5,12 +5,18 @@ OriginalError
 ├── NotPerturbable          its masses, lengths and limits are unknown here
 ├── NotSettable             it can only be reset and acted on
 ├── NotRenderable           no picture of its states can be made here
+├── NotParallel             one instance is open, and the environment does not say that another may be
+├── PolicyMisfit            the policy gives actions that the environment does not have
+├── EvaluationFailed        the environment or the policy failed after real steps had been taken
 └── StepFailed              the environment did not give a step; the query fails, the worker goes on
     ├── StepTimedOut        it took longer than its limit and was killed; the next step starts a fresh one
     └── EnvironmentDied     its process ended; the next step starts a fresh one
 """
 
 from __future__ import annotations
+
+import os
+import traceback
 
 
 class OriginalError(Exception):
@@ -33,6 +39,26 @@ class NotRenderable(OriginalError):
     """The environment has no renderer, it can't run here, or what is observed does not tell the state."""
 
 
+class NotParallel(OriginalError):
+    """A second instance was asked of an environment that runs one at a time."""
+
+
+class PolicyMisfit(OriginalError, ValueError):
+    """A policy gave actions that the environment does not have."""
+
+
+class EvaluationFailed(OriginalError):
+    """Something raised (see ``__cause__``) after ``steps`` real steps had been begun."""
+
+    def __init__(self, steps: int, cause: Exception) -> None:
+        super().__init__(f"the evaluation failed after {steps} real steps: {sentence(cause)}")
+        self.steps = steps
+        self._arguments = (steps, cause)
+
+    def __reduce__(self) -> tuple[type[EvaluationFailed], tuple[int, Exception]]:
+        return type(self), self._arguments
+
+
 class StepFailed(OriginalError):
     """The environment raised, or gave something that is no step."""
 
@@ -43,3 +69,12 @@ class StepTimedOut(StepFailed):
 
 class EnvironmentDied(StepFailed):
     """The environment's process ended."""
+
+
+def sentence(error: Exception) -> str:
+    """Describe an exception of somebody's environment: its type, its message, and the line that raised it."""
+    if isinstance(error, OriginalError):  # says it all; where it was raised is of no use to who made the environment
+        return str(error)
+    frame = traceback.extract_tb(error.__traceback__)[-1:]
+    where = f" ({os.path.basename(frame[0].filename)}:{frame[0].lineno})" if frame else ""
+    return f"{type(error).__name__}: {error}{where}"

@@ -25,6 +25,8 @@ def task_for(environment: str, preset: str) -> Task:
 class GymnasiumEnvironment:
     """A classic control task that is set to given coordinates, or reset: unwrapped, so without a time limit."""
 
+    parallel = True
+
     def __init__(self, spec: EnvironmentSpec) -> None:
         import gymnasium
 

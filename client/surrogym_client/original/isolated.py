@@ -6,14 +6,13 @@ import multiprocessing
 import os
 import signal
 import threading
-import traceback
 from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from types import TracebackType
 from typing import Any, Self
 
-from surrogym_client.original.errors import EnvironmentDied, OriginalError, StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_client.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment, sentence
 from surrogym_client.original.protocol import Array, Environment, Factory, RealStep
 from surrogym_client.original.rollouts import answering
 from surrogym_shared.spec import EnvironmentSpec
@@ -131,7 +130,7 @@ def _serve(pipe: Connection, factory: Factory) -> None:
     try:
         environment = answering(factory())
     except Exception as error:
-        pipe.send((False, _sentence(error)))
+        pipe.send((False, sentence(error)))
         return
     pipe.send((True, None))
     while True:
@@ -147,15 +146,7 @@ def _answer(environment: Environment, method: str, arguments: tuple[Any, ...]) -
         value = getattr(environment, method)(*arguments)
         return True, value.model_dump() if isinstance(value, EnvironmentSpec) else value
     except Exception as error:
-        return False, _sentence(error)
-
-
-def _sentence(error: Exception) -> str:
-    if isinstance(error, OriginalError):  # says it all; where it was raised is of no use to who made the environment
-        return str(error)
-    frame = traceback.extract_tb(error.__traceback__)[-1:]
-    where = f" ({os.path.basename(frame[0].filename)}:{frame[0].lineno})" if frame else ""
-    return f"{type(error).__name__}: {error}{where}"
+        return False, sentence(error)
 
 
 def _exit_with_parent() -> None:

@@ -16,7 +16,7 @@ from surrogym_shared.spec import BoxAction, EnvironmentSpec
 
 Preset = Literal["default", "paper"]
 Choose = Callable[[EnvironmentSpec], EnvironmentSpec]
-METHODS = ("step_from", "reset", "step", "coordinates", "begin", "act", "picture", "close")
+ATTRIBUTES = ("step_from", "reset", "step", "coordinates", "begin", "act", "picture", "close", "parallel")
 
 
 def make(
@@ -131,7 +131,7 @@ class _Respecified:
 
     def __init__(self, environment: object, spec: EnvironmentSpec) -> None:
         self._spec = spec
-        for name in METHODS:
+        for name in ATTRIBUTES:
             if hasattr(environment, name):
                 setattr(self, name, getattr(environment, name))
 

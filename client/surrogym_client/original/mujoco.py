@@ -43,6 +43,8 @@ def specification(name: str) -> EnvironmentSpec:
 class MujocoEnvironment:
     """Any Gymnasium environment with ``set_state(qpos, qvel)``, set to given coordinates or reset."""
 
+    parallel = True
+
     def __init__(self, name: str, spec: EnvironmentSpec) -> None:
         self._spec = spec
         self._env = open_mujoco(name)

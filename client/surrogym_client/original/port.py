@@ -9,6 +9,7 @@ import numpy as np
 
 from surrogym_client.evaluate import LONGEST_EPISODE, decode_actions
 from surrogym_client.original.episodes import Episode, Moment, draw
+from surrogym_client.original.errors import NotParallel
 from surrogym_client.original.protocol import Array
 from surrogym_client.original.terms import observe
 from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult
@@ -29,6 +30,8 @@ SEEDS = (2**20, 2**31)  # of resets: far from those of evaluations
 class OriginalPort:
     """A ``SurrogatePort`` over real episodes, in the autoreset mode of Stable-Baselines3 (same_step).
 
+    An environment that runs one instance at a time has one lane, in one session.
+
     Example:
         >>> name = "Pendulum-v1"
         >>> spec = original.make(name).spec()
@@ -41,6 +44,7 @@ class OriginalPort:
         self.steps = 0  # real ones, over all sessions
         self._spec = spec
         self._open_episode = open_episode
+        self._parallel = True  # until the first instance says otherwise
         self._sessions: dict[str, list[_Lane]] = {}
         self._names = count()
 
@@ -53,15 +57,24 @@ class OriginalPort:
 
         Raises:
             ValueError: another autoreset mode than same_step.
+            NotParallel: several lanes, or a second session, of an environment that runs one instance at a time.
         """
         if request.autoreset_mode != "same_step":
             raise ValueError(f"autoreset mode: expected same_step, got {request.autoreset_mode}")
         name, seed = f"original-{next(self._names)}", request.seed or 0
         limit = request.time_limit or self._spec.time_limit or LONGEST_EPISODE
-        self._sessions[name] = [
+        self._check_alone(sum(map(len, self._sessions.values())))
+        lanes = [
             _Lane(self._spec, self._open_episode, (seed, lane), request.start_box, limit)
             for lane in range(request.num_envs)
         ]
+        self._parallel = lanes[0].instance().parallel
+        self._sessions[name] = lanes
+        try:
+            self._check_alone(request.num_envs - 1)
+        except NotParallel:
+            self.close(name)
+            raise
         return SessionView(
             id=name,
             surrogate=self._spec.environment,
@@ -111,7 +124,7 @@ class OriginalPort:
             moment = lane.step(taken)
             self.steps += 1
             reward[i], terminated[i] = moment.reward, moment.terminated
-            truncated[i] = lane.over and not moment.terminated
+            truncated[i] = (lane.over or moment.truncated) and not moment.terminated
             if terminated[i] or truncated[i]:
                 final[i] = moment.observation
                 lane.begin()
@@ -141,6 +154,13 @@ class OriginalPort:
         for lane in self._sessions.pop(session, []):
             lane.close()
 
+    def _check_alone(self, others: int) -> None:
+        if others and not self._parallel:
+            raise NotParallel(
+                f"expected one lane in one session, for the environment runs one instance at a time, got {others} more "
+                "(a simulator that runs several declares it by an attribute parallel = True)"
+            )
+
     def _lanes(self, session: str) -> list[_Lane]:
         if session not in self._sessions:
             raise ValueError(f"expected an open session, got {session!r}")
@@ -148,7 +168,7 @@ class OriginalPort:
 
 
 class _Lane:
-    """One lane. Its environment is made at the first step that needs one: many lanes are only ever looked at."""
+    """One lane. Its environment is made when it is needed: many lanes are only ever looked at."""
 
     def __init__(
         self,
@@ -183,10 +203,10 @@ class _Lane:
             self._placed = draw(self._spec, self._rng, wide=True)
             self.observation = observe(self._spec, self._placed[None])[0]
         else:
-            self.observation = self._real().reset(int(self._rng.integers(*SEEDS))).observation
+            self.observation = self.instance().reset(int(self._rng.integers(*SEEDS))).observation
 
     def step(self, action: Array) -> Moment:
-        episode = self._real()
+        episode = self.instance()
         if self._placed is not None:
             episode.place(self._placed)
             self._placed = None
@@ -199,7 +219,8 @@ class _Lane:
         if self._episode is not None:
             self._episode.close()
 
-    def _real(self) -> Episode:
+    def instance(self) -> Episode:
+        """The lane's environment, made at the first call."""
         if self._episode is None:
             self._episode = self._open_episode()
         return self._episode

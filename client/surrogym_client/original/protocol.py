@@ -34,7 +34,8 @@ class RealStep:
 
 @runtime_checkable
 class OriginalEnvironment(Protocol):
-    """An environment that can be set to given coordinates. Any class with these three methods will do.
+    """An environment that can be set to given coordinates. Any class with these three methods will do. An attribute
+    ``parallel = True`` says that several instances may be open at once; without it there is one at a time.
 
     Example:
         A cart on a rail that is pushed::
@@ -135,6 +136,18 @@ class RolloutEnvironment(Protocol):
     def close(self) -> None:
         """Release what the environment holds."""
         ...
+
+
+def runs_in_parallel(environment: object) -> bool:
+    """Whether several instances of an environment may be open at once: its attribute ``parallel``, False without one.
+
+    Example:
+        A simulator sets the attribute; a machine leaves it out::
+
+            class SimulatedCart(Cart):
+                parallel = True
+    """
+    return bool(getattr(environment, "parallel", False))
 
 
 Environment = OriginalEnvironment | RolloutEnvironment

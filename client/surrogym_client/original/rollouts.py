@@ -15,6 +15,7 @@ from surrogym_client.original.protocol import (
     RealStep,
     ResettableEnvironment,
     RolloutEnvironment,
+    runs_in_parallel,
 )
 from surrogym_shared.spec import EnvironmentSpec
 
@@ -26,6 +27,7 @@ class FromReset:
         self._environment = environment
         self._spec = environment.spec()
         self._at: Array | None = None
+        self.parallel = runs_in_parallel(environment)
 
     def spec(self) -> EnvironmentSpec:
         return self._spec

@@ -33,13 +33,14 @@ class BiasedEpisode(GymnasiumEpisode):
         super().__init__(spec)
         self._variation = variation
         self._gain = 1.0
+        self._nominal = {name: getattr(self._env, name) for name in variation.physics}
 
     def reset(self, seed: int) -> Moment:
         """Factors and start are drawn from the seed; where the variation names no start, it is the environment's."""
         rng = np.random.default_rng(seed)
         for name in self._variation.physics:
             factor = _factor(rng, self._variation)
-            setattr(self._env, name, getattr(self._env, name) * factor)
+            setattr(self._env, name, self._nominal[name] * factor)
             if name == self._variation.limit:
                 self._gain = factor
         if self._task.settle is not None:
