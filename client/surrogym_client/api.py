@@ -174,14 +174,22 @@ class Api:
             repeatable=False,
         )
 
-    def renew(self, name: str, query_id: int, lease_token: str, *, lease_seconds: float = 60.0) -> None:
-        """Keep a lease alive while the original environment works.
+    def renew(
+        self,
+        name: str,
+        query_id: int,
+        lease_token: str,
+        *,
+        lease_seconds: float = 60.0,
+        retries: Retries | None = None,
+    ) -> None:
+        """Keep a lease alive while the original environment works; ``retries`` replaces the connection's.
 
         Raises:
             LeaseExpired: it has ended; the answer may still be sent.
         """
         body = wire.RenewLease(lease_token=lease_token, lease_seconds=lease_seconds)
-        self._send(f"{_surrogate(name)}/queries/{query_id}:renew", body)
+        self._send(f"{_surrogate(name)}/queries/{query_id}:renew", body, retries=retries)
 
     def fail(self, name: str, query_id: int, lease_token: str, error: str, *, begun: bool = True) -> None:
         """Give a query back with the error it caused, and whether a real step may have been taken."""

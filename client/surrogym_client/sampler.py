@@ -4,27 +4,19 @@ from __future__ import annotations
 
 import os
 import socket
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from types import TracebackType
-from typing import Literal, Self, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 
 from surrogym_client.answers import reset_seed, sample_of
 from surrogym_client.api import Api
 from surrogym_client.connection import Retries
-from surrogym_client.errors import (
-    InvalidInput,
-    LeaseExpired,
-    NotThere,
-    ServerUnreachable,
-    SurrogymClientError,
-    Unavailable,
-)
+from surrogym_client.errors import InvalidInput, LeaseExpired, NotThere
+from surrogym_client.leases import AWAY, LeaseEnded, Leases
 from surrogym_client.original.errors import StepFailed, UnknownEnvironment
 from surrogym_client.original.protocol import Environment, OriginalEnvironment, RolloutEnvironment
 from surrogym_client.original.rollouts import answering
@@ -35,11 +27,10 @@ FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "failed")
 PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)  # with a server or a storage that is away
 LOOK_SECONDS = 0.1  # how often a worker that waits looks whether it was stopped
 LAST_SECONDS = 5.0  # a sampler that was stopped asks on for so long, with a real step that is not handed in yet
-AWAY = (ServerUnreachable, Unavailable)
 STOPPED = "the sampler was stopped"
 
 T = TypeVar("T")
-Outcome = Literal["answered", "failed"]
+Outcome = Literal["answered", "failed", "dropped"]
 
 
 def worker_name() -> str:
@@ -67,10 +58,12 @@ class SamplerSettings:
 
 @dataclass(frozen=True)
 class SamplerReport:
-    """What a worker did. ``phase`` is the last one the server told."""
+    """What a worker did. ``dropped`` counts queries whose lease ended before a real step; ``phase`` is the last that
+    the server gave."""
 
     answered: int
     failed: int
+    dropped: int
     steps: int  # real ones, handed in
     seconds: float
     phase: Phase | None
@@ -81,6 +74,9 @@ class Sampler:
 
     A step that fails gives its query back with the error; in a rollout, the steps before it are the answer. A server
     that is away is waited for, and an answer is not given up meanwhile.
+
+    No real step is begun after the lease of its query has ended, as it has when the machine was suspended: another
+    sampler may have taken it. A step that is under way then is finished and handed in.
 
     Args:
         api: the server.
@@ -107,10 +103,11 @@ class Sampler:
         self._environment = environment
         self._settings = settings or SamplerSettings()
         self._report = report
-        self._counts: dict[Outcome, int] = {"answered": 0, "failed": 0}
+        self._counts: dict[Outcome, int] = {"answered": 0, "failed": 0, "dropped": 0}
         self._steps = 0
         self._phase: Phase | None = None
         self._spec: EnvironmentSpec
+        self._leases: Leases
         self._started = time.monotonic()
         self._stopping = False  # no Event: a signal handler that sets one may wait for itself
 
@@ -130,16 +127,16 @@ class Sampler:
         """
         self._started = time.monotonic()
         self._check()
-        with Heartbeat(self._api, self._surrogate, self._settings.lease_seconds) as heartbeat:
+        with Leases(self._api, self._surrogate, self._settings.lease_seconds) as self._leases:
             while not self._stopped() and (limit := self._limit()) > 0:
                 try:
-                    claimed = self._patiently(partial(self._claim, limit))
+                    claimed, since = self._patiently(partial(self._claim, limit))
                 except AWAY:
                     if self._stopped():
                         break
                     raise
                 self._phase = claimed.phase
-                self._work(claimed.queries, heartbeat)
+                self._work(claimed.queries, since)
                 if self._enough(claimed):
                     break
         return self.summary()
@@ -147,7 +144,7 @@ class Sampler:
     def summary(self) -> SamplerReport:
         """What was done so far."""
         seconds = time.monotonic() - self._started
-        return SamplerReport(self._counts["answered"], self._counts["failed"], self._steps, seconds, self._phase)
+        return SamplerReport(**self._counts, steps=self._steps, seconds=seconds, phase=self._phase)
 
     def _check(self) -> None:
         """Refuse an environment whose coordinates, action or kind of query are not the surrogate's."""
@@ -160,37 +157,42 @@ class Sampler:
             )
         self._spec = asked
 
-    def _claim(self, limit: int) -> ClaimedQueries:
-        s = self._settings
+    def _claim(self, limit: int) -> tuple[ClaimedQueries, float]:
+        """Queries, and when they were asked for by the leases' clock."""
+        s, since = self._settings, self._leases.clock()
         waits = not (s.until_done and (self._phase is None or self._phase in FINISHED))
         left = s.wait_seconds if s.time_limit is None else min(s.wait_seconds, max(0.0, self._time_left()))
-        return self._api.claim(
+        claimed = self._api.claim(
             self._surrogate,
             s.name,
             max_queries=limit,
             wait_seconds=left if waits else 0.0,
             lease_seconds=s.lease_seconds,
         )
+        return claimed, since
 
-    def _work(self, queries: list[Query], heartbeat: Heartbeat) -> None:
+    def _work(self, queries: list[Query], since: float) -> None:
         """Answer queries one by one; those left when a person interrupts are given back."""
         left, begun = list(queries), None
-        heartbeat.hold(left)
+        self._leases.hold(left, since)
         try:
             while left and not self._stopped():
                 begun = left[0]
                 self._answer(begun)
-                heartbeat.release(left.pop(0))
+                self._leases.release(left.pop(0))
         finally:
             for query in left:
-                heartbeat.release(query)
+                self._leases.release(query)
                 self._give_back(query, STOPPED, begun=query is begun)
 
     def _answer(self, query: Query) -> None:
         taken: list[NewSample] = []
         error = ""
+        outcome: Outcome = "failed"  # where no step was taken
         try:
             self._take(query, taken)
+        except LeaseEnded as ended:
+            outcome, error = "dropped", str(ended)
         except StepFailed as failed:
             error = str(failed) or "no reason given"
         except Exception as raised:  # an environment that is not isolated may raise anything
@@ -201,25 +203,28 @@ class Sampler:
         try:
             self._hand_in(taken)
         except InvalidInput as refused:
-            taken, error = [], str(refused)
-        if taken:
-            self._count(query, "answered", error)
-        else:
-            self._fail(query, error or STOPPED, begun=bool(error))
+            taken, outcome, error = [], "failed", str(refused)
+        if not taken:
+            begun = bool(error) and outcome == "failed"
+            self._patiently(lambda: self._give_back(query, error or STOPPED, begun=begun), LAST_SECONDS)
+        self._count(query, "answered" if taken else outcome, error)
 
     def _take(self, query: Query, taken: list[NewSample]) -> None:
         """Take the real steps of a query, and put each into ``taken`` as soon as it is done."""
         environment, size = self._environment, len(self._spec.coordinates)
         if isinstance(query, StepQuery):
             assert isinstance(environment, OriginalEnvironment)
+            self._leases.check(query)
             step = environment.step_from(np.array(query.coordinates), np.array(query.action))
             taken.append(sample_of(query, step, size))
             return
         assert isinstance(environment, RolloutEnvironment)
+        self._leases.check(query)
         environment.begin(reset_seed(query, self._spec.design.seed))
         for number, action in enumerate(query.actions):
             if self._stopped():
                 return
+            self._leases.check(query)
             step = environment.act(np.array(action))
             taken.append(sample_of(query, step, size, number))
             if step.terminated or step.truncated:
@@ -229,10 +234,6 @@ class Sampler:
         if samples:
             self._patiently(lambda: self._api.add_samples(self._surrogate, self._settings.name, samples), LAST_SECONDS)
             self._steps += len(samples)
-
-    def _fail(self, query: Query, error: str, *, begun: bool) -> None:
-        self._patiently(lambda: self._give_back(query, error, begun=begun), LAST_SECONDS)
-        self._count(query, "failed", error)
 
     def _patiently(self, request: Callable[[], T], once_stopped: float = 0.0) -> T:
         """Ask until the server and its storage are back; every request here may be repeated.
@@ -277,11 +278,15 @@ class Sampler:
             self._report(query, outcome, error)
 
     def _limit(self) -> int:
-        """How many queries to claim next; 0 when it is time to stop."""
+        """How many queries to claim next; 0 when it is time to stop. Dropped ones were not this worker's to answer."""
         s = self._settings
         if s.time_limit is not None and self._time_left() <= 0:
             return 0
-        return s.batch if s.max_queries is None else min(s.batch, s.max_queries - sum(self._counts.values()))
+        return s.batch if s.max_queries is None else min(s.batch, s.max_queries - self._done)
+
+    @property
+    def _done(self) -> int:
+        return self._counts["answered"] + self._counts["failed"]
 
     def _time_left(self) -> float:
         return self._started + (self._settings.time_limit or 0.0) - time.monotonic()
@@ -290,52 +295,6 @@ class Sampler:
         if self._settings.once and claimed.queries:
             return True
         return self._settings.until_done and not claimed.queries and claimed.phase in FINISHED
-
-
-class Heartbeat:
-    """Renews the leases that a worker holds, from a thread of its own, at a third of their length."""
-
-    def __init__(self, api: Api, surrogate: str, lease_seconds: float) -> None:
-        self._api = api
-        self._surrogate = surrogate
-        self._lease_seconds = lease_seconds
-        self._held: dict[int, Query] = {}
-        self._lock = threading.Lock()
-        self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._ending.set()
-        self._thread.join(timeout=5.0)
-
-    def hold(self, queries: list[Query]) -> None:
-        with self._lock:
-            self._held.update({query.id: query for query in queries})
-
-    def release(self, query: Query) -> None:
-        with self._lock:
-            self._held.pop(query.id, None)
-
-    def _beat(self) -> None:
-        while not self._ending.wait(self._lease_seconds / 3):
-            with self._lock:
-                held = list(self._held.values())
-            for query in held:
-                self._renew(query)
-
-    def _renew(self, query: Query) -> None:
-        try:
-            self._api.renew(self._surrogate, query.id, query.lease_token, lease_seconds=self._lease_seconds)
-        except AWAY:
-            return  # the next beat tries again
-        except SurrogymClientError:
-            self.release(query)  # a late answer is still a true observation, so the step goes on
 
 
 def _shape(spec: EnvironmentSpec) -> str:

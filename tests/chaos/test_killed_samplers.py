@@ -1,8 +1,10 @@
-"""kill -9 of samplers in the middle of a step: their queries go to others or are set aside, and no step is hidden."""
+"""kill -9 of samplers in the middle of a step: their queries go to others or are set aside, and no step is hidden. One
+that slept beyond its lease takes no step that others have taken meanwhile."""
 
 from __future__ import annotations
 
 import random
+import signal
 import time
 from pathlib import Path
 
@@ -49,3 +51,25 @@ def test_every_query_ends_answered_or_set_aside_with_its_error(tmp_path: Path, c
         assert "Traceback" not in server.log
     with capsys.disabled():
         print(f"\nsamplers, {tally}")
+
+
+def test_a_sampler_that_slept_beyond_its_lease_takes_no_step_that_others_have_taken(tmp_path: Path):
+    """As after closing a laptop: it holds six queries, and is stopped in the first step."""
+    with running_server(tmp_path) as server, Api(server.url) as api:
+        create(api, "slept", budget=6)
+        with noting_samplers(server.url, "slept", tmp_path / "notes", count=1, lease_seconds=1.0, batch=6) as samplers:
+            assert until(samplers.in_a_step)
+            [sleeper] = samplers.working
+            samplers.signal(sleeper, signal.SIGSTOP)
+            before = samplers.notes_in(sleeper).begun
+            samplers.start()
+            assert until(lambda: finished(api, "slept")), "others take its queries"
+            [other] = samplers.working.keys() - {sleeper}
+            samplers.kill(other)
+            samplers.signal(sleeper, signal.SIGCONT)
+            [asked] = api.ask("slept", [[0.5, 0.5]], [[0.0]])
+            assert until(lambda: api.queries("slept")[-1].status == "answered"), "it goes on"
+            assert samplers.notes_in(sleeper).begun == [*before, tuple(asked.coordinates or ())]
+            assert until(lambda: not samplers.in_a_step())
+        tally = Tally()
+        tally.judge(api, "slept", samplers.notes(), patient=True)

@@ -31,7 +31,7 @@ from surrogym_client.api import Api
 from surrogym_client.sampler import Sampler, SamplerSettings
 
 with Api(sys.argv[1]) as api:
-    Sampler(api, sys.argv[2], Slow(), SamplerSettings(name="killed", batch=1, lease_seconds=3.0)).run()
+    Sampler(api, sys.argv[2], Slow(), SamplerSettings(name="killed", batch=1, lease_seconds=3.0, once=True)).run()
 """
 
 
@@ -147,6 +147,25 @@ def test_a_sampler_killed_in_a_rollout_may_have_taken_all_its_steps_and_the_next
     expired = ledger.unresolved - ledger.failed  # the design's queries failed before
     assert (ledger.manual, expired) == (4, 4)
     assert {(s.sampler, s.attempt, s.late) for s in samples} == {("next", 2, False)}
+
+
+def test_a_sampler_that_sleeps_beyond_its_lease_in_a_rollout_stops_there_and_hands_in_what_it_took(
+    api, server_process, asked
+):
+    command = [sys.executable, "-c", KILLED, server_process.url, asked]
+    paths = os.pathsep.join(path for path in sys.path if path)
+    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths}) as slept:
+        _until(lambda: api.surrogate(asked).queries.leased == 1)
+        time.sleep(1.5)  # in the middle of the second of its four steps
+        slept.send_signal(signal.SIGSTOP)
+        settings = SamplerSettings(name="next", batch=1, once=True, wait_seconds=30.0)
+        assert Sampler(api, asked, Rail(), settings).run().steps == 4
+        slept.send_signal(signal.SIGCONT)
+        assert slept.wait(60) == 0
+    late = [(sample.step, sample.attempt) for sample in api.samples(asked) if sample.late]
+    assert late == [(step, 1) for step in range(len(late))]
+    assert len(late) < 4, "the step that was under way is finished, and no other one begun"
+    assert api.surrogate(asked).ledger.manual == 4 + len(late)
 
 
 def _until(happened):

@@ -132,8 +132,8 @@ class Acknowledging(Api):
 class NotingSamplers:
     """Processes that sample one surrogate; each notes into a file of its own."""
 
-    def __init__(self, url: str, name: str, folder: Path, count: int, lease_seconds: float) -> None:
-        self._args = (url, name, lease_seconds)
+    def __init__(self, url: str, name: str, folder: Path, count: int, lease_seconds: float, batch: int) -> None:
+        self._args = (url, name, lease_seconds, batch)
         self._folder = folder
         self._numbers = itertools.count()
         self.working: dict[Path, Any] = {}
@@ -153,6 +153,9 @@ class NotingSamplers:
         read = ((path, path.read_text().rpartition("\n")[0].rpartition("\n")[2]) for path in self.working)
         return [path for path, last in read if last.startswith('{"begun"')]
 
+    def signal(self, path: Path, number: int) -> None:
+        os.kill(self.working[path].pid, number)
+
     def kill(self, path: Path) -> None:
         """-9."""
         process = self.working.pop(path)
@@ -166,7 +169,11 @@ class NotingSamplers:
             self.start()
 
     def notes(self) -> Notes:
-        lines = [json.loads(line) for path in self._folder.glob("notes-*") for line in path.read_text().splitlines()]
+        return self.notes_in(*self._folder.glob("notes-*"))
+
+    def notes_in(self, *paths: Path) -> Notes:
+        """Those of some samplers."""
+        lines = [json.loads(line) for path in paths for line in path.read_text().splitlines()]
         return Notes(
             [tuple(line["begun"]) for line in lines if "begun" in line],
             {line["id"]: tuple(line["sample"]) for line in lines if "id" in line},
@@ -174,10 +181,12 @@ class NotingSamplers:
 
 
 @contextmanager
-def noting_samplers(url: str, name: str, folder: Path, *, count: int, lease_seconds: float) -> Iterator[NotingSamplers]:
+def noting_samplers(
+    url: str, name: str, folder: Path, *, count: int, lease_seconds: float, batch: int = 2
+) -> Iterator[NotingSamplers]:
     """Samplers until the end of the context; what they hold then is left to time out."""
     folder.mkdir()
-    samplers = NotingSamplers(url, name, folder, count, lease_seconds)
+    samplers = NotingSamplers(url, name, folder, count, lease_seconds, batch)
     try:
         yield samplers
     finally:
@@ -185,11 +194,11 @@ def noting_samplers(url: str, name: str, folder: Path, *, count: int, lease_seco
             samplers.kill(path)
 
 
-def work(url: str, name: str, lease_seconds: float, path: str) -> None:
+def work(url: str, name: str, lease_seconds: float, batch: int, path: str) -> None:
     """Sample until killed."""
     notes = os.open(path, os.O_WRONLY | os.O_APPEND)
     with Acknowledging(url, notes) as api:
-        settings = SamplerSettings(batch=2, wait_seconds=0.5, lease_seconds=lease_seconds)
+        settings = SamplerSettings(batch=batch, wait_seconds=0.5, lease_seconds=lease_seconds)
         Sampler(api, name, Noting(notes), settings).run()
 
 
