@@ -13,7 +13,6 @@ from types import FrameType
 LOOK_SECONDS = 0.5
 ORPHANED = 1
 TERMINATIONS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
-ENDING = (signal.SIGINT, *TERMINATIONS)
 
 
 def exit_with_parent() -> None:
@@ -28,6 +27,11 @@ def _watch(parent: int) -> None:
     os._exit(ORPHANED)
 
 
+def terminations() -> list[signal.Signals]:
+    """The signals of a polite kill and of a closed terminal, but those that are ignored, as nohup asks."""
+    return [number for number in TERMINATIONS if signal.getsignal(number) is not signal.SIG_IGN]
+
+
 @contextmanager
 def terminations_as_interrupts() -> Iterator[None]:
     """A polite kill is taken like Ctrl-C, so that the children are ended on the way out."""
@@ -36,8 +40,7 @@ def terminations_as_interrupts() -> Iterator[None]:
         del number, frame
         raise KeyboardInterrupt
 
-    ours = [number for number in TERMINATIONS if signal.getsignal(number) is not signal.SIG_IGN]  # as nohup asks
-    before = {number: signal.signal(number, interrupt) for number in ours}
+    before = {number: signal.signal(number, interrupt) for number in terminations()}
     try:
         yield
     finally:
@@ -56,7 +59,9 @@ def signals_between_steps() -> Iterator[Callable[[], None]]:
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None
         return
-    handlers = {number: handler for number in ENDING if callable(handler := signal.getsignal(number))}
+    handlers = {
+        number: handler for number in (signal.SIGINT, *TERMINATIONS) if callable(handler := signal.getsignal(number))
+    }
     held: list[int] = []
 
     def hold(number: int, frame: FrameType | None) -> None:

@@ -1,12 +1,18 @@
 """An environment that raises, hangs or dies costs one step, never the process that asked."""
 
 import os
+import signal
+import subprocess
+import sys
+import threading
 import time
 from functools import partial
 
 import numpy as np
 import pytest
 
+from support.machine import DIARY
+from support.noting import until
 from surrogym_client import original
 from surrogym_client.original import RealStep
 from surrogym_client.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
@@ -90,3 +96,84 @@ def _alive(pid):
     except ProcessLookupError:
         return False
     return True
+
+
+HELD = """
+import sys, time, os, signal
+import numpy as np
+from surrogym_client.original.isolated import IsolatedEnvironment
+from support.machine import Deliberate
+
+if __name__ == "__main__":
+    with IsolatedEnvironment(Deliberate, step_limit=20.0) as environment:
+        print(environment.spec().environment, flush=True)
+        environment.step_from(np.zeros(1), np.zeros(1))
+"""
+
+
+def in_a_step(folder, monkeypatch):
+    """A process of its own, in the middle of a machine's step; its diary."""
+    paths = os.pathsep.join(path for path in sys.path if path)
+    environment = {**os.environ, "PYTHONPATH": paths, DIARY: str(folder / "diary")}
+    (folder / "held.py").write_text(HELD)
+    process = subprocess.Popen(
+        [sys.executable, str(folder / "held.py")],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    assert until(lambda: "step 0" in diary_of(folder))
+    return process
+
+
+def diary_of(folder):
+    path = folder / "diary"
+    return path.read_text().splitlines() if path.exists() else []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+def test_however_its_user_ends_the_step_is_finished_and_the_machine_closed(tmp_path, monkeypatch, number):
+    with in_a_step(tmp_path, monkeypatch) as process:
+        process.send_signal(number)
+        process.wait(60)
+    assert until(lambda: "closed" in diary_of(tmp_path), 60.0)
+    assert diary_of(tmp_path) == ["open", "step 0", "done", "close", "closed"]
+
+
+def test_a_second_interrupt_waits_for_no_step(tmp_path, monkeypatch):
+    with in_a_step(tmp_path, monkeypatch) as process:
+        for _ in range(2):
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.2)
+        process.wait(60)
+    assert "closed" not in diary_of(tmp_path)
+
+
+class Numbered(Moody):
+    """Tells which step this is; the first takes a while."""
+
+    steps = 0
+
+    def step_from(self, coordinates, action):
+        self.steps += 1
+        time.sleep(1.0 if self.steps == 1 else 0.0)
+        return RealStep(coordinates, action, coordinates, reward=float(self.steps))
+
+
+def test_the_answer_to_an_interrupted_step_is_nobody_elses():
+    with IsolatedEnvironment(Numbered) as environment:
+        environment.spec()
+        threading.Timer(0.3, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+        with pytest.raises(KeyboardInterrupt):
+            step(environment, 0)
+        assert step(environment, 0).reward == 2.0
+
+
+def test_one_that_does_not_start_in_time_is_replaced(monkeypatch):
+    monkeypatch.setattr("surrogym_client.original.isolated.START_LIMIT", 0.0)
+    with IsolatedEnvironment(Moody) as environment:
+        with pytest.raises(StepTimedOut, match="to start"):
+            environment.spec()
+        monkeypatch.undo()
+        assert environment.spec() == Moody().spec()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -49,6 +50,21 @@ class SettableMachine(Line):
 
     def close(self):
         note("close")
+
+
+class Deliberate(SettableMachine):
+    """Takes its time, for a step and to close."""
+
+    def step_from(self, coordinates, action):
+        taken = super().step_from(coordinates, action)
+        time.sleep(1.0)
+        note("done")
+        return taken
+
+    def close(self):
+        super().close()
+        time.sleep(0.5)
+        note("closed")
 
 
 class Simulator(Machine):

@@ -70,6 +70,7 @@ def command(
     Example: surrogym sample pendulum --until-done
     """
     from surrogym_client.lifetime import exit_with_parent as watch_parent
+    from surrogym_client.lifetime import terminations
     from surrogym_client.original.isolated import IsolatedEnvironment
     from surrogym_client.sampler import Sampler, SamplerSettings, worker_name
     from surrogym_shared.terminal import give, on_interrupt
@@ -89,7 +90,8 @@ def command(
         factory = _factory(env, read_spec(spec), asked)
         with IsolatedEnvironment(factory, step_limit) as environment, _telling(api, surrogate, quiet=quiet) as tell:
             sampler = Sampler(api, surrogate, environment, settings, tell)
-            signal.signal(signal.SIGTERM, lambda *_: sampler.stop())
+            for number in terminations():
+                signal.signal(number, lambda *_: sampler.stop())
             with on_interrupt(lambda: _words_of_interruption(sampler.summary())):
                 report = sampler.run()
     give(asdict(report), lambda: _words(surrogate, report), as_json=as_json, quiet=quiet)

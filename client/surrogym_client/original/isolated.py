@@ -5,11 +5,13 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
+import time
 from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Any, Self
 
 from surrogym_client.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment, sentence
@@ -18,13 +20,15 @@ from surrogym_client.original.rollouts import answering
 from surrogym_shared.spec import EnvironmentSpec
 
 START_LIMIT = 120.0  # seconds; importing a simulator may take long
-CLOSE_LIMIT = 2.0
+PARENTS_BUSINESS = (signal.SIGINT, getattr(signal, "SIGHUP", signal.SIGINT))
+CLOSE_LIMIT = 2.0  # beyond what a step may take
 
 
 class IsolatedEnvironment:
     """An environment whose steps run in a child process, each within a time limit; so does a reset.
 
-    After a step that hung or a process that died, the next step starts a fresh environment.
+    After a step that hung or a process that died, the next step starts a fresh environment. On every other way out, of
+    this process as well, the step under way is finished and the environment closed.
 
     Args:
         factory: makes the environment in the child; it has to pickle (a module's function, a ``partial``).
@@ -38,6 +42,7 @@ class IsolatedEnvironment:
     def __init__(self, factory: Factory, step_limit: float = 30.0) -> None:
         self._factory = factory
         self._step_limit = step_limit
+        self._number = 0  # of the last request
         self._process: BaseProcess | None = None
         self._pipe: Connection | None = None
 
@@ -57,11 +62,13 @@ class IsolatedEnvironment:
         return step
 
     def close(self) -> None:
-        """Let the environment close; one that doesn't is killed."""
-        if self._pipe is not None and self._process is not None and self._process.is_alive():
-            with suppress(StepFailed):
-                self._ask("close", (), CLOSE_LIMIT)
-        self._kill()
+        """Let the environment finish its step and close; one that doesn't in time, or Ctrl-C, has it killed."""
+        try:
+            if self._pipe is not None and self._process is not None and self._process.is_alive():
+                with suppress(StepFailed):
+                    self._ask("close", (), self._step_limit + CLOSE_LIMIT)
+        finally:
+            self._kill()
 
     def __enter__(self) -> Self:
         return self
@@ -73,15 +80,17 @@ class IsolatedEnvironment:
 
     def _ask(self, method: str, arguments: tuple[Any, ...], limit: float) -> Any:
         pipe = self._start()
+        self._number += 1
         try:
-            pipe.send((method, arguments))
-            if not pipe.poll(limit):
-                self._kill()
-                raise StepTimedOut(f"{method} took longer than {limit:g} s and was killed")
-            ok, value = pipe.recv()
+            pipe.send((self._number, method, arguments))
+            answer = _await_answer(pipe, self._number, limit)
         except (EOFError, OSError) as error:
             code = self._kill()
             raise EnvironmentDied(f"the environment's process ended with exit code {code} in {method}") from error
+        if answer is None:
+            self._kill()
+            raise StepTimedOut(f"{method} took longer than {limit:g} s and was killed")
+        ok, value = answer
         if not ok:
             raise StepFailed(value)
         return value
@@ -92,7 +101,7 @@ class IsolatedEnvironment:
         self._kill()
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, self._factory), daemon=True)
+        self._process = context.Process(target=_serve, args=(theirs, self._factory, self._step_limit), daemon=True)
         self._process.start()
         theirs.close()
         self._await_start(self._pipe)
@@ -101,6 +110,7 @@ class IsolatedEnvironment:
     def _await_start(self, pipe: Connection) -> None:
         try:
             if not pipe.poll(START_LIMIT):
+                self._kill()
                 raise StepTimedOut(f"the environment took longer than {START_LIMIT:g} s to start")
             ok, value = pipe.recv()
         except EOFError as error:
@@ -123,22 +133,68 @@ class IsolatedEnvironment:
         return process.exitcode
 
 
-def _serve(pipe: Connection, factory: Factory) -> None:
+def _await_answer(pipe: Connection, number: int, limit: float) -> tuple[bool, Any] | None:
+    """The answer (ok, value) to one request, None after ``limit`` seconds; answers to earlier ones are passed over."""
+    deadline = time.monotonic() + limit
+    while pipe.poll(max(0.0, deadline - time.monotonic())):
+        answered, ok, value = pipe.recv()
+        if answered == number:
+            return ok, value
+    return None
+
+
+class _Ending:
+    """Ends the child on SIGTERM, but not in the middle of a step."""
+
+    def __init__(self) -> None:
+        self._working = self._asked = False
+        signal.signal(signal.SIGTERM, self._ask)
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        self._asked = True
+        if not self._working:
+            sys.exit()
+
+    def __enter__(self) -> None:
+        self._working = True
+
+    def __exit__(self, *_: object) -> None:
+        self._working = False
+        if self._asked:
+            sys.exit()
+
+
+def _serve(pipe: Connection, factory: Factory, step_limit: float) -> None:
     """The child: one answer (ok, value) for the start, then one for every request."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    for number in PARENTS_BUSINESS:
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=_exit_after_parent, args=(step_limit + CLOSE_LIMIT,), daemon=True).start()
+    working = _Ending()
     try:
-        environment = answering(factory())
+        with working:
+            environment = answering(factory())
     except Exception as error:
         pipe.send((False, sentence(error)))
         return
-    pipe.send((True, None))
-    while True:
-        try:
-            method, arguments = pipe.recv()
-        except EOFError:
-            return
-        pipe.send(_answer(environment, method, arguments))
+    closed = False
+    try:
+        pipe.send((True, None))
+        while not closed:
+            closed = _serve_one(pipe, environment, working) == "close"
+    except (EOFError, OSError):
+        return  # the parent has ended
+    finally:
+        if not closed:
+            environment.close()
+
+
+def _serve_one(pipe: Connection, environment: Environment, working: _Ending) -> str:
+    """Answer one request; gives its method back."""
+    number, method, arguments = pipe.recv()
+    with working:
+        pipe.send((number, *_answer(environment, method, arguments)))
+    return str(method)
 
 
 def _answer(environment: Environment, method: str, arguments: tuple[Any, ...]) -> tuple[bool, Any]:
@@ -149,8 +205,10 @@ def _answer(environment: Environment, method: str, arguments: tuple[Any, ...]) -
         return False, sentence(error)
 
 
-def _exit_with_parent() -> None:
+def _exit_after_parent(seconds: float) -> None:
+    """When the parent has ended, give the environment some time to close."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])
+        time.sleep(seconds)
         os._exit(1)
