@@ -20,7 +20,7 @@ from surrogym_client.leases import AWAY, LeaseEnded, Leases
 from surrogym_client.original.errors import StepFailed, UnknownEnvironment
 from surrogym_client.original.protocol import Environment, OriginalEnvironment, RolloutEnvironment
 from surrogym_client.original.rollouts import answering
-from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, StepQuery
 
 FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "failed")
@@ -155,6 +155,7 @@ class Sampler:
             raise UnknownEnvironment(
                 f"the environment does not fit surrogate {self._surrogate!r}: expected {expected}, got {got}"
             )
+        _check_actions(asked, own)
         self._spec = asked
 
     def _claim(self, limit: int) -> tuple[ClaimedQueries, float]:
@@ -300,3 +301,21 @@ class Sampler:
 def _shape(spec: EnvironmentSpec) -> str:
     names = ", ".join(spec.coordinate_names)
     return f"coordinates ({names}), a {spec.action.kind} action of {spec.action.size}, and {spec.query} queries"
+
+
+def _check_actions(asked: EnvironmentSpec, own: EnvironmentSpec) -> None:
+    """Refuse continuous actions of a surrogate that reach beyond those of the environment."""
+    if not (isinstance(asked.action, BoxAction) and isinstance(own.action, BoxAction)):
+        return
+    lower = any(a < b for a, b in zip(asked.action.low, own.action.low, strict=True))
+    higher = any(a > b for a, b in zip(asked.action.high, own.action.high, strict=True))
+    if lower or higher:
+        raise UnknownEnvironment(
+            f"the surrogate's actions are not the environment's: expected actions from {_range(own.action)}, "
+            f"got {_range(asked.action)}; register it under another name"
+        )
+
+
+def _range(action: BoxAction) -> str:
+    low, high = (", ".join(f"{bound:g}" for bound in bounds) for bounds in (action.low, action.high))
+    return f"[{low}] to [{high}]"

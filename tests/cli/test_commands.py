@@ -6,7 +6,10 @@ import json
 import numpy as np
 import pytest
 
+from support.machine import Machine, diary_in
 from surrogym_client.api import Api
+from surrogym_client.original.loading import with_choices
+from surrogym_client.policy_file import PolicyCard
 
 OWN = """
 from surrogym_client.original import RealStep
@@ -175,6 +178,17 @@ def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum
     other = on_server("evaluate", "policy.zip", "--env", "CartPole-v1", "--episodes", "1")
     assert other.code == 1
     assert "error: the policy does not fit the environment" in other.err
+
+
+def test_a_policy_of_bins_pushes_ones_own_machine_as_its_surrogate_was_pushed(surrogym, monkeypatch, tmp_path):
+    spec = with_choices(Machine.spec(None), {}, bins=5)
+    (tmp_path / "policy.zip").write_bytes(b"")
+    (tmp_path / "policy.json").write_text(PolicyCard(spec=spec).model_dump_json())
+    monkeypatch.setattr("surrogym_client.policy_file.load_policy", lambda *_: lambda o: np.ones(len(o)))
+    with diary_in(tmp_path, monkeypatch) as diary:
+        said = surrogym("evaluate", "policy.zip", "--env", "support.machine:Machine", "--episodes", "1")
+        assert said.code == 0, said.err
+        assert set(diary.read_text().splitlines()) == {"open", "reset 10000", "step -0.5", "close"}
 
 
 def _no(*_, **__):

@@ -17,6 +17,7 @@ from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.isolated import IsolatedEnvironment
 from surrogym_client.sampler import Sampler, SamplerReport, SamplerSettings
 from surrogym_shared.codes import Code, Problem
+from surrogym_shared.spec import BoxAction
 
 ONE_ROUND = SamplerSettings(name="worker", max_queries=6, wait_seconds=5.0, time_limit=60.0)
 
@@ -221,3 +222,16 @@ def test_an_unknown_surrogate_and_a_missing_server_are_told(server_process):
         Sampler(api, "nobody", Line()).run()
     with Api("http://127.0.0.1:9", retries=Retries(seconds=0)) as api, pytest.raises(ServerUnreachable):
         Sampler(api, "nobody", Line()).run()
+
+
+class Careful(Line):
+    """Takes smaller actions than the surrogate was told when it was registered."""
+
+    def spec(self):
+        return SPEC.model_copy(update={"action": BoxAction(low=(-0.5,), high=(1.0,))})
+
+
+def test_actions_that_the_environment_does_not_allow_are_refused_before_a_step(api, line):
+    with pytest.raises(UnknownEnvironment, match=r"expected actions from \[-0.5\] to \[1\], got \[-1\] to \[1\]"):
+        Sampler(api, line, Careful()).run()
+    assert api.surrogate(line).queries.leased == 0

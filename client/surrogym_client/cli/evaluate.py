@@ -105,9 +105,18 @@ def _opener(env: str | None, given: EnvironmentSpec | None, card: PolicyCard) ->
         raise CommandError(f"expected --env with the original environment, got none (noted beside the policy: {name})")
     spec = given or (noted if noted is not None and noted.environment == name else None)
     if ":" in name:
-        return lambda: open_episode(name, spec, lambda: make(name))
+        bins = _bins(noted) if given is None else None
+        return lambda: open_episode(name, given, lambda: make(name, spec=given, bins=bins))
     spec = spec or make(name).spec()
     return lambda: open_episode(name, spec, lambda: make(name, spec=spec))
+
+
+def _bins(spec: EnvironmentSpec | None) -> int | None:
+    """How many values of each continuous action a policy was trained to choose from; None where from all of them."""
+    from surrogym_shared.spec import BoxAction
+
+    action = None if spec is None else spec.action
+    return action.bins[0] if isinstance(action, BoxAction) and action.bins else None
 
 
 def _telling(update: Update, episodes: int) -> Progress:
