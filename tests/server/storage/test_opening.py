@@ -20,8 +20,9 @@ from support.postgresql import Postgresql
 from surrogym_server.errors import InvalidInput, Unavailable
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSurrogate
-from surrogym_server.storage.sql import database, open_storage
+from surrogym_server.storage.sql import database, filelock, open_storage
 from surrogym_server.storage.sql.database import connect
+from surrogym_server.storage.sql.filelock import FileLock
 from surrogym_server.storage.sql.tables import metadata
 
 WRITER = """
@@ -36,6 +37,12 @@ for number in range(100_000):
     sample = NewSample((1.0,), (1.0,), (1.0,), float(number), False)
     [id] = storage.samples.add("a", "w", [sample], key=str(number)).ids
     print(number, id, flush=True)
+"""
+
+OPENER = """
+import sys
+from surrogym_server.storage.sql import open_storage
+open_storage(sys.argv[1]).ping()
 """
 
 
@@ -106,6 +113,88 @@ def test_a_second_server_on_the_same_file_is_refused(tmp_path: Path) -> None:
     first.ping()
     first.close()
     open_storage(url).close()
+
+
+def by_symbolic_link(file: Path) -> Path:
+    link = file.with_name("symbolic.db")
+    link.symlink_to(file)
+    return link
+
+
+def by_hard_link(file: Path) -> Path:
+    link = file.with_name("hard.db")
+    link.hardlink_to(file)
+    return link
+
+
+def after_a_move(file: Path) -> Path:
+    return file.rename(file.with_name("moved.db"))
+
+
+def without_files_beside_it(file: Path) -> Path:
+    for other in file.parent.glob("*lock*"):
+        other.unlink()
+    return file
+
+
+OTHER_NAMES = [by_symbolic_link, by_hard_link, after_a_move, without_files_beside_it]
+
+
+@pytest.mark.parametrize("other_name", OTHER_NAMES)
+def test_a_second_server_is_refused_by_any_name_of_the_file(tmp_path: Path, other_name: Callable[[Path], Path]) -> None:
+    """In another process, for a lock may be kept by process; and this one's locks outlive the refusals."""
+    file = tmp_path / "surrogym.db"
+    first = open_storage(f"sqlite:///{file}")
+    second = other_name(file)
+    for _ in range(2):
+        with pytest.raises(Unavailable, match="only server"):
+            open_storage(f"sqlite:///{second}")
+        opening = subprocess.run([sys.executable, "-c", OPENER, f"sqlite:///{second}"], capture_output=True, text=True)
+        assert "only server" in opening.stderr, opening
+    first.close()
+    open_storage(f"sqlite:///{second}").close()
+
+
+def test_where_no_byte_can_be_locked_a_file_beside_refuses_a_second_server(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(filelock, "WHOLE_DESCRIPTION", None)
+    monkeypatch.setattr(filelock, "_held", set())  # as if the second were another process
+    first = FileLock(tmp_path / "surrogym.db")
+    monkeypatch.setattr(filelock, "_held", set())
+    with pytest.raises(Unavailable, match="only server"):
+        FileLock(by_symbolic_link(tmp_path / "surrogym.db"))
+    first.close()
+    FileLock(tmp_path / "surrogym.db").close()
+
+
+def delete(file: Path) -> None:
+    file.unlink()
+
+
+def replace_by_a_copy(file: Path) -> None:
+    copy = file.with_name("copy.db")
+    copy.write_bytes(file.read_bytes())
+    copy.replace(file)
+
+
+@pytest.mark.parametrize("change", [delete, after_a_move, replace_by_a_copy])
+def test_nothing_is_written_to_a_file_that_is_no_longer_in_its_place(
+    tmp_path: Path, change: Callable[[Path], Any]
+) -> None:
+    file = tmp_path / "surrogym.db"
+    storage = open_storage(f"sqlite:///{file}")
+    change(file)
+    with pytest.raises(Unavailable, match="moved, replaced or deleted"):
+        storage.surrogates.create(NewSurrogate("a", {}, 30, 0.9))
+    storage.close()
+    assert change is replace_by_a_copy or not file.exists(), "no empty database in its place"
+
+
+def test_a_file_that_can_not_be_written_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "surrogym.db").mkdir()
+    with pytest.raises(Unavailable, match=r"expected a file to read and write .*surrogym\.db"):
+        open_storage(f"sqlite:///{tmp_path}/surrogym.db")
 
 
 def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:

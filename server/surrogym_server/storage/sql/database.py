@@ -52,6 +52,8 @@ class Database:
 
     @contextlib.contextmanager
     def write(self) -> Iterator[Connection]:
+        if self._lock is not None:
+            self._lock.require_in_place()
         with self._take_turn(), _translated(), self._writing.begin() as connection:
             yield connection
 
@@ -114,8 +116,9 @@ def _sqlite(path: Path, synchronous: Synchronous) -> Database:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise Unavailable(f"expected a folder for the database, got {path.parent}: {error}") from None
-    lock = FileLock(path.with_name(path.name + ".lock"))
+    lock = FileLock(path)
     engine = sa.create_engine(URL.create("sqlite", database=str(path)), connect_args={"timeout": BUSY_SECONDS}, **POOL)
+    sa.event.listen(engine, "do_connect", lambda *_: lock.require_in_place())  # or SQLite would create another file
     sa.event.listen(engine, "connect", partial(_prepare_sqlite, synchronous))
     sa.event.listen(engine, "begin", _begin_sqlite)
     return Database(engine, lock)
