@@ -28,7 +28,7 @@ SurrogymClientError
     │   └── Forbidden
     ├── Unavailable         was tried again until the retry budget ran out
     │   └── Overloaded
-    └── ServerFailure       a defect of the server
+    └── ServerFailure       a defect of the server, or of what it has stored
 
 Every error pickles, so that it can cross from a worker process to its parent.
 """
@@ -191,6 +191,7 @@ BY_CODE: dict[Code, type[ProblemError]] = {
     Code.TOO_MANY_REQUESTS: Overloaded,
     Code.DEADLINE_EXCEEDED: Unavailable,
     Code.UNAVAILABLE: Unavailable,
+    Code.DAMAGED: ServerFailure,
     Code.INTERNAL: ServerFailure,
 }
 

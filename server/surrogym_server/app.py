@@ -15,6 +15,7 @@ from uuid import uuid4
 import torch
 from fastapi import FastAPI
 from fastapi.responses import Response
+from pydantic import ValidationError
 
 from surrogym_server import dashboard
 from surrogym_server.api import (
@@ -39,7 +40,7 @@ from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_q
 from surrogym_server.engine.fits import Fits
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import MEBIBYTE, Limits, LiveSessions, Threads
-from surrogym_server.errors import InvalidInput
+from surrogym_server.errors import Damaged, InvalidInput
 from surrogym_server.sampling.acquisition import ACQUISITIONS
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.counts import Counts
@@ -217,7 +218,13 @@ def _build_services(
 
 
 def _define(spec: dict[str, Any]) -> EnvironmentDefinition:
-    return definition_from_spec(EnvironmentSpec.model_validate(spec))
+    """Of a specification as it is stored: the wire has checked what comes in."""
+    try:
+        return definition_from_spec(EnvironmentSpec.model_validate(spec))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise Damaged(f"a stored specification can't be read: {where}: {first['msg']}") from error
 
 
 def _complete(spec: dict[str, Any]) -> dict[str, Any]:

@@ -22,6 +22,7 @@ SurrogymError
 │   ├── Unauthenticated
 │   └── Forbidden
 ├── Unavailable             storage or engine can't serve this now; try again later
+│   ├── Damaged             what is stored can't be read as it was written; whoever runs the server restores a copy
 │   ├── Overloaded          a queue or a cap is full; try again later
 │   └── DeadlineExceeded    its answer would come after the deadline it brought
 └── NumericalFailure        a covariance matrix that no jitter repairs
@@ -120,6 +121,10 @@ class Forbidden(Refused):
 
 class Unavailable(SurrogymError):
     """Can't be served now; nothing was changed; try again later."""
+
+
+class Damaged(Unavailable):
+    """What is stored can't be read as it was written; trying again helps only after a copy was restored."""
 
 
 class Overloaded(Unavailable):

@@ -36,6 +36,7 @@ class Code(StrEnum):
     TOO_MANY_REQUESTS = "too_many_requests"  # a queue or a cap is full
     DEADLINE_EXCEEDED = "deadline_exceeded"  # it would have been late, so it was not computed
     UNAVAILABLE = "unavailable"
+    DAMAGED = "damaged"  # what the server has stored can't be read as it was written
     INTERNAL = "internal"
 
 
@@ -64,6 +65,7 @@ STATUS: dict[Code, int] = {
     Code.TOO_MANY_REQUESTS: 429,
     Code.DEADLINE_EXCEEDED: 503,
     Code.UNAVAILABLE: 503,
+    Code.DAMAGED: 500,
     Code.INTERNAL: 500,
 }
 

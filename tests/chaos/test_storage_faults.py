@@ -28,6 +28,7 @@ from support.teaching import teach
 from surrogym_client.api import Api
 from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import HttpSurrogate, Retries
+from surrogym_server.storage.sql.database import BUSY_SECONDS
 from surrogym_shared.wire import OpenSession
 
 ROUNDS = times(short=1, full=10)
@@ -48,6 +49,7 @@ class Place:
 
     database: str
     faults: list[Fault]
+    one_row: Fault | None = None  # the one that stops the writes of one surrogate alone
 
 
 @contextmanager
@@ -122,7 +124,7 @@ def in_postgresql(_: Path) -> Iterator[Place]:
             finally:
                 postgresql.start()
 
-        yield Place(url, [locked, restarted])
+        yield Place(url, [locked, restarted], one_row=locked)
 
 
 @pytest.fixture(params=[in_a_file, on_a_small_disk, pytest.param(in_postgresql, marks=pytest.mark.postgresql)])
@@ -214,6 +216,15 @@ def judge_refusal(response: httpx.Response) -> None:
     assert problem["detail"].startswith("the database can't be used now: ")
 
 
+def wait_for_readiness(client: httpx.Client, status: int) -> None:
+    """Wait until ``/readyz`` answers so; no answer may take as long as the database is waited for."""
+    deadline = time.monotonic() + SECONDS
+    while (answer := client.get("/readyz")).status_code != status:
+        assert time.monotonic() < deadline, answer.text
+        assert answer.elapsed.total_seconds() < BUSY_SECONDS
+        time.sleep(0.1)
+
+
 def test_a_fault_of_the_storage_is_said_and_outlived(place: Place, tmp_path: Path):
     with running_server(tmp_path, "--database", place.database) as server:
         with Api(server.url) as api:
@@ -225,9 +236,10 @@ def test_a_fault_of_the_storage_is_said_and_outlived(place: Place, tmp_path: Pat
                     samples.add_until(success=True)
                     with fault(server):
                         judge_refusal(samples.add_until(success=False))
+                        wait_for_readiness(client, 200 if fault is place.one_row else 503)
                         stepping.go_on()
                     samples.add_until(success=True)
-                    assert client.get("/readyz").status_code == 200
+                    wait_for_readiness(client, 200)
                     stepping.go_on()
             stored = {sample.id: sample.reward for sample in api.samples("pendulum") if sample.purpose == "manual"}
             assert stored == samples.acknowledged, "all of them, each once"

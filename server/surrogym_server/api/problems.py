@@ -36,6 +36,7 @@ CODES: dict[type[errors.SurrogymError], Code] = {
     errors.Forbidden: Code.FORBIDDEN,
     errors.Overloaded: Code.TOO_MANY_REQUESTS,
     errors.DeadlineExceeded: Code.DEADLINE_EXCEEDED,
+    errors.Damaged: Code.DAMAGED,
     errors.Unavailable: Code.UNAVAILABLE,
     errors.NumericalFailure: Code.INTERNAL,
 }

@@ -27,7 +27,7 @@ async def healthz(request: Request) -> Health:
 @router.head("/readyz", include_in_schema=False, dependencies=[PUBLIC])
 @router.get("/readyz", summary="That it can work", dependencies=[PUBLIC], responses=documented(Code.UNAVAILABLE))
 def readyz(use: Use) -> Ready:
-    """Whether the database answers. Needs no token."""
+    """Whether the database has its tables and takes writes, tried at most once a second. Needs no token."""
     use.storage.ping()
     return Ready(status="ready", storage="ok")
 

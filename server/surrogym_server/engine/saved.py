@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import io
 import json
+import zlib
 from dataclasses import asdict, fields
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_server.engine.occupancy import Reservoir
 from surrogym_server.engine.session import Answer, Fingerprint, Outcome, Session
-from surrogym_server.errors import InvalidInput, UnknownSession
+from surrogym_server.errors import Damaged, InvalidInput, UnknownSession
 from surrogym_server.gp import placed
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.virtual import LaneState, VirtualSettings
 from surrogym_shared.port import ResetResult, StepResult
 
 FORMAT, WITHOUT_PATHS = 2, 1  # the one that is written, and an older one that is read as well
+MALFORMED = (BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, ValueError, LookupError, TypeError)
 RAGGED = ("final_lanes", "final_observation")  # of another length in each step
 
 Arrays = dict[str, NDArray[Any]]
@@ -60,7 +63,15 @@ def session_from_bytes(definition: EnvironmentDefinition, data: bytes, surrogate
     Raises:
         InvalidInput: saved by another version of this program.
         UnknownSession: its surrogate was deleted, and another one has its name.
+        Damaged: these are not the bytes that were saved; each array is stored with a checksum.
     """
+    try:
+        return _read(definition, data, surrogate_id)
+    except MALFORMED as error:
+        raise Damaged(f"expected a saved session, got {len(data)} bytes: {error}") from error
+
+
+def _read(definition: EnvironmentDefinition, data: bytes, surrogate_id: int) -> Session:
     with np.load(io.BytesIO(data), allow_pickle=False) as file:
         arrays: Arrays = {name: file[name] for name in file.files}
     header = json.loads(arrays["header"].tobytes())

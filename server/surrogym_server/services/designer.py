@@ -82,17 +82,21 @@ class Designer:
                 try:
                     await self.fit_all_due()
                 except Unavailable as error:
-                    logger.warning("storage is away, the design waits: %s", error)
+                    logger.warning("storage is away or damaged, the design waits: %s", error)
                 except Exception:  # one surrogate's trouble must not end the design of all others
                     logger.exception("a look for what is due failed; the next one follows")
                 await listener.wait(self._look_seconds)
 
     async def fit_all_due(self) -> None:
-        """Fit every surrogate that is due, one after the other."""
-        await asyncio.to_thread(self._give_up_hopeless)
+        """Fit every surrogate that is due, one after the other.
+
+        Raises:
+            Damaged: one of them can't be read; those that are due were fitted.
+        """
         for name in await asyncio.to_thread(self._storage.designs.due):
             with suppress(SurrogymError):  # deleted or taken by another server meanwhile
                 await self._fit(name)
+        await asyncio.to_thread(self._give_up_hopeless)
 
     def improve(self, name: str, queries: int, checkpoint: str | None, key: str | None) -> SurrogateRecord:
         """Ask the next fit for more queries, weighted by the occupancy of a checkpoint (None: the latest, if

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import copy
+import logging
 import secrets
 import time
 from collections.abc import Sequence
@@ -28,7 +29,7 @@ from surrogym_server.engine.session import (
     step_session,
 )
 from surrogym_server.engine.sessions import LiveSessions, Work
-from surrogym_server.errors import InvalidInput, NotReset, SurrogymError, TooLarge
+from surrogym_server.errors import Damaged, InvalidInput, NotReset, SurrogymError, TooLarge
 from surrogym_server.gp import CPU
 from surrogym_server.sampling.uncertainty import visited_confidence
 from surrogym_server.services.activity import SessionActivity, Tallies
@@ -39,6 +40,8 @@ from surrogym_server.storage.records import SavedSession
 from surrogym_server.surrogate.actions import policy_actions
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.virtual import VirtualSettings, expected_bytes
+
+logger = logging.getLogger(__name__)
 
 Bools = NDArray[np.bool_]
 Array = NDArray[np.float64]
@@ -210,17 +213,23 @@ class SessionService:
         return len(saved)
 
     def restore(self) -> int:
-        """Take the saved sessions back; returns how many. One whose surrogate is gone is dropped."""
-        restored = 0
-        for saved in self._storage.sessions.take():
-            try:
-                surrogate = self._storage.surrogates.get(saved.surrogate).id
-                definition = self._definitions.get(saved.surrogate).on(self._device)
-                self._live.add(session_from_bytes(definition, saved.data, surrogate))
-            except SurrogymError:
-                continue
-            restored += 1
-        return restored
+        """Take the saved sessions back; returns how many. The log names each that can't be, and why."""
+        try:
+            taken = self._storage.sessions.take()
+        except Damaged as error:
+            logger.error("the saved sessions can't be read, their trainers have to open new ones: %s", error)
+            return 0
+        return sum(map(self._restored, taken))
+
+    def _restored(self, saved: SavedSession) -> bool:
+        try:
+            surrogate = self._storage.surrogates.get(saved.surrogate).id
+            definition = self._definitions.get(saved.surrogate).on(self._device)
+            self._live.add(session_from_bytes(definition, saved.data, surrogate))
+        except SurrogymError as error:
+            logger.warning("the saved session %s is lost: %s", saved.id, error)
+            return False
+        return True
 
     async def _counted(self, id: str, seq: int | None, request: Fingerprint, work: Work, steps: int) -> Answer:
         started = time.perf_counter()

@@ -9,6 +9,7 @@ For all of it:
 - a repeat with the same idempotency ``key`` and the same arguments changes nothing and returns what the first
   returned; with other arguments it raises ``IdempotencyConflict``;
 - a database that can't be reached raises ``Unavailable``;
+- what is stored and can't be what was written raises ``Damaged``, which names it;
 - events are appended by the operations themselves; their ids grow in the order in which they become visible.
 """
 
@@ -320,7 +321,11 @@ class Storage(ABC):
 
     @abstractmethod
     def ping(self) -> None:
-        """Return when the database answers; raises ``Unavailable`` when it does not."""
+        """Return when all tables are there and the database takes writes; costs a caller little, however often it asks.
+
+        Raises:
+            Unavailable: it does not, or a write takes longer than a caller should wait.
+        """
 
     @abstractmethod
     def close(self) -> None:

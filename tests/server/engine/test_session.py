@@ -20,7 +20,7 @@ from surrogym_server.engine.session import (
     reset_session,
     step_session,
 )
-from surrogym_server.errors import InvalidInput, SeqConflict
+from surrogym_server.errors import Damaged, InvalidInput, SeqConflict
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_server.surrogate.model import SurrogateModel
 from surrogym_shared.port import StepResult
@@ -120,6 +120,23 @@ def test_a_session_saved_before_there_were_functions_comes_back(
     assert back.settings == session.settings
     ours, theirs = stepped(fitted, session)[1], stepped(fitted, back)[1]
     np.testing.assert_array_equal(ours.observation, theirs.observation)
+
+
+def test_a_saved_session_with_a_flipped_bit_is_refused_or_comes_back_the_same(
+    opened: Open, definition: EnvironmentDefinition
+):
+    session, _ = reset_session(opened(), 11, None, 1)
+    saved, refused = session_to_bytes(session), 0
+    for place in np.random.default_rng(0).integers(len(saved), size=300):
+        flipped = bytearray(saved)
+        flipped[place] ^= 1 << int(place % 8)
+        try:
+            back = session_from_bytes(definition, bytes(flipped))
+        except Damaged:
+            refused += 1
+        else:
+            assert session_to_bytes(back) == saved, "it was a byte that says nothing"
+    assert refused > 150
 
 
 def test_pathwise_lanes_of_two_versions_step_side_by_side(opened: Open, fitted: Fitted):

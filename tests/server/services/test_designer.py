@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,13 +15,14 @@ import pytest
 from support import pendulum
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.errors import InvalidInput, NumericalFailure, Unavailable
+from surrogym_server.errors import Damaged, InvalidInput, NumericalFailure, Unavailable
 from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import ATTEMPTS, Designer, phase_after
 from surrogym_server.services.models import load_model
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import NewSurrogate
 
 NAME = "pendulum"
 
@@ -202,6 +206,16 @@ def test_a_surrogate_deleted_during_its_fit_is_no_failure(answered: Storage, des
     runner.function = delete
     fit_all(designer)
     assert answered.surrogates.list() == []
+
+
+def test_a_surrogate_whose_row_is_broken_keeps_no_other_from_its_fit(answered: Storage, designer, tmp_path: Path):
+    answered.surrogates.create(NewSurrogate("broken", {}, 30, 0.999))
+    with closing(sqlite3.connect(tmp_path / "surrogym.db")) as file:
+        file.execute("UPDATE surrogates SET state = '{' WHERE name = 'broken'")
+        file.commit()
+    with pytest.raises(Damaged, match=r"surrogates\.state"):
+        fit_all(designer)
+    assert answered.surrogates.get(NAME).phase == "sampling"
 
 
 def test_the_designer_wakes_by_itself(answered: Storage, designer):

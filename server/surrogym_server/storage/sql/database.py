@@ -7,6 +7,7 @@ because a write locks the surrogate's row first. Claims, which skip what is lock
 from __future__ import annotations
 
 import contextlib
+import shlex
 import threading
 from collections.abc import Iterator
 from functools import partial
@@ -19,6 +20,7 @@ from sqlalchemy.engine import URL, Connection, Engine
 
 from surrogym_server.errors import InvalidInput, Unavailable
 from surrogym_server.storage.records import Synchronous
+from surrogym_server.storage.sql.damage import damaged, means_damage
 from surrogym_server.storage.sql.filelock import FileLock
 
 BUSY_SECONDS = 5  # how long a statement waits for what another program or thread keeps
@@ -38,7 +40,9 @@ CLOCKS: dict[str, sa.ColumnElement[float]] = {
 class Database:
     """Hands out connections inside a transaction, and translates the driver's errors."""
 
-    def __init__(self, engine: Engine, lock: FileLock | None = None) -> None:
+    def __init__(self, engine: Engine, lock: FileLock | None = None, *, way_out: str) -> None:
+        """``way_out`` says what to do when it is damaged."""
+        self.way_out = way_out
         self._engine = engine
         self._lock = lock
         self._writing = engine.execution_options(begin="BEGIN IMMEDIATE")
@@ -121,7 +125,8 @@ def _sqlite(path: Path, synchronous: Synchronous) -> Database:
     sa.event.listen(engine, "do_connect", lambda *_: lock.require_in_place())  # or SQLite would create another file
     sa.event.listen(engine, "connect", partial(_prepare_sqlite, synchronous))
     sa.event.listen(engine, "begin", _begin_sqlite)
-    return Database(engine, lock)
+    recover = f"sqlite3 {shlex.quote(str(path))} .recover | sqlite3 recovered.db"
+    return Database(engine, lock, way_out=f"restore a copy of the file, or save what can be read: {recover}")
 
 
 def _prepare_sqlite(synchronous: Synchronous, connection: Any, _: object) -> None:
@@ -138,11 +143,11 @@ def _postgresql(url: URL) -> Database:
     driven = url.set(drivername="postgresql+psycopg")
     unsaid = {name: value for name, value in POSTGRESQL.items() if name not in url.query}
     engine = sa.create_engine(driven, connect_args=unsaid, pool_pre_ping=True, **POOL)
-    return Database(engine)
+    return Database(engine, way_out="restore a copy")
 
 
 # exactly these: IntegrityError and ProgrammingError derive from DatabaseError, and are our own bugs
-UNUSABLE = (sa.exc.OperationalError, sa.exc.InterfaceError, sa.exc.TimeoutError, sa.exc.DatabaseError)
+UNUSABLE = (sa.exc.OperationalError, sa.exc.InternalError, sa.exc.InterfaceError, sa.exc.DatabaseError)
 UNSTORABLE = (sa.exc.DataError, OverflowError, UnicodeEncodeError)
 
 
@@ -150,10 +155,21 @@ UNSTORABLE = (sa.exc.DataError, OverflowError, UnicodeEncodeError)
 def _translated() -> Iterator[None]:
     try:
         yield
-    except (*UNUSABLE, *UNSTORABLE) as error:
-        reason = getattr(error, "orig", None) or error
-        if isinstance(error, UNSTORABLE):
-            raise InvalidInput(f"expected a value the database can store: {reason}") from error
+    except UNSTORABLE as error:
+        raise InvalidInput(f"expected a value the database can store: {_reason(error)}") from error
+    except UnicodeDecodeError as error:  # SQLite's message names something broken, and the driver can't read it
+        raise damaged(error) from error
+    except sa.exc.TimeoutError as error:
+        raise Unavailable(f"the database can't be used now: {error}") from error
+    except sa.exc.DBAPIError as error:
+        if means_damage(error):
+            raise damaged(_reason(error)) from error
         if type(error) in UNUSABLE:
-            raise Unavailable(f"the database can't be used now: {reason}") from error
+            raise Unavailable(f"the database can't be used now: {_reason(error)}") from error
         raise
+
+
+def _reason(error: Exception) -> str:
+    """What the driver says, without the place in a statement that nobody typed."""
+    said = str(getattr(error, "orig", None) or error)
+    return said.partition("\n")[0]

@@ -9,9 +9,11 @@ from alembic import command
 from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
+from alembic.util import CommandError
 from sqlalchemy.engine import Connection
 
 from surrogym_server.errors import Unavailable
+from surrogym_server.storage.sql.damage import damaged
 from surrogym_server.storage.sql.database import Database
 
 SCRIPTS = Path(__file__).parent / "migrations"
@@ -23,6 +25,7 @@ def migrate(database: Database) -> None:
 
     Raises:
         Unavailable: the database was written by a newer program.
+        Damaged: its schema is none that a program ever made.
     """
     config = Config()
     config.set_main_option("script_location", str(SCRIPTS).replace("%", "%%"))
@@ -34,7 +37,10 @@ def migrate(database: Database) -> None:
         _refuse_newer(present, script)
         if set(present) != set(script.get_heads()):
             config.attributes["connection"] = connection
-            command.upgrade(config, "head")
+            try:
+                command.upgrade(config, "head")
+            except CommandError as error:  # what the database says of its own schema makes no sense
+                raise damaged(error) from error
 
 
 def _take_turn(connection: Connection) -> None:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import sqlalchemy as sa
-
+from surrogym_server.errors import Damaged
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import Synchronous
+from surrogym_server.storage.sql.checks import check_pages, check_tables
 from surrogym_server.storage.sql.database import Database, connect
 from surrogym_server.storage.sql.designs import SqlDesigns
 from surrogym_server.storage.sql.ledger import SqlLedger
@@ -13,6 +13,7 @@ from surrogym_server.storage.sql.memory import SqlEvents, SqlOccupancy, SqlSessi
 from surrogym_server.storage.sql.migrate import migrate
 from surrogym_server.storage.sql.models import SqlModels
 from surrogym_server.storage.sql.queries import SqlQueries
+from surrogym_server.storage.sql.readiness import Readiness
 from surrogym_server.storage.sql.samples import SqlSamples
 from surrogym_server.storage.sql.surrogates import SqlSurrogates
 
@@ -22,6 +23,7 @@ class SqlStorage(Storage):
 
     def __init__(self, database: Database) -> None:
         self._database = database
+        self._readiness = Readiness(database)
         self.surrogates = SqlSurrogates(database)
         self.designs = SqlDesigns(database)
         self.queries = SqlQueries(database)
@@ -33,10 +35,10 @@ class SqlStorage(Storage):
         self.events = SqlEvents(database)
 
     def ping(self) -> None:
-        with self._database.read() as connection:
-            connection.execute(sa.select(1))
+        self._readiness.require()
 
     def close(self) -> None:
+        self._readiness.close()
         self._database.close()
 
 
@@ -52,11 +54,23 @@ def open_storage(url: str, synchronous: Synchronous = "full") -> Storage:
         InvalidInput: another kind of address.
         Unavailable: another server holds the SQLite file, PostgreSQL does not answer, or the database was
             written by a newer program.
+        Damaged: pages, tables or columns are broken or missing; says the way out.
     """
     database = connect(url, synchronous)
     try:
-        migrate(database)
+        _bring_up(database)
     except BaseException:
         database.close()
         raise
     return SqlStorage(database)
+
+
+def _bring_up(database: Database) -> None:
+    try:
+        with database.read() as connection:
+            check_pages(connection)
+        migrate(database)
+        with database.read() as connection:
+            check_tables(connection)
+    except Damaged as error:
+        raise Damaged(f"{error}; {database.way_out}") from error

@@ -6,13 +6,15 @@ What belongs to a surrogate goes with it (``ON DELETE CASCADE``). Ids are never 
 from __future__ import annotations
 
 import json
-from typing import Any
+import reprlib
+from typing import Any, get_args
 
 import numpy as np
 import sqlalchemy as sa
 from sqlalchemy.engine import Dialect
 
-from surrogym_server.storage.records import Array, Vector
+from surrogym_server.storage.records import Array, EventKind, Phase, Purpose, QueryKind, QueryStatus, Vector
+from surrogym_server.storage.sql.damage import damaged
 
 metadata = sa.MetaData(
     naming_convention={
@@ -40,20 +42,47 @@ class Floats(sa.types.TypeDecorator[Vector]):
         return None if value is None else np.asarray(value, dtype="<f8").tobytes()
 
     def process_result_value(self, value: bytes | None, dialect: Dialect) -> Vector | None:  # noqa: ARG002
-        return None if value is None else tuple(np.frombuffer(value, dtype="<f8").tolist())
+        try:
+            return None if value is None else tuple(np.frombuffer(value, dtype="<f8").tolist())
+        except (TypeError, ValueError) as error:
+            raise damaged(f"expected a vector of floats: {error}") from error
 
 
 class Json(sa.types.TypeDecorator[Any]):
-    """Anything that JSON can say."""
+    """Anything that JSON can say; ``place`` is its table and column."""
 
     impl = sa.Text
     cache_ok = True
+
+    def __init__(self, place: str) -> None:
+        super().__init__()
+        self.place = place
 
     def process_bind_param(self, value: Any, dialect: Dialect) -> str:  # noqa: ARG002
         return json.dumps(value)
 
     def process_result_value(self, value: str | None, dialect: Dialect) -> Any:  # noqa: ARG002
-        return None if value is None else json.loads(value)
+        try:
+            return None if value is None else json.loads(value)
+        except (TypeError, ValueError) as error:
+            raise damaged(f"expected JSON in {self.place}, got {reprlib.repr(value)}: {error}") from error
+
+
+class Word(sa.types.TypeDecorator[str]):
+    """One of the values of a ``Literal``; ``place`` is its table and column."""
+
+    impl = sa.Text
+    cache_ok = True
+
+    def __init__(self, place: str, literal: Any) -> None:
+        super().__init__()
+        self.place = place
+        self.words = get_args(literal)
+
+    def process_result_value(self, value: str | None, dialect: Dialect) -> str | None:  # noqa: ARG002
+        if value is not None and value not in self.words:
+            raise damaged(f"expected one of {list(self.words)} in {self.place}, got {reprlib.repr(value)}")
+        return value
 
 
 def _id() -> sa.Column[int]:
@@ -70,14 +99,14 @@ surrogates = sa.Table(
     metadata,
     _id(),
     sa.Column("name", sa.Text, nullable=False, unique=True),
-    sa.Column("spec", Json, nullable=False),
+    sa.Column("spec", Json("surrogates.spec"), nullable=False),
     sa.Column("budget", sa.Integer, nullable=False),
     sa.Column("target", sa.Double, nullable=False),
-    sa.Column("tolerances", Json, nullable=False, server_default="{}"),
-    sa.Column("phase", sa.Text, nullable=False),
+    sa.Column("tolerances", Json("surrogates.tolerances"), nullable=False, server_default="{}"),
+    sa.Column("phase", Word("surrogates.phase", Phase), nullable=False),
     sa.Column("paused", sa.Boolean, nullable=False),
     sa.Column("round", sa.Integer, nullable=False),
-    sa.Column("state", Json, nullable=False),
+    sa.Column("state", Json("surrogates.state"), nullable=False),
     sa.Column("error", sa.Text),
     sa.Column("extra_queries", sa.Integer, nullable=False),
     sa.Column("checkpoint", sa.Text),
@@ -95,10 +124,10 @@ queries = sa.Table(
     metadata,
     _id(),
     _owner(),
-    sa.Column("purpose", sa.Text, nullable=False),
-    sa.Column("status", sa.Text, nullable=False),
+    sa.Column("purpose", Word("queries.purpose", Purpose), nullable=False),
+    sa.Column("status", Word("queries.status", QueryStatus), nullable=False),
     sa.Column("round", sa.Integer, nullable=False),
-    sa.Column("kind", sa.Text, nullable=False, server_default="step"),
+    sa.Column("kind", Word("queries.kind", QueryKind), nullable=False, server_default="step"),
     sa.Column("coordinates", Floats, nullable=False),  # empty for a rollout
     sa.Column("action", Floats, nullable=False),  # for a rollout one after the other
     sa.Column("steps", sa.Integer, nullable=False, server_default="1"),
@@ -141,7 +170,7 @@ samples = sa.Table(
     sa.Column("query_id", Id, sa.ForeignKey("queries.id", ondelete="CASCADE"), index=True),
     sa.Column("lease_id", Id, sa.ForeignKey("leases.id", ondelete="CASCADE")),
     sa.Column("step", sa.Integer, nullable=False, server_default="0"),
-    sa.Column("purpose", sa.Text, nullable=False),
+    sa.Column("purpose", Word("samples.purpose", Purpose), nullable=False),
     sa.Column("sampler", sa.Text, nullable=False),
     sa.Column("attempt", sa.Integer, nullable=False),
     sa.Column("late", sa.Boolean, nullable=False),
@@ -179,7 +208,7 @@ requests = sa.Table(  # what an idempotency key was used for, and what it return
     sa.Column("operation", sa.Text, primary_key=True),
     sa.Column("key", sa.Text, primary_key=True),
     sa.Column("fingerprint", sa.Text, nullable=False),
-    sa.Column("result", Json, nullable=False),
+    sa.Column("result", Json("requests.result"), nullable=False),
 )
 
 models = sa.Table(
@@ -190,8 +219,8 @@ models = sa.Table(
     sa.Column("created_at", sa.Double, nullable=False),
     sa.Column("samples", sa.Integer, nullable=False),
     sa.Column("data_hash", sa.Text, nullable=False),
-    sa.Column("fidelity", Json, nullable=False),
-    sa.Column("description", Json, nullable=False),
+    sa.Column("fidelity", Json("models.fidelity"), nullable=False),
+    sa.Column("description", Json("models.description"), nullable=False),
     sa.Column("fit_seconds", sa.Double, nullable=False),
     sa.Column("blob", sa.LargeBinary, nullable=False),
 )
@@ -223,9 +252,9 @@ events = sa.Table(
     metadata,
     _id(),
     _owner(),
-    sa.Column("kind", sa.Text, nullable=False),
+    sa.Column("kind", Word("events.kind", EventKind), nullable=False),
     sa.Column("created_at", sa.Double, nullable=False),
-    sa.Column("body", Json, nullable=False),
+    sa.Column("body", Json("events.body"), nullable=False),
     sa.Index(None, "surrogate_id", "id"),
     sqlite_autoincrement=True,
 )

@@ -1,0 +1,29 @@
+"""Damage of a database: which errors of the drivers mean it, and how it is put."""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+
+import sqlalchemy as sa
+
+from surrogym_server.errors import Damaged
+
+SQLITE_CODES = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+SQLSTATES = ("XX001", "XX002", "42P01", "42703")  # data and index corrupted, undefined table and column
+OTHER_SCHEMA = re.compile(r"no such (table|column)|has no column|already exists")  # SQLite has no code for these
+UNDECODABLE = "Could not decode to UTF-8"  # nor Python's driver for this
+
+
+def damaged(reason: object) -> Damaged:
+    """The error for something stored that can't be what this program wrote."""
+    return Damaged(f"the database is damaged: {reason}")
+
+
+def means_damage(error: sa.exc.DBAPIError) -> bool:
+    """Whether an error of the driver says that what is stored can't be read, or has other tables."""
+    if getattr(error.orig, "sqlstate", None) in SQLSTATES:
+        return True
+    extended = getattr(error.orig, "sqlite_errorcode", 0)
+    said = str(error.orig)
+    return extended & 0xFF in SQLITE_CODES or UNDECODABLE in said or OTHER_SCHEMA.search(said) is not None

@@ -1,0 +1,181 @@
+"""A damaged database: refused when it is opened, in one sentence, or named by whatever reads what is broken."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import sqlalchemy as sa
+
+from surrogym_server.errors import Damaged, SurrogymError
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import NewDesign, NewSample
+from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql.checks import check_pages
+from surrogym_server.storage.sql.database import connect
+
+NAME = "pendulum"
+READS: dict[str, Callable[[Storage], Any]] = {
+    "surrogates": lambda storage: storage.surrogates.list(),
+    "due": lambda storage: storage.designs.due(),
+    "queries": lambda storage: storage.queries.list(NAME),
+    "counts": lambda storage: storage.queries.counts(NAME),
+    "samples": lambda storage: storage.samples.page(NAME, 0, 1_000),
+    "arrays": lambda storage: storage.samples.arrays(NAME),
+    "ledger": lambda storage: storage.ledger.read(NAME),
+    "models": lambda storage: storage.models.list(NAME),
+    "blob": lambda storage: storage.models.blob(NAME),
+    "occupancy": lambda storage: storage.occupancy.latest(NAME),
+    "events": lambda storage: storage.events.list(NAME),
+}
+
+
+def execute(url: str, statement: str) -> None:
+    engine = sa.create_engine(url.replace("postgresql:", "postgresql+psycopg:"), poolclass=sa.NullPool)
+    with engine.begin() as connection:
+        connection.execute(sa.text(statement))
+
+
+@pytest.fixture
+def full(
+    storage: Storage,
+    make: Callable[..., str],
+    answer_all: Callable[[str], None],
+    design: Callable[..., NewDesign],
+    by_hand: Callable[..., NewSample],
+) -> Storage:
+    """Something in every table."""
+    name = make(queries=20)
+    answer_all(name)
+    lease = storage.designs.begin(name, "me", 60)
+    assert lease is not None
+    storage.designs.commit(lease, design(queries=3))
+    storage.samples.add(name, "worker", [by_hand(float(i)) for i in range(20)], key="by hand")
+    storage.occupancy.put(name, "visited", np.ones((50, 2)))
+    storage.queries.claim(name, "worker", 1, 60.0)
+    return storage
+
+
+@pytest.fixture
+def file(full: Storage, tmp_path: Path) -> Path:
+    """A SQLite file that is filled and closed."""
+    full.close()
+    return tmp_path / "surrogym.db"
+
+
+def opened_and_read(url: str) -> list[SurrogymError]:
+    try:
+        storage = open_storage(url)
+    except SurrogymError as error:
+        return [error]
+    with closing(storage):
+        return list(all_read(storage))
+
+
+def all_read(storage: Storage) -> Iterator[SurrogymError]:
+    """The errors of all reads; any that is no ``SurrogymError`` is raised."""
+    for read in READS.values():
+        try:
+            read(storage)
+        except SurrogymError as error:
+            yield error
+
+
+@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("flips", [1, 10, 60])
+@pytest.mark.parametrize("seed", range(8))
+def test_flipped_bytes_are_told_in_one_sentence(url: str, file: Path, flips: int, seed: int) -> None:
+    content = bytearray(file.read_bytes())
+    random = np.random.default_rng(seed)
+    for place in random.integers(len(content), size=flips):
+        content[place] ^= int(random.integers(1, 256))
+    file.write_bytes(content)
+    assert not any("\n" in str(error) for error in opened_and_read(url))
+
+
+@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+def test_broken_pages_are_refused_at_opening_with_the_way_out(url: str, file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[4096:8192] = bytes(4096)
+    file.write_bytes(content)
+    with pytest.raises(Damaged, match=r"the database is damaged: .*restore a copy.*sqlite3 .*\.recover"):
+        open_storage(url)
+    assert file.read_bytes() == bytes(content), "it is left as it was"
+
+
+@pytest.mark.parametrize("statement", ["DROP TABLE evaluations", "ALTER TABLE surrogates DROP COLUMN state"])
+def test_a_table_or_column_that_is_missing_is_refused_at_opening(url: str, full: Storage, statement: str) -> None:
+    full.close()
+    execute(url, statement)
+    with pytest.raises(Damaged, match=r"(evaluations|state).*restore a copy"):
+        open_storage(url)
+
+
+def test_a_schema_that_no_program_made_is_refused(url: str, full: Storage) -> None:
+    full.close()
+    execute(url, "DELETE FROM alembic_version")
+    with pytest.raises(Damaged, match="already exists"):
+        open_storage(url)
+
+
+def test_a_table_that_is_dropped_under_the_server_is_named(url: str, full: Storage) -> None:
+    execute(url, "DROP TABLE evaluations")
+    with pytest.raises(Damaged, match="evaluations"):
+        full.ledger.read(NAME)
+
+
+BROKEN_ROWS = [
+    ("UPDATE surrogates SET spec = '{\"a'", "surrogates", r"JSON in surrogates\.spec, got '{\"a'"),
+    ("UPDATE surrogates SET phase = 'reaxy'", "surrogates", r"surrogates\.phase, got 'reaxy'"),
+    ("UPDATE queries SET status = ''", "counts", r"queries\.status"),
+    ("UPDATE models SET fidelity = ''", "models", r"JSON in models\.fidelity"),
+    ("UPDATE events SET body = 'x'", "events", r"JSON in events\.body"),
+]
+
+
+@pytest.mark.parametrize(("statement", "read", "named"), BROKEN_ROWS)
+def test_a_broken_row_is_named_by_whatever_reads_it(
+    url: str, full: Storage, statement: str, read: str, named: str
+) -> None:
+    execute(url, statement)
+    with pytest.raises(Damaged, match=named):
+        READS[read](full)
+
+
+@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize(
+    ("statement", "read"),
+    [
+        ("UPDATE queries SET error = CAST(x'ff41' AS TEXT)", "queries"),
+        ("UPDATE queries SET coordinates = x'000102'", "queries"),
+    ],
+)
+def test_bytes_that_are_no_value_are_damage(url: str, full: Storage, statement: str, read: str) -> None:
+    with closing(sqlite3.connect(url.removeprefix("sqlite:///"))) as other:
+        other.execute(statement)
+        other.commit()
+    with pytest.raises(Damaged):
+        READS[read](full)
+
+
+def test_the_check_of_a_large_file_is_cut_short(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """And then says so, and lets the server start."""
+    with closing(sqlite3.connect(tmp_path / "large.db")) as large:
+        large.execute("CREATE TABLE a (b BLOB)")
+        large.executemany("INSERT INTO a VALUES (zeroblob(1000000))", [()] * 200)
+        large.commit()
+    database = connect(f"sqlite:///{tmp_path}/large.db")
+    with database.read() as connection:
+        check_pages(connection, seconds=0.0)
+        assert connection.exec_driver_sql("SELECT count(*) FROM a").scalar() == 200, "nothing else is interrupted"
+    database.close()
+    assert "only what could be checked within 0 s" in caplog.text
+
+
+def test_nothing_is_damage_in_a_sound_database(full: Storage) -> None:
+    assert list(all_read(full)) == []

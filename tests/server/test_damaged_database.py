@@ -1,0 +1,129 @@
+"""A real server on a damaged database: it starts where it can, names what is broken, and serves the rest."""
+
+from __future__ import annotations
+
+import gzip
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from support import pendulum
+from support.server import ServerProcess, running_server
+
+STORED = Path(__file__).with_name("stored")
+NAME = "pendulum"
+SECONDS = 60.0
+
+
+def stored(folder: Path) -> Path:
+    """A database with a surrogate, its models and an open session."""
+    file = folder / "surrogym.db"
+    file.write_bytes(gzip.decompress((STORED / "r0001.db.gz").read_bytes()))
+    return file
+
+
+def execute(file: Path, statement: str, *parameters: Any) -> None:
+    with closing(sqlite3.connect(file)) as database:
+        database.execute(statement, parameters)
+        database.commit()
+
+
+def flip(file: Path, table: str, column: str) -> None:
+    """Flip one bit in the middle of a blob, of the row that was stored last."""
+    with closing(sqlite3.connect(file)) as database:
+        last = f"SELECT max(rowid) FROM {table}"
+        [blob] = database.execute(f"SELECT {column} FROM {table} WHERE rowid = ({last})").fetchone()
+        flipped = bytearray(blob)
+        flipped[len(blob) // 2] ^= 1
+        database.execute(f"UPDATE {table} SET {column} = ? WHERE rowid = ({last})", [bytes(flipped)])
+        database.commit()
+
+
+@contextmanager
+def changed(file: Path, column: str, value: str) -> Iterator[None]:
+    """Another value in a column of every surrogate, for the time of the context."""
+    with closing(sqlite3.connect(file)) as database:
+        [before] = database.execute(f"SELECT {column} FROM surrogates WHERE name = '{NAME}'").fetchone()
+    execute(file, f"UPDATE surrogates SET {column} = ? WHERE name = '{NAME}'", value)
+    try:
+        yield
+    finally:
+        execute(file, f"UPDATE surrogates SET {column} = ? WHERE name = '{NAME}'", before)
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
+    folder = tmp_path_factory.mktemp("damaged")
+    file = stored(folder)
+    flip(file, "sessions", "data")
+    with running_server(folder) as running:
+        yield running
+
+
+@pytest.fixture
+def client(server: ServerProcess) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=server.url, timeout=SECONDS) as opened:
+        yield opened
+
+
+def until(happened: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + SECONDS
+    while not happened():
+        assert time.monotonic() < deadline, "it never happened"
+        time.sleep(0.1)
+
+
+def test_a_saved_session_that_is_damaged_is_named_and_the_server_starts(server: ServerProcess, client: httpx.Client):
+    assert "the saved session" in server.log
+    assert "is lost: expected a saved session" in server.log
+    assert client.get("/readyz").json() == {"status": "ready", "storage": "ok"}
+
+
+@pytest.mark.parametrize(("column", "value"), [("spec", '{"coordinates'), ("spec", "{}"), ("phase", "reaxy")])
+def test_a_broken_row_is_an_error_that_names_it_and_others_are_served(
+    server: ServerProcess, client: httpx.Client, column: str, value: str
+):
+    with changed(server.folder / "surrogym.db", column, value):
+        answer = client.get(f"/v1/surrogates/{NAME}")
+        other = client.post("/v1/surrogates", json={"name": "other", "spec": pendulum.spec()})
+        deleted = client.delete("/v1/surrogates/other")
+    assert (answer.status_code, answer.json()["code"]) == (500, "damaged")
+    assert column in answer.json()["detail"]
+    assert (other.status_code, deleted.status_code) == (201, 204)
+    assert client.get(f"/v1/surrogates/{NAME}").status_code == 200
+    assert "Traceback" not in server.log
+
+
+def test_a_missing_table_is_an_error_that_names_it_and_the_server_is_not_ready(
+    server: ServerProcess, client: httpx.Client
+):
+    file = server.folder / "surrogym.db"
+    execute(file, "ALTER TABLE evaluations RENAME TO gone")
+    until(lambda: client.get("/readyz").status_code == 503)
+    assert "evaluations" in client.get("/readyz").json()["detail"]
+    answer = client.get(f"/v1/surrogates/{NAME}")
+    assert (answer.status_code, answer.json()["code"]) == (500, "damaged")
+    execute(file, "ALTER TABLE gone RENAME TO evaluations")
+    until(lambda: client.get("/readyz").status_code == 200)
+    assert "Traceback" not in server.log
+
+
+def test_broken_pages_end_the_start_with_one_sentence_and_the_way_out(tmp_path: Path):
+    file = stored(tmp_path)
+    content = bytearray(file.read_bytes())
+    content[4096:8192] = bytes(4096)
+    file.write_bytes(content)
+    command = [sys.executable, "-m", "surrogym_server", "serve", "--port", "0", "--database", str(file)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert ended.returncode == 1
+    [line] = ended.stderr.splitlines()
+    assert line.startswith("error: the database is damaged: ")
+    assert f"sqlite3 {file} .recover" in line
