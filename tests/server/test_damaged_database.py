@@ -116,6 +116,21 @@ def test_a_missing_table_is_an_error_that_names_it_and_the_server_is_not_ready(
     assert "Traceback" not in server.log
 
 
+def test_a_flipped_bit_in_a_model_is_told_and_the_version_before_it_is_used(
+    server: ServerProcess, client: httpx.Client
+):
+    view = client.get(f"/v1/surrogates/{NAME}").json()
+    newest, said = view["model_version"], {"coordinates": [[0.3, -0.2]], "action": [[0.7]]}
+    flip(server.folder / "surrogym.db", "models", "blob")
+    exported = client.get(f"/v1/surrogates/{NAME}/models/{newest}?format=safetensors")
+    assert (exported.status_code, exported.json()["code"]) == (500, "damaged")
+    assert f"model {newest} of '{NAME}' is not what was stored" in exported.json()["detail"]
+    predicted = client.post(f"/v1/surrogates/{NAME}/predict", json=said)
+    assert predicted.raise_for_status().json()["model_version"] == newest - 1
+    assert client.get(f"/v1/surrogates/{NAME}").json()["model_version"] == newest - 1
+    assert f"ERROR surrogym_server.services.models: model {newest} of {NAME} is set aside" in server.log
+
+
 def test_broken_pages_end_the_start_with_one_sentence_and_the_way_out(tmp_path: Path):
     file = stored(tmp_path)
     content = bytearray(file.read_bytes())

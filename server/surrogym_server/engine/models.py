@@ -9,7 +9,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from threading import Lock
 
-from surrogym_server.errors import NoModel
+from surrogym_server.errors import Damaged, NoModel
 from surrogym_server.surrogate.model import SurrogateModel
 
 CAPACITY = 64
@@ -26,8 +26,8 @@ class ModelCache:
     ) -> None:
         """
         Args:
-            load: the model of a surrogate's version; raises ``UnknownModel`` or ``UnknownSurrogate``.
-            newest: the newest stored version of each surrogate that has any.
+            load: the model of a surrogate's version; raises ``UnknownModel``, ``UnknownSurrogate`` or ``Damaged``.
+            newest: the newest stored version of each surrogate that has any; not one that ``load`` has set aside.
             capacity: how many models are kept.
         """
         self._load = load
@@ -38,12 +38,17 @@ class ModelCache:
         self._lock = Lock()
 
     def get(self, surrogate: int, version: int) -> SurrogateModel:
-        """The model of a version. Raises ``UnknownModel`` or ``UnknownSurrogate``."""
+        """The model of a version. Raises ``UnknownModel``, ``UnknownSurrogate`` or ``Damaged``."""
         with self._lock:
             if model := self._models.get((surrogate, version)):
                 self._models.move_to_end((surrogate, version))
                 return model
-        model = self._load(surrogate, version)
+        try:
+            model = self._load(surrogate, version)
+        except Damaged:
+            with self._lock:
+                self._latest.pop(surrogate, None)  # it may have been this one
+            raise
         self._keep(surrogate, version, model)
         return model
 
@@ -55,11 +60,19 @@ class ModelCache:
         return self.refresh(surrogate)
 
     def refresh(self, surrogate: int) -> int:
-        """The newest version that is stored, another server's too. Raises ``NoModel`` or ``UnknownSurrogate``."""
-        version = self._newest().get(surrogate)
-        if version is None:
-            raise NoModel("expected a surrogate with a model, but nothing has been fitted yet")
-        return self.publish(surrogate, version)
+        """The newest version that is stored and sound, another server's too.
+
+        Raises:
+            NoModel, UnknownSurrogate: as the classes say.
+            Damaged: it can't be read, and was not set aside.
+        """
+        while (version := self._newest().get(surrogate)) is not None:
+            try:
+                return self.publish(surrogate, version)
+            except Damaged:
+                if self._newest().get(surrogate) == version:
+                    raise
+        raise NoModel("expected a surrogate with a model, but nothing has been fitted yet")
 
     def look(self) -> list[int]:
         """Publish what other servers have stored of the surrogates that are in use here, and forget those that are

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from surrogym_server.engine.fidelity import fidelity_of
 from surrogym_server.engine.models import ModelCache
+from surrogym_server.errors import Damaged, InvalidInput
 from surrogym_server.sampling.uncertainty import UncertaintyResult, query_uncertainty
 from surrogym_server.services.definitions import Definitions, check_coordinates, check_points
 from surrogym_server.services.notices import Notices
@@ -20,6 +22,8 @@ from surrogym_server.surrogate.codec import from_bytes
 from surrogym_server.surrogate.describe import PointPrediction, predict_points
 from surrogym_server.surrogate.model import SurrogateModel
 from surrogym_server.virtual.imagined import Imagined, imagine
+
+logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -35,9 +39,35 @@ class Said(Generic[T]):
 
 
 def load_model(storage: Storage, definitions: Definitions, surrogate: int, version: int) -> SurrogateModel:
-    """A stored model of a surrogate's id, ready to predict. Raises ``UnknownModel`` or ``UnknownSurrogate``."""
+    """A stored model of a surrogate's id, ready to predict.
+
+    Raises:
+        UnknownModel, UnknownSurrogate: as the classes say.
+        Damaged: as ``stored_model``, or this program can't read it.
+    """
     name = storage.surrogates.name_of(surrogate)
-    return from_bytes(definitions.get(name), storage.models.blob(name, version))
+    definition, data = definitions.get(name), stored_model(storage, name, version)
+    try:
+        return from_bytes(definition, data)
+    except InvalidInput as error:
+        raise Damaged(f"model {version} of {name!r} can't be read: {error}") from error
+
+
+def stored_model(storage: Storage, name: str, version: int) -> bytes:
+    """A stored model as a file.
+
+    Raises:
+        UnknownModel, UnknownSurrogate: as the classes say.
+        Damaged: it is not what was stored. It is set aside: the version before it serves, and a fit is due.
+    """
+    try:
+        return storage.models.blob(name, version)
+    except Damaged as error:
+        if storage.models.set_aside(name, version, str(error)):
+            logger.error(
+                "model %d of %s is set aside, the one before it serves, a fit is due: %s", version, name, error
+            )
+        raise
 
 
 class ModelService:
@@ -57,8 +87,8 @@ class ModelService:
         return self._storage.models.get(name, version)
 
     def export(self, name: str, version: int) -> bytes:
-        """The model as a safetensors file. Raises ``UnknownModel``."""
-        return self._storage.models.blob(name, version)
+        """The model as a safetensors file. Raises ``UnknownModel`` or ``Damaged``."""
+        return stored_model(self._storage, name, version)
 
     def add(self, name: str, data: bytes) -> ModelRecord:
         """Import a safetensors file as the newest model, judged by this surrogate's tolerances.

@@ -107,7 +107,8 @@ class Designs(ABC):
         """Names of the surrogates to fit now, oldest first.
 
         Such a surrogate has samples, no pending or leased query, and something new since its last fit
-        (a sample, a query set aside, an ask, another budget or target). It isn't paused, and nobody holds the right.
+        (a sample, a query set aside, an ask, another budget or target, a damaged model). It isn't paused, and
+        nobody holds the right.
         """
 
     @abstractmethod
@@ -249,7 +250,7 @@ class Ledger(ABC):
 
 
 class Models(ABC):
-    """Models by version: 1, 2, ... of each surrogate. ``None`` is the latest."""
+    """Models by version: 1, 2, ... of each surrogate. ``None`` is the latest that is not set aside."""
 
     @abstractmethod
     def list(self, name: str) -> list[ModelRecord]:
@@ -261,11 +262,22 @@ class Models(ABC):
 
     @abstractmethod
     def newest(self) -> dict[int, int]:
-        """The newest version of each surrogate that has a model, by the surrogate's id."""
+        """The newest version that is not set aside of each surrogate that has one, by the surrogate's id."""
 
     @abstractmethod
     def blob(self, name: str, version: int | None = None) -> bytes:
-        """The model itself, as it was given. Raises as ``get``."""
+        """The model itself, as it was given. Raises as ``get``.
+
+        Raises:
+            Damaged: it is no longer what was given.
+        """
+
+    @abstractmethod
+    def set_aside(self, name: str, version: int, damage: str) -> bool:
+        """Note that a version is damaged: the one before it is the newest then, and a fit becomes due.
+
+        Says whether that was new; a repeat changes nothing, and no version's number is used again.
+        """
 
     @abstractmethod
     def add(self, name: str, model: NewModel) -> int:

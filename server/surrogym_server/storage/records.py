@@ -22,7 +22,7 @@ Purpose = Literal["initial", "adaptive", "manual"]
 QueryStatus = Literal["pending", "leased", "answered", "set_aside"]
 QueryKind = Literal["step", "rollout"]
 Synchronous = Literal["full", "normal"]  # of a SQLite file: wait for the disk at every commit, or not always
-EventKind = Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger"]
+EventKind = Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged"]
 
 OPEN_STATUSES: tuple[QueryStatus, ...] = ("pending", "leased")
 

@@ -7,7 +7,7 @@ from typing import Any, cast
 import pytest
 
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.errors import NoModel
+from surrogym_server.errors import Damaged, NoModel
 
 A, NOBODY = 7, 8
 
@@ -18,9 +18,12 @@ class Store:
     def __init__(self) -> None:
         self.newest = {A: 1}
         self.loaded: list[tuple[int, int]] = []
+        self.damaged: set[int] = set()
 
     def load(self, surrogate: int, version: int) -> Any:
         self.loaded.append((surrogate, version))
+        if version in self.damaged:
+            raise Damaged(f"model {version}")
         return f"{surrogate} {version}"
 
 
@@ -81,3 +84,29 @@ def test_a_surrogate_that_another_server_has_deleted_is_gone(cache: ModelCache, 
     with pytest.raises(NoModel):
         cache.latest(A)
     assert cache.look() == []
+
+
+def test_where_the_newest_is_set_aside_the_one_before_it_is_the_latest(store: Store):
+    newest = iter([{A: 3}, {A: 2}, {A: 2}, {A: 1}, {A: 1}])
+    cache = ModelCache(store.load, lambda: next(newest), capacity=2)
+    store.damaged = {2, 3}
+    assert cache.latest(A) == 1
+    assert store.loaded == [(A, 3), (A, 2), (A, 1)]
+
+
+def test_a_known_latest_that_is_found_damaged_is_known_no_longer(cache: ModelCache, store: Store):
+    store.newest[A] = 2
+    assert cache.latest(A) == 2
+    for other in (10, 11):
+        cache.get(other, 1)  # so that it has to be loaded again
+    store.damaged = {2}
+    with pytest.raises(Damaged):
+        cache.get(A, 2)
+    store.newest[A] = 1
+    assert cache.latest(A) == 1
+
+
+def test_a_newest_that_is_damaged_and_not_set_aside_is_told(cache: ModelCache, store: Store):
+    store.damaged = {1}
+    with pytest.raises(Damaged, match="model 1"):
+        cache.latest(A)

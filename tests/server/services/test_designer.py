@@ -15,7 +15,7 @@ import pytest
 from support import pendulum
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.errors import Damaged, InvalidInput, NumericalFailure, Unavailable
+from surrogym_server.errors import Damaged, InvalidInput, NoModel, NumericalFailure, Unavailable
 from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import ATTEMPTS, Designer, phase_after
@@ -216,6 +216,24 @@ def test_a_surrogate_whose_row_is_broken_keeps_no_other_from_its_fit(answered: S
     with pytest.raises(Damaged, match=r"surrogates\.state"):
         fit_all(designer)
     assert answered.surrogates.get(NAME).phase == "sampling"
+
+
+def test_a_damaged_model_is_named_and_fitted_anew(
+    answered: Storage, designer, cache: ModelCache, definitions: Definitions, tmp_path: Path, caplog
+):
+    fit_all(designer)
+    surrogate = answered.surrogates.get(NAME).id
+    with closing(sqlite3.connect(tmp_path / "surrogym.db")) as file:
+        [blob] = file.execute("SELECT blob FROM models").fetchone()
+        file.execute("UPDATE models SET blob = ?", [blob[:-1] + bytes([blob[-1] ^ 1])])
+        file.execute("UPDATE queries SET status = 'answered'")  # so that nothing else keeps a fit from being due
+        file.commit()
+    restarted = ModelCache(lambda *key: load_model(answered, definitions, *key), answered.models.newest)
+    with pytest.raises(NoModel):
+        restarted.latest(surrogate)
+    assert "model 1 of pendulum is set aside" in caplog.text
+    fit_all(designer)
+    assert restarted.latest(surrogate) == 2
 
 
 def test_the_designer_wakes_by_itself(answered: Storage, designer):

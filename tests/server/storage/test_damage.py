@@ -11,13 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 import sqlalchemy as sa
+from alembic import command
+from alembic.config import Config
 
-from surrogym_server.errors import Damaged, SurrogymError
+from surrogym_server.errors import Damaged, NoModel, SurrogymError
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewDesign, NewSample
 from surrogym_server.storage.sql import open_storage
 from surrogym_server.storage.sql.checks import check_pages
 from surrogym_server.storage.sql.database import connect
+from surrogym_server.storage.sql.migrate import SCRIPTS
+from surrogym_server.storage.sql.tables import models
 
 NAME = "pendulum"
 READS: dict[str, Callable[[Storage], Any]] = {
@@ -33,6 +37,14 @@ READS: dict[str, Callable[[Storage], Any]] = {
     "occupancy": lambda storage: storage.occupancy.latest(NAME),
     "events": lambda storage: storage.events.list(NAME),
 }
+
+
+def downgrade(connection: sa.Connection, revision: str) -> None:
+    config = Config()
+    config.set_main_option("script_location", str(SCRIPTS))
+    config.set_main_option("path_separator", "os")
+    config.attributes["connection"] = connection
+    command.downgrade(config, revision)
 
 
 def execute(url: str, statement: str) -> None:
@@ -179,3 +191,62 @@ def test_the_check_of_a_large_file_is_cut_short(tmp_path: Path, caplog: pytest.L
 
 def test_nothing_is_damage_in_a_sound_database(full: Storage) -> None:
     assert list(all_read(full)) == []
+
+
+def flip(url: str, version: int) -> None:
+    """Another byte in the middle of a stored model."""
+    engine = sa.create_engine(url.replace("postgresql:", "postgresql+psycopg:"), poolclass=sa.NullPool)
+    own = models.c.version == version
+    with engine.begin() as connection:
+        blob = bytearray(connection.execute(sa.select(models.c.blob).where(own)).scalar_one())
+        blob[len(blob) // 2] ^= 1
+        connection.execute(sa.update(models).where(own).values(blob=bytes(blob)))
+
+
+def test_a_model_that_is_not_what_was_stored_is_refused(url: str, full: Storage) -> None:
+    assert full.models.blob(NAME, 1) == b"\0model"
+    flip(url, 1)
+    for version in (1, None):
+        with pytest.raises(Damaged, match="model 1 of 'pendulum'"):
+            full.models.blob(NAME, version)
+
+
+def test_a_damaged_model_is_set_aside_once_and_the_one_before_it_is_the_newest(
+    full: Storage, design: Callable[..., NewDesign], answer_all: Callable[[str], None]
+) -> None:
+    surrogate = full.surrogates.get(NAME).id
+    assert full.models.add(NAME, design().model) == 2
+    assert full.models.set_aside(NAME, 2, "a flipped bit") is True
+    assert full.models.set_aside(NAME, 2, "a flipped bit") is False
+    assert (full.models.newest(), full.models.get(NAME).version) == ({surrogate: 1}, 1)
+    assert [model.version for model in full.models.list(NAME)] == [1, 2], "its history stays"
+    told = [event.body for event in full.events.list(NAME) if event.kind == "damaged"]
+    assert told == [{"version": 2, "error": "a flipped bit"}]
+    assert full.models.add(NAME, design().model) == 3, "no number is used twice"
+
+
+def test_a_fit_is_due_when_a_model_is_set_aside(
+    storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None], design: Callable[..., NewDesign]
+) -> None:
+    name = make()
+    answer_all(name)
+    lease = storage.designs.begin(name, "me", 60)
+    assert lease is not None
+    storage.designs.commit(lease, design())
+    assert storage.designs.due() == []
+    storage.models.set_aside(name, 1, "a flipped bit")
+    assert (storage.designs.due(), storage.models.newest()) == ([name], {})
+    with pytest.raises(NoModel):
+        storage.models.get(name)
+
+
+def test_models_from_before_get_the_checksum_of_what_they_are(url: str, full: Storage) -> None:
+    full.close()
+    with closing(connect(url)) as database, database.write() as connection:
+        downgrade(connection, "0004")
+    again = open_storage(url)
+    assert again.models.blob(NAME, 1) == b"\0model"
+    flip(url, 1)
+    with pytest.raises(Damaged):
+        again.models.blob(NAME, 1)
+    again.close()

@@ -132,6 +132,7 @@ def test_every_operation_refuses_an_unknown_surrogate(storage: Storage, by_hand:
         lambda: storage.models.list("no"),
         lambda: storage.models.get("no"),
         lambda: storage.models.blob("no"),
+        lambda: storage.models.set_aside("no", 1, "d"),
         lambda: storage.occupancy.put("no", "c", none),
         lambda: storage.occupancy.latest("no"),
         lambda: storage.events.list("no"),

@@ -13,7 +13,7 @@ from surrogym_server.storage.sql.tables import metadata
 
 logger = logging.getLogger(__name__)
 
-CHECK_SECONDS = 10.0  # 25 GB on a fast disk
+CHECK_SECONDS = 10.0  # some 25 GB that lie in memory
 
 
 def check_pages(connection: Connection, seconds: float = CHECK_SECONDS) -> None:

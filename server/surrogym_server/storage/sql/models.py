@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import Any
 
 import sqlalchemy as sa
@@ -10,14 +11,16 @@ from sqlalchemy.engine import Connection, Row
 from surrogym_server.errors import NoModel, UnknownModel
 from surrogym_server.storage import port
 from surrogym_server.storage.records import ModelRecord, NewModel
+from surrogym_server.storage.sql.damage import damaged
 from surrogym_server.storage.sql.database import Database
-from surrogym_server.storage.sql.rows import append_event, find, hold
+from surrogym_server.storage.sql.rows import append_event, find, hold, touch
 from surrogym_server.storage.sql.tables import models
 
 COLUMNS = [
     getattr(models.c, name)
     for name in ("version", "created_at", "samples", "data_hash", "fidelity", "description", "fit_seconds")
 ]
+INTACT = models.c.damage.is_(None)
 
 
 class SqlModels(port.Models):
@@ -36,16 +39,34 @@ class SqlModels(port.Models):
 
     def newest(self) -> dict[int, int]:
         with self._database.read() as connection:
-            wanted = sa.select(models.c.surrogate_id, sa.func.max(models.c.version)).group_by(models.c.surrogate_id)
+            newest = sa.select(models.c.surrogate_id, sa.func.max(models.c.version))
+            wanted = newest.where(INTACT).group_by(models.c.surrogate_id)
             return {int(surrogate): int(version) for surrogate, version in connection.execute(wanted)}
 
     def blob(self, name: str, version: int | None = None) -> bytes:
         with self._database.read() as connection:
-            return bytes(_one(connection, name, version, models.c.blob).blob)
+            row = _one(connection, name, version, models.c.version, models.c.blob, models.c.checksum)
+        if _checksum(row.blob) != row.checksum:
+            raise damaged(f"model {row.version} of {name!r} is not what was stored: its checksum is another")
+        return bytes(row.blob)
+
+    def set_aside(self, name: str, version: int, damage: str) -> bool:
+        with self._database.write() as connection:
+            held = hold(connection, name)
+            own = (models.c.surrogate_id == held.id) & (models.c.version == version) & INTACT
+            if not connection.execute(sa.update(models).where(own).values(damage=damage)).rowcount:
+                return False
+            append_event(connection, held, "damaged", version=version, error=damage)
+            touch(connection, held)
+            return True
 
     def add(self, name: str, model: NewModel) -> int:
         with self._database.write() as connection:
             return insert_model(connection, hold(connection, name), model)
+
+
+def _checksum(blob: bytes) -> str:
+    return hashlib.sha256(blob).hexdigest()
 
 
 def insert_model(connection: Connection, held: Row[Any], model: NewModel) -> int:
@@ -63,6 +84,7 @@ def insert_model(connection: Connection, held: Row[Any], model: NewModel) -> int
             description=model.description,
             fit_seconds=model.fit_seconds,
             blob=model.blob,
+            checksum=_checksum(model.blob),
         )
     )
     told = {"samples": model.samples, "fit_seconds": model.fit_seconds, "fidelity": model.fidelity}
@@ -72,8 +94,7 @@ def insert_model(connection: Connection, held: Row[Any], model: NewModel) -> int
 
 def _one(connection: Connection, name: str, version: int | None, *columns: sa.ColumnElement[Any]) -> Row[Any]:
     wanted = sa.select(*columns).where(models.c.surrogate_id == find(connection, name))
-    if version is not None:
-        wanted = wanted.where(models.c.version == version)
+    wanted = wanted.where(INTACT if version is None else models.c.version == version)
     row = connection.execute(wanted.order_by(models.c.version.desc()).limit(1)).one_or_none()
     if row is not None:
         return row

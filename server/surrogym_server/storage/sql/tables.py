@@ -223,6 +223,8 @@ models = sa.Table(
     sa.Column("description", Json("models.description"), nullable=False),
     sa.Column("fit_seconds", sa.Double, nullable=False),
     sa.Column("blob", sa.LargeBinary, nullable=False),
+    sa.Column("checksum", sa.Text, nullable=False, server_default=""),  # SHA-256 of the blob
+    sa.Column("damage", sa.Text),  # what is wrong with it, once it was found
 )
 
 occupancies = sa.Table(
