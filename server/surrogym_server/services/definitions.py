@@ -24,17 +24,17 @@ class Definitions:
     def __init__(self, storage: Storage, define: Define) -> None:
         self._storage = storage
         self._define = define
-        self._made: dict[str, tuple[float, EnvironmentDefinition]] = {}
+        self._made: dict[str, tuple[int, EnvironmentDefinition]] = {}
         self._lock = Lock()
 
     def get(self, name: str) -> EnvironmentDefinition:
         """Raises ``UnknownSurrogate``."""
         record = self._storage.surrogates.get(name)
         with self._lock:
-            created, definition = self._made.get(name, (None, None))
-            if definition is None or created != record.created_at:
+            id, definition = self._made.get(name, (None, None))
+            if definition is None or id != record.id:
                 definition = self._define(record.spec)
-                self._made[name] = (record.created_at, definition)
+                self._made[name] = (record.id, definition)
             return definition
 
 

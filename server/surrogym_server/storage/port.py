@@ -3,7 +3,8 @@
 For all of it:
 - an operation is atomic, and what it changed is durable when it returns;
 - any thread may call, and on PostgreSQL any number of servers;
-- time is the database's clock, and a lease ends by that clock alone, whoever died;
+- time is the database's clock, and a lease ends by that clock alone, whoever died; where the clock was set back, no
+  lease lasts longer for it than it was given out for;
 - an operation on a surrogate that is not there raises ``UnknownSurrogate``;
 - an operation that raises has changed nothing;
 - a repeat with the same idempotency ``key`` and the same arguments changes nothing and returns what the first
@@ -108,7 +109,7 @@ class Designs(ABC):
 
         Such a surrogate has samples, no pending or leased query, and something new since its last fit
         (a sample, a query set aside, an ask, another budget or target, a damaged model). It isn't paused, and
-        nobody holds the right.
+        nobody holds the right; one with more time left than it was given, as the clock was set back, is nobody's.
         """
 
     @abstractmethod
@@ -204,7 +205,10 @@ class Queries(ABC):
 
     @abstractmethod
     def sweep_expired(self) -> int:
-        """End the leases whose time has come, of all surrogates; returns how many."""
+        """End the leases whose time has come, of all surrogates; returns how many.
+
+        One that has more time left than it was given has that time from now: the clock was set back.
+        """
 
 
 class Samples(ABC):

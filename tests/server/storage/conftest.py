@@ -9,15 +9,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sqlalchemy as sa
 
 from support.postgresql import Postgresql, running_postgresql
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LeasedQuery, NewDesign, NewModel, NewSample, NewSurrogate
 from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql.tables import metadata
 
 SPEC = {"environment": "Pendulum-v1", "coordinates": [{"name": "angle"}, {"name": "speed"}]}
 SECONDS = 60.0  # a lease no test outlives
 NAME = "pendulum"
+TIMES = ("created_at", "begun", "expires", "fit_expires")
 
 
 @pytest.fixture(scope="session")
@@ -134,3 +137,18 @@ def until() -> Callable[[Callable[[], bool]], None]:
             time.sleep(0.01)
 
     return wait
+
+
+@pytest.fixture
+def set_clock_back(url: str) -> Callable[[float], None]:
+    """Set the database's clock back, as seen from what is stored: every stored time lies so much later."""
+
+    def change(seconds: float) -> None:
+        engine = sa.create_engine(url.replace("postgresql:", "postgresql+psycopg:"), poolclass=sa.NullPool)
+        with engine.begin() as connection:
+            for table in metadata.sorted_tables:
+                times = {name: table.c[name] + seconds for name in TIMES if name in table.c}
+                if times:
+                    connection.execute(sa.update(table).values(times))
+
+    return change

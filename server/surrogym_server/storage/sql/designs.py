@@ -57,7 +57,7 @@ class SqlDesigns(port.Designs):
             if row is None:
                 return None
             lease = FitLease(name, secrets.token_urlsafe(16), *row, expires=held.now + seconds)
-            _update(connection, held, fit_token=lease.token, fit_owner=owner, fit_expires=lease.expires)
+            _update(connection, held, fit_token=lease.token, fit_owner=owner, **_lasting(lease.expires, seconds))
             stored.update_phase(connection, held, "fitting", None)
             return lease
 
@@ -65,7 +65,7 @@ class SqlDesigns(port.Designs):
         with self._database.write() as connection:
             held = _hold_right(connection, lease)
             renewed = replace(lease, expires=held.now + seconds)
-            _update(connection, held, fit_expires=renewed.expires)
+            _update(connection, held, **_lasting(renewed.expires, seconds))
             return renewed
 
     def commit(self, lease: FitLease, design: NewDesign) -> int:
@@ -93,7 +93,9 @@ def _is_due(connection: Connection) -> sa.ColumnElement[bool]:
     """The law of ``Designs.due`` as a condition on a row of surrogates."""
     own_queries = sa.select(queries.c.id).where(queries.c.surrogate_id == surrogates.c.id)
     own_samples = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogates.c.id)
-    free = surrogates.c.fit_expires.is_(None) | (surrogates.c.fit_expires <= clock(connection))
+    now, expires = clock(connection), surrogates.c.fit_expires
+    set_back = expires > now + surrogates.c.fit_seconds  # the clock: nobody knows how old the right is
+    free = expires.is_(None) | (expires <= now) | set_back
     return sa.and_(
         surrogates.c.paused.is_(False),
         surrogates.c.revision > surrogates.c.fitted_revision,
@@ -101,6 +103,10 @@ def _is_due(connection: Connection) -> sa.ColumnElement[bool]:
         sa.exists(own_samples),
         ~sa.exists(own_queries.where(queries.c.status.in_(OPEN_STATUSES))),
     )
+
+
+def _lasting(expires: float, seconds: float) -> dict[str, float]:
+    return {"fit_expires": expires, "fit_seconds": seconds}
 
 
 def _hold_right(connection: Connection, lease: FitLease) -> Row[Any]:

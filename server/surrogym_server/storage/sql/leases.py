@@ -40,13 +40,13 @@ def begin(
         )
         for row in rows
     ]
-    connection.execute(sa.insert(leases), [_new(held, query, sampler) for query in leased])
+    connection.execute(sa.insert(leases), [_new(held, query, sampler, seconds) for query in leased])
     update = sa.update(queries).where(queries.c.id.in_([query.id for query in leased]))
     connection.execute(update.values(status="leased", attempts=queries.c.attempts + 1, sampler=sampler))
     return leased
 
 
-def _new(held: Row[Any], query: LeasedQuery, sampler: str) -> dict[str, Any]:
+def _new(held: Row[Any], query: LeasedQuery, sampler: str, seconds: float) -> dict[str, Any]:
     return {
         "surrogate_id": held.id,
         "query_id": query.id,
@@ -55,6 +55,7 @@ def _new(held: Row[Any], query: LeasedQuery, sampler: str) -> dict[str, Any]:
         "attempt": query.attempt,
         "begun": held.now,
         "expires": query.expires,
+        "seconds": seconds,
         "outcome": "open",
     }
 
@@ -122,6 +123,17 @@ def sweep(connection: Connection, held: Row[Any]) -> int:
     if ids:
         give_back(connection, held, ids, EXPIRED)
     return len(ids)
+
+
+def is_too_long(connection: Connection) -> sa.ColumnElement[bool]:
+    """Whether a lease has more time left than it was given, as the clock was set back since."""
+    return (leases.c.outcome == "open") & (leases.c.expires > clock(connection) + leases.c.seconds)
+
+
+def shorten(connection: Connection) -> None:
+    """Give the leases that are too long the time that they were given, from now: a sampler that lives keeps its own."""
+    too_long = sa.update(leases).where(is_too_long(connection))
+    connection.execute(too_long.values(expires=clock(connection) + leases.c.seconds))
 
 
 def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], error: str) -> None:

@@ -81,7 +81,7 @@ class SqlQueries(port.Queries):
             renewed = connection.execute(
                 sa.update(leases)
                 .where(leases.c.id == lease.id, live)
-                .values(expires=clock(connection) + seconds)
+                .values(expires=clock(connection) + seconds, seconds=seconds)
                 .returning(leases.c.expires)
             ).scalar()
             if renewed is None:
@@ -127,6 +127,10 @@ class SqlQueries(port.Queries):
             owners = sa.select(leases.c.surrogate_id).where(ended).distinct()
             wanted = sa.select(surrogates.c.name).where(surrogates.c.id.in_(owners))
             names = list(connection.execute(wanted).scalars())
+            set_back = connection.execute(sa.select(sa.exists().where(leasing.is_too_long(connection)))).scalar()
+        if set_back:
+            with self._database.write() as connection:
+                leasing.shorten(connection)
         return sum(self._sweep(name) for name in names)
 
     def _sweep(self, name: str) -> int:

@@ -14,7 +14,7 @@ from surrogym_server.storage.sql.database import Database, clock, conflict_inser
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, touch, unknown_surrogate
 from surrogym_server.storage.sql.tables import leases, queries, samples, surrogates
 
-NO_RIGHT = {"fit_token": None, "fit_owner": None, "fit_expires": None}
+NO_RIGHT = {"fit_token": None, "fit_owner": None, "fit_expires": None, "fit_seconds": None}
 COLUMNS = [
     getattr(surrogates.c, name)
     for name in (

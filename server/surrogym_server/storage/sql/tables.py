@@ -115,6 +115,7 @@ surrogates = sa.Table(
     sa.Column("fit_token", sa.Text),
     sa.Column("fit_owner", sa.Text),
     sa.Column("fit_expires", sa.Double),
+    sa.Column("fit_seconds", sa.Double),  # for how long the right was given out last
     sa.Column("created_at", sa.Double, nullable=False),
     sqlite_autoincrement=True,
 )
@@ -150,6 +151,7 @@ leases = sa.Table(
     sa.Column("attempt", sa.Integer, nullable=False),
     sa.Column("begun", sa.Double, nullable=False),
     sa.Column("expires", sa.Double, nullable=False),
+    sa.Column("seconds", sa.Double, nullable=False, server_default="0"),  # for how long it was given out last
     sa.Column("outcome", sa.Text, nullable=False),  # open, answered, failed, unbegun, expired
     sa.Index(None, "surrogate_id", "outcome", "expires"),
     sa.Index(  # a query has one open lease at most

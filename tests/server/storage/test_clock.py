@@ -1,0 +1,125 @@
+"""A clock that is set back makes no lease last longer, and one that is set forward loses no answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import sqlalchemy as sa
+
+from surrogym_server.errors import LeaseExpired
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import NewDesign, NewSample
+from surrogym_server.storage.sql.tables import metadata
+
+DAY, LONG, SHORT = 86_400.0, 60.0, 0.05
+Until = Callable[[Callable[[], bool]], None]
+SetBack = Callable[[float], None]
+
+
+def seconds_left(storage: Storage, name: str, query: int) -> float:
+    left = storage.queries.get(name, query).lease_seconds_left
+    assert left is not None
+    return left
+
+
+def test_every_column_of_time_is_set_back_by_these_tests() -> None:
+    doubles = {column.name for table in metadata.tables.values() for column in table.c if is_double(column)}
+    others = {"target", "reward", "seconds", "fit_seconds"}
+    assert doubles - others == {"created_at", "begun", "expires", "fit_expires"}
+
+
+def is_double(column: sa.Column[object]) -> bool:
+    return isinstance(column.type, sa.Double)
+
+
+def test_the_lease_of_a_dead_sampler_ends_though_the_clock_was_set_back(
+    storage: Storage, make: Callable[..., str], set_clock_back: SetBack, until: Until
+) -> None:
+    name = make(queries=1)
+    [dead] = storage.queries.claim(name, "dead", 1, SHORT)
+    set_clock_back(DAY)
+    until(lambda: storage.queries.sweep_expired() == 1)
+    [again] = storage.queries.claim(name, "next", 1, LONG)
+    assert again.id == dead.id
+
+
+def test_a_living_sampler_keeps_its_lease_for_as_long_as_it_was_given(
+    storage: Storage,
+    make: Callable[..., str],
+    answer: Callable[..., NewSample],
+    set_clock_back: SetBack,
+) -> None:
+    name = make(queries=2)
+    kept, renewed = storage.queries.claim(name, "alive", 2, LONG)
+    storage.queries.renew(name, renewed.id, renewed.token, 2 * LONG)
+    set_clock_back(DAY)
+    assert seconds_left(storage, name, kept.id) > LONG
+    assert storage.queries.sweep_expired() == 0
+    assert LONG / 2 < seconds_left(storage, name, kept.id) <= LONG
+    assert LONG < seconds_left(storage, name, renewed.id) <= 2 * LONG, "what the renewal gave it"
+    storage.queries.renew(name, kept.id, kept.token, LONG)
+    added = storage.samples.add(name, "alive", [answer(kept), answer(renewed)])
+    assert [sample.late for sample in storage.samples.page(name, 0, 10)] == [False, False]
+    assert added.duplicates == 0
+
+
+def test_leases_that_are_as_long_as_they_were_given_out_are_left_alone(
+    storage: Storage, make: Callable[..., str]
+) -> None:
+    name = make(queries=1)
+    [leased] = storage.queries.claim(name, "alive", 1, LONG)
+    for _ in range(5):
+        storage.queries.sweep_expired()
+    assert storage.queries.renew(name, leased.id, leased.token, LONG) >= leased.expires
+
+
+def test_the_right_to_fit_of_a_dead_server_passes_on_though_the_clock_was_set_back(
+    storage: Storage,
+    make: Callable[..., str],
+    answer_all: Callable[[str], None],
+    design: Callable[..., NewDesign],
+    set_clock_back: SetBack,
+) -> None:
+    name = make()
+    answer_all(name)
+    dead = storage.designs.begin(name, "dead", LONG)
+    assert dead is not None
+    assert storage.designs.due() == []
+    set_clock_back(DAY)
+    assert storage.designs.due() == [name]
+    heir = storage.designs.begin(name, "heir", LONG)
+    assert heir is not None
+    with pytest.raises(LeaseExpired):
+        storage.designs.commit(dead, design())
+    assert storage.designs.due() == []
+    assert storage.designs.commit(heir, design()) == 1
+
+
+def test_a_fit_that_goes_on_while_the_clock_is_set_back_counts(
+    storage: Storage,
+    make: Callable[..., str],
+    answer_all: Callable[[str], None],
+    design: Callable[..., NewDesign],
+    set_clock_back: SetBack,
+) -> None:
+    name = make()
+    answer_all(name)
+    lease = storage.designs.begin(name, "alive", LONG)
+    assert lease is not None
+    set_clock_back(DAY)
+    lease = storage.designs.renew(lease, LONG)
+    assert storage.designs.due() == [], "its heartbeat counts it anew"
+    assert storage.designs.commit(lease, design()) == 1
+
+
+def test_a_clock_that_is_set_forward_loses_no_answer(
+    storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample], set_clock_back: SetBack
+) -> None:
+    name = make(queries=1)
+    [leased] = storage.queries.claim(name, "alive", 1, LONG)
+    set_clock_back(-DAY)
+    assert storage.queries.sweep_expired() == 1
+    storage.samples.add(name, "alive", [answer(leased)])
+    assert [sample.late for sample in storage.samples.page(name, 0, 10)] == [True]
+    assert storage.queries.counts(name).answered == 1
