@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from dataclasses import replace
+from typing import Any
 
 from safetensors import SafetensorError
 from safetensors.torch import load, save
@@ -24,6 +26,7 @@ from surrogym_server.surrogate.endings import TERMINATION
 from surrogym_server.surrogate.model import OutputModel, SurrogateModel
 
 FORMAT = 3
+CHECKSUM = "checksum"
 JUMP = "jump"  # before the names of its arrays
 MALFORMED = (SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError)
 READABLE = (1, 2, 3)  # 1: a reward's timing was the definition's alone; 2: no drift
@@ -46,19 +49,20 @@ def to_bytes(model: SurrogateModel) -> bytes:
         "jumps": [[jump.size, region_header(jump.region)] for jump in model.jumps],
         "termination": None if model.ending is None else region_header(model.ending),
     }
-    return save(tensors, {"surrogym": json.dumps(header)})
+    return save(tensors, {"surrogym": json.dumps(header | {CHECKSUM: _checksum(header, tensors)})})
 
 
 def from_bytes(definition: EnvironmentDefinition, data: bytes) -> SurrogateModel:
     """The model that ``to_bytes`` stored.
 
     Raises:
-        InvalidInput: not such a file, or one of an environment with other outputs.
+        InvalidInput: not such a file, one that is damaged, or one of an environment with other outputs.
     """
     try:
         length = int.from_bytes(data[:8], "little")
         header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["surrogym"])
         tensors = load(data)
+        _require_whole(header, tensors)
         stored, terminal_reward = header["format"], float(header["terminal_reward"])
         outputs = tuple(read_output(definition, entry, tensors, str(i)) for i, entry in enumerate(header["outputs"]))
         if stored == 1 and definition.reward_timing == "after":
@@ -92,6 +96,22 @@ def from_bytes(definition: EnvironmentDefinition, data: bytes) -> SurrogateModel
     if not all(math.isfinite(jump.size) for jump in jumps):
         raise InvalidInput(f"expected jumps of finite sizes, got {[jump.size for jump in jumps][:4]}")
     return SurrogateModel(definition, outputs[:-1], outputs[-1], terminal_reward, samples, digest, ending, jumps)
+
+
+def _checksum(header: dict[str, Any], tensors: dict[str, Tensor]) -> str:
+    """SHA-256 of all that the file says, however its arrays are laid out in it."""
+    total = hashlib.sha256(json.dumps(header).encode())
+    for name in sorted(tensors):
+        total.update(f"{name} {tensors[name].dtype} {list(tensors[name].shape)}".encode())
+        total.update(tensors[name].contiguous().numpy().tobytes())
+    return total.hexdigest()
+
+
+def _require_whole(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+    """Raise ``InvalidInput`` where something is not as it was written; files from before have no checksum."""
+    written = header.pop(CHECKSUM, None)
+    if written is not None and written != _checksum(header, tensors):
+        raise InvalidInput("expected a model as it was written, got one with another checksum: the file is damaged")
 
 
 def _read_after(reward: OutputModel) -> OutputModel:

@@ -109,6 +109,7 @@ def test_thresholds_that_cannot_be_are_refused(model, rules):
     data = to_bytes(model)
     length = int.from_bytes(data[:8], "little")
     header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["surrogym"])
+    del header["checksum"]  # what it refuses first
     header["termination"]["forms"] = [[1.0, {"rules": rules, "complement": False}]]
     with pytest.raises(InvalidInput):
         from_bytes(model.definition, save(load(data), {"surrogym": json.dumps(header)}))

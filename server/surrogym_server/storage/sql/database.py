@@ -158,7 +158,7 @@ def _translated() -> Iterator[None]:
     except UNSTORABLE as error:
         raise InvalidInput(f"expected a value the database can store: {_reason(error)}") from error
     except UnicodeDecodeError as error:  # SQLite's message names something broken, and the driver can't read it
-        raise damaged(error) from error
+        raise damaged(error.object.decode(errors="replace")) from error
     except sa.exc.TimeoutError as error:
         raise Unavailable(f"the database can't be used now: {error}") from error
     except sa.exc.DBAPIError as error:
