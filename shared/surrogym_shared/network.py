@@ -14,11 +14,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_shared.archives import read_arrays, read_entries
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
 
 Array = NDArray[np.float64]
 HEAD = "surrogym-network.json"
 ARRAYS = "network.npz"
+MAX_BYTES = 16 * 1024 * 1024  # of a file's contents
 
 
 @dataclass(frozen=True)
@@ -87,14 +89,15 @@ class Network:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read what ``save`` wrote. Raises ValueError where it is something else."""
+        """Read what ``save`` wrote. Raises ValueError where it is something else, or has more than ``MAX_BYTES``."""
         try:
-            with zipfile.ZipFile(path) as file:
-                head = json.loads(file.read(HEAD))
-                with file.open(ARRAYS) as stored, np.load(stored, allow_pickle=False) as arrays:
-                    return cls(**{name: arrays[name] for name in arrays.files}, counts=tuple(head["counts"]))
-        except (zipfile.BadZipFile, KeyError, TypeError, OSError, ValueError) as error:
+            entries = read_entries(path, MAX_BYTES)
+            counts = tuple(int(count) for count in json.loads(entries[HEAD])["counts"])
+            network = cls(**read_arrays(entries[ARRAYS], MAX_BYTES), counts=counts)
+            network(np.zeros((1, len(network.mean))))  # arrays that do not fit together are refused here
+        except (LookupError, TypeError, OSError, ValueError, RecursionError) as error:
             raise ValueError(f"{path} is no network of arrays: {error}") from error
+        return network
 
     @staticmethod
     def is_at(path: Path) -> bool:

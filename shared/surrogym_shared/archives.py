@@ -1,0 +1,86 @@
+"""Zips and arrays made by somebody else: their sizes are read from headers and bounded before anything is inflated."""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+INFLATED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what numpy and torch write; others inflate without a bound
+ARRAY = ".npy"
+
+
+def read_entries(zipped: Path | bytes, limit: int) -> dict[str, bytes]:
+    """Contents of a zip by name.
+
+    Args:
+        zipped: a file, or what is in it.
+        limit: bytes that all entries together may have.
+
+    Raises:
+        OSError: the file can't be read.
+        ValueError: no zip, too large, or not of the sizes that its headers name.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(zipped) if isinstance(zipped, bytes) else zipped) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+            if size > limit:
+                raise ValueError(f"expected at most {limit} bytes inside, got {size}")
+            return {entry.filename: _content(archive, entry) for entry in archive.infolist()}
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, zlib.error) as error:
+        raise ValueError(f"expected a zip, got something else: {error}") from error
+
+
+def stored(entries: Mapping[str, bytes]) -> bytes:
+    """A zip of these contents, not compressed."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in entries.items():
+            archive.writestr(name, content)
+    return file.getvalue()
+
+
+def read_arrays(npz: bytes, limit: int) -> dict[str, NDArray[Any]]:
+    """The arrays of an npz file by name. Nothing is unpickled.
+
+    Args:
+        npz: what is in the file.
+        limit: bytes that all arrays together may have.
+
+    Raises:
+        ValueError: as ``read_entries``, or an array is not of the size that its header names.
+    """
+    entries = read_entries(npz, limit)
+    return {name.removesuffix(ARRAY): _array(name, content) for name, content in entries.items()}
+
+
+def _content(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
+    """An entry, inflated to the size that its header names and no further."""
+    if entry.compress_type not in INFLATED:
+        raise ValueError(f"expected {entry.filename!r} stored or deflated, got compression {entry.compress_type}")
+    with archive.open(entry) as file:
+        content = file.read(entry.file_size)
+    if len(content) != entry.file_size:
+        raise ValueError(f"expected {entry.file_size} bytes of {entry.filename!r}, got {len(content)}")
+    return content
+
+
+def _array(name: str, content: bytes) -> NDArray[Any]:
+    """An array whose header names as many bytes as follow it."""
+    file = io.BytesIO(content)
+    version = np.lib.format.read_magic(file)
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read_header(file)
+    named, came = math.prod(shape) * dtype.itemsize, len(content) - file.tell()
+    if dtype.hasobject or min(shape, default=0) < 0 or named != came:
+        raise ValueError(f"expected an array {name!r} of numbers in {named} bytes, got {dtype} in {came} bytes")
+    file.seek(0)
+    array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
+    return array

@@ -1,0 +1,154 @@
+"""A zip or npz that would grow beyond its bound, or lies about its sizes, costs no memory."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import struct
+import tracemalloc
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from surrogym_shared.archives import read_arrays, read_entries, stored
+from surrogym_shared.network import ARRAYS, HEAD, MAX_BYTES, Network
+
+MEBIBYTE = 1024 * 1024
+BOMB = 64 * MEBIBYTE
+
+
+@contextmanager
+def little_memory(mebibytes: float = 4) -> Iterator[None]:
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < mebibytes * MEBIBYTE
+    finally:
+        tracemalloc.stop()
+
+
+def deflated(name: str, content: bytes) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(name, content)
+    return file.getvalue()
+
+
+def lying(name: str, content: bytes, size: int) -> bytes:
+    """A deflated zip whose headers name another size, with the checksum of what is read up to there."""
+    honest, checksum = bytearray(deflated(name, content)), zlib.crc32(content[:size])
+    central = honest.index(b"PK\x01\x02")
+    struct.pack_into("<I", honest, 14, checksum)
+    struct.pack_into("<I", honest, 22, size)
+    struct.pack_into("<I", honest, central + 16, checksum)
+    struct.pack_into("<I", honest, central + 24, size)
+    return bytes(honest)
+
+
+def array_file(header: str, body: bytes) -> bytes:
+    padded = header.encode() + b" " * (-(len(header) + 11) % 64) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(padded)) + padded + body
+
+
+def test_what_is_stored_is_read(tmp_path: Path):
+    entries = {"a": b"1", "folder/b": b"", "c": bytes(1_000)}
+    (tmp_path / "a.zip").write_bytes(stored(entries))
+    assert read_entries(tmp_path / "a.zip", 1_001) == read_entries(stored(entries), 1_001) == entries
+
+
+@pytest.mark.parametrize("write", [np.savez, np.savez_compressed])
+def test_the_arrays_of_an_npz_are_read(write):
+    arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.zeros(0), "c": np.array(3), "d": np.asfortranarray(np.eye(3))}
+    file = io.BytesIO()
+    write(file, **arrays)
+    read = read_arrays(file.getvalue(), MEBIBYTE)
+    assert list(read) == list(arrays)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(read[name], array)
+        assert read[name].dtype == array.dtype
+
+
+def test_a_zip_that_would_inflate_beyond_its_bound_is_refused_unread():
+    bomb = deflated("a", bytes(BOMB))
+    with little_memory(), pytest.raises(ValueError, match=f"expected at most {MEBIBYTE} bytes inside, got {BOMB}"):
+        read_entries(bomb, MEBIBYTE)
+
+
+@pytest.mark.parametrize("size", [10, 2 * MEBIBYTE])
+def test_a_header_that_names_too_small_a_size_inflates_nothing_more(size: int):
+    bomb = lying("a", bytes(BOMB), size)
+    with little_memory(8):
+        assert len(read_entries(bomb, 2 * MEBIBYTE)["a"]) == size
+
+
+def test_a_header_that_names_too_large_a_size_is_refused():
+    with pytest.raises(ValueError, match="expected 2000 bytes of 'a', got 1000"):
+        read_entries(lying("a", bytes(1_000), 2_000), MEBIBYTE)
+
+
+@pytest.mark.parametrize("kind", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_compression_that_can_not_be_bounded_is_refused(kind: int):
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", kind) as archive:
+        archive.writestr("a", b"content")
+    with pytest.raises(ValueError, match="expected 'a' stored or deflated, got compression"):
+        read_entries(file.getvalue(), MEBIBYTE)
+
+
+@pytest.mark.parametrize("content", [b"", b"no zip", deflated("a", bytes(100))[:-30]], ids=["empty", "text", "cut"])
+def test_what_is_no_zip_is_refused(content: bytes):
+    with pytest.raises(ValueError, match="expected a zip, got something else"):
+        read_entries(content, MEBIBYTE)
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype"), [("(1000000000000,)", "<f8"), ("(-1, -1)", "<f8"), ("(1,)", "|O"), ("(1,)", "<f4")]
+)
+def test_an_array_of_another_size_than_its_header_names_is_refused(shape: str, dtype: str):
+    content = array_file(f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}", bytes(8))
+    with little_memory(), pytest.raises(ValueError, match="expected an array"):
+        read_arrays(stored({"a.npy": content}), MEBIBYTE)
+
+
+def test_pickled_objects_in_an_npz_stay_pickled():
+    file = io.BytesIO()
+    np.savez(file, a=np.array([{"code": 1}], dtype=object))
+    with pytest.raises(ValueError, match=r"expected an array 'a\.npy' of numbers"):
+        read_arrays(file.getvalue(), MEBIBYTE)
+
+
+def network_file(path: Path, npz: bytes) -> Path:
+    path.write_bytes(stored({HEAD: b'{"version": 1, "counts": []}', ARRAYS: npz}))
+    return path
+
+
+def test_a_network_whose_arrays_would_fill_the_memory_is_refused(tmp_path: Path):
+    file = io.BytesIO()
+    np.savez_compressed(file, hidden=np.zeros(BOMB // 8))
+    path = network_file(tmp_path / "policy.zip", file.getvalue())
+    assert path.stat().st_size < MEBIBYTE
+    with little_memory(), pytest.raises(ValueError, match=f"expected at most {MAX_BYTES} bytes inside, got"):
+        Network.load(path)
+
+
+@pytest.mark.parametrize("units", [3, 4])
+def test_a_network_whose_arrays_do_not_fit_together_is_refused(tmp_path: Path, units: int):
+    file = io.BytesIO()
+    parts = {"mean": 2, "deviation": 2, "hidden": (2, 3), "hidden_bias": 3, "output": (units, 1), "output_bias": 1}
+    np.savez(file, **{name: np.ones(shape) for name, shape in parts.items()}, low=[-1.0], high=[1.0])
+    path = network_file(tmp_path / "policy.zip", file.getvalue())
+    if units == 3:
+        assert Network.load(path)(np.zeros((5, 2))).shape == (5, 1)
+        return
+    with pytest.raises(ValueError, match="no network of arrays"):
+        Network.load(path)
+
+
+def test_a_pickle_in_the_place_of_a_network_is_refused(tmp_path: Path):
+    with pytest.raises(ValueError, match="no network of arrays"):
+        Network.load(network_file(tmp_path / "policy.zip", pickle.dumps([1])))
