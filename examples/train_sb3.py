@@ -2,7 +2,7 @@
 
 python train_sb3.py pendulum --steps 100000
 
-Progress goes to TensorBoard under runs/sb3; `surrogym evaluate sb3.zip --env Pendulum-v1` judges the policy.
+Progress goes to TensorBoard under runs/sb3; `surrogym evaluate sb3.zip --env Pendulum-v1 --trust-policy` judges it.
 """
 
 import argparse

@@ -9,13 +9,13 @@ from typing import Any
 
 from surrogym_client.api import Api
 from surrogym_client.evaluate import Predict
+from surrogym_client.policy_file import load_learner
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.train import (
     TrainingInterrupted,
     TrainProgress,
     TrainResult,
     TrainSettings,
-    algorithm_by_name,
     planned_steps,
     train,
 )
@@ -79,7 +79,9 @@ def train_and_improve(
     prolong = prolongs(settings, port.spec())
 
     def learn(steps: int, whole: int, settings: TrainSettings) -> None:
-        now = replace(settings, total_steps=steps, start_from=out if rounds else settings.start_from)
+        now = replace(settings, total_steps=steps)
+        if rounds:
+            now = replace(now, start_from=out, trust_policy=False)
         rounds.append(
             train(port, out, now, _shifted(progress, _steps(rounds) + visited, whole, known[-1] if known else None))
         )
@@ -169,7 +171,7 @@ def explorer(policy: Path, algorithm: str) -> Predict:
     """The policy as it explores while it learns; a network of arrays has one action for each observation."""
     if Network.is_at(policy):
         return Network.load(policy)
-    learner = algorithm_by_name(algorithm).load(policy, device="cpu")
+    learner = load_learner(policy, algorithm)
     if learner.use_sde:
         noisy: Any = learner.policy
         noisy.reset_noise(VISIT_LANES)  # each lane explores its own way

@@ -21,6 +21,13 @@ HIDDEN = 32
 CRITIC = (64, 64)
 WIDER = {"pi": [64, 64], "vf": list(CRITIC)}  # in place of the paper's, which lies 20 below it on Pendulum
 EXPLORATION = 0.5  # first deviation of a continuous action, as a share of half its range
+LEARNING_RATE = 3e-3
+LAST_RATE = 0.02  # share of the learning rate that is left at the end
+
+
+def decaying(remaining: float) -> float:
+    """Learning rate of PPO, by the share of the training that remains."""
+    return LEARNING_RATE * max(remaining, LAST_RATE)
 
 
 class Standardise(BaseFeaturesExtractor):

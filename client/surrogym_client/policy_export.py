@@ -90,7 +90,7 @@ class ArrayNetwork(nn.Module):
         return chosen[0] if len(chosen) == 1 else torch.stack(chosen, -1)
 
 
-def export_policy(policy: Path, out: Path, algorithm: str) -> float:
+def export_policy(policy: Path, out: Path, algorithm: str, *, trust: bool = False) -> float:
     """Write a policy in the form that the ending of ``out`` says, ``.onnx`` or ``.pt2``, and check it.
 
     The file is read back and asked for the actions of random observations; it is kept only if they are those of the
@@ -100,10 +100,11 @@ def export_policy(policy: Path, out: Path, algorithm: str) -> float:
         policy: what ``surrogym train``, or Stable-Baselines3, wrote.
         out: the file.
         algorithm: name of the Stable-Baselines3 class; a network of arrays needs none.
+        trust: unpickle the policy's objects, which runs any code that is in them.
 
     Raises:
         NotExportable: another ending, or actions that differ.
-        UnusablePolicy: the file is no policy of the algorithm.
+        UnusablePolicy: the file is no policy of the algorithm, or it needs ``trust``.
         ModuleNotFoundError: ONNX needs the extra ``export``.
     """
     forms: dict[str, tuple[Form, Callable[[bytes], Predict]]] = {
@@ -113,7 +114,7 @@ def export_policy(policy: Path, out: Path, algorithm: str) -> float:
     if out.suffix.lower() not in forms:
         raise NotExportable(f"expected a file ending in {' or '.join(forms)}, got {out.suffix or 'no ending'!r}")
     write, read = forms[out.suffix.lower()]
-    module, predict = _loaded(policy, algorithm)
+    module, predict = _loaded(policy, algorithm, trust=trust)
     with _quietly():
         example = (torch.zeros(2, module.size),)
         program = torch.export.export(module.eval(), example, dynamic_shapes={"observation": {0: Dim("lanes")}})
@@ -172,12 +173,12 @@ def _from_program(content: bytes) -> Predict:
     return predict
 
 
-def _loaded(policy: Path, algorithm: str) -> tuple[MostProbable | ArrayNetwork, Predict]:
+def _loaded(policy: Path, algorithm: str, *, trust: bool) -> tuple[MostProbable | ArrayNetwork, Predict]:
     """A policy as a module, and as the function it has to agree with."""
     if Network.is_at(policy):
         network = Network.load(policy)
         return ArrayNetwork(network), network
-    learner = load_learner(policy, algorithm)
+    learner = load_learner(policy, algorithm, trust=trust)
     return MostProbable(learner), lambda observation: learner.predict(observation, deterministic=True)[0]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
 DEFAULT_ALGORITHM = "PPO"
+BUFFERLESS = {"n_envs": 1, "n_steps": 1, "buffer_size": 1}  # what only acts needs no room for experience
 ONNX = ".onnx"
 
 
@@ -72,17 +74,17 @@ def read_card(policy: Path) -> PolicyCard:
         raise UnusablePolicy(f"{card_path(policy)} is no card of a policy: {first['msg']}") from error
 
 
-def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM) -> Predict:
-    """The policy as a function of observations, its most probable action each.
-
-    A network of arrays and ONNX are read as such. Any other file is unpickled: load only what you trust.
+def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM, *, trust: bool = False) -> Predict:
+    """The policy as a function of observations, its most probable action each. Nothing is unpickled without ``trust``.
 
     Args:
-        path: what ``save`` of a Stable-Baselines3 algorithm wrote, ``Network.save``, or ``surrogym export-policy``.
+        path: what ``surrogym train``, ``Network.save`` or ``surrogym export-policy`` wrote, or, with ``trust``,
+            ``save`` of a Stable-Baselines3 algorithm.
         algorithm: name of its class; a network of arrays and ONNX need none.
+        trust: unpickle a policy's objects, which runs any code that is in them.
 
     Raises:
-        UnusablePolicy: no such algorithm, or the file is none of its policies.
+        UnusablePolicy: no such algorithm, the file is none of its policies, or it needs ``trust``.
     """
     if Network.is_at(path):
         return _network(path)
@@ -90,7 +92,7 @@ def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM) -> Predict:
         from surrogym_client.policy_export import from_onnx
 
         return from_onnx(path.read_bytes())
-    model = load_learner(path, algorithm)
+    model = load_learner(path, algorithm, trust=trust)
 
     def predict(observations: NDArray[np.float32]) -> NDArray[Any]:
         actions: NDArray[Any] = model.predict(observations, deterministic=True)[0]
@@ -99,16 +101,27 @@ def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM) -> Predict:
     return predict
 
 
-def load_learner(path: Path, algorithm: str = DEFAULT_ALGORITHM, /, **changes: Any) -> BaseAlgorithm:
-    """What ``save`` of a Stable-Baselines3 algorithm wrote. It is unpickled: load only what you trust.
+def save_policy(learner: BaseAlgorithm, path: Path) -> None:
+    """Write what ``learner.save`` writes, with a description by which ``load_learner`` reads it without unpickling."""
+    from surrogym_client.policy_structure import save
+
+    save(learner, path)
+
+
+def load_learner(
+    path: Path, algorithm: str = DEFAULT_ALGORITHM, /, *, trust: bool = False, **changes: Any
+) -> BaseAlgorithm:
+    """An algorithm of Stable-Baselines3 from its file. Nothing is unpickled without ``trust``.
 
     Args:
-        path: the file.
+        path: what ``save_policy`` wrote, or, with ``trust``, ``save`` of the algorithm.
         algorithm: name of its class.
-        changes: environment, seed and hyperparameters, in the place of those that it was saved with.
+        trust: unpickle its objects, which runs any code that is in them.
+        changes: environment, seed and hyperparameters, in the place of those that it was saved with; with an
+            environment the algorithm can learn on.
 
     Raises:
-        UnusablePolicy: no such algorithm, or the file is none of its policies.
+        UnusablePolicy: no such algorithm, the file is none of its policies, or it needs ``trust``.
     """
     import stable_baselines3
 
@@ -116,14 +129,32 @@ def load_learner(path: Path, algorithm: str = DEFAULT_ALGORITHM, /, **changes: A
     if kind is None or not hasattr(kind, "load"):
         raise UnusablePolicy(f"Stable-Baselines3 has no algorithm {algorithm!r}: expected for instance PPO, SAC or DQN")
     try:
-        learner: BaseAlgorithm = kind.load(path, device="cpu", **changes)
-    except Exception as error:  # unpickling somebody's file can raise anything
+        return _loaded(kind, path, trust, changes if "env" in changes else BUFFERLESS | changes)
+    except UnusablePolicy:
+        raise
+    except pickle.UnpicklingError as error:
+        raise UnusablePolicy(f"{path}: expected numbers alone as weights, got other pickled objects") from error
+    except Exception as error:  # somebody's file can raise anything
         if changes:
-            load_learner(path, algorithm)
+            load_learner(path, algorithm, trust=trust)
             given = [f"{name}={value!r}" for name, value in changes.items() if name not in ("env", "seed")]
             raise UnusablePolicy(f"{path} does not go with {', '.join([*given, 'this surrogate'])}: {error}") from error
         raise UnusablePolicy(f"{path} is no policy of {algorithm}: {error}") from error
-    return learner
+
+
+def _loaded(kind: type[BaseAlgorithm], path: Path, trust: bool, changes: dict[str, Any]) -> BaseAlgorithm:
+    from surrogym_client.policy_structure import PickledObjects, read
+
+    if trust:
+        return kind.load(path, device="cpu", **changes)
+    try:
+        file, objects = read(path, learning="env" in changes, replaced=set(changes))
+    except PickledObjects as error:
+        raise UnusablePolicy(
+            f"{path} holds pickled objects ({', '.join(error.names)}), and reading them would run any code that is in "
+            "them: give --trust-policy (trust=True in Python) if you trust who made the file"
+        ) from None
+    return kind.load(file, device="cpu", custom_objects=objects, **changes)
 
 
 def _network(path: Path) -> Predict:

@@ -28,7 +28,8 @@ from surrogym_client.checks import Checks
 from surrogym_client.evolution import EVOLUTION_STEPS, evolve
 from surrogym_client.imagined import imagined_returns, observation_statistics
 from surrogym_client.policies import WIDER, PaperPolicy, Standardise
-from surrogym_client.policy_file import load_learner
+from surrogym_client.policies import decaying as _decaying  # files of before name it so
+from surrogym_client.policy_file import load_learner, save_policy
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.tracking import tracking, with_folder
 from surrogym_client.training import (
@@ -46,15 +47,7 @@ from surrogym_shared.spec import EnvironmentSpec
 MAX_STEPS = 10_000_000  # virtual steps that can be asked for: hours of PPO
 ON_POLICY_STEPS = 600_000
 OFF_POLICY_STEPS = 50_000  # these learn from every step, and take far longer for each
-LEARNING_RATE = 3e-3
 ATTEMPT_SEED = 1_000_003  # between the seeds of one training's networks
-LAST_RATE = 0.02  # share of the learning rate that is left at the end
-
-
-def _decaying(remaining: float) -> float:
-    return LEARNING_RATE * max(remaining, LAST_RATE)
-
-
 PPO_BATCH = 1_024  # most of a training is the update, and its cost goes by the batch
 PPO_DEFAULTS: dict[str, Any] = {
     "n_steps": 128,
@@ -126,7 +119,7 @@ def train(
             last, whole = _learned(network, checks, callbacks, prolong=prolonged)
         learner = checks.best_of(last)
         out.parent.mkdir(parents=True, exist_ok=True)
-        learner.save(out)
+        save_policy(learner, out)
     finally:
         wrapped.close()
     result = TrainResult(
@@ -227,7 +220,7 @@ def _learner(
 ) -> BaseAlgorithm:
     if settings.start_from is not None:
         changes = {**settings.hyperparameters, "env": env, "seed": settings.seed}
-        learner = load_learner(settings.start_from, algorithm.__name__, **changes)
+        learner = load_learner(settings.start_from, algorithm.__name__, trust=settings.trust_policy, **changes)
         learner.tensorboard_log = None if settings.tensorboard is None else str(settings.tensorboard)
         return learner
     extractor = {"mean": statistics[0], "deviation": statistics[1]}

@@ -33,6 +33,7 @@ class TrainSettings:
     seed: int = 0
     start_box: float = 0.5
     start_from: Path | None = None  # go on from a saved policy
+    trust_policy: bool = False  # unpickle that policy's objects, which may run code
     anew: bool = False  # begin with a new network, and go on from the saved policy only where that falls short
     prolong: bool | None = None  # as many steps again while it still gains; None: as ``prolongs``
     threads: int = 1

@@ -73,7 +73,7 @@ def test_an_evaluation_that_does_not_end_enters_its_real_steps(
     def ends(*_):
         raise ending
 
-    monkeypatch.setattr("surrogym_client.policy_file.load_policy", lambda *_: None)
+    monkeypatch.setattr("surrogym_client.policy_file.load_policy", lambda *_, **__: None)
     monkeypatch.setattr("surrogym_client.evaluate.evaluate", ends)
     ended = on_server("evaluate", "policy.zip", "--env", "Pendulum-v1")
     with Api(server_process.url) as api:

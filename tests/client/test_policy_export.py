@@ -76,9 +76,9 @@ def same(ours: np.ndarray, theirs: np.ndarray) -> None:
 @pytest.mark.parametrize("case", CASES)
 def test_a_program_of_torch_gives_the_policys_actions(tmp_path: Path, case: str):
     policy = saved(tmp_path, case)
-    export_policy(policy, tmp_path / "policy.pt2", CASES[case][0])
+    export_policy(policy, tmp_path / "policy.pt2", CASES[case][0], trust=True)
     program = torch.export.load(tmp_path / "policy.pt2").module()
-    expected = load_policy(policy, CASES[case][0])
+    expected = load_policy(policy, CASES[case][0], trust=True)
     for rows in (OBSERVATIONS, OBSERVATIONS[:1]):
         with torch.no_grad():
             got = program(torch.as_tensor(rows)).numpy()
@@ -90,10 +90,10 @@ def test_a_program_of_torch_gives_the_policys_actions(tmp_path: Path, case: str)
 @pytest.mark.parametrize("case", ["PPO, continuous", "PPO, noise by the state", "PPO, several discrete", "SAC"])
 def test_onnx_gives_the_policys_actions(tmp_path: Path, case: str):
     policy = saved(tmp_path, case)
-    export_policy(policy, tmp_path / "policy.onnx", CASES[case][0])
+    export_policy(policy, tmp_path / "policy.onnx", CASES[case][0], trust=True)
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
     got = session.run(["action"], {"observation": OBSERVATIONS})[0]
-    same(load_policy(policy, CASES[case][0])(OBSERVATIONS), got)
+    same(load_policy(policy, CASES[case][0], trust=True)(OBSERVATIONS), got)
     same(got, load_policy(tmp_path / "policy.onnx")(OBSERVATIONS))
 
 
@@ -113,7 +113,7 @@ def test_a_file_whose_actions_differ_is_not_kept(tmp_path: Path, monkeypatch):
     read = policy_export._from_program
     monkeypatch.setattr(policy_export, "_from_program", lambda content: lambda o: read(content)(o) + 1e-3)
     with pytest.raises(NotExportable, match="differ by 0"):
-        export_policy(policy, tmp_path / "policy.pt2", "PPO")
+        export_policy(policy, tmp_path / "policy.pt2", "PPO", trust=True)
     assert not (tmp_path / "policy.pt2").exists()
 
 
@@ -122,7 +122,7 @@ def test_what_can_not_be_exported_is_refused_in_words(tmp_path: Path):
     with pytest.raises(NotExportable, match=r"ending in \.onnx or \.pt2, got '\.txt'"):
         export_policy(policy, tmp_path / "policy.txt", "DQN")
     with pytest.raises(UnusablePolicy, match="no policy of SAC"):
-        export_policy(policy, tmp_path / "policy.pt2", "SAC")
+        export_policy(policy, tmp_path / "policy.pt2", "SAC", trust=True)
     (tmp_path / "junk.onnx").write_bytes(b"junk")
     with pytest.raises(NotExportable, match="expected a policy in ONNX, got 4 bytes"):
         load_policy(tmp_path / "junk.onnx")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, SpecFile, Token, read_spec
+from surrogym_client.cli.options import AsJson, Quiet, Server, SpecFile, Token, TrustPolicy, read_spec
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -54,6 +54,7 @@ def command(
     surrogate: Annotated[
         str | None, typer.Option(help="Enter the real steps into this surrogate's ledger. [default: as noted]")
     ] = None,
+    trust_policy: TrustPolicy = False,
     server: Server = None,
     token: Token = None,
     as_json: AsJson = False,
@@ -79,7 +80,7 @@ def command(
     try:
         with terminations_as_interrupts(), progress("evaluate", quiet=quiet) as update:
             update(0.0, f"reading {policy}")
-            predict = load_policy(policy, algorithm or card.algorithm)
+            predict = load_policy(policy, algorithm or card.algorithm, trust=trust_policy)
             result = evaluate(predict, opener, settings, _telling(update, episodes))
     except EvaluationFailed as failure:
         enter(failure.steps, 0, "failed")

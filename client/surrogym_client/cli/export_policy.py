@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet
+from surrogym_client.cli.options import AsJson, Quiet, TrustPolicy
 
 
 def register(app: typer.Typer) -> None:
@@ -23,6 +23,7 @@ def command(
     algorithm: Annotated[
         str | None, typer.Option(help="Stable-Baselines3 algorithm of the file. [default: as noted beside it, or PPO]")
     ] = None,
+    trust_policy: TrustPolicy = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -43,7 +44,7 @@ def command(
         update(0.0, "converting and checking")
         from surrogym_client.policy_export import CHECKS, export_policy
 
-        largest = export_policy(policy, out, algorithm or card.algorithm)
+        largest = export_policy(policy, out, algorithm or card.algorithm, trust=trust_policy)
         update(1.0, "done")
     size = out.stat().st_size
     result = {"file": str(out), "bytes": size, "observations_checked": CHECKS, "largest_difference": largest}

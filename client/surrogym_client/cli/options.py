@@ -40,6 +40,14 @@ Server = Annotated[
 Token = Annotated[str | None, typer.Option("--token", envvar="SURROGYM_TOKEN", help="Bearer token of the server.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no remarks.")]
+TrustPolicy = Annotated[
+    bool,
+    typer.Option(
+        "--trust-policy",
+        "--trust",
+        help="Unpickle the policy's objects. This runs any code in the file. Policies of surrogym train don't need it.",
+    ),
+]
 Wait = Annotated[float, typer.Option("--wait", min=0, help="Seconds to wait for what is not there yet.")]
 ExitWithParent = Annotated[
     bool, typer.Option("--exit-with-parent", hidden=True, help="End when the process that started this one ends.")

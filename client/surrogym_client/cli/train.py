@@ -103,6 +103,14 @@ def command(
         float | None, typer.Option(min=0, help="Deviations taken off the reward. [default: the specification's]")
     ] = None,
     start_from: Annotated[Path | None, typer.Option(help="Policy file to go on from.")] = None,
+    trust_policy: Annotated[
+        bool,
+        typer.Option(
+            "--trust-policy",
+            help="Unpickle the objects of --start-from. This runs any code in the file. Policies of surrogym train "
+            "don't need it.",
+        ),
+    ] = False,
     prolong: Annotated[
         bool | None,
         typer.Option(
@@ -175,6 +183,7 @@ def command(
         seed=seed,
         start_box=start_box,
         start_from=start_from,
+        trust_policy=trust_policy,
         prolong=prolong,
         tracker=None if log == "none" else log,
         tensorboard=tensorboard,
@@ -182,7 +191,7 @@ def command(
         session=session,
     )
     card = partial(_write_card, surrogate=surrogate, spec=spec, url=url, seed=seed)
-    with _keeping(card, typed(context, without=("out", "start_from", "token"))):
+    with _keeping(card, typed(context, without=("out", "start_from", "trust_policy", "token"))):
         result = _train(
             url, token, surrogate, out, settings, (improve, rounds) if improve else None, progress_file, quiet=quiet
         )
