@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, RootModel, ValidationError
 
 from surrogym_client.errors import SurrogymClientError
 from surrogym_client.evaluate import Predict
 from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import SurrogateName
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -27,14 +28,24 @@ class UnusablePolicy(SurrogymClientError):
     """The file is no policy of the algorithm, or its card is none."""
 
 
+class NotedAddress(RootModel[str]):
+    """A server's address that a file names. It is no ``str``, so that nothing connects to it: only a person gives the
+    address to which a token goes."""
+
+    model_config = ConfigDict(frozen=True)
+
+    def __str__(self) -> str:
+        return self.root
+
+
 class PolicyCard(BaseModel):
     """What a policy is for and how it came about; a JSON file of the same name beside it."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)  # train() notes more than is read here
 
     algorithm: str = DEFAULT_ALGORITHM
-    surrogate: str | None = None
-    server: str | None = None
+    surrogate: SurrogateName | None = None
+    server: NotedAddress | None = None
     spec: EnvironmentSpec | None = None
     seed: int | None = None
     virtual_steps: int | None = None
@@ -71,7 +82,8 @@ def read_card(policy: Path) -> PolicyCard:
         return PolicyCard.model_validate_json(card_path(policy).read_bytes())
     except ValidationError as error:
         first = error.errors()[0]
-        raise UnusablePolicy(f"{card_path(policy)} is no card of a policy: {first['msg']}") from error
+        where = ".".join(str(part) for part in first["loc"])
+        raise UnusablePolicy(f"{card_path(policy)} is no card of a policy: {where}: {first['msg']}") from error
 
 
 def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM, *, trust: bool = False) -> Predict:

@@ -2,14 +2,33 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from support.gifts import gift
+from support.scripted_server import problem, scripted_server
+from surrogym_client.original.classic import pendulum
+from surrogym_shared.codes import Code
+from surrogym_shared.network import Network
 
 EVALUATE = ("evaluate", "policy.zip", "--env", "Pendulum-v1", "--episodes", "1")
 EXPORT = ("export-policy", "policy.zip", "--out", "policy.onnx")
+
+
+SECRET = "a-token-of-mine"
+
+
+def network(folder: Path, **card: Any) -> None:
+    """A policy that needs no trust, and its card."""
+    d = len(pendulum().observation)
+    Network.of(pendulum(), np.zeros(d), np.ones(d), 2, np.zeros(Network.size(pendulum(), 2))).save(
+        folder / "policy.zip"
+    )
+    (folder / "policy.json").write_text(json.dumps(card))
 
 
 @pytest.fixture
@@ -36,3 +55,35 @@ def test_a_pickled_policy_is_read_when_it_is_trusted(surrogym, tmp_path, mark, a
     gift(tmp_path / "policy.zip", mark)
     assert surrogym(*arguments, flag).code == 1  # it is no policy after all
     assert mark.exists()
+
+
+@pytest.mark.parametrize("options", [(), ("--json",), ("--quiet",)])
+def test_a_server_that_a_card_names_is_not_contacted(surrogym, tmp_path, monkeypatch, options):
+    monkeypatch.setenv("SURROGYM_TOKEN", SECRET)
+    with scripted_server(problem(Code.FORBIDDEN)) as server:
+        network(tmp_path, surrogate="pendulum", server=server.url)
+        ended = surrogym(*EVALUATE, *options)
+        assert server.received == []
+    assert ended.code == 0, ended.err
+    told = f"the real steps are not reported to '{server.url}', which policy.json names: give --server to enter them"
+    assert (told in ended.err) == (options != ("--quiet",))
+    assert not options or "--json" not in options or ended.json["steps"] == 200
+
+
+def test_a_server_that_a_person_names_gets_the_real_steps_and_the_token(surrogym, tmp_path, monkeypatch):
+    monkeypatch.setenv("SURROGYM_TOKEN", SECRET)
+    with scripted_server(problem(Code.FORBIDDEN)) as noted, scripted_server(problem(Code.FORBIDDEN)) as given:
+        network(tmp_path, surrogate="pendulum", server=noted.url)
+        ended = surrogym(*EVALUATE, "--server", given.url)
+        assert noted.received == []
+        (request,) = given.received
+    assert (request.path, request.headers["Authorization"]) == ("/v1/surrogates/pendulum/ledger", f"Bearer {SECRET}")
+    assert "not entered into the ledger of 'pendulum'" in ended.err
+
+
+@pytest.mark.parametrize("name", ["..", "a/b", "", "a b", "pendulum/../other", "pendulum\n"])
+def test_a_card_with_a_name_that_none_can_have_is_refused(surrogym, tmp_path, name):
+    network(tmp_path, surrogate=name)
+    ended = surrogym(*EVALUATE)
+    assert ended.code == 1
+    assert ended.err.startswith("error: policy.json is no card of a policy: surrogate: ")

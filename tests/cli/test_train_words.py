@@ -17,6 +17,11 @@ def test_a_training_without_rounds_says_nothing_of_them():
     )
 
 
+def test_a_server_that_was_given_is_given_to_the_evaluation_too():
+    said = words_of_result(RESULT, server="http://other:8000")
+    assert said.endswith("; next: surrogym evaluate p.zip --server http://other:8000")
+
+
 def test_the_closed_loop_says_how_well_the_policys_region_is_known():
     assert "; the design was ready, no round was needed; next" in words_of_result(RESULT, closed_loop=True)
     after = replace(RESULT, visited_confidence=(0.9, 0.99914))

@@ -22,9 +22,19 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from support.exact_pendulum import ExactPendulum
 from support.gifts import LIMIT, Touches, changed, gift, pickled
+from surrogym_client.api import Api
 from surrogym_client.policies import PaperPolicy, Standardise, decaying
 from surrogym_client.policy_export import export_policy
-from surrogym_client.policy_file import UnusablePolicy, load_learner, load_policy, save_policy
+from surrogym_client.policy_file import (
+    NotedAddress,
+    PolicyCard,
+    UnusablePolicy,
+    load_learner,
+    load_policy,
+    read_card,
+    save_policy,
+    write_card,
+)
 from surrogym_client.policy_structure import ENTRY, Structure, describe
 from surrogym_client.train import TrainSettings, train
 from surrogym_shared.archives import read_entries, stored
@@ -269,6 +279,17 @@ def test_a_policy_of_another_make_is_not_described():
     assert described is not None
     assert Structure.model_validate_json(described.model_dump_json()) == described
     assert described.objects()["action_space"] == TORQUES
+
+
+def test_an_address_from_a_card_is_none_that_connects(tmp_path: Path):
+    policy = tmp_path / "policy.zip"
+    policy.touch()
+    card = PolicyCard(server=NotedAddress("http://127.0.0.1:9"))
+    write_card(policy, card)
+    assert json.loads((tmp_path / "policy.json").read_text())["server"] == "http://127.0.0.1:9"
+    assert read_card(policy) == card
+    with pytest.raises(TypeError, match="NotedAddress"):
+        Api(read_card(policy).server)  # type: ignore[arg-type]
 
 
 def test_a_plain_pickle_is_no_policy(tmp_path: Path, mark: Path):

@@ -68,7 +68,7 @@ def command(
     from surrogym_client.evaluate import EvaluationInterrupted, EvaluationSettings, evaluate
     from surrogym_client.lifetime import terminations_as_interrupts
     from surrogym_client.original.errors import EvaluationFailed
-    from surrogym_client.policy_file import load_policy, read_card
+    from surrogym_client.policy_file import card_path, load_policy, read_card
     from surrogym_shared.terminal import give, progress, say
 
     card = read_card(policy)
@@ -76,7 +76,8 @@ def command(
         raise CommandError("expected --wide or --start-scale, got both")
     settings = EvaluationSettings(episodes, first_seed, wide, start_scale, perturb, parallel)
     opener = _opener(env, read_spec(spec), card)
-    enter = partial(_enter, surrogate or card.surrogate, server or card.server, token, quiet=quiet)
+    ledger = _ledger(surrogate, server, card, card_path(policy), quiet=quiet)
+    enter = partial(_enter, ledger, server, token, quiet=quiet)
     try:
         with terminations_as_interrupts(), progress("evaluate", quiet=quiet) as update:
             update(0.0, f"reading {policy}")
@@ -122,6 +123,21 @@ def _bins(spec: EnvironmentSpec | None) -> int | None:
 
 def _telling(update: Update, episodes: int) -> Progress:
     return lambda share, terminated: update(share, f"{episodes} real episodes, {terminated} terminated")
+
+
+def _ledger(surrogate: str | None, server: str | None, card: PolicyCard, noted_in: Path, *, quiet: bool) -> str | None:
+    """The surrogate whose ledger gets the real steps; None where a card alone names its server, which is not asked."""
+    from surrogym_client.connection import DEFAULT_URL
+    from surrogym_shared.terminal import say
+
+    if surrogate or server or card.server is None or str(card.server).rstrip("/") == DEFAULT_URL:
+        return surrogate or card.surrogate
+    say(
+        f"the real steps are not reported to {str(card.server)!r}, which {noted_in} names: give --server to enter them "
+        f"into the ledger of {card.surrogate!r}",
+        quiet=quiet,
+    )
+    return None
 
 
 def _enter(

@@ -110,13 +110,18 @@ def _waiting(words: str, *, quiet: bool) -> Iterator[None]:
         yield
 
 
+def given_here(context: typer.Context, name: str) -> bool:
+    """Whether a person gave an option on this command line, and not by the environment."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
 def typed(context: typer.Context, without: Sequence[str] = ()) -> str:
     """The arguments and options that were given on the command line, but some, as they are typed."""
     words: list[str] = []
     for parameter in context.command.params:
         name = str(parameter.name)
-        source = context.get_parameter_source(name)
-        if name in without or source is None or source.name != "COMMANDLINE":
+        if name in without or not given_here(context, name):
             continue
         value = context.params[name]
         if parameter.param_type_name == "argument":

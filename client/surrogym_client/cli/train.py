@@ -23,6 +23,7 @@ from surrogym_client.cli.options import (
     Wait,
     awaited_surrogate,
     connect,
+    given_here,
     typed,
 )
 
@@ -196,7 +197,8 @@ def command(
             url, token, surrogate, out, settings, (improve, rounds) if improve else None, progress_file, quiet=quiet
         )
     summary = card(result)
-    give(summary, lambda: words_of_result(result, closed_loop=improve > 0), as_json=as_json, quiet=quiet)
+    named = server if given_here(context, "server") else None
+    give(summary, lambda: words_of_result(result, closed_loop=improve > 0, server=named), as_json=as_json, quiet=quiet)
 
 
 def _hyperparameters(chosen: list[str]) -> dict[str, Any]:
@@ -332,13 +334,13 @@ def _waiting(update: Update) -> Callable[[SurrogateView], None]:
 
 def _write_card(result: TrainResult, surrogate: str, spec: EnvironmentSpec, url: str, seed: int) -> dict[str, Any]:
     """Write the policy's card; gives back the result as JSON."""
-    from surrogym_client.policy_file import PolicyCard, write_card
+    from surrogym_client.policy_file import NotedAddress, PolicyCard, write_card
     from surrogym_client.versions import versions
 
     card = PolicyCard(
         algorithm=result.algorithm,
         surrogate=surrogate,
-        server=url,
+        server=NotedAddress(url),
         spec=spec,
         seed=seed,
         virtual_steps=result.virtual_steps,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -9,14 +10,15 @@ if TYPE_CHECKING:
     from surrogym_client.training import TrainResult
 
 
-def words_of_result(result: TrainResult, *, closed_loop: bool = False) -> str:
-    """What a training gave, and what is next."""
+def words_of_result(result: TrainResult, *, closed_loop: bool = False, server: str | None = None) -> str:
+    """What a training gave, and what is next; ``server`` is an address that the next command has to be given too."""
+    on_server = "" if server is None else f" --server {shlex.quote(server)}"
     lost = result.lost_episodes
     cut = f"; {lost} episode{'s' * (lost > 1)} cut short, lost with the server's sessions" if lost else ""
     return (
         f"{result.path}: {result.virtual_steps} virtual steps in {result.seconds:.1f} s"
         f"{_imagined(result.imagined_return)}{cut}{_loop(result.visited_confidence) if closed_loop else ''}"
-        f"{_given_up(result.networks - 1)}{_gaining(result)}; next: surrogym evaluate {result.path}"
+        f"{_given_up(result.networks - 1)}{_gaining(result)}; next: surrogym evaluate {result.path}{on_server}"
     )
 
 
