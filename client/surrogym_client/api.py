@@ -5,11 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, Self, TypeVar
-from urllib.parse import quote
 from uuid import uuid4
 
 from pydantic import BaseModel, ValidationError
 
+from surrogym_client import routes
 from surrogym_client.connection import Connection, Retries, Timeouts
 from surrogym_client.errors import NoModel, ProtocolMismatch, ServerUnreachable
 from surrogym_shared import wire
@@ -123,7 +123,7 @@ class Api:
         Raises:
             UnknownSurrogate: there is none of this name.
         """
-        return self._get(wire.SurrogateView, _surrogate(name))
+        return self._get(wire.SurrogateView, routes.surrogate(name))
 
     def patch_surrogate(
         self,
@@ -138,7 +138,7 @@ class Api:
         ``tolerances`` it takes back what was set."""
         given = None if tolerances is None else dict(tolerances)
         body = wire.PatchSurrogate(paused=paused, budget=budget, target=target, tolerances=given)
-        return self._post(wire.SurrogateView, _surrogate(name), body, method="PATCH")
+        return self._post(wire.SurrogateView, routes.surrogate(name), body, method="PATCH")
 
     def delete_surrogate(self, name: str) -> None:
         """Remove it with its samples, models and sessions; there is no way back.
@@ -146,7 +146,7 @@ class Api:
         Raises:
             UnknownSurrogate: there is none of this name.
         """
-        self.connection.send("DELETE", _surrogate(name))
+        self.connection.send("DELETE", routes.surrogate(name))
 
     # Queries
 
@@ -168,7 +168,7 @@ class Api:
         )
         return self._post(
             wire.ClaimedQueries,
-            f"{_surrogate(name)}/queries:claim",
+            f"{routes.surrogate(name)}/queries:claim",
             body,
             timeout=self.connection.timeouts.request + wait_seconds,
             repeatable=False,
@@ -189,12 +189,12 @@ class Api:
             LeaseExpired: it has ended; the answer may still be sent.
         """
         body = wire.RenewLease(lease_token=lease_token, lease_seconds=lease_seconds)
-        self._send(f"{_surrogate(name)}/queries/{query_id}:renew", body, retries=retries)
+        self._send(f"{routes.surrogate(name)}/queries/{query_id}:renew", body, retries=retries)
 
     def fail(self, name: str, query_id: int, lease_token: str, error: str, *, begun: bool = True) -> None:
         """Give a query back with the error it caused, and whether a real step may have been taken."""
         body = wire.FailQuery(lease_token=lease_token, error=error, begun=begun)
-        self._send(f"{_surrogate(name)}/queries/{query_id}:fail", body)
+        self._send(f"{routes.surrogate(name)}/queries/{query_id}:fail", body)
 
     def ask(
         self,
@@ -213,11 +213,11 @@ class Api:
             rollouts=[[list(row) for row in actions] for actions in rollouts] or None,
             idempotency_key=idempotency_key or new_key(),
         )
-        return self._post(wire.QueryList, f"{_surrogate(name)}/queries", body).queries
+        return self._post(wire.QueryList, f"{routes.surrogate(name)}/queries", body).queries
 
     def queries(self, name: str) -> list[wire.QueryView]:
         """Every query ever asked, with its state, attempts and last error."""
-        return self._get(wire.QueryList, f"{_surrogate(name)}/queries").queries
+        return self._get(wire.QueryList, f"{routes.surrogate(name)}/queries").queries
 
     # Samples and the ledger
 
@@ -240,7 +240,7 @@ class Api:
         added = [
             self._post(
                 wire.AddedSamples,
-                f"{_surrogate(name)}/add_sample",
+                f"{routes.surrogate(name)}/add_sample",
                 wire.AddSamples(sampler=sampler, samples=batch, idempotency_key=key),
             )
             for key, batch in zip(keys, batches, strict=True)
@@ -255,27 +255,27 @@ class Api:
         """All samples in order of arrival, page by page."""
         after: int | None = 0
         while after is not None:
-            page = self._get(wire.SamplePage, f"{_surrogate(name)}/samples", after=after)
+            page = self._get(wire.SamplePage, f"{routes.surrogate(name)}/samples", after=after)
             yield from page.samples
             after = page.next_after
 
     def export_samples(self, name: str, file_format: Literal["csv", "npz"]) -> bytes:
         """All samples as one file."""
-        return self.connection.send("GET", f"{_surrogate(name)}/samples", params={"format": file_format})
+        return self.connection.send("GET", f"{routes.surrogate(name)}/samples", params={"format": file_format})
 
     def report_steps(
         self, name: str, steps: int, *, episodes: int = 0, note: str = "", idempotency_key: str | None = None
     ) -> wire.Ledger:
         """Enter real steps of an evaluation into the ledger."""
         body = wire.ReportSteps(steps=steps, episodes=episodes, note=note, idempotency_key=idempotency_key or new_key())
-        return self._post(wire.Ledger, f"{_surrogate(name)}/ledger", body)
+        return self._post(wire.Ledger, f"{routes.surrogate(name)}/ledger", body)
 
     def improve(
         self, name: str, queries: int, *, checkpoint: str | None = None, idempotency_key: str | None = None
     ) -> wire.SurrogateView:
         """Ask the design for more queries, weighted by the occupancy submitted under ``checkpoint``."""
         body = wire.Improve(queries=queries, checkpoint=checkpoint, idempotency_key=idempotency_key or new_key())
-        return self._post(wire.SurrogateView, f"{_surrogate(name)}/improve", body)
+        return self._post(wire.SurrogateView, f"{routes.surrogate(name)}/improve", body)
 
     # Models
 
@@ -288,7 +288,9 @@ class Api:
         model: int | None = None,
     ) -> wire.Uncertainty:
         """Mean, deviation and uncertainty index at coordinates (n, C) and action (n, F)."""
-        return self._of_points(wire.Uncertainty, f"{_surrogate(name)}/query_uncertainty", coordinates, action, model)
+        return self._of_points(
+            wire.Uncertainty, f"{routes.surrogate(name)}/query_uncertainty", coordinates, action, model
+        )
 
     def predict(
         self,
@@ -299,11 +301,11 @@ class Api:
         model: int | None = None,
     ) -> wire.Prediction:
         """One transition each from coordinates (n, C) under action (n, F)."""
-        return self._of_points(wire.Prediction, f"{_surrogate(name)}/predict", coordinates, action, model)
+        return self._of_points(wire.Prediction, f"{routes.surrogate(name)}/predict", coordinates, action, model)
 
     def models(self, name: str) -> list[wire.ModelView]:
         """Every fit with its structure, hyperparameters and fidelity, oldest first."""
-        return self._get(wire.ModelList, f"{_surrogate(name)}/models").models
+        return self._get(wire.ModelList, f"{routes.surrogate(name)}/models").models
 
     def model(self, name: str) -> wire.ModelView:
         """The latest model's structure and fidelity. Raises ``NoModel`` before the first fit."""
@@ -311,16 +313,16 @@ class Api:
         if view.model_version is None:
             detail = f"{name!r} has no model yet: let a sampler answer its first queries"
             raise NoModel(Problem(title="No model", status=STATUS[Code.NO_MODEL], code=Code.NO_MODEL, detail=detail))
-        return self._get(wire.ModelView, f"{_surrogate(name)}/models/{view.model_version}")
+        return self._get(wire.ModelView, f"{routes.surrogate(name)}/models/{view.model_version}")
 
     def export_model(self, name: str, version: int) -> bytes:
         """The model itself, complete, as a safetensors file."""
-        route = f"{_surrogate(name)}/models/{version}"
+        route = f"{routes.surrogate(name)}/models/{version}"
         return self.connection.send("GET", route, params={"format": "safetensors"})
 
     def import_model(self, name: str, data: bytes) -> wire.ModelView:
         """Make an exported model the newest version of a surrogate with the same outputs."""
-        route = f"{_surrogate(name)}/models"
+        route = f"{routes.surrogate(name)}/models"
         reply = self.connection.send("POST", route, data, media_type=_MODEL_FILE, repeatable=False)
         return parse(wire.ModelView, reply, route)
 
@@ -353,7 +355,7 @@ class Api:
 
     def _one_stream(self, name: str, after: int | None) -> Iterator[wire.Event | None]:
         """Events of one connection; None for a sign of life. Ends only by an error."""
-        path = f"{_surrogate(name)}/events"
+        path = f"{routes.surrogate(name)}/events"
         headers = {"Accept": "text/event-stream"}
         if after is not None:
             headers["Last-Event-ID"] = str(after)
@@ -426,10 +428,6 @@ def parse(reply: type[R], content: bytes, path: str) -> R:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "body"
         raise ProtocolMismatch(f"unexpected answer of {path}: {where}: {first['msg']}") from error
-
-
-def _surrogate(name: str) -> str:
-    return f"/v1/surrogates/{quote(name, safe='')}"
 
 
 def _batches(samples: Sequence[wire.NewSample]) -> list[list[wire.NewSample]]:

@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal, Self, TypeVar, get_args
-from urllib.parse import quote
 
 import numpy as np
 
+from surrogym_client import routes
 from surrogym_client.api import Api, check_protocol, new_key, parse
 from surrogym_client.connection import Connection, Retries, Timeouts
 from surrogym_client.errors import ProtocolMismatch, SessionLost
@@ -150,7 +150,7 @@ class HttpSurrogate:
         )
 
     def submit_occupancy(self, session: str, checkpoint: str) -> wire.SubmittedOccupancy:
-        route = f"{_session(session)}/occupancy"
+        route = f"{routes.session(session)}/occupancy"
         body = wire.SubmitOccupancy(checkpoint=checkpoint).model_dump_json().encode()
         return parse(wire.SubmittedOccupancy, self.connection.send("POST", route, body), route)
 
@@ -159,14 +159,14 @@ class HttpSurrogate:
         self._forget(session)
         try:
             with suppress(SessionLost):
-                self.connection.send("DELETE", _session(session), retries=Retries(seconds=0))
+                self.connection.send("DELETE", routes.session(session), retries=Retries(seconds=0))
         finally:
             if not self._live:
                 self.disconnect()
 
     @property
     def _route(self) -> str:
-        return f"/v1/surrogates/{quote(self.surrogate, safe='')}"
+        return routes.surrogate(self.surrogate)
 
     def _in_sequence(
         self,
@@ -236,11 +236,11 @@ class HttpSurrogate:
 
     def _look_up(self, session: str) -> _Live:
         """A session that another client opened."""
-        route = _session(session)
+        route = routes.session(session)
         return self._know(parse(wire.SessionView, self.connection.send("GET", route), route))
 
     def _know(self, view: wire.SessionView) -> _Live:
-        route = _session(view.id)
+        route = routes.session(view.id)
         stream = self.connection.stream_to(f"{route}/stream")
         self._live[view.id] = _Live(route, Shape.of(view), view.seq, stream)
         return self._live[view.id]
@@ -248,7 +248,3 @@ class HttpSurrogate:
     def _forget(self, session: str) -> None:
         if live := self._live.pop(session, None):
             live.stream.close()
-
-
-def _session(session: str) -> str:
-    return f"/v1/sessions/{quote(session, safe='')}"

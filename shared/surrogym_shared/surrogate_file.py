@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.spec import NAME_IN_WORDS, NAME_PATTERN, EnvironmentSpec
 
 FORMAT = 1
 MAX_FILE_BYTES = 256 * 1024 * 1024
@@ -111,7 +112,7 @@ class SurrogateFile:
             samples = RealSamples(**{name: _array(entry, body) for name, entry in entries.items()})
             end = min(entry["data_offsets"][0] for entry in entries.values())
             model = _joined(header, body[:end])
-            name = str(own["name"])
+            name = _name(own["name"])
             tolerances = {str(output): float(value) for output, value in own.get("tolerances", {}).items()}
             ledger = {str(purpose): int(steps) for purpose, steps in own.get("ledger", {}).items()}
         except NotASurrogateFile:
@@ -172,6 +173,12 @@ def _array(entry: Any, body: bytes) -> NDArray[Any]:
         raise ValueError(f"an array of shape {shape} in {stop - start} bytes")
     raw = np.frombuffer(body[start:stop], dtype=np.uint8 if dtype == np.bool_ else dtype).reshape(shape)
     return raw.astype(np.bool_ if dtype == np.bool_ else np.float64)
+
+
+def _name(given: object) -> str:
+    if not isinstance(given, str) or not re.fullmatch(NAME_PATTERN, given):
+        raise NotASurrogateFile(f"its name: expected {NAME_IN_WORDS}, got {given!r}")
+    return given
 
 
 def _require_shapes(spec: EnvironmentSpec, samples: RealSamples) -> None:

@@ -11,6 +11,7 @@ from support.scripted_server import ScriptedServer, lost_reply, problem, reply, 
 from surrogym_client import errors
 from surrogym_client.api import Api
 from surrogym_client.connection import Retries
+from surrogym_client.transport import HttpSurrogate
 from surrogym_shared import wire
 from surrogym_shared.codes import Code
 
@@ -69,8 +70,30 @@ def test_all_pages_of_samples_are_read():
     full = wire.SamplePage(samples=[sample(1), sample(2)], next_after=2)
     last = wire.SamplePage(samples=[], next_after=None)
     with api_of(said(full), said(last)) as (api, server):
-        assert [s.id for s in api.samples("a b")] == [1, 2]
-    assert [r.path for r in server.received] == [f"/v1/surrogates/a%20b/samples?after={n}" for n in (0, 2)]
+        assert [s.id for s in api.samples("a.b")] == [1, 2]
+    assert [r.path for r in server.received] == [f"/v1/surrogates/a.b/samples?after={n}" for n in (0, 2)]
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "a/b", "a%2Fb", "../sessions", "a b", "a?b", "a#b", "a\n", "x" * 65])
+def test_a_name_that_none_can_have_reaches_no_server(name: str):
+    with api_of(reply("{}")) as (api, server):
+        remote = HttpSurrogate(server.url, name)
+        calls = [
+            lambda: api.surrogate(name),
+            lambda: api.delete_surrogate(name),
+            lambda: api.import_model(name, b""),
+            lambda: list(api.samples(name)),
+            lambda: list(api.events(name)),
+            remote.spec,
+            lambda: remote.open(wire.OpenSession(num_envs=1)),
+            lambda: remote.reset(name),
+            lambda: remote.close(name),
+        ]
+        for call in calls:
+            with pytest.raises(errors.InvalidInput, match="expected 1 to 64 letters, digits") as refusal:
+                call()
+            assert repr(name) in str(refusal.value)
+        assert server.received == []
 
 
 def event(number: int) -> str:

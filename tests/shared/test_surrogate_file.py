@@ -39,9 +39,9 @@ def rewritten(change) -> bytes:
 
 @pytest.mark.parametrize("n", [0, 1, 7])
 def test_what_was_put_in_comes_out(n: int):
-    written = SurrogateFile("a b", pendulum(), MODEL, samples(n))
+    written = SurrogateFile("a.b", pendulum(), MODEL, samples(n))
     read = SurrogateFile.from_bytes(written.to_bytes())
-    assert (read.name, read.spec) == ("a b", pendulum())
+    assert (read.name, read.spec) == ("a.b", pendulum())
     for field in RealSamples.__dataclass_fields__:
         np.testing.assert_array_equal(getattr(read.samples, field), getattr(written.samples, field))
     assert json.loads(read.model[8 : 8 + int.from_bytes(read.model[:8], "little")])["__metadata__"] == {
@@ -87,6 +87,9 @@ HOSTILE = {
     "samples of different lengths": lambda h: h["samples.reward"].update(shape=[3], data_offsets=[0, 24]),
     "tolerances that are none": lambda h: with_own(h, tolerances={"theta": "small"}),
     "a ledger that is a list": lambda h: with_own(h, ledger=[1]),
+    "a name that leads elsewhere": lambda h: with_own(h, name="../pendulum"),
+    "a name of dots": lambda h: with_own(h, name=".."),
+    "a name that is none": lambda h: with_own(h, name=None),
     "an entry that is a number": lambda h: h.update({"samples.reward": 3}),
 }
 

@@ -8,7 +8,7 @@ Every contradiction is refused here, with what was expected and what came.
 from __future__ import annotations
 
 from surrogym_shared.spec.actions import BoxAction, DiscreteAction, MultiDiscreteAction
-from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, NAME_PATTERN
+from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, NAME_IN_WORDS, NAME_PATTERN
 from surrogym_shared.spec.coordinates import Bounds, Coordinate, Fixed, Normal, Uniform, limits
 from surrogym_shared.spec.environment import AcquisitionChoice, Design, EnvironmentSpec
 from surrogym_shared.spec.rewards import DeclaredReward, Quantity, Reward, RewardTerm, Success
@@ -17,6 +17,7 @@ from surrogym_shared.spec.terms import AllOf, Inequality, ObservationEntry, Part
 __all__ = [
     "MAX_DIMENSIONS",
     "MAX_ROLLOUT_QUERY",
+    "NAME_IN_WORDS",
     "NAME_PATTERN",
     "AcquisitionChoice",
     "AllOf",

@@ -12,6 +12,7 @@ MAX_DIMENSIONS = 64
 MAX_TERM_PARTS = 64
 MAX_DISCRETE_ACTIONS = 4096
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+NAME_IN_WORDS = "1 to 64 letters, digits, '.', '_' or '-', the first a letter or a digit"
 MAX_INEQUALITIES = 16  # in a group, and groups
 MAX_ROLLOUT_QUERY = 4_096  # real steps that one query may ask for
 REWARD = "reward"
