@@ -115,7 +115,12 @@ class Api:
 
     def surrogates(self) -> list[wire.SurrogateSummary]:
         """All of them, oldest first, with phase, what was spent, and confidence."""
-        return self._get(wire.SurrogateList, "/v1/surrogates").surrogates
+        found: list[wire.SurrogateSummary] = []
+        after: int | None = 0
+        while after is not None:
+            page = self._get(wire.SurrogateList, "/v1/surrogates", after=after)
+            found, after = found + page.surrogates, page.next_after
+        return found
 
     def surrogate(self, name: str) -> wire.SurrogateView:
         """One, with its specification, the fidelity of every output, its ledger and counts of queries.

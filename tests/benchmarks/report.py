@@ -120,6 +120,19 @@ def growth(found: dict[str, Any]) -> Iterator[Line]:
     yield "concurrent sessions of 16 lanes", "", reached, None
 
 
+def lists(found: dict[str, Any]) -> Iterator[Line]:
+    for count, measured in found["surrogates"].items():
+        most = 50 * int(count) / 1_000
+        for path in ("/metrics", "/v1/surrogates"):
+            ms, processor = measured[path]["ms"], measured[path]["processor ms"]
+            yield (
+                f"{path}, {int(count):,} surrogates",
+                f"{most:.0f} ms",
+                f"{ms:.0f} ms ({processor:.0f} of the processor)",
+                ms <= most,
+            )
+
+
 def memory(found: dict[str, Any]) -> Iterator[Line]:
     mib = [m for _, m in found["readings"]]
     reached = f"{min(mib):.1f} to {max(mib):.1f} MiB, last quarter {found['growth']:+.1%} of the first"
@@ -134,6 +147,7 @@ PARTS = {
     "predict": predict,
     "evidence": evidence,
     "growth": growth,
+    "lists": lists,
     "memory": memory,
 }
 

@@ -101,6 +101,34 @@ def event(number: int) -> str:
     return f"id: {number}\nevent: sample\ndata: {body}\n\n"
 
 
+def summary(name: str) -> wire.SurrogateSummary:
+    return wire.SurrogateSummary(
+        name=name,
+        environment="",
+        phase="collecting",
+        paused=False,
+        round=0,
+        samples=0,
+        model_version=None,
+        confidence_index=None,
+        target=0.999,
+        budget=10,
+        ledger=wire.Ledger(),
+        queries=wire.QueryCounts(),
+        created_at=0.0,
+    )
+
+
+def test_all_pages_of_surrogates_are_read():
+    pages = [
+        wire.SurrogateList(surrogates=[summary("a")], next_after=7),
+        wire.SurrogateList(surrogates=[summary("b")]),
+    ]
+    with api_of(*map(said, pages)) as (api, server):
+        assert [found.name for found in api.surrogates()] == ["a", "b"]
+    assert [request.path for request in server.received] == ["/v1/surrogates?after=0", "/v1/surrogates?after=7"]
+
+
 def test_a_broken_stream_of_events_goes_on_after_the_last_one():
     first = reply(": connected\n\n" + event(1) + event(2), content_type="text/event-stream")
     second = reply(": connected\n\n" + event(3), content_type="text/event-stream")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
@@ -19,14 +19,12 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 from surrogym_server.api.auth import READ
 from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.problems import documented
+from surrogym_server.api.series import exposition
 from surrogym_server.api.state import Services, Use
 from surrogym_server.services.counts import Counts, Durations
-from surrogym_server.services.surrogates import SurrogateStatus
 from surrogym_shared.codes import Code
 
 router = APIRouter(tags=["service"], route_class=DoorRoute)
-
-BY_SURROGATE = ("surrogate",)
 
 
 @router.get(
@@ -40,7 +38,8 @@ def metrics(request: Request, use: Use) -> Response:
     """Requests, steps, fits and expiries since the start of this process; samples, queries and fidelity as stored."""
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_Reading(request.app.version, use, request.app.state.counts))
-    return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
+    text = generate_latest(registry) + exposition(use.storage.surrogates.summaries())
+    return Response(text, media_type=CONTENT_TYPE_LATEST)
 
 
 class _Reading:
@@ -53,10 +52,6 @@ class _Reading:
 
     def collect(self) -> Iterator[Metric]:
         yield InfoMetricFamily("surrogym_build", "Version of the server.", {"version": self._version})
-        yield from self._process()
-        yield from _of_surrogates(self._use.surrogates.list())
-
-    def _process(self) -> Iterator[Metric]:
         counts = self._counts
         yield _requests(counts)
         yield _durations("surrogym_step_seconds", "Of a request that steps a session, waiting included.", counts.steps)
@@ -83,33 +78,3 @@ def _requests(counts: Counts) -> Metric:
 
 def _durations(name: str, text: str, durations: Durations) -> Metric:
     return HistogramMetricFamily(name, text, buckets=list(durations.cumulative()), sum_value=durations.sum)
-
-
-def _of_surrogates(statuses: Iterable[SurrogateStatus]) -> list[Metric]:
-    samples = CounterMetricFamily(
-        "surrogym_real_steps", "Acknowledged real steps by purpose.", labels=("surrogate", "purpose")
-    )
-    unresolved = GaugeMetricFamily(
-        "surrogym_unresolved_steps",
-        "Real steps that leases which ended without an answer may have taken.",
-        labels=("surrogate", "outcome"),
-    )
-    queries = GaugeMetricFamily("surrogym_queries", "Queries by status.", labels=("surrogate", "status"))
-    phase = GaugeMetricFamily("surrogym_phase", "1 for the phase of a surrogate.", labels=("surrogate", "phase"))
-    confidence = GaugeMetricFamily(
-        "surrogym_confidence_index", "Of the latest model: the smallest over outputs.", labels=BY_SURROGATE
-    )
-    version = GaugeMetricFamily("surrogym_model_version", "The latest one.", labels=BY_SURROGATE)
-    for status in statuses:
-        name, ledger = status.record.name, status.ledger
-        for purpose in ("initial", "adaptive", "manual", "evaluation"):
-            samples.add_metric([name, purpose], getattr(ledger, purpose))
-        unresolved.add_metric([name, "failed"], ledger.failed)
-        unresolved.add_metric([name, "expired"], ledger.unresolved - ledger.failed)
-        for kind in ("pending", "leased", "answered", "set_aside"):
-            queries.add_metric([name, kind], getattr(status.queries, kind))
-        phase.add_metric([name, status.record.phase], 1)
-        if status.model is not None:
-            confidence.add_metric([name], status.model.fidelity["confidence_index"])
-            version.add_metric([name], status.model.version)
-    return [samples, unresolved, queries, phase, confidence, version]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Query
 from fastapi.responses import Response
 
 from surrogym_server import convert
@@ -18,6 +18,8 @@ from surrogym_shared.codes import Code
 from surrogym_shared.wire import CreateSurrogate, Improve, PatchSurrogate, SurrogateList, SurrogateView
 
 router = APIRouter(prefix="/v1/surrogates", tags=["surrogates"], route_class=DoorRoute)
+
+MAX_PAGE = 1_000
 
 
 @router.post(
@@ -37,10 +39,15 @@ def create(body: Annotated[CreateSurrogate, example(examples.CREATE)], use: Use)
     return convert.surrogate_view(status)
 
 
-@router.get("", summary="All surrogates", dependencies=[READ])
-def list_all(use: Use) -> SurrogateList:
-    """Each with its phase, number of samples and confidence, oldest first."""
-    return SurrogateList(surrogates=[convert.surrogate_summary(status) for status in use.surrogates.list()])
+@router.get("", summary="All surrogates", dependencies=[READ], responses=documented(Code.INVALID_REQUEST))
+def list_all(
+    use: Use,
+    after: Annotated[int, Query(ge=0, le=2**63 - 1)] = 0,
+    limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = MAX_PAGE,
+) -> SurrogateList:
+    """Each with its phase, number of samples and confidence, oldest first, in pages: give ``next_after`` as ``after``
+    for the next."""
+    return convert.surrogate_list(use.surrogates.list(after, limit + 1), limit)
 
 
 @router.get(

@@ -15,7 +15,7 @@ from surrogym_server.convert.resources import (
     query_view,
     sample_page,
     sample_view,
-    surrogate_summary,
+    surrogate_list,
     surrogate_view,
     uncertainty,
 )
@@ -60,7 +60,7 @@ __all__ = [
     "session_view",
     "step_frame",
     "step_reply",
-    "surrogate_summary",
+    "surrogate_list",
     "surrogate_view",
     "uncertainty",
 ]

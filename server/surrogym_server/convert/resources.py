@@ -13,7 +13,7 @@ from surrogym_server.sampling.uncertainty import UncertaintyResult
 from surrogym_server.services.models import Said
 from surrogym_server.services.queries import Claim
 from surrogym_server.services.samples import Added
-from surrogym_server.services.surrogates import SurrogateStatus
+from surrogym_server.services.surrogates import Listed, SurrogateStatus
 from surrogym_server.storage.records import (
     EventRecord,
     LeasedQuery,
@@ -29,8 +29,13 @@ from surrogym_shared import spec as wire
 from surrogym_shared import wire as replies
 
 
-def surrogate_summary(status: SurrogateStatus) -> replies.SurrogateSummary:
-    return replies.SurrogateSummary(**_summary_fields(status))
+def surrogate_list(listed: Sequence[Listed], limit: int) -> replies.SurrogateList:
+    """A page of ``limit`` surrogates; another one follows where more are ``listed``."""
+    page, more = listed[:limit], len(listed) > limit
+    surrogates = [_summary_fields(one) for one in page]
+    return replies.SurrogateList.model_validate(
+        {"surrogates": surrogates, "next_after": page[-1].summary.id if more else None}
+    )
 
 
 def surrogate_view(status: SurrogateStatus) -> replies.SurrogateView:
@@ -45,29 +50,33 @@ def surrogate_view(status: SurrogateStatus) -> replies.SurrogateView:
     )
 
 
-def _summary_fields(status: SurrogateStatus) -> dict[str, Any]:
-    record, model = status.record, status.model
+def _summary_fields(listed: Listed) -> dict[str, Any]:
+    summary = listed.summary
     return {
-        "name": record.name,
-        "environment": record.spec["environment"],
-        "phase": record.phase,
-        "paused": record.paused,
-        "round": record.round,
-        "samples": status.samples,
-        "model_version": None if model is None else model.version,
-        "confidence_index": None if model is None else model.fidelity["confidence_index"],
-        "target": record.target,
-        "budget": record.budget,
-        "ledger": ledger(status.ledger),
-        "queries": replies.QueryCounts(**asdict(status.queries)),
-        "samplers": list(status.samplers),
-        "sessions": status.sessions,
-        "created_at": record.created_at,
+        "name": summary.name,
+        "environment": summary.environment,
+        "phase": summary.phase,
+        "paused": summary.paused,
+        "round": summary.round,
+        "samples": summary.ledger.total,
+        "model_version": summary.model_version,
+        "confidence_index": summary.confidence_index,
+        "target": summary.target,
+        "budget": summary.budget,
+        "ledger": _ledger_fields(summary.ledger),
+        "queries": vars(summary.queries),
+        "samplers": list(listed.samplers),
+        "sessions": listed.sessions,
+        "created_at": summary.created_at,
     }
 
 
 def ledger(record: LedgerRecord) -> replies.Ledger:
-    return replies.Ledger(**asdict(record), total=record.total)
+    return replies.Ledger(**_ledger_fields(record))
+
+
+def _ledger_fields(record: LedgerRecord) -> dict[str, int]:
+    return {**vars(record), "total": record.total}
 
 
 def claimed(claim: Claim, lease_seconds: float) -> replies.ClaimedQueries:

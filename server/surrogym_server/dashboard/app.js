@@ -27,7 +27,7 @@ function say(state, text = state) {
 function route() {
   const name = location.hash.startsWith("#/s/") ? decodeURIComponent(location.hash.slice(4)) : null;
   page.view?.close();
-  page.view = name === null ? listView(main) : surrogateView(main, name, { role: () => page.role, refresh });
+  page.view = name === null ? listView(main, { refresh }) : surrogateView(main, name, { role: () => page.role, refresh });
   document.title = name === null ? "Surrogym" : `${name} · Surrogym`;
   refresh();
 }

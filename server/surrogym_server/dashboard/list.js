@@ -25,17 +25,33 @@ function row(surrogate) {
     h("span", { class: "alive note" }, alive(surrogate))));
 }
 
-export function listView(main) {
+const PAGE = 100;
+
+async function firstOf(count) {
+  const found = [];
+  let after = 0;
+  do {
+    const { surrogates, next_after: next } = await call("GET", `/v1/surrogates?after=${after}&limit=${PAGE}`);
+    found.push(...surrogates);
+    after = next;
+  } while (after && found.length < count);
+  return { found, rest: Boolean(after) };
+}
+
+export function listView(main, { refresh }) {
   const list = h("ul", { class: "list" });
+  let wished = PAGE;
+  const more = h("button", { type: "button", hidden: true, onclick: () => { wished += PAGE; refresh(); } }, `Show ${PAGE} more`);
   const place = h("div", {}, h("div", { class: "card loading", "aria-busy": "true" }, "Asking the server…"));
   const rows = keyed(list, row);
-  main.replaceChildren(h("h1", {}, "Surrogates"), place);
+  main.replaceChildren(h("h1", {}, "Surrogates"), place, more);
   return {
     async refresh() {
-      const { surrogates } = await call("GET", "/v1/surrogates");
-      rows(surrogates.map(({ created_at, queries, round, ...rest }) => rest), (surrogate) => surrogate.name);
-      const wanted = surrogates.length ? list : place.querySelector(".welcome") ?? EMPTY();
+      const { found, rest } = await firstOf(wished);
+      rows(found.map(({ created_at, queries, round, ...rest }) => rest), (surrogate) => surrogate.name);
+      const wanted = found.length ? list : place.querySelector(".welcome") ?? EMPTY();
       if (place.firstChild !== wanted) place.replaceChildren(wanted);
+      more.hidden = !rest;
     },
     fail: (error) => place.replaceChildren(h("div", { class: "card bad", role: "alert" }, error.message)),
     repaint() {},

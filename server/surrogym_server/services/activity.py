@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -148,9 +148,10 @@ class Samplers:
         fresh = {key: at for key, at in self._heard.copy().items() if now - at < ALIVE_SECONDS}
         self._heard = fresh | {(surrogate, sampler): now}
 
-    def alive(self, surrogate: str) -> list[str]:
+    def by_surrogate(self) -> dict[str, list[str]]:
         """Names of those that asked or answered within the last minute."""
-        now = self._clock()
-        return sorted(
-            sampler for (name, sampler), at in self._heard.items() if name == surrogate and now - at < ALIVE_SECONDS
-        )
+        now, alive = self._clock(), defaultdict[str, list[str]](list)
+        for (surrogate, sampler), at in sorted(self._heard.items()):
+            if now - at < ALIVE_SECONDS:
+                alive[surrogate].append(sampler)
+        return alive

@@ -203,18 +203,12 @@ class Designer:
 
     def _give_up_hopeless(self) -> None:
         """Fail the designs whose initial queries were all set aside: nothing to fit, and nothing to wait for."""
-        for record in self._storage.surrogates.list():
+        for name in self._storage.designs.hopeless():
             with suppress(UnknownSurrogate):  # deleted meanwhile
-                if record.phase == "collecting" and not record.paused and (error := self._hopeless(record.name)):
-                    self._storage.surrogates.set_phase(record.name, "failed", error)
-                    self._notices.post(record.name)
-
-    def _hopeless(self, name: str) -> str | None:
-        counts = self._storage.queries.counts(name)
-        if counts.open or not counts.set_aside or self._storage.samples.count(name):
-            return None
-        last = self._storage.queries.list(name, ("set_aside",))[-1]
-        return f"all {counts.set_aside} initial queries were set aside; the last said: {last.error}"
+                set_aside = self._storage.queries.list(name, ("set_aside",))
+                error = f"all {len(set_aside)} initial queries were set aside; the last said: {set_aside[-1].error}"
+                self._storage.surrogates.set_phase(name, "failed", error)
+                self._notices.post(name)
 
 
 def phase_after(result: DesignResult) -> Phase:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import textwrap
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -20,11 +21,10 @@ from surrogym_server.services.definitions import Define
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import (
-    LedgerRecord,
     ModelRecord,
     NewSurrogate,
-    QueryCounts,
     SurrogateRecord,
+    SurrogateSummary,
 )
 from surrogym_server.surrogate.definition import EnvironmentDefinition
 
@@ -37,17 +37,21 @@ SHOWN = 120  # characters of a value in an error
 
 
 @dataclass(frozen=True)
-class SurrogateStatus:
-    """A surrogate and all that is counted of it."""
+class Listed:
+    """What a list shows of a surrogate, and who works with it."""
+
+    summary: SurrogateSummary
+    samplers: tuple[str, ...]  # heard of within the last minute
+    sessions: int  # open
+
+
+@dataclass(frozen=True)
+class SurrogateStatus(Listed):
+    """A surrogate with its specification and its latest model."""
 
     record: SurrogateRecord
     outputs: tuple[str, ...]
-    model: ModelRecord | None  # the latest
-    ledger: LedgerRecord
-    queries: QueryCounts
-    samples: int
-    samplers: tuple[str, ...]  # heard of within the last minute
-    sessions: int  # open
+    model: ModelRecord | None
 
 
 class SurrogateService:
@@ -108,9 +112,13 @@ class SurrogateService:
         """Raises ``UnknownSurrogate``."""
         return self._status(self._storage.surrogates.get(name))
 
-    def list(self) -> list[SurrogateStatus]:
-        """All of them, oldest first."""
-        return [self._status(record) for record in self._storage.surrogates.list()]
+    def list(self, after: int, limit: int) -> list[Listed]:
+        """Up to ``limit`` surrogates with an id above ``after``, oldest first."""
+        alive, sessions = self._samplers.by_surrogate(), Counter(session.surrogate for session in self._live)
+        return [
+            Listed(summary, tuple(alive.get(summary.name, ())), sessions[summary.name])
+            for summary in self._storage.surrogates.summaries(after, limit)
+        ]
 
     def change(
         self,
@@ -149,13 +157,11 @@ class SurrogateService:
         except NoModel:
             model = None
         return SurrogateStatus(
+            summary=self._storage.surrogates.summary(name),
             record=record,
             outputs=self._define(record.spec).outputs,
             model=model,
-            ledger=self._storage.ledger.read(name),
-            queries=self._storage.queries.counts(name),
-            samples=self._storage.samples.count(name),
-            samplers=tuple(self._samplers.alive(name)),
+            samplers=tuple(self._samplers.by_surrogate().get(name, ())),
             sessions=sum(session.surrogate == name for session in self._live),
         )
 

@@ -40,6 +40,7 @@ from surrogym_server.storage.records import (
     SampleRecord,
     SavedSession,
     SurrogateRecord,
+    SurrogateSummary,
 )
 
 MAX_ATTEMPTS = 3
@@ -63,8 +64,15 @@ class Surrogates(ABC):
         """Raises ``UnknownSurrogate`` when it was deleted."""
 
     @abstractmethod
-    def list(self) -> list[SurrogateRecord]:
-        """All of them, oldest first."""
+    def summary(self, name: str) -> SurrogateSummary: ...
+
+    @abstractmethod
+    def summaries(self, after: int = 0, limit: int | None = None) -> list[SurrogateSummary]:
+        """Up to ``limit`` surrogates with an id above ``after``, oldest first.
+
+        The number of statements does not depend on the number of surrogates. No model is loaded, and no specification
+        is parsed beyond the name of its environment.
+        """
 
     @abstractmethod
     def change(
@@ -111,6 +119,11 @@ class Designs(ABC):
         (a sample, a query set aside, an ask, another budget or target, a damaged model). It isn't paused, and
         nobody holds the right; one with more time left than it was given, as the clock was set back, is nobody's.
         """
+
+    @abstractmethod
+    def hopeless(self) -> list[str]:
+        """Names of the surrogates that collect, are not paused, have neither samples nor open queries, and whose
+        queries were set aside: there is nothing to fit, and nothing to wait for. Oldest first."""
 
     @abstractmethod
     def begin(self, name: str, owner: str, seconds: float) -> FitLease | None:

@@ -251,6 +251,25 @@ class LedgerRecord:
 
 
 @dataclass(frozen=True)
+class SurrogateSummary:
+    """What a list shows of a surrogate."""
+
+    id: int
+    name: str
+    budget: int
+    target: float
+    phase: Phase
+    paused: bool
+    round: int
+    created_at: float
+    environment: str
+    ledger: LedgerRecord
+    queries: QueryCounts
+    model_version: int | None  # the latest one
+    confidence_index: float | None  # of it
+
+
+@dataclass(frozen=True)
 class OccupancyRecord:
     checkpoint: str
     round: int  # of the design when it was submitted

@@ -106,3 +106,8 @@ class SurrogateView(SurrogateSummary):
 
 class SurrogateList(Reply):
     surrogates: list[SurrogateSummary]
+    next_after: int | None = Field(
+        default=None,
+        exclude_if=lambda after: after is None,  # a list that is whole is what clients know that follow no pages
+        description="give it as ``after`` for the next page; left out where this is the last",
+    )

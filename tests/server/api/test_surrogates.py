@@ -51,6 +51,22 @@ def test_the_list_has_what_the_page_shows(client: httpx.Client, taught: str):
     assert listed[taught]["model_version"] == finished.model_version
 
 
+def test_surrogates_come_in_pages(client: httpx.Client, taught: str, fresh: str):
+    whole = client.get("/v1/surrogates").json()
+    assert whole.keys() == {"surrogates"}, "as clients know it that follow no pages"
+    listed: list[str] = []
+    after: int | None = 0
+    while after is not None:
+        page = client.get("/v1/surrogates", params={"limit": 1, "after": after}).json()
+        assert len(page["surrogates"]) == 1
+        listed, after = [*listed, page["surrogates"][0]["name"]], page.get("next_after")
+    assert listed == [summary["name"] for summary in whole["surrogates"]]
+    assert {taught, fresh} <= set(listed)
+    for wrong in ({"limit": 0}, {"limit": 1_001}, {"after": -1}, {"after": "pendulum"}):
+        refused = client.get("/v1/surrogates", params=wrong)
+        assert (refused.status_code, refused.json()["code"]) == (422, "invalid_request")
+
+
 def test_improve_asks_more_and_raises_the_budget(client: httpx.Client, name: str):
     before = pendulum.teach(client, name, budget=6)
     body = {"queries": 2, "idempotency_key": "once"}

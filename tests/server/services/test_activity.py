@@ -78,6 +78,6 @@ def test_a_sampler_that_falls_silent_is_gone():
     clock.now += 40
     samplers.heard("a", "two")
     samplers.heard("b", "three")
-    assert samplers.alive("a") == ["one", "two"]
+    assert samplers.by_surrogate()["a"] == ["one", "two"]
     clock.now += 40
-    assert samplers.alive("a") == ["two"]
+    assert samplers.by_surrogate()["a"] == ["two"]

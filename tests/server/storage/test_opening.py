@@ -59,10 +59,10 @@ def test_migrations_make_the_tables_the_program_uses(url: str) -> None:
 
 def test_opening_again_keeps_everything(url: str, storage: Storage, make: Callable[..., str]) -> None:
     make(name="kept")
-    before = storage.surrogates.list()
+    before = storage.surrogates.get("kept")
     storage.close()
     again = open_storage(url)
-    assert again.surrogates.list() == before
+    assert again.surrogates.get("kept") == before
     again.close()
 
 
@@ -83,7 +83,7 @@ def test_text_is_utf8_in_a_database_that_knows_no_encoding(postgresql: Postgresq
     opened.surrogates.create(NewSurrogate("a", {"environment": "Fräse 3 µm"}, 30, 0.9))
     opened.close()
     again = open_storage(url)
-    assert again.surrogates.list()[0].spec == {"environment": "Fräse 3 µm"}
+    assert again.surrogates.get("a").spec == {"environment": "Fräse 3 µm"}
     again.close()
 
 

@@ -59,7 +59,7 @@ def test_a_name_given_anew_is_another_surrogate(
 def test_surrogates_are_listed_in_order_of_creation(storage: Storage, make: Callable[..., str]) -> None:
     for name in ("b", "a", "c"):
         make(name=name)
-    assert [record.name for record in storage.surrogates.list()] == ["b", "a", "c"]
+    assert [summary.name for summary in storage.surrogates.summaries()] == ["b", "a", "c"]
 
 
 def test_change_touches_what_is_given_and_no_more(storage: Storage, make: Callable[..., str]) -> None:
@@ -111,6 +111,7 @@ def test_every_operation_refuses_an_unknown_surrogate(storage: Storage, by_hand:
     none = np.zeros((0, 2))
     operations: list[Callable[[], object]] = [
         lambda: storage.surrogates.get("no"),
+        lambda: storage.surrogates.summary("no"),
         lambda: storage.surrogates.change("no", paused=True),
         lambda: storage.surrogates.set_phase("no", "ready"),
         lambda: storage.surrogates.delete("no"),

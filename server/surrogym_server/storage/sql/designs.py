@@ -25,6 +25,11 @@ from surrogym_server.storage.sql.models import insert_model
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, recall, remember, touch
 from surrogym_server.storage.sql.tables import queries, samples, surrogates
 
+# conditions on a row of surrogates
+OWN_QUERIES = sa.select(queries.c.id).where(queries.c.surrogate_id == surrogates.c.id)
+OWN_SAMPLES = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogates.c.id)
+OPEN_QUERY = sa.exists(OWN_QUERIES.where(queries.c.status.in_(OPEN_STATUSES)))
+
 
 class SqlDesigns(port.Designs):
     def __init__(self, database: Database) -> None:
@@ -45,6 +50,13 @@ class SqlDesigns(port.Designs):
         with self._database.read() as connection:
             wanted = sa.select(surrogates.c.name).where(_is_due(connection)).order_by(surrogates.c.id)
             return list(connection.execute(wanted).scalars())
+
+    def hopeless(self) -> list[str]:
+        with self._database.read() as connection:
+            collects = (surrogates.c.phase == "collecting") & surrogates.c.paused.is_(False)
+            set_aside = sa.exists(OWN_QUERIES.where(queries.c.status == "set_aside"))
+            wanted = sa.select(surrogates.c.name).where(collects, set_aside, ~OPEN_QUERY, ~sa.exists(OWN_SAMPLES))
+            return list(connection.execute(wanted.order_by(surrogates.c.id)).scalars())
 
     def begin(self, name: str, owner: str, seconds: float) -> FitLease | None:
         with self._database.write() as connection:
@@ -91,8 +103,6 @@ class SqlDesigns(port.Designs):
 
 def _is_due(connection: Connection) -> sa.ColumnElement[bool]:
     """The law of ``Designs.due`` as a condition on a row of surrogates."""
-    own_queries = sa.select(queries.c.id).where(queries.c.surrogate_id == surrogates.c.id)
-    own_samples = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogates.c.id)
     now, expires = clock(connection), surrogates.c.fit_expires
     set_back = expires > now + surrogates.c.fit_seconds  # the clock: nobody knows how old the right is
     free = expires.is_(None) | (expires <= now) | set_back
@@ -100,8 +110,8 @@ def _is_due(connection: Connection) -> sa.ColumnElement[bool]:
         surrogates.c.paused.is_(False),
         surrogates.c.revision > surrogates.c.fitted_revision,
         free,
-        sa.exists(own_samples),
-        ~sa.exists(own_queries.where(queries.c.status.in_(OPEN_STATUSES))),
+        sa.exists(OWN_SAMPLES),
+        ~OPEN_QUERY,
     )
 
 

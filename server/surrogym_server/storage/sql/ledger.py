@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+from typing import Any
+
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from surrogym_server.storage import port
 from surrogym_server.storage.records import LedgerRecord, fingerprint
 from surrogym_server.storage.sql.database import Database, clock
-from surrogym_server.storage.sql.rows import append_event, find, hold, recall, remember
+from surrogym_server.storage.sql.rows import Span, append_event, find, hold, recall, remember, within
 from surrogym_server.storage.sql.tables import evaluations, leases, queries, samples
 
 OPERATION = "report_steps"
@@ -35,32 +38,39 @@ class SqlLedger(port.Ledger):
             return _read(connection, find(connection, name))
 
 
+def ledgers(connection: Connection, span: Span) -> dict[int, LedgerRecord]:
+    """The ledger of each surrogate of the span that has anything to count."""
+    counted: defaultdict[int, dict[str, int]] = defaultdict(dict)
+    statement = sa.union_all(_samples_of(span), _evaluations_of(span), _unresolved_of(connection, span))
+    for surrogate, what, steps in connection.execute(statement).all():
+        counted[surrogate][what] = int(steps)
+    return {surrogate: _record(**counts) for surrogate, counts in counted.items()}
+
+
 def _read(connection: Connection, surrogate_id: int) -> LedgerRecord:
-    purposes = ("initial", "adaptive", "manual")
-    counts = [sa.func.count().filter(samples.c.purpose == purpose).label(purpose) for purpose in purposes]
-    evaluation = sa.select(sa.func.coalesce(sa.func.sum(evaluations.c.steps), 0)).where(
-        evaluations.c.surrogate_id == surrogate_id
-    )
-    failed = leases.c.outcome == "failed"
-    expired = (leases.c.outcome == "expired") | (
-        (leases.c.outcome == "open") & (leases.c.expires <= clock(connection))  # not swept yet
-    )
-    row = connection.execute(
-        sa.select(
-            *counts,
-            evaluation.scalar_subquery().label("evaluation"),
-            _steps_asked(surrogate_id, expired | failed).label("unresolved"),
-            _steps_asked(surrogate_id, failed).label("failed"),
-        ).where(samples.c.surrogate_id == surrogate_id)
-    ).one()
-    return LedgerRecord(**{field: int(value) for field, value in row._mapping.items()})
+    return ledgers(connection, (surrogate_id, surrogate_id)).get(surrogate_id, LedgerRecord())
 
 
-def _steps_asked(surrogate_id: int, of_leases: sa.ColumnElement[bool]) -> sa.ScalarSelect[int]:
-    """Steps that such leases of a surrogate were given out for."""
-    return (
-        sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0))
-        .select_from(leases.join(queries, queries.c.id == leases.c.query_id))
-        .where(leases.c.surrogate_id == surrogate_id, of_leases)
-        .scalar_subquery()
-    )
+def _record(*, failed: int = 0, expired: int = 0, **steps: int) -> LedgerRecord:
+    return LedgerRecord(**steps, unresolved=failed + expired, failed=failed)
+
+
+def _samples_of(span: Span) -> sa.Select[Any]:
+    counted = sa.select(samples.c.surrogate_id, samples.c.purpose, sa.func.count())
+    return counted.where(within(samples, span)).group_by(samples.c.surrogate_id, samples.c.purpose)
+
+
+def _evaluations_of(span: Span) -> sa.Select[Any]:
+    evaluation = sa.literal_column("'evaluation'", sa.Text)
+    summed = sa.select(evaluations.c.surrogate_id, evaluation, sa.func.sum(evaluations.c.steps))
+    return summed.where(within(evaluations, span)).group_by(evaluations.c.surrogate_id)
+
+
+def _unresolved_of(connection: Connection, span: Span) -> sa.Select[Any]:
+    """Steps that leases were given out for which failed, or expired, swept or not."""
+    unswept = (leases.c.outcome == "open") & (leases.c.expires <= clock(connection))
+    ended = leases.c.outcome.in_(("failed", "expired")) | unswept
+    how = sa.case((leases.c.outcome == "failed", "failed"), else_="expired").label("how")
+    summed = sa.select(leases.c.surrogate_id, how, sa.func.sum(queries.c.steps))
+    joined = summed.join_from(leases, queries, queries.c.id == leases.c.query_id)
+    return joined.where(within(leases, span), ended).group_by(leases.c.surrogate_id, how)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from typing import Any
 
+import msgspec
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
@@ -13,7 +15,7 @@ from surrogym_server.storage import port
 from surrogym_server.storage.records import ModelRecord, NewModel
 from surrogym_server.storage.sql.damage import damaged
 from surrogym_server.storage.sql.database import Database
-from surrogym_server.storage.sql.rows import append_event, find, hold, touch
+from surrogym_server.storage.sql.rows import Span, append_event, find, hold, touch, within
 from surrogym_server.storage.sql.tables import models
 
 COLUMNS = [
@@ -21,6 +23,13 @@ COLUMNS = [
     for name in ("version", "created_at", "samples", "data_hash", "fidelity", "description", "fit_seconds")
 ]
 INTACT = models.c.damage.is_(None)
+
+
+class _Judged(msgspec.Struct):
+    confidence_index: float
+
+
+_JUDGED = msgspec.json.Decoder(_Judged)
 
 
 class SqlModels(port.Models):
@@ -69,6 +78,16 @@ def _checksum(blob: bytes) -> str:
     return hashlib.sha256(blob).hexdigest()
 
 
+def newest_of(connection: Connection, span: Span) -> dict[int, tuple[int, float]]:
+    """Version and confidence index of the newest model of each surrogate of the span that has one."""
+    latest = sa.select(models.c.surrogate_id, sa.func.max(models.c.version).label("version"))
+    newest = latest.where(within(models, span), INTACT).group_by(models.c.surrogate_id).subquery()
+    same = (models.c.surrogate_id == newest.c.surrogate_id) & (models.c.version == newest.c.version)
+    fidelity = sa.type_coerce(models.c.fidelity, sa.Text)
+    rows = connection.execute(sa.select(models.c.surrogate_id, models.c.version, fidelity).join(newest, same)).all()
+    return {surrogate: (version, _confidence_index(fidelity)) for surrogate, version, fidelity in rows}
+
+
 def insert_model(connection: Connection, held: Row[Any], model: NewModel) -> int:
     """Store a model as the newest version; the surrogate is held, so that versions have no gaps."""
     newest = sa.select(sa.func.max(models.c.version)).where(models.c.surrogate_id == held.id)
@@ -90,6 +109,14 @@ def insert_model(connection: Connection, held: Row[Any], model: NewModel) -> int
     told = {"samples": model.samples, "fit_seconds": model.fit_seconds, "fidelity": model.fidelity}
     append_event(connection, held, "fit", version=version, **told)
     return version
+
+
+def _confidence_index(fidelity: str) -> float:
+    """The one field of a fidelity: parsing all of it takes ten times as long."""
+    try:
+        return _JUDGED.decode(fidelity).confidence_index
+    except msgspec.DecodeError:  # it holds NaN, which Python's parser alone reads
+        return float(json.loads(fidelity)["confidence_index"])
 
 
 def _one(connection: Connection, name: str, version: int | None, *columns: sa.ColumnElement[Any]) -> Row[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,7 +21,7 @@ from surrogym_server.storage.records import (
 )
 from surrogym_server.storage.sql import leases as leasing
 from surrogym_server.storage.sql.database import Database, clock
-from surrogym_server.storage.sql.rows import find, hold, insert_queries, recall, remember
+from surrogym_server.storage.sql.rows import Span, find, hold, insert_queries, recall, remember, within
 from surrogym_server.storage.sql.tables import leases, queries, surrogates
 
 COLUMNS = [
@@ -114,12 +115,8 @@ class SqlQueries(port.Queries):
 
     def counts(self, name: str) -> QueryCounts:
         with self._database.read() as connection:
-            wanted = (
-                sa.select(queries.c.status, sa.func.count())
-                .where(queries.c.surrogate_id == find(connection, name))
-                .group_by(queries.c.status)
-            )
-            return QueryCounts(**dict(connection.execute(wanted).all()))
+            id = find(connection, name)
+            return query_counts(connection, (id, id)).get(id, QueryCounts())
 
     def sweep_expired(self) -> int:
         with self._database.read() as connection:
@@ -139,6 +136,16 @@ class SqlQueries(port.Queries):
                 return leasing.sweep(connection, hold(connection, name))
         except UnknownSurrogate:  # deleted meanwhile
             return 0
+
+
+def query_counts(connection: Connection, span: Span) -> dict[int, QueryCounts]:
+    """How many queries of each status there are, of each surrogate of the span that has any."""
+    counted: defaultdict[int, dict[str, int]] = defaultdict(dict)
+    wanted = sa.select(queries.c.surrogate_id, queries.c.status, sa.func.count()).where(within(queries, span))
+    rows = connection.execute(wanted.group_by(queries.c.surrogate_id, queries.c.status)).all()
+    for surrogate, status, count in rows:
+        counted[surrogate][status] = count
+    return {surrogate: QueryCounts(**counts) for surrogate, counts in counted.items()}
 
 
 def _ended(query_id: int) -> LeaseExpired:

@@ -14,6 +14,7 @@ from surrogym_server.storage.records import Array, EventKind, Purpose
 from surrogym_server.storage.sql.database import clock
 from surrogym_server.storage.sql.tables import events, queries, requests, surrogates
 
+Span = tuple[int, int]  # of ids of surrogates, the first and the last
 HELD = (surrogates.c.id, surrogates.c.phase, surrogates.c.paused, surrogates.c.round)
 
 
@@ -36,6 +37,11 @@ def hold(connection: Connection, name: str, *extra: sa.ColumnElement[Any]) -> Ro
     if found is None:
         raise unknown_surrogate(name)
     return found
+
+
+def within(table: sa.Table, span: Span) -> sa.ColumnElement[bool]:
+    """Whether a row of a table belongs to a surrogate of the span."""
+    return table.c.surrogate_id.between(*span)
 
 
 def unknown_surrogate(name: str) -> UnknownSurrogate:

@@ -9,9 +9,10 @@ from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage import port
-from surrogym_server.storage.records import OPEN_STATUSES, NewSurrogate, Phase, SurrogateRecord
+from surrogym_server.storage.records import OPEN_STATUSES, NewSurrogate, Phase, SurrogateRecord, SurrogateSummary
 from surrogym_server.storage.sql.database import Database, clock, conflict_insert
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, touch, unknown_surrogate
+from surrogym_server.storage.sql.summaries import read_summaries
 from surrogym_server.storage.sql.tables import leases, queries, samples, surrogates
 
 NO_RIGHT = {"fit_token": None, "fit_owner": None, "fit_expires": None, "fit_seconds": None}
@@ -48,10 +49,16 @@ class SqlSurrogates(port.Surrogates):
             raise UnknownSurrogate("expected a surrogate that is there, got one that was deleted")
         return str(name)
 
-    def list(self) -> list[SurrogateRecord]:
+    def summary(self, name: str) -> SurrogateSummary:
         with self._database.read() as connection:
-            rows = connection.execute(sa.select(*COLUMNS).order_by(surrogates.c.id))
-            return [_record(row) for row in rows]
+            found = read_summaries(connection, surrogates.c.name == name, limit=1)
+        if not found:
+            raise unknown_surrogate(name)
+        return found[0]
+
+    def summaries(self, after: int = 0, limit: int | None = None) -> list[SurrogateSummary]:
+        with self._database.read() as connection:
+            return read_summaries(connection, surrogates.c.id > after, limit)
 
     def change(
         self,

@@ -1,0 +1,25 @@
+"""The page of very many surrogates: a hundred at once, more where they are wished for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from playwright.sync_api import Page, expect
+
+from support.many import fill
+from support.server import running_server
+
+Open = Callable[..., Page]
+
+
+def test_a_hundred_surrogates_are_shown_and_more_on_demand(tmp_path: Path, open_page: Open, complaints: list[str]):
+    fill(tmp_path / "surrogym.db", 104)
+    with running_server(tmp_path) as server:
+        page = open_page(server.url)
+        rows, more = page.locator("a.row"), page.get_by_role("button", name="Show 100 more")
+        expect(rows).to_have_count(100)
+        more.click()
+        expect(rows).to_have_count(104)
+        expect(more).to_be_hidden()
+    assert complaints == []

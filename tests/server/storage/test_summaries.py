@@ -1,0 +1,135 @@
+"""What a list shows of surrogates is what each of them says by itself, at a cost that many share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+import sqlalchemy as sa
+
+from surrogym_server.storage.port import MAX_ATTEMPTS, Storage
+from surrogym_server.storage.records import NewDesign, NewModel, NewSample, SurrogateSummary
+
+LONG = 60.0
+
+
+@contextmanager
+def statements() -> Iterator[list[str]]:
+    """The SQL that is sent meanwhile."""
+    sent: list[str] = []
+
+    def note(_: object, __: object, statement: str, *___: object) -> None:
+        sent.append(statement)
+
+    sa.event.listen(sa.Engine, "before_cursor_execute", note)
+    try:
+        yield sent
+    finally:
+        sa.event.remove(sa.Engine, "before_cursor_execute", note)
+
+
+@pytest.fixture
+def worked(
+    storage: Storage,
+    make: Callable[..., str],
+    answer: Callable[..., NewSample],
+    answer_all: Callable[[str], None],
+    design: Callable[..., NewDesign],
+) -> list[str]:
+    """Names: one with models, an evaluation and a failed lease, one with a lease that ran out, and one untouched."""
+    done, left, untouched = (make(name=name) for name in ("done", "left", "untouched"))
+    first, *_ = storage.queries.claim(done, "a", 1, LONG)
+    storage.queries.fail(done, first.id, first.token, "unreachable")
+    answer_all(done)
+    lease = storage.designs.begin(done, "me", LONG)
+    assert lease is not None
+    storage.designs.commit(lease, design(queries=2, model=judged(0.9)))
+    storage.models.add(done, judged(float("nan")))
+    storage.models.add(done, judged(0.95))
+    storage.ledger.report(done, 7, key="e")
+    [query, *_] = storage.queries.claim(left, "a", 2, LONG)
+    storage.samples.add(left, "a", [answer(query)])
+    storage.queries.claim(left, "a", 1, -1.0)
+    return [done, left, untouched]
+
+
+def judged(confidence_index: float) -> NewModel:
+    return NewModel(3, "abc", {"outputs": [], "confidence_index": confidence_index}, {}, 0.5, b"model")
+
+
+def test_a_summary_says_what_the_surrogate_says_by_itself(storage: Storage, worked: list[str]) -> None:
+    summaries = storage.surrogates.summaries()
+    assert [summary.name for summary in summaries] == worked
+    for summary in summaries:
+        record = storage.surrogates.get(summary.name)
+        assert summary == storage.surrogates.summary(summary.name)
+        assert summary.environment == "Pendulum-v1"
+        assert (summary.id, summary.phase, summary.round) == (record.id, record.phase, record.round)
+        assert (summary.budget, summary.target) == (record.budget, record.target)
+        assert summary.ledger == storage.ledger.read(summary.name)
+        assert summary.ledger.total == storage.samples.count(summary.name)
+        assert summary.queries == storage.queries.counts(summary.name)
+    done, left, untouched = summaries
+    assert (done.model_version, done.confidence_index, left.model_version) == (3, 0.95, None)
+    assert (done.ledger.evaluation, done.ledger.failed, done.ledger.unresolved) == (7, 1, 1)
+    assert (left.ledger.initial, left.ledger.failed, left.ledger.unresolved) == (1, 0, 1), "expired, and not yet swept"
+    assert (untouched.ledger.total, untouched.queries.pending) == (0, 3)
+
+
+def test_an_index_that_is_no_number_spoils_no_list(storage: Storage, make: Callable[..., str]) -> None:
+    storage.models.add(make(), judged(float("nan")))
+    index = storage.surrogates.summaries()[0].confidence_index
+    assert index is not None
+    assert index != index
+
+
+def test_pages_follow_one_another(storage: Storage, make: Callable[..., str]) -> None:
+    names = [make(name=f"s-{number}") for number in range(5)]
+    storage.surrogates.delete(names.pop(2))
+    seen: list[SurrogateSummary] = []
+    while page := storage.surrogates.summaries(seen[-1].id if seen else 0, 2):
+        assert len(page) <= 2
+        seen += page
+    assert [summary.name for summary in seen] == names
+    assert {summary.queries.pending for summary in seen} == {3}
+
+
+@pytest.mark.parametrize(
+    "look",
+    [
+        lambda storage: storage.surrogates.summaries(),
+        lambda storage: (storage.designs.hopeless(), storage.designs.due()),
+        lambda storage: storage.models.newest(),
+        lambda storage: storage.queries.sweep_expired(),
+    ],
+    ids=["summaries", "designer", "models", "sweeper"],
+)
+def test_many_surrogates_take_no_more_statements_than_a_few(
+    storage: Storage, make: Callable[..., str], look: Callable[[Storage], object]
+) -> None:
+    """Ten seconds for a list of a thousand is what several statements for each came to."""
+    sent = []
+    for count in (2, 20):
+        for number in range(count):
+            storage.models.add(make(name=f"s-{count}-{number}"), judged(0.9))
+        with statements() as found:
+            look(storage)
+        sent.append(len(found))
+    assert sent[0] == sent[1] <= 6
+
+
+def test_a_design_without_samples_is_hopeless_once_all_its_queries_are_set_aside(
+    storage: Storage, make: Callable[..., str], by_hand: Callable[..., NewSample]
+) -> None:
+    hopeless, sampled, waiting = (make(queries=1, name=name) for name in ("hopeless", "sampled", "waiting"))
+    storage.samples.add(sampled, "a", [by_hand()])
+    for name in (sampled, hopeless):
+        for _ in range(MAX_ATTEMPTS):
+            assert storage.designs.hopeless() == []
+            [query] = storage.queries.claim(name, "a", 1, LONG)
+            storage.queries.fail(name, query.id, query.token, "no power")
+    assert storage.designs.hopeless() == [hopeless]
+    storage.surrogates.change(hopeless, paused=True)
+    assert storage.designs.hopeless() == []
+    assert storage.queries.counts(waiting).pending == 1
