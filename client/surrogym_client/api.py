@@ -277,10 +277,14 @@ class Api:
 
     def improve(
         self, name: str, queries: int, *, checkpoint: str | None = None, idempotency_key: str | None = None
-    ) -> wire.SurrogateView:
-        """Ask the design for more queries, weighted by the occupancy submitted under ``checkpoint``."""
+    ) -> wire.ImprovedSurrogate:
+        """Ask the design for more queries, weighted by the occupancy submitted under ``checkpoint``.
+
+        Raises:
+            BeyondBudget: the budget has not as many left, and this token may not raise it; one of role admin does.
+        """
         body = wire.Improve(queries=queries, checkpoint=checkpoint, idempotency_key=idempotency_key or new_key())
-        return self._post(wire.SurrogateView, f"{routes.surrogate(name)}/improve", body)
+        return self._post(wire.ImprovedSurrogate, f"{routes.surrogate(name)}/improve", body)
 
     # Models
 

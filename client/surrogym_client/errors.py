@@ -25,7 +25,8 @@ SurrogymClientError
     │   └── NoModel
     ├── Refused
     │   ├── Unauthenticated
-    │   └── Forbidden
+    │   ├── Forbidden
+    │   └── BeyondBudget    an admin raises the budget, or fewer real steps are asked for
     ├── Unavailable         was tried again until the retry budget ran out
     │   └── Overloaded
     └── ServerFailure       a defect of the server, or of what it has stored
@@ -154,6 +155,10 @@ class Forbidden(Refused):
     """The token's role does not allow this."""
 
 
+class BeyondBudget(Refused):
+    """The budget has not as many real steps left, and this token may not raise it."""
+
+
 class Unavailable(ProblemError):
     """The server can't serve this now."""
 
@@ -171,6 +176,7 @@ BY_CODE: dict[Code, type[ProblemError]] = {
     Code.INVALID_SPEC: InvalidSpec,
     Code.UNAUTHENTICATED: Unauthenticated,
     Code.FORBIDDEN: Forbidden,
+    Code.BEYOND_BUDGET: BeyondBudget,
     Code.NOT_FOUND: InvalidInput,
     Code.UNKNOWN_SURROGATE: UnknownSurrogate,
     Code.UNKNOWN_SESSION: UnknownSession,

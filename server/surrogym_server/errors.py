@@ -20,7 +20,8 @@ SurrogymError
 │   └── NoModel             nothing has been fitted yet
 ├── Refused
 │   ├── Unauthenticated
-│   └── Forbidden
+│   ├── Forbidden
+│   └── BeyondBudget        more real steps than the budget has left, from a caller who may not raise it
 ├── Unavailable             storage or engine can't serve this now; try again later
 │   ├── Damaged             what is stored can't be read as it was written; whoever runs the server restores a copy
 │   ├── Overloaded          a queue or a cap is full; try again later
@@ -117,6 +118,10 @@ class Unauthenticated(Refused):
 
 class Forbidden(Refused):
     """The token's role does not allow this."""
+
+
+class BeyondBudget(Refused):
+    """More real steps than the budget has left; who may raise it can."""
 
 
 class Unavailable(SurrogymError):

@@ -16,6 +16,7 @@ class Code(StrEnum):
     INVALID_SPEC = "invalid_spec"  # a specification that contradicts itself
     UNAUTHENTICATED = "unauthenticated"  # no token, or an unknown one
     FORBIDDEN = "forbidden"  # a token whose role does not allow this
+    BEYOND_BUDGET = "beyond_budget"  # more real steps than the budget has left; an admin's token raises it
     NOT_FOUND = "not_found"  # no such route
     UNKNOWN_SURROGATE = "unknown_surrogate"
     UNKNOWN_SESSION = "unknown_session"
@@ -45,6 +46,7 @@ STATUS: dict[Code, int] = {
     Code.INVALID_SPEC: 422,
     Code.UNAUTHENTICATED: 401,
     Code.FORBIDDEN: 403,
+    Code.BEYOND_BUDGET: 403,
     Code.NOT_FOUND: 404,
     Code.UNKNOWN_SURROGATE: 404,
     Code.UNKNOWN_SESSION: 404,

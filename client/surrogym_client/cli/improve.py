@@ -27,11 +27,14 @@ def command(
 ) -> None:
     """Ask the design for more queries. A sampler has to answer them.
 
+    The budget has to hold them. With an admin's token, or on a server without tokens, it is raised to.
+
     Example: surrogym improve pendulum --queries 10
     """
     from surrogym_shared.terminal import give
 
     with connect(server, token) as api:
         view = api.improve(surrogate, queries, checkpoint=checkpoint)
-    words = f"{queries} more queries for {view.name}; its budget is now {view.budget}"
+    raised = f"was raised by {view.budget_raised_by} to {view.budget}" if view.budget_raised_by else "holds them"
+    words = f"{queries} more queries for {view.name}; its budget {raised}, with {view.budget_left} left"
     give(view.model_dump(mode="json"), lambda: words, as_json=as_json, quiet=quiet)

@@ -126,7 +126,7 @@ def command(
         typer.Option(
             min=0,
             help="More real queries in each round, where the policy goes, until that is known or the design ready. A "
-            "sampler has to be running.",
+            "sampler has to be running, and the budget has to hold them; an admin's token raises it.",
         ),
     ] = 0,
     rounds: Annotated[int, typer.Option(min=1, help="Rounds of --improve, at most.")] = 3,
@@ -148,10 +148,11 @@ def command(
 
     Example: surrogym train pendulum --out policy.zip --seed 0
     """
+    from surrogym_client.budget import words_of_rounds
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.cli.train_words import words_of_result
     from surrogym_client.lifetime import exit_with_parent as watch_parent
-    from surrogym_shared.terminal import give, on_interrupt, progress
+    from surrogym_shared.terminal import give, on_interrupt, progress, say
     from surrogym_shared.wire import OF_PARTICLES
 
     if exit_with_parent:
@@ -173,6 +174,9 @@ def command(
         penalty=penalty,
     )
     spec, url = _trainable(surrogate, server, token, wait, quiet=quiet)
+    if improve:
+        with connect(server, token) as api:
+            say(words_of_rounds(api, surrogate, improve, rounds), quiet=quiet)
     with on_interrupt(lambda: NOTHING_YET), progress("prepare", quiet=quiet) as update:
         update(None, "importing Stable-Baselines3")
         from surrogym_client.train import TrainSettings  # torch; imported once there is something to train on

@@ -34,6 +34,7 @@ CODES: dict[type[errors.SurrogymError], Code] = {
     errors.NoModel: Code.NO_MODEL,
     errors.Unauthenticated: Code.UNAUTHENTICATED,
     errors.Forbidden: Code.FORBIDDEN,
+    errors.BeyondBudget: Code.BEYOND_BUDGET,
     errors.Overloaded: Code.TOO_MANY_REQUESTS,
     errors.DeadlineExceeded: Code.DEADLINE_EXCEEDED,
     errors.Damaged: Code.DAMAGED,

@@ -4,18 +4,26 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 
 from surrogym_server import convert
 from surrogym_server.api import examples
 from surrogym_server.api.auth import ADMIN, READ, TRAIN
 from surrogym_server.api.body import example
+from surrogym_server.api.caller import role_of
 from surrogym_server.api.door import DoorRoute, json_up_to
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_shared.codes import Code
-from surrogym_shared.wire import CreateSurrogate, Improve, PatchSurrogate, SurrogateList, SurrogateView
+from surrogym_shared.wire import (
+    CreateSurrogate,
+    Improve,
+    ImprovedSurrogate,
+    PatchSurrogate,
+    SurrogateList,
+    SurrogateView,
+)
 
 router = APIRouter(prefix="/v1/surrogates", tags=["surrogates"], route_class=DoorRoute)
 
@@ -91,10 +99,14 @@ async def delete(name: str, use: Use) -> Response:
     "/{name}/improve",
     summary="Ask the design for more queries",
     dependencies=[TRAIN],
-    responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.INVALID_REQUEST),
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.INVALID_REQUEST, Code.BEYOND_BUDGET),
 )
-def improve(name: str, body: Annotated[Improve, example(examples.IMPROVE)], use: Use) -> SurrogateView:
-    """Chosen by the acquisition, weighted by the states that policies visited and submitted. The budget is
-    raised to hold them."""
-    use.designer.improve(name, body.queries, body.checkpoint, body.idempotency_key)
-    return convert.surrogate_view(use.surrogates.status(name))
+def improve(
+    name: str, body: Annotated[Improve, example(examples.IMPROVE)], request: Request, use: Use
+) -> ImprovedSurrogate:
+    """Chosen by the acquisition, weighted by the states that policies visited and submitted. The budget has to hold
+    them, beside the steps that were taken, asked for or promised before; a token of role ``admin`` raises it to, and
+    ``budget_raised_by`` says by how much."""
+    may_raise = role_of(request.scope) == "admin"
+    granted = use.designer.improve(name, body.queries, body.checkpoint, body.idempotency_key, raise_budget=may_raise)
+    return convert.improved(use.surrogates.status(name), granted.raised)

@@ -39,15 +39,24 @@ def surrogate_list(listed: Sequence[Listed], limit: int) -> replies.SurrogateLis
 
 
 def surrogate_view(status: SurrogateStatus) -> replies.SurrogateView:
+    return replies.SurrogateView(**_view_fields(status))
+
+
+def improved(status: SurrogateStatus, raised: int) -> replies.ImprovedSurrogate:
+    return replies.ImprovedSurrogate(**_view_fields(status), budget_raised_by=raised)
+
+
+def _view_fields(status: SurrogateStatus) -> dict[str, Any]:
     record, model = status.record, status.model
-    return replies.SurrogateView(
+    return {
         **_summary_fields(status),
-        spec=wire.EnvironmentSpec.model_validate(record.spec),
-        tolerances=record.tolerances,
-        outputs=list(status.outputs),
-        fidelity=None if model is None else replies.Fidelity.model_validate(model.fidelity),
-        error=record.error,
-    )
+        "spec": wire.EnvironmentSpec.model_validate(record.spec),
+        "budget_left": status.budget_left,
+        "tolerances": record.tolerances,
+        "outputs": list(status.outputs),
+        "fidelity": None if model is None else replies.Fidelity.model_validate(model.fidelity),
+        "error": record.error,
+    }
 
 
 def _summary_fields(listed: Listed) -> dict[str, Any]:

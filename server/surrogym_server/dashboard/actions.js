@@ -34,9 +34,9 @@ export function actions(name, { role, refresh }) {
 
   async function run(work, done) {
     try {
-      await work();
+      const reply = await work();
       said.className = "note good";
-      said.textContent = done;
+      said.textContent = typeof done === "function" ? done(reply) : done;
       refresh();
     } catch (error) {
       said.className = "bad";
@@ -46,7 +46,8 @@ export function actions(name, { role, refresh }) {
   const steps = () => Math.max(1, Math.round(Number(more.value) || 1));
   pause.addEventListener("click", () => run(() => call("PATCH", path, { paused: !now.paused }), now.paused ? "It goes on." : "Paused: no query is given out."));
   const add = () => run(() => call("PATCH", path, { budget: now.budget + steps() }), `The budget is now ${count(now.budget + steps())}.`);
-  const improve = () => run(() => call("POST", `${path}/improve`, { queries: steps() }), `${count(steps())} more real steps are asked for, where they tell most.`);
+  const improve = () => run(() => call("POST", `${path}/improve`, { queries: steps() }), ({ budget, budget_raised_by: raised }) =>
+    `${count(steps())} more real steps are asked for, where they tell most${raised ? `; that raised the budget to ${count(budget)}` : ""}.`);
   const remove = async () => {
     if (!(await confirmed(name))) return;
     await run(() => call("DELETE", path), "Deleted.");

@@ -19,10 +19,10 @@ from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import (
     OPEN_STATUSES,
     FitLease,
+    Granted,
     NewDesign,
     NewModel,
     Phase,
-    SurrogateRecord,
 )
 
 logger = logging.getLogger(__name__)
@@ -98,20 +98,23 @@ class Designer:
                 await self._fit(name)
         await asyncio.to_thread(self._give_up_hopeless)
 
-    def improve(self, name: str, queries: int, checkpoint: str | None, key: str | None) -> SurrogateRecord:
+    def improve(
+        self, name: str, queries: int, checkpoint: str | None, key: str | None, *, raise_budget: bool
+    ) -> Granted:
         """Ask the next fit for more queries, weighted by the occupancy of a checkpoint (None: the latest, if
-        any).
+        any), and for ``raise_budget`` raise the budget to hold them.
 
         Raises:
             InvalidInput: no occupancy was submitted under this name.
+            BeyondBudget: the budget has not as many left, and may not be raised.
         """
         if checkpoint is not None and self._storage.occupancy.get(name, checkpoint) is None:
             raise InvalidInput(f"no occupancy was submitted as {checkpoint!r}: submit it from a session first")
         if checkpoint is None and (latest := self._storage.occupancy.latest(name)) is not None:
             checkpoint = latest.checkpoint
-        record = self._storage.designs.ask(name, queries, checkpoint=checkpoint, key=key)
+        granted = self._storage.designs.ask(name, queries, checkpoint=checkpoint, key=key, raise_budget=raise_budget)
         self._notices.post(name)
-        return record
+        return granted
 
     async def _fit(self, name: str) -> None:
         lease = await asyncio.to_thread(self._storage.designs.begin, name, self._owner, FIT_LEASE_SECONDS)
@@ -155,6 +158,7 @@ class Designer:
         name = lease.surrogate
         record, samples = self._storage.surrogates.get(name), self._storage.samples.arrays(name)
         pending = self._storage.queries.list(name, (*OPEN_STATUSES, "set_aside"))
+        spoken = len(samples.reward) + sum(query.steps for query in pending)
         steps = [query for query in pending if query.kind == "step"]
         visited = None if lease.checkpoint is None else self._storage.occupancy.get(name, lease.checkpoint)
         return DesignJob(
@@ -170,7 +174,7 @@ class Designer:
             pending_coordinates=np.array([query.coordinates for query in steps]) if steps else None,
             pending_action=np.array([query.action for query in steps]) if steps else None,
             pending_rollouts=tuple(query.actions for query in pending if query.kind == "rollout"),
-            extra_queries=lease.extra_queries,
+            extra_queries=min(lease.extra_queries, max(0, record.budget - spoken)),  # it may have been lowered since
             occupancy=None if visited is None else visited.states,
             threads=self._threads,
         )

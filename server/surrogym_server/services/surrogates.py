@@ -52,6 +52,7 @@ class SurrogateStatus(Listed):
     record: SurrogateRecord
     outputs: tuple[str, ...]
     model: ModelRecord | None
+    budget_left: int  # real steps that may still be asked for within it
 
 
 class SurrogateService:
@@ -161,6 +162,7 @@ class SurrogateService:
             record=record,
             outputs=self._define(record.spec).outputs,
             model=model,
+            budget_left=self._storage.designs.left(name),
             samplers=tuple(self._samplers.by_surrogate().get(name, ())),
             sessions=sum(session.surrogate == name for session in self._live),
         )

@@ -24,6 +24,7 @@ from surrogym_server.storage.records import (
     Array,
     EventRecord,
     FitLease,
+    Granted,
     LeasedQuery,
     LedgerRecord,
     ModelRecord,
@@ -104,12 +105,30 @@ class Designs(ABC):
     """The right to fit: at any time at most one server fits a surrogate."""
 
     @abstractmethod
-    def ask(self, name: str, queries: int, *, checkpoint: str | None = None, key: str | None = None) -> SurrogateRecord:
+    def ask(
+        self,
+        name: str,
+        queries: int,
+        *,
+        checkpoint: str | None = None,
+        key: str | None = None,
+        raise_budget: bool = False,
+    ) -> Granted:
         """Ask the next fit for ``queries`` more, whatever its verdict; a fit becomes due.
 
-        Counted in real steps: a rollout's are as many as its actions. The budget is raised to hold them, beside the
-        samples, the open queries and what was asked before.
+        Counted in real steps: a rollout's are as many as its actions.
+
+        Args:
+            raise_budget: raise the budget by what it has not ``left``.
+
+        Raises:
+            BeyondBudget: the budget has not as many left, and may not be raised.
         """
+
+    @abstractmethod
+    def left(self, name: str) -> int:
+        """Real steps of the budget that are neither taken, nor asked for by a query without an answer (open or set
+        aside), nor promised by ``ask``; 0 where there are more of these than the budget holds."""
 
     @abstractmethod
     def due(self) -> list[str]:

@@ -67,6 +67,14 @@ class SurrogateRecord:
 
 
 @dataclass(frozen=True)
+class Granted:
+    """What ``Designs.ask`` led to."""
+
+    record: SurrogateRecord  # as it is now
+    raised: int  # real steps that the budget was raised by
+
+
+@dataclass(frozen=True)
 class FitLease:
     """The right to fit one surrogate, until it expires. Given back whole to renew, commit or abort."""
 

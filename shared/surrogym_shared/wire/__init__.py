@@ -87,6 +87,7 @@ from surrogym_shared.wire.sessions import (
 from surrogym_shared.wire.surrogates import (
     CreateSurrogate,
     Fidelity,
+    ImprovedSurrogate,
     Ledger,
     OutputFidelity,
     PatchSurrogate,
@@ -128,6 +129,7 @@ __all__ = [
     "Imagined",
     "ImaginedEpisode",
     "Improve",
+    "ImprovedSurrogate",
     "Key",
     "LeasedQuery",
     "Ledger",

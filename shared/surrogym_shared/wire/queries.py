@@ -178,7 +178,8 @@ class ReportSteps(Request):
 
 
 class Improve(Request):
-    """Ask the design for more queries, chosen by the acquisition; budget is raised to fit them."""
+    """Ask the design for more queries, chosen by the acquisition. The budget has to hold them; a token of role admin
+    raises it to."""
 
     queries: Annotated[int, Field(ge=1, le=10_000, description="real steps: a rollout's count one by one")]
     checkpoint: Key | None = Field(default=None, description="weigh by the occupancy submitted under this name")

@@ -98,10 +98,19 @@ class SurrogateSummary(Reply):
 
 class SurrogateView(SurrogateSummary):
     spec: EnvironmentSpec
+    budget_left: int = Field(
+        description="real steps of the budget that are neither taken, nor asked for, nor promised to who asked for more"
+    )
     tolerances: dict[str, float] = Field(description="set since the surrogate was created, by output, in its own unit")
     outputs: list[str]
     fidelity: Fidelity | None
     error: str | None = Field(default=None, description="why the phase is failed, or the last query was set aside")
+
+
+class ImprovedSurrogate(SurrogateView):
+    """A surrogate that was asked for more queries."""
+
+    budget_raised_by: int = Field(description="real steps that the request added to the budget; 0: it held them")
 
 
 class SurrogateList(Reply):

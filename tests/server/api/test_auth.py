@@ -9,6 +9,7 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from support import pendulum
 from support.server import running_server
 from surrogym_server import dashboard
 
@@ -77,6 +78,28 @@ def test_a_role_may_do_its_part_alone(guarded: httpx.Client, call: str):
             assert reply.status_code in (200, 204, 404, 415, 422), role
         else:
             assert (reply.status_code, reply.json()["code"]) == (403, "forbidden"), role
+
+
+def test_a_train_token_asks_within_the_budget_and_an_admin_raises_it(guarded: httpx.Client):
+    """A real step costs money: who trains may not decide how many are taken."""
+    train, admin = ({"authorization": f"Bearer {TOKENS[role]}"} for role in ("train", "admin"))
+    guarded.post("/v1/surrogates", json={"name": "owned", "spec": pendulum.spec()}, headers=admin).raise_for_status()
+    left = pendulum.BUDGET - pendulum.INITIAL
+    path = "/v1/surrogates/owned/improve"
+
+    def ask(queries: int, headers: dict[str, str]) -> httpx.Response:
+        return guarded.post(path, json={"queries": queries}, headers=headers)
+
+    refused = ask(left + 1, train)
+    assert (refused.status_code, refused.json()["code"]) == (403, "beyond_budget")
+    assert f"at most {left} more queries" in refused.json()["detail"]
+    assert "surrogym change owned --budget" in refused.json()["detail"]
+    within = ask(left, train).raise_for_status().json()
+    assert (within["budget"], within["budget_left"], within["budget_raised_by"]) == (pendulum.BUDGET, 0, 0)
+    assert ask(1, train).status_code == 403
+    raised = ask(3, admin).raise_for_status().json()
+    assert (raised["budget"], raised["budget_raised_by"]) == (pendulum.BUDGET + 3, 3)
+    guarded.delete("/v1/surrogates/owned", headers=admin).raise_for_status()
 
 
 @pytest.mark.parametrize("role", ROLES)

@@ -71,7 +71,8 @@ def test_improve_asks_more_and_raises_the_budget(client: httpx.Client, name: str
     before = pendulum.teach(client, name, budget=6)
     body = {"queries": 2, "idempotency_key": "once"}
     for _ in range(2):
-        client.post(f"/v1/surrogates/{name}/improve", json=body).raise_for_status()
+        improved = client.post(f"/v1/surrogates/{name}/improve", json=body).raise_for_status().json()
+        assert (improved["budget"], improved["budget_raised_by"], improved["budget_left"]) == (8, 2, 0)
     after = pendulum.finish(client, name)
     assert (before["samples"], after["samples"], after["budget"]) == (6, 8, 8)
 

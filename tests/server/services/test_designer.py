@@ -22,7 +22,7 @@ from surrogym_server.services.designer import ATTEMPTS, Designer, phase_after
 from surrogym_server.services.models import load_model
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.records import NewSurrogate
+from surrogym_server.storage.records import NewSurrogate, SurrogateRecord
 
 NAME = "pendulum"
 
@@ -116,6 +116,15 @@ def test_the_job_has_what_the_design_knows(answered: Storage, designer, runner: 
     job = runner.jobs[0]
     assert (len(job.reward), job.extra_queries, job.budget) == (pendulum.INITIAL, 2, pendulum.BUDGET)
     np.testing.assert_array_equal(job.occupancy, np.ones((3, 2)))
+
+
+def test_a_budget_lowered_after_somebody_asked_holds_all_the_same(answered: Storage, designer, runner: Runner):
+    """What was promised within the old budget is not asked beyond the new one."""
+    answered.designs.ask(NAME, 2)
+    answered.surrogates.change(NAME, budget=pendulum.INITIAL + 1)
+    fit_all(designer)
+    assert runner.jobs[0].extra_queries == 1
+    assert len(answered.queries.list(NAME)) <= pendulum.INITIAL + 1
 
 
 def test_occupancy_steers_nothing_unless_it_was_asked_for(answered: Storage, designer, runner: Runner):
@@ -249,7 +258,10 @@ def test_the_designer_wakes_by_itself(answered: Storage, designer):
 
 def test_improve_takes_the_latest_occupancy_unless_one_is_named(answered: Storage, designer):
     async def run() -> None:
-        improve = designer().improve
+        def improve(name: str, queries: int, checkpoint: str | None, key: str | None) -> SurrogateRecord:
+            return made.improve(name, queries, checkpoint, key, raise_budget=True).record
+
+        made = designer()
         assert improve(NAME, 1, None, None).checkpoint is None
         for checkpoint in ("first", "second"):
             answered.occupancy.put(NAME, checkpoint, np.ones((1, 2)))

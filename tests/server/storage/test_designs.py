@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from surrogym_server.errors import (
+    BeyondBudget,
     IdempotencyConflict,
     InvalidInput,
     LeaseExpired,
@@ -234,19 +236,52 @@ def test_asking_raises_the_budget_and_reaches_the_next_fit_once(
     storage.surrogates.change(due, budget=4)
     storage.designs.commit(begun(storage, due), design(phase="ready"))
     for _ in range(2):
-        record = storage.designs.ask(due, 5, checkpoint="half-way", key="k")
-    assert (record.extra_queries, record.budget, record.checkpoint) == (5, 8, "half-way")
+        granted = storage.designs.ask(due, 5, checkpoint="half-way", key="k", raise_budget=True)
+        record = granted.record
+        assert (record.extra_queries, record.budget, record.checkpoint) == (5, 8, "half-way")
+        assert granted.raised == 4, "a repeat says what the first said"
     with pytest.raises(IdempotencyConflict):
         storage.designs.ask(due, 6, checkpoint="half-way", key="k")
     lease = begun(storage, due)
     assert (lease.extra_queries, lease.checkpoint) == (5, "half-way")
-    storage.designs.ask(due, 2)
+    storage.designs.ask(due, 2, raise_budget=True)
     storage.designs.commit(lease, design(queries=5))
     assert storage.surrogates.get(due).extra_queries == 2, "asked for after the fit began"
 
 
 def test_a_budget_that_is_large_enough_stays(storage: Storage, due: str) -> None:
-    assert storage.designs.ask(due, 5).budget == 30
+    granted = storage.designs.ask(due, 5, raise_budget=True)
+    assert (granted.record.budget, granted.raised) == (30, 0)
+
+
+def test_who_may_not_raise_the_budget_gets_what_it_has_left(storage: Storage, due: str) -> None:
+    """The budget is the owner's: steps taken, queries open or set aside, and what was promised before all count."""
+    storage.queries.enqueue(due, np.zeros((2, 2)), np.zeros((2, 1)))
+    for _ in range(MAX_ATTEMPTS):
+        [leased] = storage.queries.claim(due, "a", 1, LONG)
+        storage.queries.fail(due, leased.id, leased.token, "unreachable")
+    storage.surrogates.change(due, budget=10)
+    assert storage.designs.left(due) == 10 - 3 - 2
+    storage.designs.ask(due, 4)
+    assert storage.designs.left(due) == 1
+    with pytest.raises(BeyondBudget, match=r"at most 1 more queries.* 10 real steps.*got 2.*--budget 11"):
+        storage.designs.ask(due, 2)
+    assert (storage.designs.left(due), storage.surrogates.get(due).extra_queries) == (1, 4), "nothing was changed"
+    storage.designs.ask(due, 1)
+    storage.surrogates.change(due, budget=3)
+    assert storage.designs.left(due) == 0
+
+
+def test_many_who_ask_at_once_get_no_more_than_the_budget_has_left(storage: Storage, due: str) -> None:
+    def ask(_: int) -> int:
+        try:
+            return storage.designs.ask(due, 4).record.extra_queries
+        except BeyondBudget:
+            return 0
+
+    with ThreadPoolExecutor(8) as threads:
+        granted = [extra for extra in threads.map(ask, range(16)) if extra]
+    assert sorted(granted) == [4, 8, 12, 16, 20, 24], "27 of 30 were left"
 
 
 def test_a_fit_of_a_deleted_surrogate_goes_nowhere(

@@ -9,11 +9,12 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
-from surrogym_server.errors import LeaseExpired, UnknownSurrogate
+from surrogym_server.errors import BeyondBudget, LeaseExpired, UnknownSurrogate
 from surrogym_server.storage import port
 from surrogym_server.storage.records import (
     OPEN_STATUSES,
     FitLease,
+    Granted,
     NewDesign,
     Phase,
     SurrogateRecord,
@@ -35,16 +36,30 @@ class SqlDesigns(port.Designs):
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def ask(self, name: str, queries: int, *, checkpoint: str | None = None, key: str | None = None) -> SurrogateRecord:
+    def ask(
+        self,
+        name: str,
+        queries: int,
+        *,
+        checkpoint: str | None = None,
+        key: str | None = None,
+        raise_budget: bool = False,
+    ) -> Granted:
         body = fingerprint(queries, checkpoint)
         with self._database.write() as connection:
-            held = hold(connection, name, surrogates.c.budget, surrogates.c.extra_queries)
-            if recall(connection, held, "ask", key, body) is None:
-                extra = held.extra_queries + queries
-                budget = max(held.budget, stored.spoken_for(connection, held.id) + extra)
+            held = hold(connection, name)
+            raised = recall(connection, held, "ask", key, body)
+            if raised is None:
+                before = stored.read(connection, name)
+                raised = _to_raise(connection, before, queries, allowed=raise_budget)
+                extra, budget = before.extra_queries + queries, before.budget + raised
                 touch(connection, held, extra_queries=extra, budget=budget, checkpoint=checkpoint)
-                remember(connection, held, "ask", key, body, True)
-            return stored.read(connection, name)
+                remember(connection, held, "ask", key, body, raised)
+            return Granted(stored.read(connection, name), 0 if raised is True else raised)  # True: of an older program
+
+    def left(self, name: str) -> int:
+        with self._database.read() as connection:
+            return max(0, _unspoken(connection, stored.read(connection, name)))
 
     def due(self) -> list[str]:
         with self._database.read() as connection:
@@ -117,6 +132,24 @@ def _is_due(connection: Connection) -> sa.ColumnElement[bool]:
 
 def _lasting(expires: float, seconds: float) -> dict[str, float]:
     return {"fit_expires": expires, "fit_seconds": seconds}
+
+
+def _unspoken(connection: Connection, record: SurrogateRecord) -> int:
+    """What is left of the budget; less than nothing where it was lowered, or more was handed in by hand."""
+    return record.budget - stored.spoken_for(connection, record.id) - record.extra_queries
+
+
+def _to_raise(connection: Connection, record: SurrogateRecord, queries: int, *, allowed: bool) -> int:
+    """By how much the budget has to be raised for so many further queries. Raises ``BeyondBudget``."""
+    unspoken = _unspoken(connection, record)
+    missing = max(0, queries - unspoken)
+    if missing and not allowed:
+        raise BeyondBudget(
+            f"expected at most {max(0, unspoken)} more queries, which is what the budget of {record.budget} real steps "
+            f"of {record.name!r} has left, got {queries}: a token of role admin may raise it "
+            f"(surrogym change {record.name} --budget {record.budget + missing})"
+        )
+    return missing
 
 
 def _hold_right(connection: Connection, lease: FitLease) -> Row[Any]:

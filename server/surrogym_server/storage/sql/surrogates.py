@@ -9,7 +9,7 @@ from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage import port
-from surrogym_server.storage.records import OPEN_STATUSES, NewSurrogate, Phase, SurrogateRecord, SurrogateSummary
+from surrogym_server.storage.records import NewSurrogate, Phase, SurrogateRecord, SurrogateSummary
 from surrogym_server.storage.sql.database import Database, clock, conflict_insert
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, touch, unknown_surrogate
 from surrogym_server.storage.sql.summaries import read_summaries
@@ -172,10 +172,11 @@ def _ask_anew(connection: Connection, held: Row[Any], before: SurrogateRecord, b
 
 
 def spoken_for(connection: Connection, surrogate_id: int) -> int:
-    """Samples there are, and those that open queries may become."""
+    """Samples there are, and those that queries without an answer stand for: open ones, and those set aside, of which
+    steps may have been taken."""
     taken = sa.select(sa.func.count()).where(samples.c.surrogate_id == surrogate_id)
     awaited = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0)).where(
-        queries.c.surrogate_id == surrogate_id, queries.c.status.in_(OPEN_STATUSES)
+        queries.c.surrogate_id == surrogate_id, queries.c.status != "answered"
     )
     return int(connection.execute(sa.select(taken.scalar_subquery() + awaited.scalar_subquery())).scalar_one())
 
