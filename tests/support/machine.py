@@ -11,6 +11,7 @@ from pathlib import Path
 from support.moody import Line
 from support.rail import Rail
 
+STEP_SECONDS = "MACHINE_STEP_SECONDS"  # environment variable: how long a deliberate machine takes
 DIARY = "MACHINE_DIARY"  # environment variable: the file that everything is noted in, also by other processes
 
 
@@ -57,7 +58,7 @@ class Deliberate(SettableMachine):
 
     def step_from(self, coordinates, action):
         taken = super().step_from(coordinates, action)
-        time.sleep(1.0)
+        time.sleep(float(os.environ.get(STEP_SECONDS, "1")))
         note("done")
         return taken
 
