@@ -35,7 +35,7 @@ class Api:
 
     Args:
         url: the server's address; default ``SURROGYM_URL``, then http://127.0.0.1:8000.
-        token: bearer token; default ``SURROGYM_TOKEN``.
+        token: bearer token; default ``SURROGYM_TOKEN``, then the one in the file ``SURROGYM_TOKEN_FILE``.
         timeouts: seconds per kind of request.
         retries: how long to go on after lost connections, lost replies and 503.
 

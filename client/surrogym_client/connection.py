@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from ipaddress import ip_address
+from pathlib import Path
 from typing import Any, Self, TypeVar
 from urllib.request import getproxies, proxy_bypass
 
@@ -21,10 +22,12 @@ from surrogym_client.errors import (
     ServerUnreachable,
     SurrogymClientError,
     Unavailable,
+    UnusableToken,
     error_from_problem,
 )
 from surrogym_client.stream import Stream, StreamUnavailable
 from surrogym_shared.codes import Problem
+from surrogym_shared.secret_files import tokens_in
 
 T = TypeVar("T")
 
@@ -32,6 +35,7 @@ JSON = "application/json"
 DEFAULT_URL = "http://127.0.0.1:8000"
 URL_VARIABLE = "SURROGYM_URL"
 TOKEN_VARIABLE = "SURROGYM_TOKEN"
+TOKEN_FILE_VARIABLE = "SURROGYM_TOKEN_FILE"
 
 _NOT_SENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout, StreamUnavailable)
 _TIMEOUTS = (httpx.TimeoutException, TimeoutError)
@@ -77,12 +81,13 @@ class Connection:
 
     Args:
         url: the server's address; default ``SURROGYM_URL``, then http://127.0.0.1:8000.
-        token: bearer token; default ``SURROGYM_TOKEN``.
+        token: bearer token; default ``SURROGYM_TOKEN``, then the one in the file ``SURROGYM_TOKEN_FILE``.
         timeouts: seconds per kind of request.
         retries: how long to go on after lost connections, lost replies and 503.
 
     Raises:
         ServerUnreachable: the address is none.
+        UnusableToken: the file of the token can't be used.
     """
 
     def __init__(
@@ -95,7 +100,7 @@ class Connection:
         self.url = _checked(url or os.environ.get(URL_VARIABLE) or DEFAULT_URL)
         self.timeouts = timeouts or Timeouts()
         self.retries = retries or Retries()
-        self._token = token if token is not None else os.environ.get(TOKEN_VARIABLE)
+        self._token = token if token is not None else _token_of_environment()
         self._client = _new_client(self.url, self._token)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -224,6 +229,28 @@ class Connection:
 
     def _timeout(self, seconds: float | None) -> httpx.Timeout:
         return httpx.Timeout(seconds or self.timeouts.request, connect=self.timeouts.connect)
+
+
+def token_in(path: Path) -> str:
+    """The token in a file, of the form that ``surrogym serve --token-file`` takes too, with one line.
+
+    Raises:
+        UnusableToken: it can't be read, or does not hold one token.
+    """
+    try:
+        tokens = tokens_in(path)
+    except OSError as error:
+        raise UnusableToken(f"the token file {str(path)!r} can't be read: {error.strerror}") from error
+    except ValueError as error:
+        raise UnusableToken(f"the token file {str(path)!r}: {error}") from None
+    if len(tokens) != 1:
+        raise UnusableToken(f"the token file {str(path)!r}: expected one token, got {len(tokens)}")
+    return next(iter(tokens))
+
+
+def _token_of_environment() -> str | None:
+    file = os.environ.get(TOKEN_FILE_VARIABLE)
+    return os.environ.get(TOKEN_VARIABLE) or (token_in(Path(file)) if file else None)
 
 
 def _checked(url: str) -> str:

@@ -3,6 +3,7 @@
 SurrogymClientError
 ├── ServerUnreachable       no answer within the retry budget; the last request may have been carried out
 │   └── RequestTimeout      the server took the request and did not answer in time
+├── UnusableToken           the file that should hold the token can't be used; nothing was sent
 ├── ProtocolMismatch        what answered does not speak this version of the protocol
 └── ProblemError            the server refused; ``problem`` is its body, and nothing was changed
     ├── InvalidInput        the request can't be used: wrong route, field, shape, type or range
@@ -49,6 +50,10 @@ class ServerUnreachable(SurrogymClientError):
 
 class RequestTimeout(ServerUnreachable):
     """The server did not answer in time. The connection was dropped, so a late answer is never read."""
+
+
+class UnusableToken(SurrogymClientError):
+    """The file that should hold the token can't be read, or does not hold one. Check its path, and its only line."""
 
 
 class ProtocolMismatch(SurrogymClientError):

@@ -31,7 +31,7 @@ class SurrogateVecEnv(VecEnv):
         url: the server's address; None takes ``SURROGYM_URL``, then http://127.0.0.1:8000.
         surrogate: its name.
         num_envs: N.
-        token: bearer token; default ``SURROGYM_TOKEN``.
+        token: bearer token; default ``SURROGYM_TOKEN``, then the one in the file ``SURROGYM_TOKEN_FILE``.
         timeouts: seconds per kind of request.
         retries: how long to go on after lost connections, lost replies and 503.
         transport: how steps travel; see ``HttpSurrogate``.

@@ -51,7 +51,7 @@ class HttpSurrogate:
     Args:
         url: the server's address; default ``SURROGYM_URL``, then http://127.0.0.1:8000.
         surrogate: name of the surrogate.
-        token: bearer token; default ``SURROGYM_TOKEN``.
+        token: bearer token; default ``SURROGYM_TOKEN``, then the one in the file ``SURROGYM_TOKEN_FILE``.
         timeouts: seconds per kind of request.
         retries: how long to go on after lost connections, lost replies and 503.
         transport: how reset, step and rollout travel. ``stream`` is the fastest: frames over a WebSocket;

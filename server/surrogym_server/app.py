@@ -41,6 +41,7 @@ from surrogym_server.engine.fits import Fits
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import MEBIBYTE, Limits, LiveSessions, Threads
 from surrogym_server.errors import Damaged, InvalidInput
+from surrogym_server.private import keep_private
 from surrogym_server.sampling.acquisition import ACQUISITIONS
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.counts import Counts
@@ -100,6 +101,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     """
     _check_device(settings.device)
     logger.info("acquisitions: %s", ", ".join(ACQUISITIONS.names))
+    keep_private(settings)
     storage = open_storage(settings.database_url, settings.synchronous)
     app = FastAPI(
         title="Surrogym",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self
 from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, FilePath, ValidationError, model_validator
@@ -13,12 +13,12 @@ from pydantic import BaseModel, ConfigDict, Field, FilePath, ValidationError, mo
 from surrogym_server.errors import InvalidInput
 from surrogym_server.logs import LogFormat
 from surrogym_server.storage.records import Synchronous
+from surrogym_shared.secret_files import parse_token, tokens_in
 from surrogym_shared.wire import MAX_LANES, Role
 
 PREFIX = "SURROGYM_"
 LOCAL_NAMES = ("localhost",)
 MIN_TOKEN_LENGTH = 8
-ROLES: tuple[Role, ...] = get_args(Role)
 
 LogLevel = Literal["critical", "error", "warning", "info", "debug"]
 
@@ -38,6 +38,7 @@ class Settings(BaseModel):
         str | None, Field(pattern=r"^https?://[^/@?#]+/?$", description="address that browsers know, behind a proxy")
     ] = None
     tokens: dict[str, Role] = Field(default_factory=dict, description="role of each bearer token")
+    token_file: Path | None = Field(default=None, description="file with one token a line, alone or as role:token")
     insecure: bool = Field(default=False, description="allow another address than loopback without a token")
     tls_certificate: FilePath | None = Field(default=None, description="chain of certificates, as PEM")
     tls_key: FilePath | None = Field(default=None, description="its private key, as PEM")
@@ -110,42 +111,31 @@ def read_settings(environment: Mapping[str, str], **options: Any) -> Settings:
         for name in Settings.model_fields
         if name != "tokens" and PREFIX + name.upper() in environment
     }
-    given = {name: value for name, value in options.items() if value is not None}
-    token_file = given.pop("token_file", environment.get(f"{PREFIX}TOKEN_FILE"))
-    tokens = _read_tokens(environment, token_file)
+    given = fields | {name: value for name, value in options.items() if value is not None}
+    file = given.pop("token_file", None) or None
+    tokens = _read_tokens(environment, file)
     try:
-        return Settings.model_validate({**fields, "tokens": tokens, **given})
+        return Settings.model_validate({"tokens": tokens, **given, "token_file": file})
     except ValidationError as error:
         raise InvalidInput(_one_sentence(error)) from error
 
 
-def _read_tokens(environment: Mapping[str, str], token_file: str | Path | None) -> dict[str, Role]:
+def _read_tokens(environment: Mapping[str, str], file: str | Path | None) -> dict[str, Role]:
     entries = environment.get(f"{PREFIX}TOKENS", "").split(",")
     if token := environment.get(f"{PREFIX}TOKEN"):
         entries.append(f"admin:{token}")
-    if token_file:
-        entries.extend(_read_lines(Path(token_file)))
-    return dict(_parse_token(entry.strip()) for entry in entries if entry.strip())
-
-
-def _read_lines(path: Path) -> list[str]:
     try:
-        lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInput(f"the token file {str(path)!r} can't be read: {error}") from error
-    if not any(lines):
-        raise InvalidInput(f"the token file {str(path)!r} is empty: expected lines like 'sample:token'")
-    return lines
-
-
-def _parse_token(entry: str) -> tuple[str, Role]:
-    role, colon, token = entry.partition(":")
-    if not colon:
-        return entry, "admin"
-    for known in ROLES:
-        if role == known:
-            return token, known
-    raise InvalidInput(f"a token's role: expected one of {', '.join(ROLES)} before its colon, got another word")
+        tokens = dict(parse_token(entry.strip()) for entry in entries if entry.strip())
+    except ValueError as error:
+        raise InvalidInput(str(error)) from None
+    if file is None:
+        return tokens
+    try:
+        return tokens | tokens_in(Path(file))
+    except OSError as error:
+        raise InvalidInput(f"the token file {str(file)!r} can't be read: {error}") from error
+    except ValueError as error:
+        raise InvalidInput(f"the token file {str(file)!r}: {error}") from None
 
 
 def _one_sentence(error: ValidationError) -> str:

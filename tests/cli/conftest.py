@@ -27,7 +27,7 @@ class Said:
 def surrogym(capsys, monkeypatch, tmp_path):
     """``surrogym("status", "--json")`` gives exit code, output and errors."""
     monkeypatch.chdir(tmp_path)
-    for name in ("SURROGYM_URL", "SURROGYM_TOKEN"):
+    for name in ("SURROGYM_URL", "SURROGYM_TOKEN", "SURROGYM_TOKEN_FILE"):
         monkeypatch.delenv(name, raising=False)
 
     def run(*arguments: str) -> Said:

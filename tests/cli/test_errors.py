@@ -106,7 +106,7 @@ def test_an_unknown_surrogate(on_server, command):
 @pytest.mark.parametrize(
     ("answer", "way_out"),
     [
-        (problem(Code.UNAUTHENTICATED), "; give a token of this server by --token or SURROGYM_TOKEN"),
+        (problem(Code.UNAUTHENTICATED), "; give a token of this server by SURROGYM_TOKEN or --token-file"),
         (problem(Code.FORBIDDEN), "; surrogym doctor says what this token may do"),
         (reply("<html>"), "; surrogym doctor says more"),
     ],

@@ -3,6 +3,7 @@
 import pickle
 import socket
 import threading
+from pathlib import Path
 
 import pytest
 
@@ -127,6 +128,37 @@ def test_the_token_is_sent_and_the_environment_gives_defaults(monkeypatch: pytes
                 connection.send("GET", "/x")
             assert server.received[-1].headers["Authorization"] == expected
         assert server.received[-1].path == "/x"
+
+
+def test_a_token_comes_from_a_file_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    (tmp_path / "token").write_text("train:from-a-file\n")
+    monkeypatch.setenv("SURROGYM_TOKEN_FILE", str(tmp_path / "token"))
+    for token, expected in (("", "from-a-file"), ("from-environment", "from-environment")):
+        monkeypatch.setenv("SURROGYM_TOKEN", token)
+        with scripted_server(reply("done")) as server, Connection(server.url) as connection:
+            connection.send("GET", "/x")
+            assert server.received[-1].headers["Authorization"] == f"Bearer {expected}"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "can't be read: No such file or directory"),
+        ("", "expected lines like 'sample:token', got none"),
+        ("read:one-secret\ntrain:two-secret", "expected one token, got 2"),
+        ("king:a-secret", "a token's role: expected one of read, train, sample, admin before its colon, got another"),
+    ],
+)
+def test_a_token_file_that_holds_no_token_is_refused(monkeypatch, tmp_path: Path, content: str | None, message: str):
+    file = tmp_path / "token"
+    if content is not None:
+        file.write_text(content)
+    monkeypatch.delenv("SURROGYM_TOKEN", raising=False)
+    monkeypatch.setenv("SURROGYM_TOKEN_FILE", str(file))
+    with pytest.raises(errors.UnusableToken, match=message) as refusal:
+        Connection()
+    assert str(file) in str(refusal.value)
+    assert "secret" not in str(refusal.value)
 
 
 def test_without_anything_it_is_the_loopback_server(monkeypatch: pytest.MonkeyPatch):

@@ -6,7 +6,18 @@ from typing import Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, Tolerances, connect, read_tolerances
+from surrogym_client.cli.options import (
+    AsJson,
+    Quiet,
+    Server,
+    Surrogate,
+    Token,
+    TokenFile,
+    Tolerances,
+    connect,
+    read_tolerances,
+    token_from,
+)
 
 USUAL = "=usual"  # takes a tolerance back
 
@@ -17,6 +28,7 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
+    context: typer.Context,
     surrogate: Surrogate,
     tolerance: Tolerances = None,
     budget: Annotated[int | None, typer.Option(min=2, help="Real steps the design may take.")] = None,
@@ -24,6 +36,7 @@ def command(
     paused: Annotated[bool | None, typer.Option("--pause/--resume", help="Stop asking for queries, or go on.")] = None,
     server: Server = None,
     token: Token = None,
+    token_file: TokenFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -39,7 +52,7 @@ def command(
 
     back = {text.removesuffix(USUAL): None for text in tolerance or () if text.endswith(USUAL)}
     tolerances = read_tolerances([text for text in tolerance or () if not text.endswith(USUAL)]) | back
-    with connect(server, token) as api:
+    with connect(server, token_from(context, token, token_file)) as api:
         view = api.patch_surrogate(
             surrogate, paused=paused, budget=budget, target=target, tolerances=tolerances or None
         )

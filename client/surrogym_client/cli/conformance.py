@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, Token
+from surrogym_client.cli.options import AsJson, Quiet, Server, Token, TokenFile, token_from
 
 
 def register(app: typer.Typer) -> None:
@@ -15,11 +15,13 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
+    context: typer.Context,
     server: Server = None,
     surrogate: Annotated[
         str, typer.Option("--surrogate", help="A free name; the surrogate is deleted at the end.")
     ] = "conformance",
     token: Token = None,
+    token_file: TokenFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -33,7 +35,7 @@ def command(
 
     outcomes = []
     with on_interrupt(lambda: f"interrupted; nothing stays of {surrogate!r}"):
-        for outcome in conformance(server, token, surrogate):
+        for outcome in conformance(server, token_from(context, token, token_file), surrogate):
             outcomes.append(outcome)
             if not as_json and (outcome.failure or not quiet):
                 typer.echo(f"✗ {outcome.name}: {outcome.failure}" if outcome.failure else f"✓ {outcome.name}")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, connect
+from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, TokenFile, connect, token_from
 
 
 def register(app: typer.Typer) -> None:
@@ -15,10 +15,12 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
+    context: typer.Context,
     surrogate: Surrogate,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
     server: Server = None,
     token: Token = None,
+    token_file: TokenFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -28,7 +30,7 @@ def command(
     """
     from surrogym_shared.terminal import give
 
-    with connect(server, token) as api:
+    with connect(server, token_from(context, token, token_file)) as api:
         view = api.surrogate(surrogate)
         if not yes:
             typer.confirm(f"Delete {surrogate!r} with its {view.samples} real samples?", abort=True, err=True)

@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, SpecFile, StepLimit, Token, connect, read_spec
+from surrogym_client.cli.options import (
+    AsJson,
+    Quiet,
+    Server,
+    SpecFile,
+    StepLimit,
+    Token,
+    TokenFile,
+    connect,
+    read_spec,
+    token_from,
+)
 
 if TYPE_CHECKING:
     from surrogym_client.doctor import Finding
@@ -20,6 +31,7 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
+    context: typer.Context,
     env: Annotated[
         str | None, typer.Option(help="Also make this environment and take one real step: an id, or module:factory.")
     ] = None,
@@ -27,6 +39,7 @@ def command(
     step_limit: StepLimit = 30.0,
     server: Server = None,
     token: Token = None,
+    token_file: TokenFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -43,7 +56,7 @@ def command(
     def findings() -> Iterator[Finding]:
         given = read_spec(spec)
         yield from installation()
-        with connect(server, token) as api:
+        with connect(server, token_from(context, token, token_file)) as api:
             yield from service(api)
         if env is not None:
             from surrogym_client.original.loading import make

@@ -16,7 +16,7 @@ EXTRAS = {
     "mujoco": ("mujoco", "imageio"),
 }
 START_SERVER = "start one with surrogym serve, or name another by --server or SURROGYM_URL"
-GIVE_TOKEN = "give a token of this server by --token or SURROGYM_TOKEN"
+GIVE_TOKEN = "give a token of this server by SURROGYM_TOKEN or --token-file"
 
 
 class CommandError(Exception):

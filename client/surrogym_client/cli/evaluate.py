@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, SpecFile, Token, TrustPolicy, read_spec
+from surrogym_client.cli.options import (
+    AsJson,
+    Quiet,
+    Server,
+    SpecFile,
+    Token,
+    TokenFile,
+    TrustPolicy,
+    read_spec,
+    token_from,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,6 +36,7 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
+    context: typer.Context,
     policy: Annotated[Path, typer.Argument(help="Policy file that surrogym train, or Stable-Baselines3, wrote.")],
     env: Annotated[
         str | None, typer.Option(help="Gymnasium id or package.module:factory. [default: what it was trained for]")
@@ -57,6 +68,7 @@ def command(
     trust_policy: TrustPolicy = False,
     server: Server = None,
     token: Token = None,
+    token_file: TokenFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -77,7 +89,7 @@ def command(
     settings = EvaluationSettings(episodes, first_seed, wide, start_scale, perturb, parallel)
     opener = _opener(env, read_spec(spec), card)
     ledger = _ledger(surrogate, server, card, card_path(policy), quiet=quiet)
-    enter = partial(_enter, ledger, server, token, quiet=quiet)
+    enter = partial(_enter, ledger, server, token_from(context, token, token_file), quiet=quiet)
     try:
         with terminations_as_interrupts(), progress("evaluate", quiet=quiet) as update:
             update(0.0, f"reading {policy}")

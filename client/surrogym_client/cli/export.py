@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, connect
+from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, TokenFile, connect, token_from
 
 if TYPE_CHECKING:
     from surrogym_client.api import Api
@@ -19,6 +19,7 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
+    context: typer.Context,
     surrogate: Surrogate,
     out: Annotated[
         Path,
@@ -28,6 +29,7 @@ def command(
     ],
     server: Server = None,
     token: Token = None,
+    token_file: TokenFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -40,8 +42,13 @@ def command(
     """
     from surrogym_shared.terminal import give, on_interrupt, progress
 
+    token = token_from(context, token, token_file)
     stays = "interrupted; nothing was written, and the same command begins anew"
-    with on_interrupt(lambda: stays), progress("export", quiet=quiet) as update, connect(server, token) as api:
+    with (
+        on_interrupt(lambda: stays),
+        progress("export", quiet=quiet) as update,
+        connect(server, token) as api,
+    ):
         update(0.0, f"reading {surrogate}")
         content = _content(api, surrogate, out)
         out.write_bytes(content)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, Token, connect
+from surrogym_client.cli.options import AsJson, Quiet, Server, Token, TokenFile, connect, token_from
 
 
 def register(app: typer.Typer) -> None:
@@ -16,10 +16,12 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
+    context: typer.Context,
     file: Annotated[Path, typer.Argument(help="What surrogym export wrote with the ending .surrogate.")],
     name: Annotated[str | None, typer.Option(help="Name of the surrogate. [default: as in the file]")] = None,
     server: Server = None,
     token: Token = None,
+    token_file: TokenFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -34,8 +36,13 @@ def command(
     from surrogym_shared.surrogate_file import SurrogateFile
     from surrogym_shared.terminal import give, on_interrupt, progress
 
+    token = token_from(context, token, token_file)
     stays = "interrupted; nothing stays of it at the server, and the same command begins anew"
-    with on_interrupt(lambda: stays), progress("import", quiet=quiet) as update, connect(server, token) as api:
+    with (
+        on_interrupt(lambda: stays),
+        progress("import", quiet=quiet) as update,
+        connect(server, token) as api,
+    ):
         update(0.0, f"reading {file}")
         read = SurrogateFile.load(file)
         view = import_surrogate(api, read, name, lambda share: update(share, f"{len(read.samples)} real samples"))

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, connect
+from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, TokenFile, connect, token_from
 
 
 def register(app: typer.Typer) -> None:
@@ -15,6 +15,7 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
+    context: typer.Context,
     surrogate: Surrogate,
     queries: Annotated[int, typer.Option("--queries", "-n", min=1, help="How many more real steps.")] = 10,
     checkpoint: Annotated[
@@ -22,6 +23,7 @@ def command(
     ] = None,
     server: Server = None,
     token: Token = None,
+    token_file: TokenFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -33,7 +35,7 @@ def command(
     """
     from surrogym_shared.terminal import give
 
-    with connect(server, token) as api:
+    with connect(server, token_from(context, token, token_file)) as api:
         view = api.improve(surrogate, queries, checkpoint=checkpoint)
     raised = f"was raised by {view.budget_raised_by} to {view.budget}" if view.budget_raised_by else "holds them"
     words = f"{queries} more queries for {view.name}; its budget {raised}, with {view.budget_left} left"

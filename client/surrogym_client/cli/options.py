@@ -15,18 +15,23 @@ if TYPE_CHECKING:
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import SurrogateView
 
+SHOWN = (
+    "warning: --token shows the token in the list of processes; SURROGYM_TOKEN, --token-file or SURROGYM_TOKEN_FILE "
+    "keep it out of there"
+)
 QUICK = 1.0  # seconds a person waits for a server that is not there
 
 
 def names_of_surrogates(ctx: typer.Context, incomplete: str) -> list[str]:
     """What a shell completes a surrogate's name to; nothing where no server answers within a second."""
     from surrogym_client.api import Api
-    from surrogym_client.connection import Retries, Timeouts
+    from surrogym_client.connection import Retries, Timeouts, token_in
     from surrogym_client.errors import SurrogymClientError
 
     limits, at_once = Timeouts(connect=QUICK, request=QUICK), Retries(seconds=0)
     try:
-        with Api(ctx.params.get("server"), ctx.params.get("token"), timeouts=limits, retries=at_once) as api:
+        token = ctx.params.get("token") or (token_in(file) if (file := ctx.params.get("token_file")) else None)
+        with Api(ctx.params.get("server"), token, timeouts=limits, retries=at_once) as api:
             return [surrogate.name for surrogate in api.surrogates() if surrogate.name.startswith(incomplete)]
     except SurrogymClientError:
         return []
@@ -37,7 +42,18 @@ Server = Annotated[
     str | None,
     typer.Option("--server", envvar="SURROGYM_URL", help="Address of the server. [default: http://127.0.0.1:8000]"),
 ]
-Token = Annotated[str | None, typer.Option("--token", envvar="SURROGYM_TOKEN", help="Bearer token of the server.")]
+Token = Annotated[
+    str | None,
+    typer.Option(
+        "--token",
+        envvar="SURROGYM_TOKEN",
+        help="Bearer token of the server. Typed here it shows in the list of processes; the variable and --token-file "
+        "don't show it.",
+    ),
+]
+TokenFile = Annotated[
+    Path | None, typer.Option("--token-file", envvar="SURROGYM_TOKEN_FILE", help="File with the bearer token.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no remarks.")]
 TrustPolicy = Annotated[
@@ -81,6 +97,32 @@ def connect(server: str | None, token: str | None, wait: float = 0.0, *, quiet: 
             with _waiting(f"for a server at {api.url}", quiet=quiet):
                 api.wait_until_ready(wait)
     return api
+
+
+def token_from(context: typer.Context, token: str | None, file: Path | None) -> str | None:
+    """The bearer token: what was typed comes before the environment, and there the token before its file.
+
+    A person is told what shows the token to others.
+
+    Raises:
+        CommandError: both were typed.
+        UnusableToken: the file does not hold one.
+    """
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.connection import token_in
+    from surrogym_shared.secret_files import open_to_others
+    from surrogym_shared.terminal import say
+
+    quiet, typed_file = bool(context.params.get("quiet")), given_here(context, "token_file")
+    if given_here(context, "token"):
+        if typed_file:
+            raise CommandError("expected --token or --token-file, got both")
+        say(SHOWN, quiet=quiet)
+    if file is None or (token is not None and not typed_file):
+        return token
+    if warning := open_to_others(file):
+        say(f"warning: {warning}", quiet=quiet)
+    return token_in(file)
 
 
 def awaited_surrogate(api: Api, name: str, wait: float, *, quiet: bool) -> SurrogateView:

@@ -14,11 +14,13 @@ from surrogym_client.cli.options import (
     Server,
     SpecFile,
     Token,
+    TokenFile,
     Tolerances,
     Wait,
     connect,
     read_spec,
     read_tolerances,
+    token_from,
 )
 
 if TYPE_CHECKING:
@@ -32,6 +34,7 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
+    context: typer.Context,
     environment: Annotated[
         str | None, typer.Argument(help="Gymnasium id, or package.module:factory of one's own.")
     ] = None,
@@ -63,6 +66,7 @@ def command(
     wait: Wait = 0.0,
     server: Server = None,
     token: Token = None,
+    token_file: TokenFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -90,7 +94,7 @@ def command(
     if print_spec:
         typer.echo(chosen.model_dump_json(indent=2))
         return
-    with connect(server, token, wait, quiet=quiet) as api:
+    with connect(server, token_from(context, token, token_file), wait, quiet=quiet) as api:
         view = api.create_surrogate(name or default_name(chosen.environment or environment or ""), chosen)
     give(view.model_dump(mode="json"), lambda: _words(view, environment or ""), as_json=as_json, quiet=quiet)
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, connect
+from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, TokenFile, connect, token_from
 
 
 def register(app: typer.Typer) -> None:
@@ -17,10 +17,12 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
+    context: typer.Context,
     surrogate: Surrogate,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write.")] = Path("report.html"),
     server: Server = None,
     token: Token = None,
+    token_file: TokenFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -31,8 +33,13 @@ def command(
     """
     from surrogym_shared.terminal import give, on_interrupt, progress
 
+    token = token_from(context, token, token_file)
     stays = "interrupted; nothing was written, and the same command begins anew"
-    with on_interrupt(lambda: stays), progress("report", quiet=quiet) as update, connect(server, token) as api:
+    with (
+        on_interrupt(lambda: stays),
+        progress("report", quiet=quiet) as update,
+        connect(server, token) as api,
+    ):
         update(0.0, f"reading {surrogate}")
         view, models, samples = api.surrogate(surrogate), api.models(surrogate), list(api.samples(surrogate))
         from surrogym_client.report.maps import cuts

@@ -21,10 +21,12 @@ from surrogym_client.cli.options import (
     StepLimit,
     Surrogate,
     Token,
+    TokenFile,
     Wait,
     awaited_surrogate,
     connect,
     read_spec,
+    token_from,
 )
 
 if TYPE_CHECKING:
@@ -43,6 +45,7 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
+    context: typer.Context,
     surrogate: Surrogate,
     env: Annotated[
         str | None, typer.Option(help="Gymnasium id or package.module:factory. [default: the surrogate's id]")
@@ -61,6 +64,7 @@ def command(
     exit_with_parent: ExitWithParent = False,
     server: Server = None,
     token: Token = None,
+    token_file: TokenFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -85,7 +89,7 @@ def command(
         max_queries=max_queries,
         time_limit=time_limit,
     )
-    with connect(server, token, wait, quiet=quiet) as api:
+    with connect(server, token_from(context, token, token_file), wait, quiet=quiet) as api:
         asked = awaited_surrogate(api, surrogate, wait, quiet=quiet).spec
         factory = _factory(env, read_spec(spec), asked)
         with IsolatedEnvironment(factory, step_limit) as environment, _telling(api, surrogate, quiet=quiet) as tell:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Server, Token, connect, names_of_surrogates
+from surrogym_client.cli.options import AsJson, Server, Token, TokenFile, connect, names_of_surrogates, token_from
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -30,12 +30,14 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
+    context: typer.Context,
     surrogate: Annotated[
         str | None, typer.Argument(help="One surrogate. [default: all]", autocompletion=names_of_surrogates)
     ] = None,
     watching: Annotated[bool, typer.Option("--watch", "-w", help="Stay, and show it anew until Ctrl-C.")] = False,
     server: Server = None,
     token: Token = None,
+    token_file: TokenFile = None,
     as_json: AsJson = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Names and phases alone, without a heading.")] = False,
 ) -> None:
@@ -48,7 +50,7 @@ def command(
     from surrogym_shared.terminal import watch
 
     form: Form = "json" if as_json else "short" if quiet else "words"
-    with connect(server, token) as api:
+    with connect(server, token_from(context, token, token_file)) as api:
         look = partial(_all, api, form) if surrogate is None else partial(_one, api, surrogate, form)
         seen = look()  # an unknown name or a wrong address ends it here, also with --watch
         if watching:

@@ -20,10 +20,12 @@ from surrogym_client.cli.options import (
     Server,
     Surrogate,
     Token,
+    TokenFile,
     Wait,
     awaited_surrogate,
     connect,
     given_here,
+    token_from,
     typed,
 )
 
@@ -139,6 +141,7 @@ def command(
     exit_with_parent: ExitWithParent = False,
     server: Server = None,
     token: Token = None,
+    token_file: TokenFile = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -173,6 +176,7 @@ def command(
         trust=trust,
         penalty=penalty,
     )
+    token = token_from(context, token, token_file)
     spec, url = _trainable(surrogate, server, token, wait, quiet=quiet)
     if improve:
         with connect(server, token) as api:

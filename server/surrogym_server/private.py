@@ -1,0 +1,39 @@
+"""Files of the server that hold secrets: new ones are private, and those that others may read are named at start."""
+
+from __future__ import annotations
+
+import logging
+import os
+from contextlib import suppress
+from pathlib import Path
+
+import sqlalchemy as sa
+
+from surrogym_server.settings import Settings
+from surrogym_shared.secret_files import open_to_others
+
+logger = logging.getLogger(__name__)
+
+
+def keep_private(settings: Settings) -> None:
+    """Make a new SQLite file readable for its owner alone, and warn of every secret file that others may read.
+
+    SQLite gives the files beside it (``-wal``, ``-shm``) the same mode. A database that is there keeps its own.
+    """
+    database = _sqlite_file(settings.database_url)
+    if database is not None:
+        with suppress(OSError):  # opening it says what is wrong, and an existing one stays as it is
+            database.parent.mkdir(parents=True, exist_ok=True)
+            os.close(os.open(database, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+    for path in (database, settings.token_file, settings.tls_key):
+        if path is not None and (warning := open_to_others(path)):
+            logger.warning(warning)
+
+
+def _sqlite_file(url: str) -> Path | None:
+    try:
+        parsed = sa.make_url(url)
+    except sa.exc.ArgumentError:
+        return None  # refused when it is opened
+    is_file = parsed.get_backend_name() == "sqlite" and parsed.database not in (None, "", ":memory:")
+    return Path(str(parsed.database)) if is_file else None

@@ -1,0 +1,51 @@
+"""Files that hold secrets: the tokens in them, and who may read them."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import get_args
+
+from surrogym_shared.wire import Role
+
+OTHERS = stat.S_IRGRP | stat.S_IROTH
+
+
+def open_to_others(path: Path) -> str | None:
+    """A warning about a file that other users of this machine may read, and what closes it; None where they may not."""
+    try:
+        mode = stat.S_IMODE(path.stat().st_mode)
+    except OSError:
+        return None
+    if os.name != "posix" or not mode & OTHERS:
+        return None
+    return f"{path} may be read by other users of this machine (mode {mode:o}): chmod 600 {path} closes it"
+
+
+def tokens_in(path: Path) -> dict[str, Role]:
+    """The tokens of a file, one a line, with their roles.
+
+    Raises:
+        OSError: it can't be read.
+        ValueError: no token, or an unknown role; names no token.
+    """
+    lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
+    if not any(lines):
+        raise ValueError("expected lines like 'sample:token', got none")
+    return dict(parse_token(line) for line in lines if line)
+
+
+def parse_token(entry: str) -> tuple[str, Role]:
+    """A token and its role, from ``role:token``, or from a token alone, which is an admin's.
+
+    Raises:
+        ValueError: an unknown role; names no token.
+    """
+    role, colon, token = entry.partition(":")
+    if not colon:
+        return entry, "admin"
+    for known in get_args(Role):
+        if role == known:
+            return token, known
+    raise ValueError(f"a token's role: expected one of {', '.join(get_args(Role))} before its colon, got another word")
