@@ -25,7 +25,7 @@ from surrogym_server.storage.sql.tables import models
 
 NAME = "pendulum"
 READS: dict[str, Callable[[Storage], Any]] = {
-    "surrogates": lambda storage: storage.surrogates.list(),
+    "surrogates": lambda storage: storage.surrogates.summaries(),
     "due": lambda storage: storage.designs.due(),
     "queries": lambda storage: storage.queries.list(NAME),
     "counts": lambda storage: storage.queries.counts(NAME),
@@ -145,6 +145,7 @@ BROKEN_ROWS = [
     ("UPDATE surrogates SET spec = '{\"a'", "surrogates", r"JSON in surrogates\.spec, got '{\"a'"),
     ("UPDATE surrogates SET phase = 'reaxy'", "surrogates", r"surrogates\.phase, got 'reaxy'"),
     ("UPDATE queries SET status = ''", "counts", r"queries\.status"),
+    ("UPDATE models SET fidelity = ''", "surrogates", "the fidelity of a model can't be read"),
     ("UPDATE models SET fidelity = ''", "models", r"JSON in models\.fidelity"),
     ("UPDATE events SET body = 'x'", "events", r"JSON in events\.body"),
 ]

@@ -115,8 +115,11 @@ def _confidence_index(fidelity: str) -> float:
     """The one field of a fidelity: parsing all of it takes ten times as long."""
     try:
         return _JUDGED.decode(fidelity).confidence_index
-    except msgspec.DecodeError:  # it holds NaN, which Python's parser alone reads
-        return float(json.loads(fidelity)["confidence_index"])
+    except msgspec.DecodeError:  # it may hold NaN, which Python's parser alone reads
+        try:
+            return float(json.loads(fidelity)["confidence_index"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise damaged(f"the fidelity of a model can't be read: {error!r}") from error
 
 
 def _one(connection: Connection, name: str, version: int | None, *columns: sa.ColumnElement[Any]) -> Row[Any]:
