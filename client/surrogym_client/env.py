@@ -37,7 +37,8 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
         options: fields of ``OpenSession``: variant, seed, model, time_limit, penalty, ...
 
     Raises:
-        ValueError: an option that does not exist or is out of range.
+        TypeError: an unknown option.
+        ValueError: an option is out of range.
         NotRenderable: no picture can be made.
         SurrogymClientError: the session can't be opened.
 

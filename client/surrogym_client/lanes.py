@@ -21,6 +21,7 @@ from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult, S
 from surrogym_shared.wire import AutoresetMode, OpenSession
 
 REOPENINGS = 3
+OPTIONS = tuple(name for name in OpenSession.model_fields if name not in ("num_envs", "autoreset_mode"))
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,13 @@ def session_request(num_envs: int, mode: AutoresetMode, options: dict[str, Any])
     """The request that opens a session.
 
     Raises:
-        ValueError: an option does not exist or is out of range.
+        TypeError: an unknown option, in Python's words for an unknown keyword: trainers pass keywords to try whether an
+            environment takes them (TorchRL's ``GymEnv`` passes ``frameskip``), and take back those refused like this.
+        ValueError: an option is out of range.
     """
+    for name in options:
+        if name not in OPTIONS:
+            raise TypeError(f"got an unexpected keyword argument {name!r}: session options are {', '.join(OPTIONS)}")
     try:
         return OpenSession(num_envs=num_envs, autoreset_mode=mode, **options)
     except ValidationError as error:

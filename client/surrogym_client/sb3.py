@@ -38,7 +38,8 @@ class SurrogateVecEnv(VecEnv):
         options: fields of ``OpenSession``: variant, seed, model, time_limit, penalty, occupancy, ...
 
     Raises:
-        ValueError: an option that does not exist or is out of range.
+        TypeError: an unknown option.
+        ValueError: an option is out of range.
         SurrogymClientError: the session can't be opened.
 
     Example:

@@ -40,10 +40,12 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         deviations: ask for the deviation of each model output.
         render_mode: None, or rgb_array: as in ``RemoteEnv``.
         original: ``package.module:factory`` of one's own environment, to render it.
+        max_episode_steps: Gymnasium's name of the option ``time_limit``, as ``make_vec`` passes it.
         options: fields of ``OpenSession``: variant, seed, model, time_limit, penalty, ...
 
     Raises:
-        ValueError: an option that does not exist or is out of range.
+        TypeError: an unknown option.
+        ValueError: an option is out of range.
         NotRenderable: no picture can be made.
         SurrogymClientError: the session can't be opened.
 
@@ -61,9 +63,11 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         deviations: bool = False,
         render_mode: str | None = None,
         original: str | None = None,
+        max_episode_steps: int | None = None,
         **options: Any,
     ) -> None:
         mode = _mode(autoreset_mode)
+        options = _with_time_limit(options, max_episode_steps)
         self._lanes = Lanes(port, session_request(num_envs, WIRE_MODE[mode], options), deviations=deviations)
         self.num_envs = num_envs
         self.autoreset_mode = mode  # as SyncVectorEnv has it; TorchRL reads it here
@@ -141,6 +145,14 @@ def _mode(mode: AutoresetMode | str) -> AutoresetMode:
         if mode in (known, known.value, name):
             return known
     raise ValueError(f"autoreset_mode: expected one of {list(WIRE_MODE.values())}, got {mode!r}")
+
+
+def _with_time_limit(options: dict[str, Any], max_episode_steps: int | None) -> dict[str, Any]:
+    if max_episode_steps is None:
+        return options
+    if options.get("time_limit") is not None:
+        raise ValueError("expected time_limit or max_episode_steps, which mean the same, got both")
+    return options | {"time_limit": max_episode_steps}
 
 
 def _step_infos(step: LaneStep, lanes: Bools) -> dict[str, Any]:

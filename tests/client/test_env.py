@@ -1,6 +1,7 @@
 """RemoteEnv is a Gymnasium environment that loses no information of the surrogate."""
 
 import pickle
+from collections.abc import Callable
 
 import gymnasium
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 from support.exact_pendulum import ExactEnv, ExactPendulum
 from surrogym_client.env import RemoteEnv
 from surrogym_client.errors import NotReset
+from surrogym_client.sb3 import SurrogateVecEnv
+from surrogym_client.vector import RemoteVectorEnv
 
 ACTION = np.array([0.5], dtype=np.float32)
 
@@ -59,13 +62,24 @@ def test_options_reach_the_session():
     assert request.autoreset_mode == "disabled"
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [({"varaint": "deterministic"}, "'varaint'"), ({"penalty": -1.0}, "'penalty'.*got -1")],
-)
-def test_a_wrong_option_is_named(options: dict[str, object], message: str):
-    with pytest.raises(ValueError, match=message):
-        RemoteEnv(ExactPendulum(), **options)
+def test_a_value_out_of_range_is_named():
+    with pytest.raises(ValueError, match=r"'penalty'.*got -1"):
+        RemoteEnv(ExactPendulum(), penalty=-1.0)
+
+
+@pytest.mark.parametrize("kind", [RemoteEnv, RemoteVectorEnv, SurrogateVecEnv.from_port])
+@pytest.mark.parametrize("name", ["varaint", "frameskip", "num_lanes"])
+def test_an_unknown_keyword_is_refused_in_pythons_words(kind: Callable[..., object], name: str):
+    """Trainers try keywords and take back those refused like this: TorchRL's ``GymEnv`` tries ``frameskip``."""
+    port = ExactPendulum()
+    with pytest.raises(TypeError, match=rf"got an unexpected keyword argument '{name}'.*variant, seed"):
+        kind(port, **{name: 1})
+    assert port.opened == []
+
+
+def test_one_lane_takes_no_autoreset_mode():
+    with pytest.raises(TypeError, match="unexpected keyword argument 'autoreset_mode'"):
+        RemoteEnv(ExactPendulum(), autoreset_mode="same_step")
 
 
 def test_rendering_is_refused():

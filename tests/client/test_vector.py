@@ -108,6 +108,18 @@ def test_an_unknown_autoreset_mode_is_refused():
         RemoteVectorEnv(ExactPendulum(), 2, autoreset_mode="sometimes")
 
 
+def test_the_time_limit_may_be_given_by_gymnasiums_name():
+    """``gymnasium.make_vec`` hands ``max_episode_steps`` to a vector environment, which has no wrapper for it."""
+    envs = RemoteVectorEnv(ExactPendulum(), 2, max_episode_steps=3)
+    envs.reset(seed=0)
+    assert [envs.step(actions(1)[0][:2])[3].tolist() for _ in range(3)] == [[False] * 2, [False] * 2, [True] * 2]
+
+
+def test_two_time_limits_are_refused():
+    with pytest.raises(ValueError, match="expected time_limit or max_episode_steps, which mean the same, got both"):
+        RemoteVectorEnv(ExactPendulum(), 2, max_episode_steps=3, time_limit=4)
+
+
 @pytest.mark.parametrize(
     ("mask", "error"),
     [
