@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from surrogym_client.lanes import Lanes, session_request
 from surrogym_client.original.rendering import Picture
-from surrogym_client.pictures import RENDER_MODES, pictures_for
+from surrogym_client.pictures import RENDER_MODES, metadata_of, pictures_for
 from surrogym_client.spaces import space
 from surrogym_shared.port import SurrogatePort
 
@@ -58,11 +58,12 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
         original: str | None = None,
         **options: Any,
     ) -> None:
+        request, spec = session_request(1, "disabled", options), port.spec()
         self.render_mode = render_mode
-        self._pictures = pictures_for(render_mode, port.spec, original)
-        if self._pictures is not None:
-            self.metadata = {**self.metadata, "render_fps": self._pictures.frames_per_second}
-        self._lanes = Lanes(port, session_request(1, "disabled", options), deviations=deviations)
+        self._pictures = pictures_for(render_mode, spec, original)
+        self._shown: Observation | None = None
+        self.metadata = metadata_of(spec, original, self._pictures)
+        self._lanes = Lanes(port, request, deviations=deviations)
         self.observation_space = space(self._lanes.view.observation_space)
         self.action_space = space(self._lanes.view.action_space)
 

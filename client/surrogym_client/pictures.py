@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.original.errors import NotRenderable
 from surrogym_client.original.protocol import Array
-from surrogym_client.original.rendering import Picture, renderer_of
+from surrogym_client.original.rendering import Picture, can_be_drawn, renderer_of
 from surrogym_shared.spec import EnvironmentSpec, Part
 
 Read = Callable[[Array], float]  # a coordinate from an observation (D,)
@@ -36,8 +37,10 @@ class Pictures:
         self._renderer = renderer_of(spec, original)
         self.frames_per_second = self._renderer.frames_per_second
 
-    def of(self, observation: NDArray[Any]) -> Picture:
-        """The picture (height, width, 3) of an observation (D,)."""
+    def of(self, observation: NDArray[Any] | None) -> Picture:
+        """The picture (height, width, 3) of an observation (D,). Raises ``ResetNeeded`` where there is none yet."""
+        if observation is None:
+            raise gymnasium.error.ResetNeeded("nothing to render yet: expected reset() before render()")
         return self._renderer.draw(self._read(np.asarray(observation, dtype=np.float64)))
 
     def close(self) -> None:
@@ -45,7 +48,7 @@ class Pictures:
         self._renderer.close()
 
 
-def pictures_for(render_mode: str | None, spec: Callable[[], EnvironmentSpec], original: str | None) -> Pictures | None:
+def pictures_for(render_mode: str | None, spec: EnvironmentSpec, original: str | None) -> Pictures | None:
     """What draws in this mode; None where nothing is to be drawn.
 
     Raises:
@@ -58,7 +61,19 @@ def pictures_for(render_mode: str | None, spec: Callable[[], EnvironmentSpec], o
         raise ValueError(
             f"a surrogate can't be rendered so: expected render_mode None or rgb_array, got {render_mode!r}"
         )
-    return Pictures(spec(), original)
+    return Pictures(spec, original)
+
+
+def metadata_of(spec: EnvironmentSpec, original: str | None, pictures: Pictures | None) -> dict[str, Any]:
+    """Gymnasium's ``metadata`` of a surrogate: the render modes that work here, and the frames per second of its
+    pictures."""
+    fps = {} if pictures is None else {"render_fps": pictures.frames_per_second}
+    return {"render_modes": _render_modes(spec, original), **fps}
+
+
+def _render_modes(spec: EnvironmentSpec, original: str | None) -> list[str]:
+    shown = all(_read(spec, name) is not None for name in spec.coordinate_names) and can_be_drawn(spec, original)
+    return list(RENDER_MODES) if shown else []
 
 
 def coordinates_from_observation(spec: EnvironmentSpec) -> Callable[[Array], Array]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from surrogym_client.env import LOST, Observation
 from surrogym_client.lanes import Lanes, LaneStep, session_request
 from surrogym_client.original.rendering import Picture
-from surrogym_client.pictures import RENDER_MODES, pictures_for
+from surrogym_client.pictures import metadata_of, pictures_for
 from surrogym_client.spaces import space
 from surrogym_shared import wire
 from surrogym_shared.port import Bools, SurrogatePort
@@ -68,13 +68,14 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     ) -> None:
         mode = _mode(autoreset_mode)
         options = _with_time_limit(options, max_episode_steps)
-        self._lanes = Lanes(port, session_request(num_envs, WIRE_MODE[mode], options), deviations=deviations)
+        request, spec = session_request(num_envs, WIRE_MODE[mode], options), port.spec()
         self.num_envs = num_envs
         self.autoreset_mode = mode  # as SyncVectorEnv has it; TorchRL reads it here
         self.render_mode = render_mode
-        self._pictures = pictures_for(render_mode, port.spec, original)
-        fps = {} if self._pictures is None else {"render_fps": self._pictures.frames_per_second}
-        self.metadata = {"render_modes": RENDER_MODES, "autoreset_mode": mode, **fps}
+        self._pictures = pictures_for(render_mode, spec, original)
+        self._shown: Observation | None = None
+        self.metadata = {"autoreset_mode": mode, **metadata_of(spec, original, self._pictures)}
+        self._lanes = Lanes(port, request, deviations=deviations)
         self.single_observation_space = space(self._lanes.view.observation_space)
         self.single_action_space = space(self._lanes.view.action_space)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -109,7 +110,10 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
 
     def render(self) -> tuple[Picture, ...] | None:
         """A picture (height, width, 3) of every lane; None without a render mode."""
-        return None if self._pictures is None else tuple(self._pictures.of(shown) for shown in self._shown)
+        if self._pictures is None:
+            return None
+        shown = [None] if self._shown is None else self._shown
+        return tuple(self._pictures.of(observation) for observation in shown)
 
     def close_extras(self, **_: Any) -> None:
         if self._pictures is not None:

@@ -19,7 +19,7 @@ from surrogym_client.original.episodes import draw
 from surrogym_client.original.errors import NotRenderable
 from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
 from surrogym_client.original.terms import observe
-from surrogym_client.pictures import Pictures, coordinates_from_observation
+from surrogym_client.pictures import Pictures, coordinates_from_observation, metadata_of
 from surrogym_client.registration import SWING_UP
 from surrogym_client.vector import RemoteVectorEnv
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
@@ -41,6 +41,7 @@ LINE = EnvironmentSpec(
     action=BoxAction(low=(-1,), high=(1,)),
     start={"x": Uniform(low=-1, high=1)},
 )
+BLIND = LINE.model_copy(update={"observation": (ObservationEntry(name="s", term=Term.sin(x=1)),)})
 OWN = """
 import numpy as np
 
@@ -138,11 +139,7 @@ def test_an_environment_of_ones_own_draws_itself(own: None) -> None:
     [
         (LINE, None, r"expected original='package\.module:factory'"),
         (LINE, "line:Blind", r"have a method picture\(coordinates\), got a Blind"),
-        (
-            LINE.model_copy(update={"observation": (ObservationEntry(name="s", term=Term.sin(x=1)),)}),
-            "line:Line",
-            "got none that tells 'x'",
-        ),
+        (BLIND, "line:Line", "got none that tells 'x'"),
     ],
 )
 def test_what_can_not_be_shown_is_refused_in_words(own: None, spec, original, message) -> None:
@@ -156,3 +153,43 @@ def test_a_renderer_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPat
     env.reset(seed=0)
     with pytest.raises(NotRenderable, match=r"Pendulum-v1 can't be shown here: .*surrogym\[render\]"):
         env.render()
+
+
+@pytest.mark.parametrize("kind", [RemoteEnv, RemoteVectorEnv])
+def test_a_render_mode_is_declared_only_where_its_renderer_is_installed(kind, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert kind(ExactPendulum()).metadata["render_modes"] == ["rgb_array"]
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    assert kind(ExactPendulum()).metadata["render_modes"] == []
+
+
+@pytest.mark.parametrize(
+    ("spec", "original", "modes"),
+    [
+        (SPECS[SWING_UP], None, ["rgb_array"]),
+        (SPECS["Reacher-v5"], None, []),
+        (LINE, None, []),
+        (LINE, "line:Line", ["rgb_array"]),
+        (LINE, SWING_UP, ["rgb_array"]),
+        (BLIND, "line:Line", []),
+    ],
+)
+def test_what_is_declared_follows_what_can_be_drawn(spec, original, modes, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in ("pygame", "mujoco"):
+        monkeypatch.setitem(sys.modules, module, None)
+    assert metadata_of(spec, original, None) == {"render_modes": modes}
+
+
+def test_rendering_before_a_reset_is_refused() -> None:
+    for env in (
+        RemoteEnv(ExactPendulum(), render_mode="rgb_array"),
+        RemoteVectorEnv(ExactPendulum(), 2, render_mode="rgb_array"),
+    ):
+        with pytest.raises(gymnasium.error.ResetNeeded, match=r"expected reset\(\) before render\(\)"):
+            env.render()
+
+
+def test_what_can_not_be_rendered_opens_no_session() -> None:
+    for kind in (RemoteEnv, RemoteVectorEnv):
+        with pytest.raises(ValueError, match="expected render_mode None or rgb_array, got 'human'"):
+            kind(port := ExactPendulum(), render_mode="human")
+        assert port.opened == []

@@ -7,8 +7,9 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 import pytest
-from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from support.distributions import needed
 
 ROOT = Path(__file__).parents[2]
 PIN = re.compile(r"([A-Za-z0-9][A-Za-z0-9._-]*)==([A-Za-z0-9.!]+)")
@@ -17,20 +18,6 @@ PIN = re.compile(r"([A-Za-z0-9][A-Za-z0-9._-]*)==([A-Za-z0-9.!]+)")
 def lines() -> list[str]:
     text = (ROOT / "constraints.txt").read_text(encoding="utf-8")
     return [line for line in text.splitlines() if line and not line.startswith("#")]
-
-
-def needed(requirement: str, found: dict[str, set[str]]) -> dict[str, set[str]]:
-    """All installed distributions that a requirement leads to, with the extras asked of each."""
-    asked = Requirement(requirement)
-    name, extras = canonicalize_name(asked.name), set(asked.extras)
-    if name in found and extras <= found[name]:
-        return found
-    found.setdefault(name, set()).update(extras)
-    for line in distribution(name).requires or ():
-        marker = Requirement(line).marker
-        if marker is None or any(marker.evaluate({"extra": extra}) for extra in {"", *extras}):
-            needed(line, found)
-    return found
 
 
 def test_every_line_is_an_exact_pin_without_an_address_or_a_local_build() -> None:

@@ -5,6 +5,7 @@ Shapes: C coordinates; a picture is (height, width, 3) uint8.
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -19,6 +20,8 @@ from surrogym_shared.spec import EnvironmentSpec
 
 Picture = NDArray[np.uint8]
 FRAMES_PER_SECOND = 30
+# What an environment imports to draw itself, and the extra that brings it, by the package of Gymnasium it is in.
+DRAWN_WITH = {"gymnasium.envs.classic_control.": ("pygame", "render"), "gymnasium.envs.mujoco.": ("mujoco", "mujoco")}
 
 
 @runtime_checkable
@@ -71,6 +74,23 @@ def renderer_of(spec: EnvironmentSpec, original: str | None = None) -> Renderer:
     return _Native(name, spec)
 
 
+def can_be_drawn(spec: EnvironmentSpec, original: str | None = None) -> bool:
+    """Whether ``renderer_of`` has a renderer here: a built-in adapter's, with what it imports installed, or one that a
+    person names. Finding out imports nothing."""
+    if original is not None and ":" in original:
+        return True
+    name = original or spec.environment
+    return is_known(name) and all(find_spec(module) is not None for module, _ in _drawn_with(name))
+
+
+def _drawn_with(name: str) -> list[tuple[str, str]]:
+    """The module that an environment draws itself with and the extra that brings it; empty where numpy is enough."""
+    import gymnasium
+
+    place = str(gymnasium.spec(name).entry_point)
+    return [needed for package, needed in DRAWN_WITH.items() if place.startswith(package)]
+
+
 class _Own:
     def __init__(self, name: str) -> None:
         made = load_factory(name)()
@@ -119,5 +139,5 @@ class _Native:
         self._env.close()
 
     def _unavailable(self, error: Exception) -> NotRenderable:
-        extra = "render" if self._name in TASKS else "mujoco"
-        return NotRenderable(f"{self._name} can't be shown here: {error} (pip install 'surrogym[{extra}]')")
+        way_out = "".join(f" (pip install 'surrogym[{extra}]')" for _, extra in _drawn_with(self._name))
+        return NotRenderable(f"{self._name} can't be shown here: {error}{way_out}")
