@@ -111,10 +111,10 @@ help:  ## This list
 	@touch $@ .venv/demo
 
 .venv-extras: pyproject.toml constraints-extras.txt | .venv/bin/python
-	@echo "installing RLlib, TorchRL, MLflow and Weights & Biases into .venv-extras"
+	@echo "installing RLlib, TorchRL, tianshou, sb3-contrib, MLflow and Weights & Biases into .venv-extras"
 	@$(PYTHON) -m venv .venv-extras
 	@.venv-extras/bin/python -m pip install -qq --disable-pip-version-check --constraint constraints-extras.txt \
-	    --editable ".[train,torchrl,rllib,trackers]"
+	    --editable ".[train,torchrl,rllib,tianshou,contrib,trackers]"
 	@touch $@
 
 .venv/dev: $(PINS) | .venv/bin/python

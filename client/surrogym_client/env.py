@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_client.lanes import Lanes, session_request
+from surrogym_client.lanes import LaneReset, Lanes, LaneStep, session_request
 from surrogym_client.original.rendering import Picture
 from surrogym_client.pictures import RENDER_MODES, metadata_of, pictures_for
 from surrogym_client.spaces import space
@@ -75,28 +75,15 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
     ) -> tuple[Observation, dict[str, Any]]:
         super().reset(seed=seed)
         start = self._lanes.reset(seed)
-        info: dict[str, Any] = {"model_version": int(start.model_version[0])}
-        if start.lost is not None:
-            info[LOST] = start.lost
         self._shown = start.observation[0]
-        return self._shown, info
+        return self._shown, start_info(start, 0)
 
     def step(self, action: Any) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
         step = self._lanes.step(np.asarray(action)[None])
         result = step.result
-        info: dict[str, Any] = {
-            "model_version": int(result.model_version[0]),
-            "reward_mean": float(result.reward_mean[0]),
-        }
-        if result.deviation is not None:
-            info["deviation"] = result.deviation[0]
-        if result.untrusted is not None:
-            info["untrusted"] = bool(result.untrusted[0])
-        if step.lost is not None:
-            info[LOST] = step.lost
         terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
         self._shown = result.observation[0]
-        return self._shown, float(result.reward[0]), terminated, truncated, info
+        return self._shown, float(result.reward[0]), terminated, truncated, step_info(step, 0)
 
     def render(self) -> Picture | None:
         """The picture (height, width, 3) of the state that was last observed; None without a render mode."""
@@ -106,3 +93,27 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
         if self._pictures is not None:
             self._pictures.close()
         self._lanes.close()
+
+
+def start_info(start: LaneReset, lane: int) -> dict[str, Any]:
+    """The info of one lane's reset."""
+    info: dict[str, Any] = {"model_version": int(start.model_version[lane])}
+    if start.lost is not None:
+        info[LOST] = start.lost
+    return info
+
+
+def step_info(step: LaneStep, lane: int) -> dict[str, Any]:
+    """The info of one lane's step."""
+    result = step.result
+    info: dict[str, Any] = {
+        "model_version": int(result.model_version[lane]),
+        "reward_mean": float(result.reward_mean[lane]),
+    }
+    if result.deviation is not None:
+        info["deviation"] = result.deviation[lane]
+    if result.untrusted is not None:
+        info["untrusted"] = bool(result.untrusted[lane])
+    if step.cut[lane]:
+        info[LOST] = step.lost
+    return info

@@ -115,21 +115,25 @@ class Lanes:
         self._cut, self._held = self._cut & ~chosen, self._held & ~chosen
         return LaneReset(self._observation.copy(), self._version.copy(), lost)
 
-    def step(self, action: NDArray[Any]) -> LaneStep:
-        """Step all lanes with actions (N, F) or (N,)."""
+    def step(self, action: NDArray[Any], mask: Bools | None = None) -> LaneStep:
+        """Step all lanes with actions (N, F) or (N,), or with autoreset disabled those of the mask (N,)."""
+        chosen = np.ones(self.num_envs, dtype=bool) if mask is None else mask
         try:
-            result = self._advance(action)
+            result = self._advance(action, chosen)
         except SessionLost as error:
             self._reopen(error)
             result = self._standing()
         began = _none(self.num_envs) if self.mode == "same_step" else ~self._running
-        cut, self._cut, self._held = self._cut, _none(self.num_envs), _none(self.num_envs)
+        cut, self._cut, self._held = self._cut & chosen, self._cut & ~chosen, _none(self.num_envs)
         if cut.any():
             result = self._ended(result, cut)
+        if not chosen.all():
+            result = replace(result, observation=np.where(chosen[:, None], result.observation, self._observation))
         step = LaneStep(result, began, self._version, cut, self._reason if cut.any() else None)
         self._version = result.model_version
         self._observation = result.observation
-        self._running = ~(result.terminated | result.truncated) | (self.mode == "same_step")
+        over = result.terminated | result.truncated
+        self._running = np.where(chosen, ~over | (self.mode == "same_step"), self._running)
         return step
 
     def close(self) -> None:
@@ -151,8 +155,8 @@ class Lanes:
             result = self.port.reset(self.view.id, seed=numbers, mask=None if seeded.all() else seeded)
         return result
 
-    def _advance(self, action: NDArray[Any]) -> StepResult:
-        idle = self._cut | self._held
+    def _advance(self, action: NDArray[Any], chosen: Bools) -> StepResult:
+        idle = self._cut | self._held | ~chosen
         if idle.all():
             return self._standing()
         mask = ~idle if idle.any() else None

@@ -169,3 +169,7 @@ def test_close_ends_the_session_once():
     envs.close()
     envs.close()
     assert not port.sessions
+
+
+def test_its_length_is_the_number_of_lanes():
+    assert len(RemoteVectorEnv(ExactPendulum(), 3)) == 3

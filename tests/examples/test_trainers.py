@@ -33,6 +33,13 @@ def test_torchrl(server: ServerProcess, tmp_path: Path) -> None:
 
 
 @needs_extras
+def test_tianshou(server: ServerProcess, tmp_path: Path) -> None:
+    said = run(server, tmp_path, program("train_tianshou.py"), "pendulum", "--steps", "2048", python=str(EXTRAS))
+    assert "imagined return: -" in said
+    assert (tmp_path / "tianshou.pt").exists()
+
+
+@needs_extras
 def test_rllib(server: ServerProcess, tmp_path: Path) -> None:
     said = run(server, tmp_path, program("train_rllib.py"), "pendulum", "--iterations", "2", python=str(EXTRAS))
     assert "iteration 2: imagined return -" in said
