@@ -114,7 +114,7 @@ def design() -> Callable[..., NewDesign]:
         model = NewModel(
             samples=3,
             data_hash="abc",
-            fidelity={"target": 0.999},
+            fidelity={"target": 0.999, "confidence_index": 0.9},
             description={},
             fit_seconds=0.5,
             blob=b"\0model",

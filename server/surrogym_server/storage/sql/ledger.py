@@ -10,11 +10,13 @@ from sqlalchemy.engine import Connection
 
 from surrogym_server.storage import port
 from surrogym_server.storage.records import LedgerRecord, fingerprint
+from surrogym_server.storage.sql.damage import damaged
 from surrogym_server.storage.sql.database import Database, clock
 from surrogym_server.storage.sql.rows import Span, append_event, find, hold, recall, remember, within
 from surrogym_server.storage.sql.tables import evaluations, leases, queries, samples
 
 OPERATION = "report_steps"
+COUNTED = ("initial", "adaptive", "manual", "evaluation", "failed", "expired")
 
 
 class SqlLedger(port.Ledger):
@@ -43,6 +45,8 @@ def ledgers(connection: Connection, span: Span) -> dict[int, LedgerRecord]:
     counted: defaultdict[int, dict[str, int]] = defaultdict(dict)
     statement = sa.union_all(_samples_of(span), _evaluations_of(span), _unresolved_of(connection, span))
     for surrogate, what, steps in connection.execute(statement).all():
+        if what not in COUNTED:
+            raise damaged(f"expected one of {list(COUNTED)} in samples.purpose, got {what!r}")
         counted[surrogate][what] = int(steps)
     return {surrogate: _record(**counts) for surrogate, counts in counted.items()}
 
@@ -56,7 +60,8 @@ def _record(*, failed: int = 0, expired: int = 0, **steps: int) -> LedgerRecord:
 
 
 def _samples_of(span: Span) -> sa.Select[Any]:
-    counted = sa.select(samples.c.surrogate_id, samples.c.purpose, sa.func.count())
+    purpose = sa.type_coerce(samples.c.purpose, sa.Text)  # its own type would refuse the words of the other parts
+    counted = sa.select(samples.c.surrogate_id, purpose, sa.func.count())
     return counted.where(within(samples, span)).group_by(samples.c.surrogate_id, samples.c.purpose)
 
 

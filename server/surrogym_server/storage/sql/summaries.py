@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from typing import Any
 
 import msgspec
@@ -9,6 +10,7 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from surrogym_server.storage.records import LedgerRecord, QueryCounts, SurrogateSummary
+from surrogym_server.storage.sql.damage import damaged
 from surrogym_server.storage.sql.ledger import ledgers
 from surrogym_server.storage.sql.models import newest_of
 from surrogym_server.storage.sql.queries import query_counts
@@ -48,6 +50,13 @@ def read_summaries(
     summaries = []
     for id, *known, spec in rows:
         counted = (spent.get(id, none_spent), queue.get(id, no_queries), *newest.get(id, (None, None)))
-        fields: tuple[Any, ...] = (id, *known, _NAMED.decode(spec).environment, *counted)
+        fields: tuple[Any, ...] = (id, *known, _environment(spec), *counted)
         summaries.append(SurrogateSummary(*fields))
     return summaries
+
+
+def _environment(spec: str) -> str:
+    try:
+        return _NAMED.decode(spec).environment
+    except msgspec.DecodeError as error:
+        raise damaged(f"expected JSON in surrogates.spec, got {reprlib.repr(spec)}: {error}") from error
