@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import gc
+import logging
 import os
 import signal
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType
 
@@ -20,6 +22,8 @@ from surrogym_server.app import create_app, say_goodbye
 from surrogym_server.cli.connections import PromptMessages, connections_within, patient
 from surrogym_server.errors import InvalidInput
 from surrogym_server.settings import Settings
+
+logger = logging.getLogger(__name__)
 
 GRACE_SECONDS = 5
 PARENT_LOOK_SECONDS = 0.5
@@ -51,6 +55,7 @@ class Runner(uvicorn.Server):
         self._url = url
         self._ready_file = ready_file
         self._tell = tell
+        self._ended_by: signal.Signals | None = None
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
@@ -59,13 +64,23 @@ class Runner(uvicorn.Server):
             _write_at_once(self._ready_file, self._url)
         self._tell(self._url)
 
+    @contextmanager
+    def capture_signals(self) -> Generator[None, None, None]:
+        """Besides those of uvicorn the signal of a terminal that closes, unless it is ignored, as under nohup."""
+        ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+        with super().capture_signals(), nullcontext() if ignored else _handled(signal.SIGHUP, self.handle_exit):
+            yield
+
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        if self._ended_by is not None:
+            logger.info("%s: the server ends", self._ended_by.name)
         say_goodbye(self._app)
         await super().shutdown(sockets)
 
     def handle_exit(self, sig: int, _: FrameType | None) -> None:
         self.force_exit = self.should_exit and sig == signal.SIGINT
         self.should_exit = True
+        self._ended_by = signal.Signals(sig)
 
 
 def run(settings: Settings, ready_file: Path | None, exit_with_parent: bool, tell: Tell) -> None:
@@ -81,6 +96,15 @@ def run(settings: Settings, ready_file: Path | None, exit_with_parent: bool, tel
         if exit_with_parent:
             threading.Thread(target=_end_with_parent, args=(runner, os.getppid()), daemon=True).start()
         runner.run(sockets=[listener])
+
+
+@contextmanager
+def _handled(sig: signal.Signals, handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    before = signal.signal(sig, handler)
+    try:
+        yield
+    finally:
+        signal.signal(sig, before)
 
 
 def _exempt_from_collection() -> None:

@@ -63,7 +63,7 @@ def serve(
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No remarks; the log is what --log-level says.")] = False,
 ) -> None:
-    """Run the server until Ctrl-C.
+    """Run the server until Ctrl-C, SIGTERM, or the end of its terminal (SIGHUP, unless ignored, as under nohup).
 
     Most options can also be given as environment variables, such as SURROGYM_PORT; a token as SURROGYM_TOKEN.
 

@@ -39,7 +39,7 @@ class Fits:
         theirs, self._lifeline = context.Pipe(duplex=False)
         self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=_live_with, initargs=(theirs,))
         others = active_children()
-        with _interrupt_blocked(), theirs:
+        with _terminal_blocked(), theirs:
             self._pool.submit(_warm)
         self._processes = [child for child in active_children() if child not in others]
 
@@ -72,9 +72,10 @@ class Fits:
 
 
 @contextmanager
-def _interrupt_blocked() -> Iterator[None]:
-    """Block Ctrl-C for processes started within: they inherit the mask; this one takes its Ctrl-C afterwards."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+def _terminal_blocked() -> Iterator[None]:
+    """Block what a terminal sends to all its processes, by Ctrl-C or when it closes, for those started within: they
+    inherit the mask; this one takes its signals afterwards."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
     try:
         yield
     finally:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import signal
 import subprocess
 import sys
+import termios
 import time
 from importlib.metadata import version
 from pathlib import Path
@@ -17,7 +19,7 @@ import pytest
 import torch
 
 from support import pendulum
-from support.server import running_server, start_server
+from support.server import STARTING_SECONDS, running_server, start_server
 
 SERVE = [sys.executable, "-m", "surrogym_server", "serve"]
 PATIENCE = 60.0
@@ -71,7 +73,9 @@ def test_help_has_an_example():
     assert "surrogym serve --port" in result.stdout
 
 
-def test_a_clean_end_brings_the_sessions_back(tmp_path: Path):
+@pytest.mark.parametrize("sig", [signal.SIGTERM, signal.SIGHUP])
+def test_a_clean_end_brings_the_sessions_back(tmp_path: Path, sig: signal.Signals):
+    """A terminal that closes (SIGHUP) ends the server as politely as SIGTERM does."""
     server = start_server(tmp_path)
     with httpx.Client(base_url=server.url, timeout=60) as client:
         pendulum.teach(client, "p", budget=5)
@@ -82,11 +86,56 @@ def test_a_clean_end_brings_the_sessions_back(tmp_path: Path):
             client.post(f"/v1/sessions/{session}/reset", json={"seq": 1}).raise_for_status()
         step = {"seq": 2, "action": [[0.5], [-0.5]]}
         first = client.post(f"/v1/sessions/{sessions[0]}/step", json=step).content
-    assert server.stop() == 0
+    assert server.stop(sig) == 0
     assert "Traceback" not in server.log
+    assert f"{sig.name}: the server ends" in server.log
+    assert "sessions saved: 2" in server.log
     with running_server(tmp_path) as again, httpx.Client(base_url=again.url, timeout=60) as client:
         replies = [client.post(f"/v1/sessions/{session}/step", json=step).content for session in sessions]
     assert replies == [first, first], "a repeat of the last step, and the same step made only now"
+
+
+def test_under_nohup_a_terminal_that_closes_ends_nothing(tmp_path: Path):
+    """Who starts a server with SIGHUP ignored wants it to stay."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        server = start_server(tmp_path)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    server.process.send_signal(signal.SIGHUP)
+    for _ in range(5):
+        assert httpx.get(f"{server.url}/healthz").status_code == 200
+        time.sleep(0.1)
+    assert server.stop() == 0
+    assert "SIGHUP" not in server.log
+
+
+def test_a_window_that_is_closed_over_a_server_costs_no_session(tmp_path: Path):
+    """The kernel hangs up on all its processes, that of the fits too, and nothing can be written any more."""
+    ready, database = tmp_path / "ready", tmp_path / "surrogym.db"
+    window, terminal = os.openpty()
+    with subprocess.Popen(
+        [*SERVE, "--port", "0", "--database", str(database), "--ready-file", str(ready), "--quiet"],
+        stdin=terminal,
+        stdout=terminal,
+        stderr=terminal,
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    ) as process:
+        os.close(terminal)
+        try:
+            deadline = time.monotonic() + STARTING_SECONDS
+            while not ready.exists():
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+            with httpx.Client(base_url=ready.read_text(), timeout=60) as client:
+                pendulum.teach(client, "p", budget=5)
+                session = client.post("/v1/surrogates/p/sessions", json={"seed": 0}).raise_for_status().json()["id"]
+        finally:
+            os.close(window)  # which ends the process
+        assert process.wait(PATIENCE) == 0
+    with running_server(tmp_path) as again:
+        assert httpx.get(f"{again.url}/v1/sessions/{session}").status_code == 200
 
 
 def test_a_clean_end_does_not_wait_for_long_polls_and_streams(tmp_path: Path):
