@@ -1,26 +1,32 @@
-"""Routes of the service: the one place where a name becomes part of an address."""
+"""Routes of the service: the one place where a name becomes part of an address.
+
+Quoting alone would not do: ``..`` has no quoted form, and a server undoes that of a slash.
+"""
 
 from __future__ import annotations
 
 import re
+from urllib.parse import quote
 
 from surrogym_client.errors import refused_here
 from surrogym_shared.codes import Code
 from surrogym_shared.spec import NAME_IN_WORDS, NAME_PATTERN
 
+SESSION_PATTERN = r"[^/\\]*[^/\\.][^/\\]*"  # a server chooses the form of its ids
+
 
 def surrogate(name: str) -> str:
     """The route of a surrogate. Raises ``InvalidInput`` for a name that none can have."""
-    return f"/v1/surrogates/{_segment(name, 'name of a surrogate')}"
+    return f"/v1/surrogates/{_segment(name, NAME_PATTERN, f'name of a surrogate: expected {NAME_IN_WORDS}')}"
 
 
 def session(identity: str) -> str:
     """The route of a session. Raises ``InvalidInput`` for an id that none can have."""
-    return f"/v1/sessions/{_segment(identity, 'id of a session')}"
+    expected = "id of a session: expected no slash, and something else than dots"
+    return f"/v1/sessions/{_segment(identity, SESSION_PATTERN, expected)}"
 
 
-def _segment(text: str, what: str) -> str:
-    """A part of a path. Quoting would not do: ``..`` has no quoted form, and servers undo that of a slash."""
-    if re.fullmatch(NAME_PATTERN, text):
-        return text
-    raise refused_here(Code.INVALID_REQUEST, f"{what}: expected {NAME_IN_WORDS}, got {text!r}")
+def _segment(text: str, pattern: str, expected: str) -> str:
+    if not re.fullmatch(pattern, text):
+        raise refused_here(Code.INVALID_REQUEST, f"{expected}, got {text!r}")
+    return quote(text, safe="")

@@ -86,14 +86,29 @@ def test_a_name_that_none_can_have_reaches_no_server(name: str):
             lambda: list(api.events(name)),
             remote.spec,
             lambda: remote.open(wire.OpenSession(num_envs=1)),
-            lambda: remote.reset(name),
-            lambda: remote.close(name),
         ]
         for call in calls:
             with pytest.raises(errors.InvalidInput, match="expected 1 to 64 letters, digits") as refusal:
                 call()
             assert repr(name) in str(refusal.value)
         assert server.received == []
+
+
+@pytest.mark.parametrize("identity", ["", ".", "..", "a/b", "../surrogates", "a\\b"])
+def test_an_id_that_no_session_can_have_reaches_no_server(identity: str):
+    with api_of(reply("{}")) as (api, server):
+        remote = HttpSurrogate(api.url, "pendulum")
+        for call in (remote.reset, remote.close):
+            with pytest.raises(errors.InvalidInput, match="expected no slash, and something else than dots"):
+                call(identity)
+        assert server.received == []
+
+
+@pytest.mark.parametrize(("identity", "sent"), [("-2aay_C", "-2aay_C"), ("a b%2Fc", "a%20b%252Fc"), ("a..", "a..")])
+def test_the_id_of_a_session_is_quoted(identity: str, sent: str):
+    with api_of(reply("")) as (api, server):
+        HttpSurrogate(api.url, "pendulum").close(identity)
+        assert [request.path for request in server.received] == [f"/v1/sessions/{sent}"]
 
 
 def event(number: int) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from surrogym_server.engine.design_job import DesignJob, DesignResult
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.errors import InvalidInput, LeaseExpired, SurrogymError, Unavailable, UnknownSurrogate
+from surrogym_server.errors import Damaged, InvalidInput, LeaseExpired, SurrogymError, Unavailable, UnknownSurrogate
 from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.notices import Notices
@@ -88,14 +88,14 @@ class Designer:
                 await listener.wait(self._look_seconds)
 
     async def fit_all_due(self) -> None:
-        """Fit every surrogate that is due, one after the other.
-
-        Raises:
-            Damaged: one of them can't be read; those that are due were fitted.
-        """
+        """Fit every surrogate that is due, one after the other."""
         for name in await asyncio.to_thread(self._storage.designs.due):
-            with suppress(SurrogymError):  # deleted or taken by another server meanwhile
+            try:
                 await self._fit(name)
+            except Damaged as error:
+                logger.warning("the design of %s waits: %s", name, error)
+            except SurrogymError as error:  # deleted or taken by another server meanwhile
+                logger.debug("%s is not fitted: %s", name, error)
         await asyncio.to_thread(self._give_up_hopeless)
 
     def improve(

@@ -15,7 +15,7 @@ import pytest
 from support import pendulum
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.errors import Damaged, InvalidInput, NoModel, NumericalFailure, Unavailable
+from surrogym_server.errors import InvalidInput, NoModel, NumericalFailure, Unavailable
 from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import ATTEMPTS, Designer, phase_after
@@ -222,8 +222,7 @@ def test_a_surrogate_whose_row_is_broken_keeps_no_other_from_its_fit(answered: S
     with closing(sqlite3.connect(tmp_path / "surrogym.db")) as file:
         file.execute("UPDATE surrogates SET state = '{' WHERE name = 'broken'")
         file.commit()
-    with pytest.raises(Damaged, match=r"surrogates\.state"):
-        fit_all(designer)
+    fit_all(designer)
     assert answered.surrogates.get(NAME).phase == "sampling"
 
 
