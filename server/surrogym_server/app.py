@@ -35,6 +35,7 @@ from surrogym_server.api.auth import Gate
 from surrogym_server.api.guards import BodyLimit, KnownHosts, OwnPages
 from surrogym_server.api.observe import Observed
 from surrogym_server.api.state import Services
+from surrogym_server.api.turns import Turns
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
 from surrogym_server.engine.fits import Fits
@@ -116,6 +117,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     app.state.gate = Gate(settings.tokens)
     app.state.max_body_bytes = settings.max_body_bytes
     app.state.parsing = asyncio.Lock()
+    app.state.turns = Turns()
     app.state.notices = None
     app.state.counts = Counts()
     problems.install(app)

@@ -62,13 +62,20 @@ class FrameSplitter:
     """Gathers chunks, as they come, into whole frames.
 
     ``max_bytes`` is the longest payload worth gathering: beyond it the chunks so far are given back as they are, for
-    the library to refuse.
+    the library to refuse. ``max_frames`` is how many frames of one chunk are taken apart: one more says that there are
+    too many, and the rest is dropped.
     """
 
-    def __init__(self, max_bytes: float = float("inf")) -> None:
+    def __init__(self, max_bytes: float = float("inf"), max_frames: float = float("inf")) -> None:
         self._max_bytes = max_bytes
+        self._max_frames = max_frames
         self._held = bytearray()
         self._due = 0  # nothing is whole before so many bytes are held
+
+    @property
+    def held(self) -> int:
+        """Bytes of a frame that is not whole yet."""
+        return len(self._held)
 
     def split(self, chunk: bytes) -> list[tuple[bytes, Extent | None]]:
         """The frames that are whole with this chunk, in order, each with its extent; None marks what is too long."""
@@ -79,7 +86,7 @@ class FrameSplitter:
             chunk = bytes(self._held)
             self._held.clear()
         found: list[tuple[bytes, Extent | None]] = []
-        while chunk:
+        while chunk and len(found) <= self._max_frames:
             extent = extent_of(chunk)
             if extent is not None and extent.end - extent.payload > self._max_bytes:
                 return [*found, (chunk, None)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import random
-import socket
 from collections.abc import Callable, Iterator
 
 import httpx
@@ -15,14 +14,13 @@ from websockets.sync.client import connect
 
 from support import pendulum
 from support.chaos import SEED, times
-from support.hostile import connected, mutated, resident_mib
+from support.hostile import mutated, resident_mib, upgraded
 from support.server import ServerProcess
 from surrogym_shared import frames
 from surrogym_shared.codes import PROBLEM_MEDIA_TYPE, Problem
 
 MUTATIONS = times(short=250, full=17_000)  # of each of six kinds
 WARM, GROWTH_MIB = 50, 24.0
-KEY = "c3Vycm9neW0tZnJhbWVzLg=="  # of a handshake: any 16 bytes
 ACTION = np.array([[0.5], [-1.5]])
 
 pytestmark = pytest.mark.timeout(3_600)
@@ -132,18 +130,8 @@ def websocket_frames(source: random.Random) -> bytes:
     return (head + bytes(4) + content) * source.randint(1, 4)
 
 
-def upgraded(server: ServerProcess, session: str) -> socket.socket:
-    """A stream of a session, as a bare connection."""
-    opened = connected(server.url, seconds=10.0)
-    lines = ("Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13", f"Sec-WebSocket-Key: {KEY}")
-    head = [f"GET /v1/sessions/{session}/stream HTTP/1.1", "Host: 127.0.0.1", *lines, "", ""]
-    opened.sendall("\r\n".join(head).encode())
-    assert opened.recv(65_536).startswith(b"HTTP/1.1 101")
-    return opened
-
-
 def test_random_websocket_frames_leave_no_error_in_the_log(server: ServerProcess, session: str):
-    source, stream = random.Random(SEED), upgraded(server, session)
+    source, stream = random.Random(SEED), upgraded(server.url, session)
     for _ in range(MUTATIONS):
         try:
             stream.sendall(websocket_frames(source))
@@ -152,7 +140,7 @@ def test_random_websocket_frames_leave_no_error_in_the_log(server: ServerProcess
                 stream.recv(65_536)
         except OSError:
             stream.close()
-            stream = upgraded(server, session)
+            stream = upgraded(server.url, session)
     stream.close()
     assert server.process.poll() is None
     assert "Traceback" not in server.log

@@ -9,6 +9,7 @@ import statistics
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import httpx
@@ -17,7 +18,7 @@ import pytest
 from websockets.sync.client import connect
 
 from support.chaos import times
-from support.hostile import connected, head, read_all, resident_mib
+from support.hostile import KEY, connected, head, read_all, resident_mib, upgraded
 from support.server import ServerProcess, running_server
 from support.teaching import teach
 from surrogym_client.api import Api
@@ -254,3 +255,66 @@ def test_idle_connections_are_closed_and_others_are_served(server: ServerProcess
         assert step_seconds(client, session) < SLOWER * calm
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+@pytest.mark.parametrize("frame", [b"\x00\x80\0\0\0\0", b"\x89\x80\0\0\0\0", b"\x82\x80\0\0\0\0"])
+def test_a_flood_of_empty_frames_ends_its_stream(server: ServerProcess, session: str, frame: bytes):
+    with upgraded(server.url, session) as attacker, contextlib.suppress(ConnectionError):
+        attacker.sendall(b"\x02\x80\0\0\0\0" + frame * 40_000)
+        assert b"at most 256 frames at once" in read_all(attacker)
+
+
+def test_unfinished_messages_have_a_bound_together(narrow: ServerProcess):
+    """128 KiB in all streams there."""
+    with Api(narrow.url) as api, httpx.Client(base_url=narrow.url, timeout=60) as client:
+        teach(api, "pendulum", pendulum(), queries=6)
+        id = opened(client).json()["id"]
+    with upgraded(narrow.url, id) as attacker, contextlib.suppress(ConnectionError):
+        attacker.sendall(b"\x82\xff" + (2**20).to_bytes(8, "big") + b"\0\0\0\0" + b"x" * (2 * JSON_BYTES))
+        assert b"unfinished messages of at most 131072 bytes" in read_all(attacker)
+
+
+def test_an_unfinished_message_is_waited_for_as_long_as_a_request(server: ServerProcess, session: str):
+    with upgraded(server.url, session) as attacker:
+        attacker.sendall(b"\x82\x8a\0\0\0\0abc")
+        assert f"a whole message within {REQUEST_SECONDS} s".encode() in read_all(attacker)
+
+
+def test_few_requests_may_wait_for_the_one_before_them(server: ServerProcess):
+    with connected(server.url) as attacker, contextlib.suppress(ConnectionError):
+        attacker.sendall(b"GET /v1/surrogates HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n" * 4_000)
+        assert b"at most 16 requests that wait for an answer" in read_all(attacker)
+
+
+def test_a_stream_is_opened_by_get_alone(server: ServerProcess):
+    lines = ("connection: Upgrade", "upgrade: websocket", "sec-websocket-version: 13", f"sec-websocket-key: {KEY}")
+    with connected(server.url) as attacker:
+        attacker.sendall(head("/v1/sessions/x/stream", *lines, "content-length: 3", "", "") + b"abc")
+        assert b"expected GET to open a stream" in read_all(attacker)
+
+
+def test_many_who_only_look_are_refused_and_others_are_served(server: ServerProcess, client: httpx.Client):
+    body = {"coordinates": [0.1, 0.0], "actions": [[0.5]] * 100, "draws": 8}
+    with ThreadPoolExecutor(50) as pool, httpx.Client(base_url=server.url, timeout=120) as lookers:
+        asked = [pool.submit(lookers.post, "/v1/surrogates/pendulum/imagine", json=body) for _ in range(50)]
+        claim = {"sampler": "worker", "wait_seconds": 0}
+        assert client.post("/v1/surrogates/pendulum/queries:claim", json=claim, timeout=20).status_code == 200
+        replies = [one.result() for one in asked]
+    assert {reply.status_code for reply in replies} == {200, 429}
+    beyond = next(reply for reply in replies if reply.status_code == 429)
+    refused(beyond, Code.TOO_MANY_REQUESTS, "at most 34 predictions at work or waiting")
+
+
+def test_a_body_that_nobody_asked_for_is_ignored(server: ServerProcess, client: httpx.Client):
+    for path in ("/v1/surrogates", "/healthz"):
+        assert client.request("GET", path, content=b"x" * 100).status_code == 200
+    with client.stream("GET", "/v1/events", content=b"x" * 10) as events:
+        assert next(events.iter_lines()).startswith(": connected")
+    assert "Traceback" not in server.log, server.log[-6000:]
+
+
+def test_a_path_can_forge_no_line_of_the_log(server: ServerProcess, client: httpx.Client):
+    assert client.get("/x%0aERROR%20forged%1b%5b31m").status_code == 404
+    assert "\nERROR forged" not in server.log
+    assert "\x1b" not in server.log
+    assert "/x\\nERROR forged\\x1b[31m -> 404" in server.log

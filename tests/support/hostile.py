@@ -9,6 +9,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 TOKENS = [b"NaN", b"1e999", b"-1e999", b"5e-324", b"null", b'""', b"[]", b"{}", b"true", b"9" * 400, b"[" * 2_000]
+KEY = "c3Vycm9neW0tZnJhbWVzLg=="  # of a handshake: any 16 bytes
 NUMBER = re.compile(rb"-?\d+(\.\d+)?")
 
 
@@ -81,3 +82,13 @@ def read_all(opened: socket.socket) -> bytes:
     except ConnectionResetError:
         pass
     return b"".join(parts)
+
+
+def upgraded(url: str, session: str) -> socket.socket:
+    """The stream of a session, as a bare connection."""
+    opened = connected(url)
+    lines = ("Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13", f"Sec-WebSocket-Key: {KEY}")
+    head = [f"GET /v1/sessions/{session}/stream HTTP/1.1", "Host: 127.0.0.1", *lines, "", ""]
+    opened.sendall("\r\n".join(head).encode())
+    assert opened.recv(65_536).startswith(b"HTTP/1.1 101")
+    return opened

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from collections.abc import Callable
+from typing import Annotated, Any, Literal, TypeVar
 
 from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
@@ -15,15 +16,23 @@ from surrogym_server.api.body import example
 from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
+from surrogym_server.api.turns import Turns
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import Imagine, Imagined, ModelList, ModelView, Points, Prediction, Uncertainty
 
 router = APIRouter(prefix="/v1/surrogates/{name}", tags=["models"], route_class=DoorRoute)
 
+T = TypeVar("T")
+
 SAFETENSORS = "application/octet-stream"
 FILE: dict[str, Any] = {SAFETENSORS: {"schema": {"type": "string", "format": "binary"}}}
 POINT_ERRORS = documented(
-    Code.UNKNOWN_SURROGATE, Code.UNKNOWN_MODEL, Code.NO_MODEL, Code.INVALID_REQUEST, Code.TOO_LARGE
+    Code.UNKNOWN_SURROGATE,
+    Code.UNKNOWN_MODEL,
+    Code.NO_MODEL,
+    Code.INVALID_REQUEST,
+    Code.TOO_LARGE,
+    Code.TOO_MANY_REQUESTS,
 )
 
 
@@ -75,23 +84,38 @@ async def add(name: str, request: Request, use: Use) -> ModelView:
     dependencies=[READ],
     responses=POINT_ERRORS,
 )
-def query_uncertainty(name: str, body: Annotated[Points, example(examples.POINTS)], use: Use) -> Uncertainty:
+async def query_uncertainty(
+    name: str, body: Annotated[Points, example(examples.POINTS)], request: Request, use: Use
+) -> Uncertainty:
     """Per point and output: mean, deviation, model uncertainty (eq. 10), input probability (eq. 11) and the
     uncertainty index (eq. 12) of Active Uncertainty Reduction."""
     q, u = convert.numbers("coordinates", body.coordinates), convert.numbers("action", body.action)
-    return convert.uncertainty(use.models.query_uncertainty(name, q, u, body.model))
+    said = await _in_turn(request, lambda: use.models.query_uncertainty(name, q, u, body.model))
+    return convert.uncertainty(said)
 
 
 @router.post("/predict", summary="The stateless transition", dependencies=[READ], responses=POINT_ERRORS)
-def predict(name: str, body: Annotated[Points, example(examples.POINTS)], use: Use) -> Prediction:
+async def predict(
+    name: str, body: Annotated[Points, example(examples.POINTS)], request: Request, use: Use
+) -> Prediction:
     """One mean step from each point; no session is needed."""
     q, u = convert.numbers("coordinates", body.coordinates), convert.numbers("action", body.action)
-    return convert.prediction(use.models.predict(name, q, u, body.model))
+    return convert.prediction(await _in_turn(request, lambda: use.models.predict(name, q, u, body.model)))
 
 
 @router.post("/imagine", summary="An episode from a given state", dependencies=[READ], responses=POINT_ERRORS)
-def imagine(name: str, body: Annotated[Imagine, example(examples.IMAGINE)], use: Use) -> Imagined:
+async def imagine(
+    name: str, body: Annotated[Imagine, example(examples.IMAGINE)], request: Request, use: Use
+) -> Imagined:
     """Without a session: the mean's episode, and those of functions drawn from the posterior, which part where the
     model is not sure. An episode that terminates is shorter than ``actions``."""
     q, u = convert.numbers("coordinates", body.coordinates), convert.numbers("actions", body.actions)
-    return convert.imagined(use.models.imagine(name, q, u, draws=body.draws, seed=body.seed, version=body.model))
+    draws, seed, version = body.draws, body.seed, body.model
+    episodes = await _in_turn(request, lambda: use.models.imagine(name, q, u, draws=draws, seed=seed, version=version))
+    return convert.imagined(episodes)
+
+
+async def _in_turn(request: Request, work: Callable[[], T]) -> T:
+    """Who may only look must not keep samplers and trainers waiting."""
+    turns: Turns = request.app.state.turns
+    return await turns.take(request, work)

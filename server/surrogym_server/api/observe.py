@@ -23,6 +23,8 @@ FAILED = 500  # a request that ended before its reply began
 
 _GIVEN = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _HEADER = REQUEST_HEADER.encode()
+# No page of another site may load a reply, not even to see whether it is one.
+_FOR_BROWSERS = ((b"cross-origin-resource-policy", b"same-origin"), (b"x-content-type-options", b"nosniff"))
 _PROCESS, _NUMBERS = secrets.token_hex(4), count(1)  # drawing each id is a call of the system
 
 
@@ -40,13 +42,13 @@ class Observed:
         id = _id_of(scope)
         REQUEST_ID.set(id)  # for good: the task is this request's own, and the handler of the unexpected is outside
         started, status = time.perf_counter(), FAILED
-        header = (_HEADER, id.encode())
+        headers = (*_FOR_BROWSERS, (_HEADER, id.encode()))
 
         async def identified(message: Message) -> None:
             nonlocal status
             if "headers" in message or message["type"] == "http.response.start":
                 status = message.get("status", status)
-                message["headers"] = [*message.get("headers", ()), header]
+                message["headers"] = [*message.get("headers", ()), *headers]
             await send(message)
 
         try:
@@ -66,7 +68,8 @@ class Observed:
         durations.observe(seconds)
         level = logging.WARNING if status >= FAILED else logging.INFO if status >= 400 else logging.DEBUG
         if logger.isEnabledFor(level):
-            logger.log(level, "%s %s -> %d in %.1f ms", method, scope["path"], status, 1e3 * seconds)
+            path = scope["path"].encode("unicode_escape").decode()  # one line, whatever the caller wrote
+            logger.log(level, "%s %s -> %d in %.1f ms", method, path, status, 1e3 * seconds)
 
 
 def _id_of(scope: Scope) -> str:

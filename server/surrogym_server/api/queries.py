@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 
 from surrogym_server import convert
@@ -43,10 +43,14 @@ LEASE_ERRORS = documented(
     dependencies=[SAMPLE],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
-async def claim(name: str, body: Annotated[ClaimQueries, example(examples.CLAIM)], use: Use) -> ClaimedQueries:
+async def claim(
+    name: str, body: Annotated[ClaimQueries, example(examples.CLAIM)], request: Request, use: Use
+) -> ClaimedQueries:
     """Up to ``max_queries`` at once, each to one sampler only. While there are none the reply waits, at most
     ``wait_seconds``, or until the design is finished."""
-    claimed = await use.queries.claim(name, body.sampler, body.max_queries, body.lease_seconds, body.wait_seconds)
+    claimed = await use.queries.claim(
+        name, body.sampler, body.max_queries, body.lease_seconds, body.wait_seconds, request.is_disconnected
+    )
     return convert.claimed(claimed, body.lease_seconds)
 
 

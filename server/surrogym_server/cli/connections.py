@@ -9,6 +9,8 @@ from typing import Any
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.protocols.utils import ClientDisconnected
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.frames import CloseCode
+from websockets.protocol import State
 
 from surrogym_server.api.problems import problem_response
 from surrogym_server.api.stream import EXTENSION, Prompt
@@ -18,6 +20,12 @@ from surrogym_shared.messages import MASKED, WHOLE_BINARY, Extent, FrameSplitter
 MAX_HEADERS = 100
 MAX_HEAD_BYTES = 64 * 1024
 HEAD_TOO_LARGE = 431
+HEAD = (
+    f"expected at most {MAX_HEADERS} headers and {MAX_HEAD_BYTES} bytes of target, headers and trailers of a request, "
+    "got more"
+)
+MAX_FRAMES = 256  # of a WebSocket in one read, and fragments of one message
+MAX_PIPELINED = 16  # requests of one connection that wait for the one before them
 SPARE_FILES = 128  # for the database, pipes and whatever else is open beside connections
 
 
@@ -28,8 +36,12 @@ def connections_within(most: int) -> int:
     return most if hard == resource.RLIM_INFINITY else max(min(most, hard - SPARE_FILES), 1)
 
 
-class HeadTooLarge(Exception):
-    """Raised inside the parser, which then stops: the headers, the target or the trailers are beyond their limits."""
+class TooMuch(Exception):
+    """Raised inside the parser, which then stops: what came is beyond a limit."""
+
+    def __init__(self, detail: str, status: int) -> None:
+        super().__init__(detail)
+        self.status = status
 
 
 def patient(seconds: float, most: int) -> type[HttpToolsProtocol]:
@@ -40,13 +52,14 @@ def patient(seconds: float, most: int) -> type[HttpToolsProtocol]:
         _head_bytes = 0  # of target, headers and trailers of this request
         _head_lines = 0
         _head_complete = False
+        _too_much: TooMuch | None = None
         _unparsed = 0  # bytes since the parser last came to the end of something
 
         def data_received(self, data: bytes) -> None:
             self._unparsed += len(data)
             super().data_received(data)
             if self._unparsed > MAX_HEAD_BYTES and not self.transport.is_closing():
-                self._refuse_head()
+                self._refuse(Code.TOO_LARGE, HEAD, status=HEAD_TOO_LARGE)
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
@@ -78,6 +91,8 @@ def patient(seconds: float, most: int) -> type[HttpToolsProtocol]:
 
         def on_headers_complete(self) -> None:
             self._head_complete, self._unparsed = True, 0
+            if len(self.pipeline) >= MAX_PIPELINED:
+                self._stop(f"expected at most {MAX_PIPELINED} requests that wait for an answer, got one more", 429)
             super().on_headers_complete()
 
         def on_body(self, body: bytes) -> None:
@@ -93,19 +108,25 @@ def patient(seconds: float, most: int) -> type[HttpToolsProtocol]:
             super().on_message_complete()
 
         def send_400_response(self, msg: str) -> None:
-            if self._head_bytes > MAX_HEAD_BYTES or self._head_lines > MAX_HEADERS:
-                self._refuse_head()
-                return
-            self._refuse(Code.INVALID_REQUEST, f"expected a request of HTTP/1.1, got none: {msg}", status=400)
+            if self._too_much is not None:
+                self._refuse(Code.TOO_LARGE, str(self._too_much), status=self._too_much.status)
+            else:
+                self._refuse(Code.INVALID_REQUEST, f"expected a request of HTTP/1.1, got none: {msg}", status=400)
+
+        def handle_websocket_upgrade(self) -> None:
+            if self.scope["method"] == "GET":
+                super().handle_websocket_upgrade()
+            else:
+                self._refuse(Code.INVALID_REQUEST, "expected GET to open a stream, got another method", status=400)
 
         def _count(self, size: int) -> None:
             self._head_bytes += size
             if self._head_bytes > MAX_HEAD_BYTES or self._head_lines > MAX_HEADERS:
-                raise HeadTooLarge
+                self._stop(HEAD, HEAD_TOO_LARGE)
 
-        def _refuse_head(self) -> None:
-            bounds = f"at most {MAX_HEADERS} headers and {MAX_HEAD_BYTES} bytes of target, headers and trailers"
-            self._refuse(Code.TOO_LARGE, f"expected {bounds}, got more", status=HEAD_TOO_LARGE)
+        def _stop(self, detail: str, status: int) -> None:
+            self._too_much = TooMuch(detail, status)
+            raise self._too_much
 
         def _wait(self) -> None:
             self._timer = asyncio.get_running_loop().call_later(seconds, self._late)
@@ -131,21 +152,44 @@ def patient(seconds: float, most: int) -> type[HttpToolsProtocol]:
     return Patient
 
 
+class Unfinished:
+    """Bytes of messages that have begun and not ended, of all streams together."""
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+        self.bytes = 0
+
+
+def prompt(seconds: float, most_together: int) -> type[WebSocketsSansIOProtocol]:
+    """uvicorn's WebSocket, with a limit of seconds for a message to arrive whole, and of bytes of unfinished messages
+    in all streams together."""
+    unfinished = Unfinished(most_together)
+
+    class Bounded(PromptMessages):
+        _together, _seconds = unfinished, seconds
+
+    return Bounded
+
+
 class PromptMessages(WebSocketsSansIOProtocol):
     """uvicorn's WebSocket, which offers the app to answer a message where it arrives.
 
     The way of ASGI wakes a task through a queue, and back, for each message. That takes as long as all else a small
     step needs. What is no whole binary message, and what the app does not answer at once, goes that way all the same;
-    so does everything while the app is busy, and so the order of messages is kept.
+    so does everything while the app is busy, and so the order of messages is kept. The library gets whole frames alone.
     """
 
+    _together = Unfinished(2**28)
+    _seconds = 30.0
     _answer: Prompt | None = None
-    _chunks = 0  # before the app took the offer; more than the handshake may have left half a frame with the library
+    _oversized = False  # a frame that the library is to refuse; what follows belongs to it
     _waiting = False  # the app has asked for the next message
+    _counted = 0  # of ``_together``
+    _timer: asyncio.TimerHandle | None = None
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
-        self._frames = FrameSplitter(self.config.ws_max_size)
+        self._frames = FrameSplitter(self.config.ws_max_size, MAX_FRAMES)
 
     def handle_connect(self, event: Any) -> None:
         super().handle_connect(event)
@@ -154,16 +198,22 @@ class PromptMessages(WebSocketsSansIOProtocol):
             offers[EXTENSION] = self._take
 
     def data_received(self, data: bytes) -> None:
-        if self._answer is None:
-            self._chunks += 1
+        if not self.handshake_initiated or self._oversized:  # the handshake comes whole, from the HTTP protocol
             super().data_received(data)
             return
         whole = self._frames.split(data)
+        if len(whole) > MAX_FRAMES or len(self.frames) > MAX_FRAMES:
+            self._end(f"expected at most {MAX_FRAMES} frames at once and in one message, got more")
+            return
         for frame, extent in whole:
-            if extent is None:
-                self._answer = None
+            self._oversized = extent is None
             if len(whole) > 1 or extent is None or not self._answered(self._answer, frame, extent):
                 super().data_received(frame)
+        self._count(self._frames.held + sum(map(len, self.frames)))
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._count(0)
+        super().connection_lost(exc)
 
     def send_receive_event_to_app(self) -> None:
         if self.curr_msg_data_type == "text":  # refused by the app, and uvicorn logs an error for what is no UTF-8
@@ -184,8 +234,7 @@ class PromptMessages(WebSocketsSansIOProtocol):
         self.handshake_complete |= self.close_sent  # by a refusal; uvicorn would call it none, and log an error
 
     def _take(self, answer: Prompt) -> None:
-        if self._chunks == 1:
-            self._answer = answer
+        self._answer = answer
 
     def _answered(self, answer: Prompt | None, frame: bytes, extent: Extent) -> bool:
         free = self._waiting and self.queue.empty() and not self.frames and self.writable.is_set()
@@ -196,3 +245,28 @@ class PromptMessages(WebSocketsSansIOProtocol):
             return False
         self.transport.write(b"".join((header(len(reply)), reply)))
         return True
+
+    def _count(self, unfinished: int) -> None:
+        """Note how many bytes of an unfinished message are held, and end the connection where that is too much."""
+        if unfinished == self._counted:
+            return
+        self._together.bytes += unfinished - self._counted
+        self._counted = unfinished
+        if self._timer is not None and not unfinished:
+            self._timer.cancel()
+            self._timer = None
+        elif self._timer is None and unfinished:
+            late = f"expected a whole message within {self._seconds:g} s"
+            self._timer = self.loop.call_later(self._seconds, self._end, late)
+        if self._together.bytes > self._together.most:
+            self._end(f"expected unfinished messages of at most {self._together.most} bytes in all streams, got more")
+
+    def _end(self, reason: str) -> None:
+        """Close the connection because of what came."""
+        if self.close_sent or self.transport.is_closing():
+            return
+        if self.conn.state is State.OPEN:
+            self.conn.send_close(CloseCode.POLICY_VIOLATION, reason)
+            self.handle_parser_exception()
+        else:
+            self.transport.close()

@@ -19,7 +19,7 @@ from fastapi import FastAPI
 
 from surrogym_server import logs
 from surrogym_server.app import create_app, say_goodbye
-from surrogym_server.cli.connections import PromptMessages, connections_within, patient
+from surrogym_server.cli.connections import connections_within, patient, prompt
 from surrogym_server.errors import InvalidInput
 from surrogym_server.settings import Settings
 
@@ -39,7 +39,7 @@ class Runner(uvicorn.Server):
         config = uvicorn.Config(
             app,
             http=patient(settings.request_seconds, connections_within(settings.max_connections)),
-            ws=PromptMessages,
+            ws=prompt(settings.request_seconds, settings.max_bodies_bytes),
             log_config=None,
             access_log=False,  # ours names the request
             server_header=False,

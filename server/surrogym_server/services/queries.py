@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,8 +40,18 @@ class QueryService:
         self._notices = notices
         self._samplers = samplers or Samplers()
 
-    async def claim(self, name: str, sampler: str, limit: int, lease_seconds: float, wait_seconds: float) -> Claim:
+    async def claim(
+        self,
+        name: str,
+        sampler: str,
+        limit: int,
+        lease_seconds: float,
+        wait_seconds: float,
+        gone: Callable[[], Awaitable[bool]] | None = None,
+    ) -> Claim:
         """Lease up to ``limit`` queries; while there are none, wait for some, or for the design to finish.
+
+        ``gone`` says whether the sampler has left meanwhile: it then gets no lease.
 
         Raises:
             UnknownSurrogate: no such surrogate, or it was deleted meanwhile.
@@ -54,6 +64,8 @@ class QueryService:
                 if left <= 0:
                     break
                 await listener.wait(min(left, POLL_SECONDS))
+                if gone is not None and await gone():
+                    break
                 claim = await self._claim(name, sampler, limit, lease_seconds)
             return claim
 

@@ -28,7 +28,8 @@ AutoresetMode = Literal["next_step", "same_step", "disabled"]
 Role = Literal["read", "train", "sample", "admin"]
 
 SurrogateName = Annotated[str, Field(pattern=NAME_PATTERN)]
-Key = Annotated[str, Field(min_length=1, max_length=128)]
+VISIBLE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"  # no control characters: it is shown to people
+Key = Annotated[str, Field(min_length=1, max_length=128, pattern=VISIBLE)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Seq = Annotated[int, Field(ge=1)]
 Measured = Annotated[float, Field(ge=-MAX_MEASURED, le=MAX_MEASURED, allow_inf_nan=False)]

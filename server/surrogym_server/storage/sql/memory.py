@@ -7,12 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 import sqlalchemy as sa
 
+from surrogym_server.errors import TooLarge
 from surrogym_server.storage import port
 from surrogym_server.storage.records import Array, EventRecord, OccupancyRecord, SavedSession
 from surrogym_server.storage.sql.database import Database, conflict_insert
 from surrogym_server.storage.sql.rows import find, hold
 from surrogym_server.storage.sql.tables import events, occupancies
 from surrogym_server.storage.sql.tables import sessions as saved
+
+MAX_CHECKPOINTS = 1_000  # of a surrogate
 
 
 class SqlOccupancy(port.Occupancy):
@@ -24,6 +27,10 @@ class SqlOccupancy(port.Occupancy):
             held = hold(connection, name)
             own = (occupancies.c.surrogate_id == held.id, occupancies.c.checkpoint == checkpoint)
             connection.execute(sa.delete(occupancies).where(*own))
+            others = sa.select(sa.func.count()).where(occupancies.c.surrogate_id == held.id)
+            if connection.execute(others).scalar_one() >= MAX_CHECKPOINTS:
+                beyond = f"expected at most {MAX_CHECKPOINTS} checkpoints of {name!r}, got one more"
+                raise TooLarge(f"{beyond}: submit under the name of one of them")
             connection.execute(
                 sa.insert(occupancies).values(
                     surrogate_id=held.id,
