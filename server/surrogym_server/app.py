@@ -32,6 +32,7 @@ from surrogym_server.api import (
     surrogates,
 )
 from surrogym_server.api.auth import Gate
+from surrogym_server.api.caller import fingerprint
 from surrogym_server.api.guards import BodyLimit, KnownHosts, OwnPages
 from surrogym_server.api.observe import Observed
 from surrogym_server.api.state import Services
@@ -118,6 +119,9 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     app.state.max_body_bytes = settings.max_body_bytes
     app.state.parsing = asyncio.Lock()
     app.state.turns = Turns()
+    if settings.tokens:
+        known = ", ".join(f"{role} {fingerprint(token)}" for token, role in settings.tokens.items())
+        logger.info("fingerprints of the tokens: %s", known)
     app.state.notices = None
     app.state.counts = Counts()
     problems.install(app)

@@ -12,7 +12,14 @@ LogFormat = Literal["text", "json"]
 REQUEST_ID: ContextVar[str | None] = ContextVar("request_id", default=None)
 
 
+# A path or a name may hold a line break, and what it wrote behind that would look like a line of ours.
+_ESCAPES = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160), 0x2028, 0x2029)}
+
+
 class _TextFormatter(logging.Formatter):
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        return super().formatMessage(record).rstrip("\n").translate(_ESCAPES)
+
     def format(self, record: logging.LogRecord) -> str:
         line = f"{record.levelname} {record.name}: {super().format(record)}"
         request = REQUEST_ID.get()

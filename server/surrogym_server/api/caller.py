@@ -1,11 +1,20 @@
-"""Who sends a request, as far as the server can tell."""
+"""Who sends a request, as far as the server can tell, and in words that name no token."""
 
 from __future__ import annotations
+
+import hashlib
+from functools import lru_cache
+from ipaddress import ip_address
 
 from starlette.types import Scope
 
 from surrogym_server.api.auth import Gate, bearer_token
+from surrogym_server.errors import Unauthenticated
 from surrogym_shared.wire import Role
+
+SALT = b"surrogym"
+WORK = 2**12  # of scrypt: some 10 ms and 4 MB for each guess at the token behind a fingerprint
+FINGERPRINT_BYTES = 5
 
 
 def role_of(scope: Scope) -> Role:
@@ -16,3 +25,37 @@ def role_of(scope: Scope) -> Role:
     """
     gate: Gate = scope["app"].state.gate
     return "admin" if gate.open else gate.role_of(bearer_token(scope) or "")
+
+
+def caller(scope: Scope) -> str:
+    """Role and fingerprint of a request's token, and the address it came from. Only known tokens have a fingerprint:
+    what was mistyped may be the password of something else."""
+    return f"{_holder(scope)} from {_address(scope)}"
+
+
+@lru_cache(maxsize=1_024)
+def fingerprint(token: str) -> str:
+    """Ten characters that tell tokens apart, the same on every server and after every start."""
+    return hashlib.scrypt(token.encode(), salt=SALT, n=WORK, r=8, p=1, dklen=FINGERPRINT_BYTES).hex()
+
+
+def _holder(scope: Scope) -> str:
+    gate: Gate = scope["app"].state.gate
+    if gate.open:
+        return "anybody"
+    token = bearer_token(scope)
+    if token is None:
+        return "nobody"
+    try:
+        return f"{gate.role_of(token)} {fingerprint(token)}"
+    except Unauthenticated:
+        return "an unknown token"
+
+
+def _address(scope: Scope) -> str:
+    """Of the connection; behind a proxy on this machine the one that it forwards."""
+    host, _ = scope.get("client") or ("", 0)
+    try:
+        return str(ip_address(host))
+    except ValueError:
+        return "an unknown address"

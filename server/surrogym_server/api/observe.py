@@ -1,4 +1,5 @@
-"""Every request gets an id, which its reply, its problem body and its log lines carry, and is timed by route."""
+"""Every request gets an id, which its reply, its problem body and its log lines carry, and is timed by route. What
+changes something, and what is refused, leaves a line that says who sent it."""
 
 from __future__ import annotations
 
@@ -10,6 +11,7 @@ from itertools import count
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from surrogym_server.api.caller import caller
 from surrogym_server.api.headers import raw_header
 from surrogym_server.api.problems import REQUEST_HEADER
 from surrogym_server.logs import REQUEST_ID
@@ -19,6 +21,19 @@ logger = logging.getLogger("surrogym_server.requests")
 
 UNKNOWN_ROUTE = "unknown"
 METHODS = frozenset({"GET", "POST", "PUT", "PATCH", "DELETE", "HEAD", "OPTIONS"})
+CHANGING = frozenset({"POST", "PUT", "PATCH", "DELETE"})  # each leaves a line that says who, unless it is frequent
+FREQUENT = frozenset(  # routes that change nothing for long, or only look, and are called again and again
+    {
+        "/v1/sessions/{id}/reset",
+        "/v1/sessions/{id}/step",
+        "/v1/sessions/{id}/rollout",
+        "/v1/surrogates/{name}/queries:claim",
+        "/v1/surrogates/{name}/queries/{query_id}:renew",
+        "/v1/surrogates/{name}/query_uncertainty",
+        "/v1/surrogates/{name}/predict",
+        "/v1/surrogates/{name}/imagine",
+    }
+)
 FAILED = 500  # a request that ended before its reply began
 
 _GIVEN = re.compile(r"[A-Za-z0-9._-]{1,64}")
@@ -66,10 +81,11 @@ class Observed:
         if durations is None:
             durations = self._counts.requests[key] = Durations()
         durations.observe(seconds)
-        level = logging.WARNING if status >= FAILED else logging.INFO if status >= 400 else logging.DEBUG
+        told = status >= 400 or (method in CHANGING and route not in FREQUENT)
+        level = logging.WARNING if status >= FAILED else logging.INFO if told else logging.DEBUG
         if logger.isEnabledFor(level):
-            path = scope["path"].encode("unicode_escape").decode()  # one line, whatever the caller wrote
-            logger.log(level, "%s %s -> %d in %.1f ms", method, path, status, 1e3 * seconds)
+            who = caller(scope)
+            logger.log(level, "%s %s -> %d in %.1f ms, by %s", method, scope["path"], status, 1e3 * seconds, who)
 
 
 def _id_of(scope: Scope) -> str:
