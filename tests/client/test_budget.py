@@ -72,9 +72,10 @@ def test_commands_say_it_in_one_sentence(
     tmp_path: Path,
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SURROGYM_TOKEN", TOKENS["train"])
     monkeypatch.setattr("surrogym_client.cli.train._trainable", lambda *_, **__: (pendulum(), guarded.url))
     with pytest.raises(SystemExit) as ended:
-        main([command[0], owned, *command[1:], "--server", guarded.url, "--token", TOKENS["train"]])
+        main([command[0], owned, *command[1:], "--server", guarded.url])
     said = capsys.readouterr().err
     assert ended.value.code == 1
     assert said.startswith("error: ")
