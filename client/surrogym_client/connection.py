@@ -260,6 +260,8 @@ def _checked(url: str) -> str:
         raise ServerUnreachable(f"expected a server address like {DEFAULT_URL}, got {url!r}: {error}") from error
     if parsed.scheme not in ("http", "https") or not parsed.host:
         raise ServerUnreachable(f"expected a server address like {DEFAULT_URL}, got {url!r}")
+    if parsed.userinfo:  # it would be written into cards and reports, and sent in the place of the token
+        raise ServerUnreachable(f"expected an address without user and password, got one with them at {parsed.host!r}")
     return url.rstrip("/")
 
 
@@ -280,7 +282,8 @@ def _is_loopback(url: str) -> bool:
 
 
 def _body(response: httpx.Response) -> bytes:
-    if not response.is_error:
+    kind = response.headers.get("content-type", "")
+    if response.is_success and not kind.startswith("text/html"):
         return response.content
     try:
         problem = Problem.model_validate_json(response.content)
@@ -289,7 +292,7 @@ def _body(response: httpx.Response) -> bytes:
             raise httpx.RemoteProtocolError(f"a gateway answered {response.status_code}") from None
         raise ProtocolMismatch(
             f"expected a Surrogym server at {response.url}, got status {response.status_code} "
-            f"of type {response.headers.get('content-type', 'unknown')!r}"
+            f"of type {kind or 'unknown'!r}"
         ) from None
     raise error_from_problem(problem)
 

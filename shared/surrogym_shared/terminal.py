@@ -21,10 +21,18 @@ WATCH_SECONDS = 1.0  # between looks at what is watched
 Update = Callable[[float | None, str], None]  # share done in [0, 1], None for as before; a few words
 
 
+_CONTROLS = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"}
+
+
+def visible(text: str) -> str:
+    """The text with control characters written out: names and errors of others must not steer a terminal."""
+    return text.translate(_CONTROLS)
+
+
 def say(text: str, *, quiet: bool = False) -> None:
     """A remark for the person, on standard error."""
     if not quiet:
-        typer.echo(text, err=True)
+        typer.echo(visible(text), err=True)
 
 
 def give(result: dict[str, Any], text: Callable[[], str], *, as_json: bool, quiet: bool = False) -> None:
@@ -32,7 +40,7 @@ def give(result: dict[str, Any], text: Callable[[], str], *, as_json: bool, quie
     if as_json:
         typer.echo(json.dumps(result, indent=2))
     elif not quiet:
-        typer.echo(text())
+        typer.echo(visible(text()))
 
 
 def watch(look: Callable[[], str], seconds: float = WATCH_SECONDS) -> None:
@@ -51,7 +59,7 @@ def _screen() -> Iterator[Callable[[str], None]]:
         def show(text: str) -> None:
             if shown[-1:] != [text]:
                 shown[:] = [text]
-                typer.echo(text)
+                typer.echo(visible(text))
 
         yield show
         return
@@ -62,7 +70,7 @@ def _screen() -> Iterator[Callable[[str], None]]:
 
         def draw(text: str) -> None:
             with _interrupt_afterwards():
-                live.update(Text(text), refresh=True)
+                live.update(Text(visible(text)), refresh=True)
 
         yield draw
 

@@ -194,3 +194,10 @@ def test_pauses_grow_to_their_limit_and_end_with_the_budget():
     threading.Event().wait(0.5)
     assert next(pauses, None) is None
     assert list(NEVER.delays()) == []
+
+
+def test_an_address_with_a_password_is_refused_without_showing_it():
+    """It would be written into cards and reports, and sent in the place of the token."""
+    with pytest.raises(errors.ServerUnreachable, match="without user and password") as refused:
+        Connection("http://bob:hunter2@127.0.0.1:1", None)
+    assert "hunter2" not in str(refused.value)

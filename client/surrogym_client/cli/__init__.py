@@ -10,6 +10,7 @@ from importlib.metadata import entry_points
 import typer
 
 from surrogym_client.cli.errors import sentence
+from surrogym_shared.terminal import say
 
 COMMANDS = (
     "register",
@@ -43,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         message = sentence(error)
         if message is None:
             raise
-        typer.echo(f"error: {message}", err=True)
+        say(f"error: {message}")
         sys.exit(1)
 
 

@@ -31,14 +31,14 @@ def command(
     Example: surrogym conformance --server http://127.0.0.1:8000
     """
     from surrogym_client.conformance import conformance
-    from surrogym_shared.terminal import give, on_interrupt
+    from surrogym_shared.terminal import give, on_interrupt, visible
 
     outcomes = []
     with on_interrupt(lambda: f"interrupted; nothing stays of {surrogate!r}"):
         for outcome in conformance(server, token_from(context, token, token_file), surrogate):
             outcomes.append(outcome)
             if not as_json and (outcome.failure or not quiet):
-                typer.echo(f"✗ {outcome.name}: {outcome.failure}" if outcome.failure else f"✓ {outcome.name}")
+                typer.echo(visible(f"✗ {outcome.name}: {outcome.failure}") if outcome.failure else f"✓ {outcome.name}")
     failed = [outcome for outcome in outcomes if outcome.failure]
     result = {"passed": len(outcomes) - len(failed), "failed": {o.name: o.failure for o in failed}}
     give(result, lambda: f"{result['passed']} of {len(outcomes)} checks passed", as_json=as_json, quiet=quiet)

@@ -47,7 +47,7 @@ def command(
 
     Example: surrogym status pendulum --watch
     """
-    from surrogym_shared.terminal import watch
+    from surrogym_shared.terminal import visible, watch
 
     form: Form = "json" if as_json else "short" if quiet else "words"
     with connect(server, token_from(context, token, token_file)) as api:
@@ -56,7 +56,7 @@ def command(
         if watching:
             watch(partial(_patiently, look, as_json))
         else:
-            typer.echo(json.dumps(json.loads(seen), indent=2) if as_json else seen)
+            typer.echo(json.dumps(json.loads(seen), indent=2) if as_json else visible(seen))
 
 
 def _all(api: Api, form: Form) -> str:

@@ -6,7 +6,7 @@ import asyncio
 import resource
 from typing import Any
 
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 from uvicorn.protocols.utils import ClientDisconnected
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.frames import CloseCode
@@ -53,6 +53,7 @@ def patient(seconds: float, most: int) -> type[HttpToolsProtocol]:
         _head_lines = 0
         _head_complete = False
         _too_much: TooMuch | None = None
+        _working: RequestResponseCycle | None = None  # the request that the app works at, or did last
         _unparsed = 0  # bytes since the parser last came to the end of something
 
         def data_received(self, data: bytes) -> None:
@@ -143,7 +144,14 @@ def patient(seconds: float, most: int) -> type[HttpToolsProtocol]:
             else:
                 self._refuse(Code.REQUEST_TIMEOUT, f"expected a whole request within {seconds:g} s")
 
+        def _start_asgi_task(self, cycle: RequestResponseCycle, app: Any) -> None:
+            self._working = cycle
+            super()._start_asgi_task(cycle, app)
+
         def _refuse(self, code: Code, detail: str, status: int | None = None) -> None:
+            if self._working is not None:  # its answer would go to a closed connection
+                self._working.disconnected = True
+                self._working.message_event.set()
             reply = problem_response(code, detail, status=status, headers={"connection": "close"})
             lines = b"".join(name + b": " + value + b"\r\n" for name, value in reply.raw_headers)
             self.transport.write(b"HTTP/1.1 %d \r\n%s\r\n%s" % (reply.status_code, lines, bytes(reply.body)))
