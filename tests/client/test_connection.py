@@ -98,11 +98,13 @@ def test_a_refusal_is_raised_at_once_as_its_own_error():
         assert len(server.received) == 1
 
 
-def test_a_server_of_another_kind_is_no_surrogym_server():
+@pytest.mark.parametrize("status", [200, 302, 307, 404])
+def test_a_server_of_another_kind_is_no_surrogym_server(status: int):
+    """A login page or a redirect must not be exported as samples."""
     with (
-        scripted_server(reply("<html>", 404, "text/html")) as server,
+        scripted_server(reply("<html>", status, "text/html")) as server,
         Connection(server.url) as connection,
-        pytest.raises(errors.ProtocolMismatch, match=r"expected a Surrogym server.*404.*text/html"),
+        pytest.raises(errors.ProtocolMismatch, match=rf"expected a Surrogym server.*{status}.*text/html"),
     ):
         connection.send("GET", "/x")
 

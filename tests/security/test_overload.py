@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from websockets.sync.client import connect
 
+from support import pendulum as wire_pendulum
 from support.chaos import times
 from support.hostile import KEY, connected, head, read_all, resident_mib, upgraded
 from support.server import ServerProcess, running_server
@@ -311,3 +312,21 @@ def test_a_body_that_nobody_asked_for_is_ignored(server: ServerProcess, client: 
     with client.stream("GET", "/v1/events", content=b"x" * 10) as events:
         assert next(events.iter_lines()).startswith(": connected")
     assert "Traceback" not in server.log, server.log[-6000:]
+
+
+def test_a_sampler_that_has_gone_gets_no_lease(server: ServerProcess, client: httpx.Client):
+    client.post(
+        "/v1/surrogates", json={"name": "idle", "spec": wire_pendulum.spec(initial=2, budget=2)}
+    ).raise_for_status()
+    wire_pendulum.claim(client, "idle", max_queries=2)
+    waiting = b'{"sampler": "ghost", "wait_seconds": 30}'
+    with connected(server.url) as ghost:
+        ghost.sendall(head("/v1/surrogates/idle/queries:claim", f"content-length: {len(waiting)}", "", "") + waiting)
+        time.sleep(0.5)
+    time.sleep(0.5)
+    by_hand = {"coordinates": [[0.9, 0.0]], "action": [[-1.0]]}
+    client.post("/v1/surrogates/idle/queries", json=by_hand).raise_for_status()
+    time.sleep(1.0)
+    claimed = client.post("/v1/surrogates/idle/queries:claim", json={"sampler": "living"}).json()
+    assert len(claimed["queries"]) == 1
+    client.delete("/v1/surrogates/idle").raise_for_status()
