@@ -102,7 +102,6 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
         Unavailable: the database is taken, or does not answer.
     """
     _check_device(settings.device)
-    logger.info("acquisitions: %s", ", ".join(ACQUISITIONS.names))
     keep_private(settings)
     storage = open_storage(settings.database_url, settings.synchronous)
     app = FastAPI(
@@ -157,6 +156,7 @@ async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: 
     engine = _build_engine(settings, design)
     app.state.notices = engine.notices
     services, sweeper = _build_services(settings, design, storage, engine, app.state.counts)
+    logger.info("acquisitions: %s", ", ".join(ACQUISITIONS.names))
     engine.fits.start()
     restored = services.sessions.restore()
     if restored:

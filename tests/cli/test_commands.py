@@ -184,7 +184,7 @@ def test_a_policy_of_bins_pushes_ones_own_machine_as_its_surrogate_was_pushed(su
     spec = with_choices(Machine.spec(None), {}, bins=5)
     (tmp_path / "policy.zip").write_bytes(b"")
     (tmp_path / "policy.json").write_text(PolicyCard(spec=spec).model_dump_json())
-    monkeypatch.setattr("surrogym_client.policy_file.load_policy", lambda *_: lambda o: np.ones(len(o)))
+    monkeypatch.setattr("surrogym_client.policy_file.load_policy", lambda *_, **__: lambda o: np.ones(len(o)))
     with diary_in(tmp_path, monkeypatch) as diary:
         said = surrogym("evaluate", "policy.zip", "--env", "support.machine:Machine", "--episodes", "1")
         assert said.code == 0, said.err

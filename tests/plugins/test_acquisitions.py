@@ -18,7 +18,8 @@ from surrogym_client.original.classic import pendulum
 from surrogym_shared.spec import AcquisitionChoice as Choice
 from surrogym_shared.spec import Design
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "plugins" / "acquisition"
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "plugins" / "acquisition"
 BROKEN = "broken_acquisition"
 
 
@@ -87,3 +88,12 @@ def test_a_server_starts_without_a_broken_package_and_names_it(server: ServerPro
     assert "the acquisition 'broken' is left out" in server.log
     assert "No module named 'nowhere_to_be_found'" in server.log
     assert "focused_variance" in server.log
+
+
+def test_the_page_shows_the_example():
+    """Every line of the page's class stands in the package's module."""
+    page = (ROOT / "docs" / "how-to" / "plugins.md").read_text()
+    shown = page.partition("```python\n")[2].partition("```")[0]
+    module = (EXAMPLE / "focused_variance.py").read_text()
+    assert [line for line in shown.splitlines() if line not in module.splitlines()] == []
+    assert 'focused_variance = "focused_variance:FocusedVariance"' in (EXAMPLE / "pyproject.toml").read_text()

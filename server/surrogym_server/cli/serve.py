@@ -63,7 +63,9 @@ def serve(
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No remarks; the log is what --log-level says.")] = False,
 ) -> None:
-    """Run the server until Ctrl-C, SIGTERM, or the end of its terminal (SIGHUP, unless ignored, as under nohup).
+    """Run the server until Ctrl-C.
+
+    SIGTERM and the end of its terminal (SIGHUP, unless ignored as under nohup) end it as cleanly: sessions are saved.
 
     Most options can also be given as environment variables, such as SURROGYM_PORT; a token as SURROGYM_TOKEN.
 
