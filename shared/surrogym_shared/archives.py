@@ -6,15 +6,22 @@ import io
 import math
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 INFLATED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what numpy and torch write; others inflate without a bound
 ARRAY = ".npy"
+
+
+class Header(NamedTuple):
+    """Shape and type of an array in an npz file, known before the array is made."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
 
 
 def read_entries(zipped: Path | bytes, limit: int) -> dict[str, bytes]:
@@ -47,18 +54,24 @@ def stored(entries: Mapping[str, bytes]) -> bytes:
     return file.getvalue()
 
 
-def read_arrays(npz: bytes, limit: int) -> dict[str, NDArray[Any]]:
+def read_arrays(
+    npz: bytes, limit: int, require: Callable[[Mapping[str, Header]], None] = lambda _: None
+) -> dict[str, NDArray[Any]]:
     """The arrays of an npz file by name. Nothing is unpickled.
 
     Args:
         npz: what is in the file.
         limit: bytes that all arrays together may have.
+        require: called with all headers by name before any array is made; raises ValueError to refuse them.
 
     Raises:
-        ValueError: as ``read_entries``, or an array is not of the size that its header names.
+        ValueError: as ``read_entries`` and ``require``, or an array is not of the size that its header names.
     """
-    entries = read_entries(npz, limit)
-    return {name.removesuffix(ARRAY): _array(name, content) for name, content in entries.items()}
+    entries = {name.removesuffix(ARRAY): content for name, content in read_entries(npz, limit).items()}
+    require({name: _header(name, content) for name, content in entries.items()})
+    return {
+        name: np.lib.format.read_array(io.BytesIO(content), allow_pickle=False) for name, content in entries.items()
+    }
 
 
 def _content(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
@@ -72,8 +85,8 @@ def _content(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
     return content
 
 
-def _array(name: str, content: bytes) -> NDArray[Any]:
-    """An array whose header names as many bytes as follow it."""
+def _header(name: str, content: bytes) -> Header:
+    """The header of an array of numbers, if it names as many bytes as follow it."""
     file = io.BytesIO(content)
     version = np.lib.format.read_magic(file)
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -81,6 +94,4 @@ def _array(name: str, content: bytes) -> NDArray[Any]:
     named, came = math.prod(shape) * dtype.itemsize, len(content) - file.tell()
     if dtype.hasobject or min(shape, default=0) < 0 or named != came:
         raise ValueError(f"expected an array {name!r} of numbers in {named} bytes, got {dtype} in {came} bytes")
-    file.seek(0)
-    array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
-    return array
+    return Header(shape, dtype)

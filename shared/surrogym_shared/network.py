@@ -7,20 +7,31 @@ from __future__ import annotations
 
 import json
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, PositiveInt, ValidationError
 
-from surrogym_shared.archives import read_arrays, read_entries
+from surrogym_shared.archives import Header, read_arrays, read_entries
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
 
 Array = NDArray[np.float64]
 HEAD = "surrogym-network.json"
 ARRAYS = "network.npz"
 MAX_BYTES = 16 * 1024 * 1024  # of a file's contents
+MAX_HEAD_BYTES = 64 * 1024
+
+
+class _Head(BaseModel):
+    """The JSON head of a file."""
+
+    version: Literal[1]
+    counts: tuple[PositiveInt, ...]
 
 
 @dataclass(frozen=True)
@@ -92,20 +103,20 @@ class Network:
         """Read what ``save`` wrote. Raises ValueError where it is something else, or has more than ``MAX_BYTES``."""
         try:
             entries = read_entries(path, MAX_BYTES)
-            counts = tuple(int(count) for count in json.loads(entries[HEAD])["counts"])
-            network = cls(**read_arrays(entries[ARRAYS], MAX_BYTES), counts=counts)
-            network(np.zeros((1, len(network.mean))))  # arrays that do not fit together are refused here
-        except (LookupError, TypeError, OSError, ValueError, RecursionError) as error:
+            counts = _read_counts(entries[HEAD])
+            arrays = read_arrays(entries[ARRAYS], MAX_BYTES, partial(_require_chain, counts))
+        except (LookupError, TypeError, OSError, ValueError, RecursionError, MemoryError) as error:
             raise ValueError(f"{path} is no network of arrays: {error}") from error
-        return network
+        return cls(**arrays, counts=counts)
 
     @staticmethod
     def is_at(path: Path) -> bool:
         """Whether a file looks like what ``save`` writes."""
-        if not zipfile.is_zipfile(path):
+        try:
+            with zipfile.ZipFile(path) as file:
+                return HEAD in file.namelist()
+        except zipfile.BadZipFile:
             return False
-        with zipfile.ZipFile(path) as file:
-            return HEAD in file.namelist()
 
 
 def counts_of(spec: EnvironmentSpec) -> tuple[int, ...]:
@@ -124,3 +135,39 @@ def bounds_of(spec: EnvironmentSpec) -> tuple[Array, Array]:
     if isinstance(spec.action, BoxAction):
         return np.array(spec.action.low), np.array(spec.action.high)
     return np.zeros(0), np.zeros(0)
+
+
+def _read_counts(head: bytes) -> tuple[int, ...]:
+    if len(head) > MAX_HEAD_BYTES:
+        raise ValueError(f"expected {HEAD} of at most {MAX_HEAD_BYTES} bytes, got {len(head)}")
+    try:
+        return _Head.model_validate_json(head).counts
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ValueError(f"{HEAD}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+
+
+def _require_chain(counts: tuple[int, ...], headers: Mapping[str, Header]) -> None:
+    """Raise ValueError unless the arrays are those of one policy, whose layers and bounds fit together.
+
+    Shapes that merely broadcast are refused: a call would compute far larger arrays than the file holds.
+    """
+    names = {name for name in Network.__dataclass_fields__ if name != "counts"}
+    if names != set(headers):
+        raise ValueError(f"expected the arrays {', '.join(sorted(names))}, got {', '.join(sorted(headers)) or 'none'}")
+    for name, shape in _chained(counts, headers).items():
+        header = headers[name]
+        if header.shape != shape or header.dtype.kind != "f":
+            raise ValueError(f"expected {name} as floats of shape {shape}, got {header.dtype} of {header.shape}")
+    if counts and sum(counts) != headers["output_bias"].shape[0]:
+        raise ValueError(f"expected {sum(counts)} outputs for the counts, got {headers['output_bias'].shape[0]}")
+
+
+def _chained(counts: tuple[int, ...], headers: Mapping[str, Header]) -> dict[str, tuple[int, ...]]:
+    """The shapes of one policy with as many observation entries, hidden units and outputs as the headers name."""
+    d, units, outputs, bounds = (
+        (headers[name].shape or (0,))[0] for name in ("mean", "hidden_bias", "output_bias", "low")
+    )
+    layers = {"hidden": (d, units), "hidden_bias": (units,), "output": (units, outputs), "output_bias": (outputs,)}
+    limits = (bounds if counts else outputs,)  # a discrete action may have none
+    return {"mean": (d,), "deviation": (d,), **layers, "low": limits, "high": limits}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import pickle
 import struct
 import tracemalloc
@@ -118,7 +119,7 @@ def test_an_array_of_another_size_than_its_header_names_is_refused(shape: str, d
 def test_pickled_objects_in_an_npz_stay_pickled():
     file = io.BytesIO()
     np.savez(file, a=np.array([{"code": 1}], dtype=object))
-    with pytest.raises(ValueError, match=r"expected an array 'a\.npy' of numbers"):
+    with pytest.raises(ValueError, match="expected an array 'a' of numbers"):
         read_arrays(file.getvalue(), MEBIBYTE)
 
 
@@ -152,3 +153,59 @@ def test_a_network_whose_arrays_do_not_fit_together_is_refused(tmp_path: Path, u
 def test_a_pickle_in_the_place_of_a_network_is_refused(tmp_path: Path):
     with pytest.raises(ValueError, match="no network of arrays"):
         Network.load(network_file(tmp_path / "policy.zip", pickle.dumps([1])))
+
+
+PENDULUM = {"mean": 3, "deviation": 3, "hidden": (3, 1), "hidden_bias": 1, "output": (1, 1), "output_bias": 1}
+PENDULUM |= {"low": 1, "high": 1}
+MANY = 500_000
+
+
+@pytest.mark.parametrize(
+    ("shapes", "message"),
+    [
+        ({"hidden": (20_000, 1, 3, 1), "hidden_bias": (1, 20_000, 1)}, r"expected hidden(_bias)? as floats of shape"),
+        ({"hidden": (MANY, 1, 3, 1), "hidden_bias": (1, 400_000, 1)}, r"expected hidden(_bias)? as floats of shape"),
+        ({"deviation": (MANY, 1)}, r"expected deviation as floats of shape \(3,\), got float64 of \(500000, 1\)"),
+        ({"output": (MANY, 1, 1)}, "expected output as floats of shape"),
+        ({"mean": ()}, "expected mean as floats of shape"),
+        ({"low": (MANY, 1)}, "expected low as floats of shape"),
+        ({"extra": 1}, "expected the arrays .*, got .*extra"),
+    ],
+    ids=str,
+)
+def test_arrays_that_would_broadcast_are_refused_before_they_are_made(tmp_path: Path, monkeypatch, shapes, message):
+    file = io.BytesIO()
+    np.savez_compressed(file, **{name: np.zeros(shape) for name, shape in (PENDULUM | shapes).items()})
+    path = network_file(tmp_path / "policy.zip", file.getvalue())
+    monkeypatch.setattr(np.lib.format, "read_array", lambda *_, **__: pytest.fail("an array was made"))
+    with little_memory(64), pytest.raises(ValueError, match=message):
+        Network.load(path)
+
+
+@pytest.mark.parametrize(
+    ("head", "message"),
+    [
+        ({"counts": [3]}, "expected 3 outputs for the counts, got 1"),
+        ({"counts": [-1, 2]}, r"counts\.0: Input should be greater than 0"),
+        ({"counts": ["a"]}, r"counts\.0: Input should be a valid integer"),
+        ({"counts": [], "version": 2}, "version: Input should be 1"),
+        ({"counts": [1] * 50_000}, "expected surrogym-network.json of at most 65536 bytes, got "),
+    ],
+    ids=["too many", "negative", "text", "version", "long"],
+)
+def test_a_network_whose_head_does_not_fit_is_refused(tmp_path: Path, head, message):
+    file = io.BytesIO()
+    np.savez(file, **{name: np.zeros(shape) for name, shape in PENDULUM.items()})
+    path = tmp_path / "policy.zip"
+    path.write_bytes(stored({HEAD: json.dumps({"version": 1} | head).encode(), ARRAYS: file.getvalue()}))
+    with pytest.raises(ValueError, match=message):
+        Network.load(path)
+
+
+def test_a_network_that_finds_no_memory_is_refused_in_a_sentence(tmp_path: Path, monkeypatch):
+    def full(*_: object) -> None:
+        raise MemoryError("Unable to allocate 1 GiB")
+
+    monkeypatch.setattr("surrogym_shared.network.read_arrays", full)
+    with pytest.raises(ValueError, match=r"policy\.zip is no network of arrays: Unable to allocate 1 GiB"):
+        Network.load(network_file(tmp_path / "policy.zip", b""))
