@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 DEFAULT_ALGORITHM = "PPO"
 BUFFERLESS = {"n_envs": 1, "n_steps": 1, "buffer_size": 1}  # what only acts needs no room for experience
 ONNX = ".onnx"
+MAX_CARD_BYTES = 1024 * 1024
 
 
 class UnusablePolicy(SurrogymClientError):
@@ -71,15 +72,19 @@ def read_card(policy: Path) -> PolicyCard:
     """The card of a policy; an empty one where there is none.
 
     Raises:
-        UnusablePolicy: the card can't be read.
+        UnusablePolicy: the card is invalid, or has more than ``MAX_CARD_BYTES``.
         FileNotFoundError: there is no such policy.
     """
     if not policy.is_file():
         raise FileNotFoundError(2, "no such policy file", str(policy))
     if not card_path(policy).exists():
         return PolicyCard()
+    with card_path(policy).open("rb") as file:
+        content = file.read(MAX_CARD_BYTES + 1)
+    if len(content) > MAX_CARD_BYTES:
+        raise UnusablePolicy(f"{card_path(policy)} is no card of a policy: expected at most {MAX_CARD_BYTES} bytes")
     try:
-        return PolicyCard.model_validate_json(card_path(policy).read_bytes())
+        return PolicyCard.model_validate_json(content)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])

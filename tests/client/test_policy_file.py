@@ -6,6 +6,7 @@ import io
 import json
 import pickle
 import re
+import tracemalloc
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from surrogym_client.api import Api
 from surrogym_client.policies import PaperPolicy, Standardise, decaying
 from surrogym_client.policy_export import export_policy
 from surrogym_client.policy_file import (
+    MAX_CARD_BYTES,
     NotedAddress,
     PolicyCard,
     UnusablePolicy,
@@ -290,6 +292,18 @@ def test_an_address_from_a_card_is_none_that_connects(tmp_path: Path):
     assert read_card(policy) == card
     with pytest.raises(TypeError, match="NotedAddress"):
         Api(read_card(policy).server)  # type: ignore[arg-type]
+
+
+def test_a_card_is_read_to_its_bound_alone(tmp_path: Path):
+    (tmp_path / "policy.zip").touch()
+    with (tmp_path / "policy.json").open("wb") as card:
+        card.truncate(2**28)
+    tracemalloc.start()
+    with pytest.raises(UnusablePolicy, match=f"no card of a policy: expected at most {MAX_CARD_BYTES} bytes"):
+        read_card(tmp_path / "policy.zip")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 * MAX_CARD_BYTES
 
 
 def test_a_plain_pickle_is_no_policy(tmp_path: Path, mark: Path):
