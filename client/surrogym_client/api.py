@@ -167,17 +167,23 @@ class Api:
         """Lease queries to answer; waits up to ``wait_seconds`` for some. An empty list is no error.
 
         A claim whose reply is lost is not sent again: its leases run out, and the queries come back.
+
+        Raises:
+            ProtocolMismatch: the server gave more than ``max_queries``.
         """
         body = wire.ClaimQueries(
             sampler=sampler, max_queries=max_queries, wait_seconds=wait_seconds, lease_seconds=lease_seconds
         )
-        return self._post(
+        claimed = self._post(
             wire.ClaimedQueries,
             f"{routes.surrogate(name)}/queries:claim",
             body,
             timeout=self.connection.timeouts.request + wait_seconds,
             repeatable=False,
         )
+        if len(claimed.queries) > max_queries:
+            raise ProtocolMismatch(f"expected {max_queries} queries of a claim at most, got {len(claimed.queries)}")
+        return claimed
 
     def renew(
         self,

@@ -17,20 +17,22 @@ from surrogym_client.api import Api
 from surrogym_client.connection import Retries
 from surrogym_client.errors import InvalidInput, LeaseExpired, NotThere
 from surrogym_client.leases import AWAY, LeaseEnded, Leases
-from surrogym_client.original.errors import StepFailed, UnknownEnvironment
+from surrogym_client.limits import check_environment, check_query
+from surrogym_client.original.errors import QueryRefused, StepFailed
 from surrogym_client.original.protocol import Environment, OriginalEnvironment, RolloutEnvironment
 from surrogym_client.original.rollouts import answering
-from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, StepQuery
 
 FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "failed")
 PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)  # with a server or a storage that is away
 LOOK_SECONDS = 0.1  # how often a worker that waits looks whether it was stopped
 LAST_SECONDS = 5.0  # a sampler that was stopped asks on for so long, with a real step that is not handed in yet
+AGAIN_SECONDS = 1.0  # until the next claim, after one in which no query could be begun
 STOPPED = "the sampler was stopped"
 
 T = TypeVar("T")
-Outcome = Literal["answered", "failed", "dropped"]
+Outcome = Literal["answered", "failed", "dropped", "refused"]
 
 
 def worker_name() -> str:
@@ -43,7 +45,8 @@ class SamplerSettings:
     """How a worker works.
 
     ``batch``: queries claimed at once. ``until_done``: stop when the design has reached its target or its budget;
-    ``once``: stop after the first claim that gives any; ``max_queries`` and ``time_limit`` (seconds) stop it too.
+    ``once``: stop after the first claim that gives any; ``max_queries`` and ``time_limit`` (seconds) stop it too. No
+    query is begun beyond either of them.
     """
 
     name: str = field(default_factory=worker_name)
@@ -58,12 +61,13 @@ class SamplerSettings:
 
 @dataclass(frozen=True)
 class SamplerReport:
-    """What a worker did. ``dropped`` counts queries whose lease ended before a real step; ``phase`` is the last that
-    the server gave."""
+    """What a worker did. ``dropped`` counts queries whose lease ended before a real step, ``refused`` those that the
+    environment's own specification does not allow; ``phase`` is the last that the server gave."""
 
     answered: int
     failed: int
     dropped: int
+    refused: int
     steps: int  # real ones, handed in
     seconds: float
     phase: Phase | None
@@ -77,6 +81,9 @@ class Sampler:
 
     No real step is begun after the lease of its query has ended, as it has when the machine was suspended: another
     sampler may have taken it. A step that is under way then is finished and handed in.
+
+    The server is not trusted with the environment: each query is checked against the environment's own specification,
+    and one that lies outside is given back as not begun before anything is sent to the environment.
 
     Args:
         api: the server.
@@ -103,10 +110,12 @@ class Sampler:
         self._environment = environment
         self._settings = settings or SamplerSettings()
         self._report = report
-        self._counts: dict[Outcome, int] = {"answered": 0, "failed": 0, "dropped": 0}
+        self._counts: dict[Outcome, int] = {"answered": 0, "failed": 0, "dropped": 0, "refused": 0}
+        self._refused: set[int] = set()  # ids; the server offers these queries again
         self._steps = 0
         self._phase: Phase | None = None
         self._spec: EnvironmentSpec
+        self._own: EnvironmentSpec
         self._leases: Leases
         self._started = time.monotonic()
         self._stopping = False  # no Event: a signal handler that sets one may wait for itself
@@ -139,6 +148,8 @@ class Sampler:
                 self._work(claimed.queries, since)
                 if self._enough(claimed):
                     break
+                if claimed.queries and self._none_allowed(claimed):
+                    self._pause(AGAIN_SECONDS)
         return self.summary()
 
     def summary(self) -> SamplerReport:
@@ -147,16 +158,10 @@ class Sampler:
         return SamplerReport(**self._counts, steps=self._steps, seconds=seconds, phase=self._phase)
 
     def _check(self) -> None:
-        """Refuse an environment whose coordinates, action or kind of query are not the surrogate's."""
+        """Refuse an environment that does not fit the surrogate."""
         self._environment = answering(self._environment)
-        asked, own = self._api.surrogate(self._surrogate).spec, self._environment.spec()
-        expected, got = _shape(asked), _shape(own)
-        if expected != got:
-            raise UnknownEnvironment(
-                f"the environment does not fit surrogate {self._surrogate!r}: expected {expected}, got {got}"
-            )
-        _check_actions(asked, own)
-        self._spec = asked
+        self._spec, self._own = self._api.surrogate(self._surrogate).spec, self._environment.spec()
+        check_environment(self._surrogate, self._spec, self._own)
 
     def _claim(self, limit: int) -> tuple[ClaimedQueries, float]:
         """Queries, and when they were asked for by the leases' clock."""
@@ -173,11 +178,11 @@ class Sampler:
         return claimed, since
 
     def _work(self, queries: list[Query], since: float) -> None:
-        """Answer queries one by one; those left when a person interrupts are given back."""
+        """Answer queries one by one; those left when a person interrupts or the time is over are given back."""
         left, begun = list(queries), None
         self._leases.hold(left, since)
         try:
-            while left and not self._stopped():
+            while left and not self._stopped() and not self._out_of_time():
                 begun = left[0]
                 self._answer(begun)
                 self._leases.release(left.pop(0))
@@ -191,7 +196,10 @@ class Sampler:
         error = ""
         outcome: Outcome = "failed"  # where no step was taken
         try:
+            check_query(self._own, query)
             self._take(query, taken)
+        except QueryRefused as refused:
+            outcome, error = "refused", str(refused)
         except LeaseEnded as ended:
             outcome, error = "dropped", str(ended)
         except StepFailed as failed:
@@ -203,8 +211,8 @@ class Sampler:
             raise
         try:
             self._hand_in(taken)
-        except InvalidInput as refused:
-            taken, outcome, error = [], "failed", str(refused)
+        except InvalidInput as invalid:
+            taken, outcome, error = [], "failed", str(invalid)
         if not taken:
             begun = bool(error) and outcome == "failed"
             self._patiently(lambda: self._give_back(query, error or STOPPED, begun=begun), LAST_SECONDS)
@@ -274,6 +282,10 @@ class Sampler:
             return  # the query has gone to the next one already
 
     def _count(self, query: Query, outcome: Outcome, error: str) -> None:
+        if outcome == "refused":
+            if query.id in self._refused:
+                return
+            self._refused.add(query.id)
         self._counts[outcome] += 1
         if self._report is not None:
             self._report(query, outcome, error)
@@ -281,13 +293,16 @@ class Sampler:
     def _limit(self) -> int:
         """How many queries to claim next; 0 when it is time to stop. Dropped ones were not this worker's to answer."""
         s = self._settings
-        if s.time_limit is not None and self._time_left() <= 0:
+        if self._out_of_time():
             return 0
         return s.batch if s.max_queries is None else min(s.batch, s.max_queries - self._done)
 
     @property
     def _done(self) -> int:
-        return self._counts["answered"] + self._counts["failed"]
+        return self._counts["answered"] + self._counts["failed"] + self._counts["refused"]
+
+    def _out_of_time(self) -> bool:
+        return self._settings.time_limit is not None and self._time_left() <= 0
 
     def _time_left(self) -> float:
         return self._started + (self._settings.time_limit or 0.0) - time.monotonic()
@@ -295,27 +310,8 @@ class Sampler:
     def _enough(self, claimed: ClaimedQueries) -> bool:
         if self._settings.once and claimed.queries:
             return True
-        return self._settings.until_done and not claimed.queries and claimed.phase in FINISHED
+        return self._settings.until_done and self._none_allowed(claimed) and claimed.phase in FINISHED
 
-
-def _shape(spec: EnvironmentSpec) -> str:
-    names = ", ".join(spec.coordinate_names)
-    return f"coordinates ({names}), a {spec.action.kind} action of {spec.action.size}, and {spec.query} queries"
-
-
-def _check_actions(asked: EnvironmentSpec, own: EnvironmentSpec) -> None:
-    """Refuse continuous actions of a surrogate that reach beyond those of the environment."""
-    if not (isinstance(asked.action, BoxAction) and isinstance(own.action, BoxAction)):
-        return
-    lower = any(a < b for a, b in zip(asked.action.low, own.action.low, strict=True))
-    higher = any(a > b for a, b in zip(asked.action.high, own.action.high, strict=True))
-    if lower or higher:
-        raise UnknownEnvironment(
-            f"the surrogate's actions are not the environment's: expected actions from {_range(own.action)}, "
-            f"got {_range(asked.action)}; register it under another name"
-        )
-
-
-def _range(action: BoxAction) -> str:
-    low, high = (", ".join(f"{bound:g}" for bound in bounds) for bounds in (action.low, action.high))
-    return f"[{low}] to [{high}]"
+    def _none_allowed(self, claimed: ClaimedQueries) -> bool:
+        """Whether a claim gave nothing but queries that the environment does not allow, or nothing."""
+        return all(query.id in self._refused for query in claimed.queries)

@@ -55,8 +55,8 @@ def command(
     until_done: Annotated[
         bool, typer.Option("--until-done", help="Stop when the design has reached its target or budget.")
     ] = False,
-    max_queries: Annotated[int | None, typer.Option(min=1, help="Stop after so many queries.")] = None,
-    time_limit: Annotated[float | None, typer.Option(min=0, help="Stop after so many seconds.")] = None,
+    max_queries: Annotated[int | None, typer.Option(min=1, help="Most queries to begin.")] = None,
+    time_limit: Annotated[float | None, typer.Option(min=0, help="Seconds after which no query is begun.")] = None,
     step_limit: StepLimit = 30.0,
     batch: Annotated[int, typer.Option(min=1, max=256, help="Queries to claim at once.")] = 4,
     worker: Annotated[str | None, typer.Option(help="Name of this worker. [default: host and process]")] = None,
@@ -160,7 +160,7 @@ def _tell(query: Query, outcome: Outcome, error: str) -> None:
 def _words(surrogate: str, report: SamplerReport) -> str:
     from surrogym_client.waiting import FINISHED, IN_WORDS
 
-    others = {"failed": report.failed, "dropped": report.dropped}
+    others = {"failed": report.failed, "dropped": report.dropped, "refused": report.refused}
     apart = "".join(f", {count} {outcome}" for outcome, count in others.items() if count)
     said = f"{report.answered} queries answered with {report.steps} real steps{apart} in {report.seconds:.1f} s"
     if report.phase in IN_WORDS:

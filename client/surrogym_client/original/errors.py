@@ -7,6 +7,7 @@ OriginalError
 ├── NotRenderable           no picture of its states can be made here
 ├── NotParallel             one instance is open, and the environment does not say that another may be
 ├── PolicyMisfit            the policy gives actions that the environment does not have
+├── QueryRefused            a query asks for what the environment does not allow; nothing was sent to it
 ├── EvaluationFailed        the environment or the policy failed after real steps had been taken
 └── StepFailed              the environment did not give a step; the query fails, the worker goes on
     ├── StepTimedOut        it took longer than its limit and was killed; the next step starts a fresh one
@@ -45,6 +46,10 @@ class NotParallel(OriginalError):
 
 class PolicyMisfit(OriginalError, ValueError):
     """A policy gave actions that the environment does not have."""
+
+
+class QueryRefused(OriginalError):
+    """A query lies outside the environment's own specification; nothing was sent to the environment."""
 
 
 class EvaluationFailed(OriginalError):

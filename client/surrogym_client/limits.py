@@ -1,0 +1,110 @@
+"""What a server may have the original environment do: the limits of the environment's own specification."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeAlias
+
+from surrogym_client.original.errors import QueryRefused, UnknownEnvironment
+from surrogym_shared.spec import MAX_ROLLOUT_QUERY, BoxAction, Coordinate, DiscreteAction, EnvironmentSpec
+from surrogym_shared.spec import limits as sampled
+from surrogym_shared.wire import Query, StepQuery
+
+ROUNDING = 1e-6  # of the larger limit: float32 rounds by less
+
+Range: TypeAlias = tuple[float, float]
+
+
+def check_environment(surrogate: str, asked: EnvironmentSpec, own: EnvironmentSpec) -> None:
+    """Check that an environment fits a surrogate: coordinates, action, kind of query, and ranges within its own.
+
+    Raises:
+        UnknownEnvironment: it does not.
+    """
+    expected, got = _shape(asked), _shape(own)
+    if expected != got:
+        raise UnknownEnvironment(
+            f"the environment does not fit surrogate {surrogate!r}: expected {expected}, got {got}"
+        )
+    _check_ranges("actions", _action_ranges(asked), _action_ranges(own))
+    _check_ranges("coordinates", [sampled(c.sampling) for c in asked.coordinates], _coordinate_ranges(own))
+
+
+def check_query(own: EnvironmentSpec, query: Query) -> None:
+    """Check everything that a query asks for against the environment's own specification; call before the first step.
+
+    A coordinate may be anywhere within its bounds or, on a side without a bound, within its sampling range.
+
+    Raises:
+        QueryRefused: the environment does not allow it.
+    """
+    if query.kind != own.query:
+        raise QueryRefused(f"expected a {own.query} query, got a {query.kind} query")
+    if isinstance(query, StepQuery):
+        names = [f"coordinate {name!r}" for name in own.coordinate_names]
+        _check_values("coordinates", names, query.coordinates, _coordinate_ranges(own))
+        _check_action(own, query.action)
+        return
+    longest = own.max_rollout or own.time_limit or MAX_ROLLOUT_QUERY
+    if not 1 <= len(query.actions) <= longest:
+        raise QueryRefused(f"expected a rollout of 1 to {longest} actions, got {len(query.actions)}")
+    for action in query.actions:
+        _check_action(own, action)
+
+
+def _check_action(own: EnvironmentSpec, action: Sequence[float]) -> None:
+    _check_values("action", [f"action {i}" for i in range(own.action.size)], action, _action_ranges(own))
+    if not isinstance(own.action, BoxAction) and not all(float(value).is_integer() for value in action):
+        raise QueryRefused(f"expected the numbers of discrete actions, got {list(action)}")
+
+
+def _check_values(what: str, names: Sequence[str], values: Sequence[float], ranges: Sequence[Range]) -> None:
+    if len(values) != len(ranges):
+        raise QueryRefused(f"{what}: expected {len(ranges)} numbers, got {len(values)}")
+    for name, value, allowed in zip(names, values, ranges, strict=True):
+        if not _within((value, value), allowed):
+            raise QueryRefused(f"{name}: expected a value in [{allowed[0]:g}, {allowed[1]:g}], got {value:g}")
+
+
+def _check_ranges(what: str, asked: Sequence[Range], own: Sequence[Range]) -> None:
+    if not all(map(_within, asked, own)):
+        raise UnknownEnvironment(
+            f"the surrogate's {what} are not the environment's: expected {what} from {_words(own)}, "
+            f"got {_words(asked)}; register it under another name"
+        )
+
+
+def _within(asked: Range, allowed: Range) -> bool:
+    """Whether a range lies in another one, but for rounding; NaN lies in none."""
+    slack = ROUNDING * max(map(abs, allowed))
+    return allowed[0] - slack <= asked[0] and asked[1] <= allowed[1] + slack
+
+
+def _action_ranges(spec: EnvironmentSpec) -> list[Range]:
+    action = spec.action
+    if isinstance(action, BoxAction):
+        return list(zip(action.low, action.high, strict=True))
+    counts = (action.n,) if isinstance(action, DiscreteAction) else action.nvec
+    return [(0, n - 1) for n in counts]
+
+
+def _coordinate_ranges(spec: EnvironmentSpec) -> list[Range]:
+    return [_coordinate_range(coordinate) for coordinate in spec.coordinates]
+
+
+def _coordinate_range(coordinate: Coordinate) -> Range:
+    low, high = sampled(coordinate.sampling)
+    bounds = coordinate.bounds
+    if bounds is None:
+        return low, high
+    return low if bounds.low is None else bounds.low, high if bounds.high is None else bounds.high
+
+
+def _shape(spec: EnvironmentSpec) -> str:
+    names = ", ".join(spec.coordinate_names)
+    return f"coordinates ({names}), a {spec.action.kind} action of {spec.action.size}, and {spec.query} queries"
+
+
+def _words(ranges: Sequence[Range]) -> str:
+    low, high = (", ".join(f"{bound:g}" for bound in bounds) for bounds in zip(*ranges, strict=True))
+    return f"[{low}] to [{high}]"

@@ -1,0 +1,160 @@
+"""A server that asks for more than the person, or the environment's own specification, allows moves no machine."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+import uuid
+
+import pytest
+
+from support.moody import SPEC, Line
+from support.rail import SPEC as RAIL
+from surrogym_client.api import Api
+from surrogym_client.errors import ProtocolMismatch
+from surrogym_client.limits import check_environment, check_query
+from surrogym_client.original.errors import QueryRefused, UnknownEnvironment
+from surrogym_client.sampler import Sampler, SamplerSettings
+from surrogym_shared.spec import Bounds, Coordinate, DiscreteAction, MultiDiscreteAction, Uniform
+from surrogym_shared.wire import RolloutQuery, StepQuery
+
+WIDE = (Coordinate(name="x", sampling=Uniform(low=-1, high=1), bounds=Bounds(high=3)),)
+LEASE = {"id": 1, "number": 0, "purpose": "manual", "attempt": 1, "lease_token": "t", "lease_seconds": 60.0}
+
+
+class Machine(Line):
+    """Notes what it is driven to; a step takes ``seconds``."""
+
+    def __init__(self, seconds=0.0):
+        self.driven = []
+        self.seconds = seconds
+
+    def step_from(self, coordinates, action):
+        self.driven.append((float(coordinates[0]), float(action[0])))
+        time.sleep(self.seconds)
+        return super().step_from(coordinates, action)
+
+
+class Forged(Api):
+    """Its server changes what a claim asks for (``forge``), or gives as many queries as there are (``greedy``)."""
+
+    def __init__(self, url, forge=None, *, greedy=False):
+        super().__init__(url)
+        self.forge, self.greedy = forge or (lambda query: query), greedy
+
+    def _post(self, kind, route, body, **options):
+        if self.greedy and route.endswith("queries:claim"):
+            body = body.model_copy(update={"max_queries": 6})
+        return super()._post(kind, route, body, **options)
+
+    def claim(self, name, sampler, **options):
+        claimed = super().claim(name, sampler, **options)
+        return claimed.model_copy(update={"queries": [self.forge(query) for query in claimed.queries]})
+
+
+@pytest.fixture
+def line(server_process):
+    name = f"line-{uuid.uuid4().hex[:8]}"
+    with Api(server_process.url) as api:
+        api.create_surrogate(name, SPEC)
+        yield name
+        api.delete_surrogate(name)
+
+
+def step(coordinates, action):
+    return StepQuery(**LEASE, coordinates=coordinates, action=action)
+
+
+def rollout(actions):
+    return RolloutQuery(**LEASE, actions=actions)
+
+
+def test_a_server_that_gives_more_than_was_claimed_moves_nothing(server_process, line):
+    machine = Machine()
+    settings = SamplerSettings(max_queries=1, until_done=True, wait_seconds=5.0)
+    with Forged(server_process.url, greedy=True) as api, pytest.raises(ProtocolMismatch, match=r"expected 1 .* got 6"):
+        Sampler(api, line, machine, settings).run()
+    assert machine.driven == []
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"coordinates": [1e6]}, r"coordinate 'x': expected a value in \[-1, 1\], got 1e\+06"),
+        ({"action": [500.0]}, r"action 0: expected a value in \[-1, 1\], got 500"),
+        ({"coordinates": [0.0, 0.0]}, "coordinates: expected 1 numbers, got 2"),
+    ],
+)
+def test_a_query_beyond_the_environment_is_given_back_unbegun(server_process, line, change, why):
+    machine, told = Machine(), []
+
+    def forge(query):
+        return query.model_copy(update=change) if query.number == 0 else query
+
+    with Forged(server_process.url, forge) as api:
+        settings = SamplerSettings(batch=3, once=True, wait_seconds=5.0)
+        report = Sampler(api, line, machine, settings, lambda *seen: told.append(seen)).run()
+        view, [refused] = api.surrogate(line), [query.error for query in api.queries(line) if query.error]
+    assert (report.answered, report.refused, len(machine.driven)) == (2, 1, 2)
+    assert (view.ledger.unresolved, view.queries.leased, view.queries.pending) == (0, 0, 4)
+    [(outcome, error)] = [(outcome, error) for _, outcome, error in told if error]
+    assert (outcome, error) == ("refused", refused)
+    assert re.fullmatch(why, error)
+
+
+def test_queries_that_are_refused_again_and_again_are_told_once(server_process, line):
+    told = []
+    with Forged(server_process.url, lambda query: query.model_copy(update={"action": [math.nan]})) as api:
+        settings = SamplerSettings(batch=2, wait_seconds=5.0, time_limit=1.5)
+        report = Sampler(api, line, Machine(), settings, lambda *seen: told.append(seen)).run()
+    assert report.refused == len(told) == 2
+
+
+def test_the_time_limit_holds_between_the_queries_of_a_claim(server_process, line):
+    machine = Machine(seconds=1.0)
+    with Api(server_process.url) as api:
+        Sampler(api, line, machine, SamplerSettings(batch=6, wait_seconds=5.0, time_limit=0.5)).run()
+        view = api.surrogate(line)
+    assert len(machine.driven) == 1
+    assert (view.ledger.total, view.ledger.unresolved, view.queries.pending) == (1, 0, 5)
+
+
+def test_a_bound_extends_the_sampling_range_and_float32_may_round():
+    spec = SPEC.model_copy(update={"coordinates": WIDE})
+    for x in (-1.0, -1.0 - 1e-7, 2.9, 3.0 + 2e-7):
+        check_query(spec, step([x], [1.0 + 1e-7]))
+    for x in (-1.1, 3.1, math.inf, math.nan):
+        with pytest.raises(QueryRefused, match=r"in \[-1, 3\]"):
+            check_query(spec, step([x], [0.0]))
+
+
+@pytest.mark.parametrize(
+    ("action", "good", "bad"),
+    [
+        (DiscreteAction(n=3), [2.0], [[3.0], [-1.0], [0.5], [], [0.0, 0.0]]),
+        (MultiDiscreteAction(nvec=(2, 3)), [1.0, 2.0], [[2.0, 0.0], [0.0], [0.0, 1.5]]),
+    ],
+)
+def test_a_discrete_action_is_one_of_its_numbers(action, good, bad):
+    spec = SPEC.model_copy(update={"action": action})
+    check_query(spec, step([0.0], good))
+    for numbers in bad:
+        with pytest.raises(QueryRefused, match="action"):
+            check_query(spec, step([0.0], numbers))
+
+
+def test_a_rollout_is_checked_whole_before_its_first_step():
+    check_query(RAIL, rollout([[1.0]] * 20))
+    for actions, why in (([[1.0]] * 21, "1 to 20 actions, got 21"), ([], "got 0"), ([[0.0], [9.0]], "got 9")):
+        with pytest.raises(QueryRefused, match=why):
+            check_query(RAIL, rollout(actions))
+    with pytest.raises(QueryRefused, match="expected a rollout query, got a step query"):
+        check_query(RAIL, step([0.0], [0.0]))
+
+
+def test_a_surrogate_sampled_beyond_the_environment_is_refused():
+    wide = SPEC.model_copy(update={"coordinates": (Coordinate(name="x", sampling=Uniform(low=-1, high=2)),)})
+    with pytest.raises(UnknownEnvironment, match=r"expected coordinates from \[-1\] to \[1\], got \[-1\] to \[2\]"):
+        check_environment("line", wide, SPEC)
+    check_environment("line", wide, SPEC.model_copy(update={"coordinates": WIDE}))
