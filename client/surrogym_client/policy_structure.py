@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import torch
 from gymnasium import Space, spaces
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule
@@ -26,6 +27,7 @@ from stable_baselines3.td3.policies import TD3Policy
 from torch.optim import RMSprop
 
 from surrogym_client.policies import PaperPolicy, Standardise, decaying
+from surrogym_client.policy_settings import PolicySettings
 from surrogym_client.spaces import space
 from surrogym_shared.archives import read_entries, stored
 from surrogym_shared.wire import ActionSpace, BoxSpace, DiscreteSpace, MultiDiscreteSpace
@@ -44,6 +46,7 @@ REMADE = (  # by Stable-Baselines3, when it builds the algorithm and when that b
     *("lr_schedule", "exploration_schedule", "rollout_buffer_class", "replay_buffer_class"),
     *("_last_obs", "_last_original_obs", "_last_episode_starts", "ep_info_buffer", "ep_success_buffer"),
 )
+VARIABLES = {"log_ent_coef"}  # SAC's
 IDLE = {"learning_rate": 0.0, "clip_range": 0.2, "clip_range_vf": None, "train_freq": 1, "action_noise": None}
 
 Layers = Annotated[list[Annotated[int, Field(ge=1)]], Field(max_length=64)]
@@ -144,14 +147,15 @@ def describe(learner: BaseAlgorithm) -> Structure | None:
     )
 
 
-def read(path: Path, *, learning: bool, replaced: set[str]) -> tuple[io.BytesIO, dict[str, Any]]:
+def read(path: Path, *, lanes: int, replaced: set[str]) -> tuple[io.BytesIO, dict[str, Any]]:
     """A policy's file without anything pickled, and the objects that belong in the place of what was.
 
     Both are for ``load`` of a Stable-Baselines3 algorithm: the file, and ``custom_objects``.
 
     Args:
         path: what ``save`` wrote.
-        learning: the algorithm is to learn on; otherwise objects that learning alone needs are left out.
+        lanes: of the environment on which the algorithm continues to learn; 0 if it only acts, which leaves out the
+            objects that only learning needs.
         replaced: attributes that the caller sets, so that the file's are not needed.
 
     Raises:
@@ -162,15 +166,29 @@ def read(path: Path, *, learning: bool, replaced: set[str]) -> tuple[io.BytesIO,
     data = dict(json.loads(_entry(entries, "data")))
     pickled = [name for name, value in data.items() if isinstance(value, dict) and PICKLED in value]
     structure = Structure.model_validate_json(entries[ENTRY]) if ENTRY in entries else None
-    objects: dict[str, Any] = dict.fromkeys((*REMADE, *replaced)) | ({} if learning else IDLE)
+    objects: dict[str, Any] = dict.fromkeys((*REMADE, *replaced)) | ({} if lanes else IDLE)
     if structure is not None:
         _require_weights(structure, _entry(entries, "policy" + WEIGHTS))
         objects |= structure.objects()
     if unknown := [name for name in pickled if name not in objects]:
         raise PickledObjects(unknown)
-    data |= dict.fromkeys((*pickled, *NEEDED))  # placeholders: load takes the objects for them
+    settings = _settings(data, {*objects, *pickled, *NEEDED})
+    if lanes and structure is not None:
+        settings.require_memory(lanes, objects["observation_space"], objects["action_space"])
+    placeholders = dict.fromkeys(({*pickled} - replaced) | {*NEEDED})  # load takes the objects for them
+    data = {"verbose": 0, **settings.attributes, **placeholders}
     weights = {name: _plain(content) for name, content in entries.items() if name.endswith(WEIGHTS)}
+    _require_variables(weights.get("pytorch_variables" + WEIGHTS))
     return io.BytesIO(stored({"data": json.dumps(data).encode(), **weights})), objects
+
+
+def _settings(data: Mapping[str, Any], replaced: set[str]) -> PolicySettings:
+    """The settings of a file, without those that something else replaces."""
+    try:
+        return PolicySettings.model_validate({name: value for name, value in data.items() if name not in replaced})
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ValueError(f"data: {first['loc'][0]}: {first['msg']}, got {str(first['input'])[:40]!r}") from error
 
 
 def _entry(entries: Mapping[str, bytes], name: str) -> bytes:
@@ -189,6 +207,13 @@ def _require_weights(structure: Structure, file: bytes) -> None:
     came = len(file) // np.dtype(np.float32).itemsize
     if structure.weights > came:
         raise ValueError(f"expected weights for layers of {structure.weights} numbers, got {came} numbers at most")
+
+
+def _require_variables(file: bytes | None) -> None:
+    """Stable-Baselines3 sets each of these tensors wherever in the algorithm its name points to."""
+    found = {} if file is None else torch.load(io.BytesIO(file), map_location="cpu", weights_only=True)
+    if unknown := {*(found or {})} - VARIABLES:
+        raise ValueError(f"expected no variables but {', '.join(VARIABLES)}, got {', '.join(map(str, unknown))}")
 
 
 def _given(values: dict[str, Any]) -> dict[str, Any]:

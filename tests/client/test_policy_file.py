@@ -37,6 +37,7 @@ from surrogym_client.policy_file import (
     save_policy,
     write_card,
 )
+from surrogym_client.policy_settings import MAX_EXPERIENCE_BYTES
 from surrogym_client.policy_structure import ENTRY, Structure, describe
 from surrogym_client.train import TrainSettings, train
 from surrogym_shared.archives import read_entries, stored
@@ -261,6 +262,65 @@ def test_a_description_that_lies_is_refused(tmp_path: Path, change: dict[str, An
     described = json.loads(read_entries(policy, LIMIT)[ENTRY])
     policy.write_bytes(stored(read_entries(policy, LIMIT) | {ENTRY: json.dumps(described | change).encode()}))
     with pytest.raises(UnusablePolicy, match=re.compile(f"is no policy of PPO: .*({message})", re.DOTALL)):
+        load_policy(policy)
+
+
+def with_data(policy: Path, /, **settings: Any) -> Path:
+    data = json.loads(read_entries(policy, LIMIT)["data"])
+    return changed(policy, data=json.dumps(data | settings).encode())
+
+
+def test_entries_that_are_no_settings_never_become_attributes(tmp_path: Path):
+    policy = saved(tmp_path, "PPO, continuous")
+    expected = load_policy(policy)(OBSERVATIONS)
+    gifts = dict.fromkeys(("predict", "learn", "policy", "get_env", "device", "verbose", "start_time"), "x")
+    with_data(policy, **gifts, env=None, n_envs=10**6, _custom_logger=True, rollout_buffer_kwargs={"n_envs": 10**6})
+    np.testing.assert_array_equal(load_policy(policy)(OBSERVATIONS), expected)
+    learner = load_learner(policy, "PPO", env=Idle(TORQUES))
+    learner.learn(16, reset_num_timesteps=False)
+    assert (learner.n_envs, learner.verbose) == (1, 0)
+
+
+def test_a_pickled_environment_does_not_replace_the_one_given(tmp_path: Path, mark: Path):
+    policy = with_data(saved(tmp_path, "PPO, continuous"), env=pickled(mark))
+    load_learner(policy, "PPO", env=Idle(TORQUES)).learn(16)
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize(
+    ("case", "setting"),
+    [("PPO, continuous", {"n_steps": 10**12}), ("SAC", {"buffer_size": 10**12}), ("DQN", {"buffer_size": 10**9})],
+)
+def test_experience_beyond_its_bound_is_refused_for_learning_alone(tmp_path: Path, case: str, setting: dict[str, int]):
+    policy, (algorithm, action_space, _) = with_data(saved(tmp_path, case), **setting), CASES[case]
+    assert len(load_policy(policy, algorithm)(OBSERVATIONS)) == len(OBSERVATIONS)
+    with pytest.raises(
+        UnusablePolicy, match=rf"expected at most {MAX_EXPERIENCE_BYTES} bytes of experience, got \d+ \("
+    ):
+        load_learner(policy, algorithm, env=Idle(action_space))
+    load_learner(policy, algorithm, env=Idle(action_space), **dict.fromkeys(setting, 8))
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"batch_size": "x"}, "data: batch_size: Input should be a valid integer, got 'x'"),
+        ({"n_epochs": 10**9}, "data: n_epochs: Input should be less than or equal to 10000, got '1000000000'"),
+        ({"gamma": float("nan")}, "data: gamma: Input should be a finite number, got 'nan'"),
+        ({"_n_updates": [1]}, "data: _n_updates: Input should be a valid integer"),
+    ],
+    ids=str,
+)
+def test_a_setting_of_another_type_is_named(tmp_path: Path, setting: dict[str, Any], message: str):
+    with pytest.raises(UnusablePolicy, match=message):
+        load_policy(with_data(saved(tmp_path, "PPO, continuous"), **setting))
+
+
+def test_variables_that_would_overwrite_the_policy_are_refused(tmp_path: Path):
+    file = io.BytesIO()
+    torch.save({"policy.log_std": torch.zeros(7)}, file)
+    policy = changed(saved(tmp_path, "PPO, continuous"), pytorch_variables__pth=file.getvalue())
+    with pytest.raises(UnusablePolicy, match=r"expected no variables but log_ent_coef, got policy\.log_std"):
         load_policy(policy)
 
 

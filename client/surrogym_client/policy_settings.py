@@ -1,0 +1,94 @@
+"""The settings and counters that a policy's file may give to an algorithm of Stable-Baselines3.
+
+Stable-Baselines3 makes every entry of a file an attribute of the algorithm, methods included. Only the entries here
+pass, each of its type; all others are ignored, and the algorithm's defaults apply.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any
+
+from gymnasium import spaces
+from pydantic import BaseModel, ConfigDict, Field
+
+MAX_EXPERIENCE_BYTES = 2 * 1024**3
+Count = Annotated[int, Field(ge=0, le=2**53)]
+Positive = Annotated[int, Field(ge=1, le=2**53)]
+Batch = Annotated[int, Field(ge=1, le=2**20)]
+Passes = Annotated[int, Field(ge=-1, le=10_000)]  # over the experience or by gradient; -1 for as many as steps
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class ReplaySettings(BaseModel):
+    """Keywords of the replay buffer; the others follow from the algorithm's settings."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, strict=True)
+
+    handle_timeout_termination: bool | None = None
+
+
+class PolicySettings(BaseModel):
+    """Entries of a file by the names of the algorithms' attributes. An entry that is None or absent is the default."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, strict=True, allow_inf_nan=False)
+
+    seed: Annotated[int, Field(ge=0, lt=2**32)] | None = None
+    gamma: Share | None = None
+    learning_rate: Annotated[float, Field(ge=0)] | None = None
+    max_grad_norm: float | None = None
+    use_sde: bool | None = None
+    sde_sample_freq: Annotated[int, Field(ge=-1)] | None = None
+    use_sde_at_warmup: bool | None = None
+    stats_window_size: Annotated[Batch | None, Field(alias="_stats_window_size")] = None
+    # experience
+    n_steps: Positive | None = None
+    buffer_size: Positive | None = None
+    optimize_memory_usage: bool | None = None
+    replay_buffer_kwargs: ReplaySettings | None = None
+    batch_size: Batch | None = None
+    # PPO and A2C
+    n_epochs: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    gae_lambda: Share | None = None
+    vf_coef: float | None = None
+    normalize_advantage: bool | None = None
+    target_kl: float | None = None
+    # SAC, TD3, DDPG and DQN
+    ent_coef: float | Annotated[str, Field(pattern=r"^auto(_[0-9.e+-]+)?$", max_length=32)] | None = None
+    target_entropy: float | None = None
+    learning_starts: Count | None = None
+    tau: Share | None = None
+    gradient_steps: Passes | None = None
+    target_update_interval: Positive | None = None
+    policy_delay: Positive | None = None
+    target_noise_clip: float | None = None
+    target_policy_noise: float | None = None
+    exploration_initial_eps: Share | None = None
+    exploration_final_eps: Share | None = None
+    exploration_fraction: Share | None = None
+    exploration_rate: Share | None = None
+    # progress
+    num_timesteps: Count | None = None
+    total_timesteps: Annotated[Count | None, Field(alias="_total_timesteps")] = None
+    steps_at_start: Annotated[Count | None, Field(alias="_num_timesteps_at_start")] = None
+    progress_remaining: Annotated[float | None, Field(alias="_current_progress_remaining")] = None
+    episodes: Annotated[Count | None, Field(alias="_episode_num")] = None
+    updates: Annotated[Count | None, Field(alias="_n_updates")] = None
+    calls: Annotated[Count | None, Field(alias="_n_calls")] = None
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """Attributes of the algorithm that the file gives, by name."""
+        return self.model_dump(by_alias=True, exclude_none=True)
+
+    def require_memory(self, lanes: int, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+        """Raise ValueError if the experience for learning needs more than ``MAX_EXPERIENCE_BYTES``."""
+        numbers = 2 * _size(observation_space) + _size(action_space) + 4  # rewards, ends, values and the like
+        steps = max(self.buffer_size or 0, (self.n_steps or 0) * lanes)
+        if (needed := 4 * numbers * steps) > MAX_EXPERIENCE_BYTES:
+            asked = f"n_steps={self.n_steps}, buffer_size={self.buffer_size}, {lanes} lanes"
+            raise ValueError(f"expected at most {MAX_EXPERIENCE_BYTES} bytes of experience, got {needed} ({asked})")
+
+
+def _size(space: spaces.Space[Any]) -> int:
+    return math.prod(space.shape or ())
