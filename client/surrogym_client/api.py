@@ -109,9 +109,10 @@ class Api:
 
     # Surrogates
 
-    def create_surrogate(self, name: str, spec: EnvironmentSpec) -> wire.SurrogateView:
-        """Register an original environment; the same name with the same specification is harmless."""
-        return self._post(wire.SurrogateView, "/v1/surrogates", wire.CreateSurrogate(name=name, spec=spec))
+    def create_surrogate(self, name: str, spec: EnvironmentSpec) -> wire.CreatedSurrogate:
+        """Register an original environment; the same name with the same specification is harmless, and ``created`` of
+        the reply is False then."""
+        return self._post(wire.CreatedSurrogate, "/v1/surrogates", wire.CreateSurrogate(name=name, spec=spec))
 
     def surrogates(self) -> list[wire.SurrogateSummary]:
         """All of them, oldest first, with phase, what was spent, and confidence."""

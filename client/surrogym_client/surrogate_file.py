@@ -11,7 +11,7 @@ import numpy as np
 
 from surrogym_client.api import Api
 from surrogym_client.env import RemoteEnv
-from surrogym_client.errors import SurrogymClientError, UnknownSurrogate
+from surrogym_client.errors import SpecConflict, SurrogymClientError
 from surrogym_client.vector import RemoteVectorEnv
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
@@ -50,7 +50,7 @@ def import_surrogate(
     """Make a surrogate of a file: it serves the same model at once, judged by the same tolerances.
 
     Its design is paused, and its samples count as manual ones. Where anything fails, or Ctrl-C is pressed, nothing of
-    it stays.
+    it stays; a surrogate that another request created is never touched.
 
     Args:
         api: the server; needs the role admin.
@@ -64,11 +64,7 @@ def import_surrogate(
         SurrogymClientError: as every request.
     """
     name = name or file.name
-    try:
-        api.surrogate(name)
-    except UnknownSurrogate:
-        api.create_surrogate(name, file.spec)
-    else:
+    if not _created(api, name, file):
         raise NotImportable(f"expected a name that is free, got {name!r}: give another by --name")
     try:
         api.patch_surrogate(name, paused=True, tolerances=file.tolerances or None)
@@ -82,6 +78,14 @@ def import_surrogate(
     except BaseException:
         api.delete_surrogate(name)
         raise
+
+
+def _created(api: Api, name: str, file: SurrogateFile) -> bool:
+    """Create the surrogate; whether the name was free. The server decides, so that of two imports one creates it."""
+    try:
+        return api.create_surrogate(name, file.spec).created
+    except SpecConflict:
+        return False
 
 
 def open_file(path: str | Path) -> SurrogatePort:

@@ -88,6 +88,39 @@ def test_a_model_of_another_environment_is_refused_and_leaves_nothing(
             api.surrogate(name)
 
 
+def interrupted(_: float) -> None:
+    raise KeyboardInterrupt
+
+
+class Overtaken(Api):
+    """Another person imports the same file under the same name just before this one's import creates it."""
+
+    def create_surrogate(self, name, spec):
+        with Api(self.connection.url) as other:
+            import_surrogate(other, self.theirs, name)
+        return super().create_surrogate(name, spec)
+
+
+def test_of_two_imports_at_once_the_later_leaves_the_others_surrogate_alone(
+    pendulum_server: ServerProcess, file: Path, name: str
+) -> None:
+    read = SurrogateFile.load(file)
+
+    with Overtaken(pendulum_server.url) as api:
+        api.theirs = read
+        with pytest.raises(NotImportable, match="a name that is free"):
+            import_surrogate(api, read, name, interrupted)
+        assert api.surrogate(name).samples == len(read.samples)
+
+
+def test_an_interrupted_import_leaves_nothing(pendulum_server: ServerProcess, file: Path, name: str) -> None:
+    with Api(pendulum_server.url) as api:
+        with pytest.raises(KeyboardInterrupt):
+            import_surrogate(api, SurrogateFile.load(file), name, interrupted)
+        with pytest.raises(UnknownSurrogate):
+            api.surrogate(name)
+
+
 def test_gymnasium_and_stable_baselines_take_the_file(file: Path) -> None:
     env = gymnasium.make("surrogym/File-v0", file=file)
     first, _ = env.reset(seed=1)

@@ -101,7 +101,7 @@ def _stage(done: Path, run: Callable[[], Row]) -> None:
 def _design(cell: Cell, api: Api, tell: Say) -> Row:
     """Answer the queries of the design, then hold some of its models against unseen real steps."""
     spec = cell.spec
-    view = api.create_surrogate(cell.name, spec)
+    budget = api.create_surrogate(cell.name, spec).budget
     environment = make(spec.environment, spec=spec)
     try:
         answered = count(1)
@@ -109,7 +109,7 @@ def _design(cell: Cell, api: Api, tell: Say) -> Row:
         def look(query: Query, outcome: Outcome, error: str) -> None:
             del query  # its number counts those of all designs
             number = next(answered)
-            tell(min(0.3, 0.3 * number / view.budget), f"real step {number} {outcome}{': ' if error else ''}{error}")
+            tell(min(0.3, 0.3 * number / budget), f"real step {number} {outcome}{': ' if error else ''}{error}")
 
         Sampler(api, cell.name, environment, SamplerSettings(until_done=True), look).run()
     finally:

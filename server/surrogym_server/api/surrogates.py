@@ -17,6 +17,7 @@ from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
+    CreatedSurrogate,
     CreateSurrogate,
     Improve,
     ImprovedSurrogate,
@@ -38,13 +39,13 @@ MAX_PAGE = 1_000
     openapi_extra=json_up_to(128),
     responses=documented(Code.INVALID_REQUEST, Code.INVALID_SPEC, Code.SPEC_CONFLICT),
 )
-def create(body: Annotated[CreateSurrogate, example(examples.CREATE)], use: Use) -> SurrogateView:
+def create(body: Annotated[CreateSurrogate, example(examples.CREATE)], use: Use) -> CreatedSurrogate:
     """Create a surrogate from a specification and queue its initial queries. The same name and specification
-    again change nothing; another specification under the name is refused."""
+    again change nothing, and ``created`` is false; another specification under the name is refused."""
     spec = body.spec
     budget = convert.default_budget(spec)
-    status = use.surrogates.create(body.name, spec.model_dump(mode="json"), budget, spec.design.target)
-    return convert.surrogate_view(status)
+    status, created = use.surrogates.create(body.name, spec.model_dump(mode="json"), budget, spec.design.target)
+    return convert.created(status, created=created)
 
 
 @router.get("", summary="All surrogates", dependencies=[READ], responses=documented(Code.INVALID_REQUEST))

@@ -5,6 +5,7 @@ from surrogym_server.convert.numbers import numbers
 from surrogym_server.convert.resources import (
     added_samples,
     claimed,
+    created,
     event,
     imagined,
     improved,
@@ -37,6 +38,7 @@ from surrogym_server.convert.sessions import (
 __all__ = [
     "added_samples",
     "claimed",
+    "created",
     "default_budget",
     "definition_from_spec",
     "event",

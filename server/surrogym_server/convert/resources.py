@@ -42,6 +42,10 @@ def surrogate_view(status: SurrogateStatus) -> replies.SurrogateView:
     return replies.SurrogateView(**_view_fields(status))
 
 
+def created(status: SurrogateStatus, *, created: bool) -> replies.CreatedSurrogate:
+    return replies.CreatedSurrogate(**_view_fields(status), created=created)
+
+
 def improved(status: SurrogateStatus, raised: int) -> replies.ImprovedSurrogate:
     return replies.ImprovedSurrogate(**_view_fields(status), budget_raised_by=raised)
 

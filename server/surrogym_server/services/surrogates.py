@@ -84,8 +84,10 @@ class SurrogateService:
         self._notices = notices
         self._samplers = samplers
 
-    def create(self, name: str, spec: dict[str, Any], budget: int, target: float) -> SurrogateStatus:
+    def create(self, name: str, spec: dict[str, Any], budget: int, target: float) -> tuple[SurrogateStatus, bool]:
         """Create a surrogate with its initial queries; the same name and spec again changes nothing.
+
+        Returns its status, and whether this call made it.
 
         Raises:
             SpecConflict: the name exists with another spec.
@@ -107,7 +109,7 @@ class SurrogateService:
         if not created:
             check_same(name, self._complete(present.spec), self._complete(spec))
         self._notices.post(name)
-        return self.status(name)
+        return self.status(name), created
 
     def status(self, name: str) -> SurrogateStatus:
         """Raises ``UnknownSurrogate``."""

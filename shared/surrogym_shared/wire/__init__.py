@@ -85,6 +85,7 @@ from surrogym_shared.wire.sessions import (
     SubmittedOccupancy,
 )
 from surrogym_shared.wire.surrogates import (
+    CreatedSurrogate,
     CreateSurrogate,
     Fidelity,
     ImprovedSurrogate,
@@ -120,6 +121,7 @@ __all__ = [
     "ClaimQueries",
     "ClaimedQueries",
     "CreateSurrogate",
+    "CreatedSurrogate",
     "DiscreteSpace",
     "Event",
     "FailQuery",

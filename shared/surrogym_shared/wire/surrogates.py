@@ -107,6 +107,12 @@ class SurrogateView(SurrogateSummary):
     error: str | None = Field(default=None, description="why the phase is failed, or the last query was set aside")
 
 
+class CreatedSurrogate(SurrogateView):
+    """A surrogate that was registered."""
+
+    created: bool = Field(description="whether this request made it; false: it was there, with the same specification")
+
+
 class ImprovedSurrogate(SurrogateView):
     """A surrogate that was asked for more queries."""
 
