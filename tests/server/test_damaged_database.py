@@ -136,6 +136,7 @@ def test_broken_pages_end_the_start_with_one_sentence_and_the_way_out(tmp_path: 
     content = bytearray(file.read_bytes())
     content[4096:8192] = bytes(4096)
     file.write_bytes(content)
+    file.chmod(0o600)  # or a line of its own would say that others may read it
     command = [sys.executable, "-m", "surrogym_server", "serve", "--port", "0", "--database", str(file)]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert ended.returncode == 1
