@@ -72,7 +72,7 @@ def test_the_whole_loop_through_a_generated_client(call: Call, name: str):
     models = module("models")
     spec = models.EnvironmentSpec.from_dict(pendulum.spec() | {"design": {"initial": QUERIES, "budget": QUERIES}})
     created = call("surrogates_create", body=models.CreateSurrogate(name=name, spec=spec))
-    assert isinstance(created, models.SurrogateView)
+    assert isinstance(created, models.CreatedSurrogate)
     assert created.spec.time_limit == spec.time_limit
     original, answered, phase = GymnasiumEnvironment(pendulum_spec()), 0, ""
     while phase not in ("ready", "over_budget"):
