@@ -15,7 +15,6 @@ from uuid import uuid4
 import torch
 from fastapi import FastAPI
 from fastapi.responses import Response
-from pydantic import ValidationError
 
 from surrogym_server import dashboard
 from surrogym_server.api import (
@@ -38,11 +37,12 @@ from surrogym_server.api.observe import Observed
 from surrogym_server.api.state import Services
 from surrogym_server.api.turns import Turns
 from surrogym_server.convert import definition_from_spec
+from surrogym_server.convert.stored import read_stored
 from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
 from surrogym_server.engine.fits import Fits
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import MEBIBYTE, Limits, LiveSessions, Threads
-from surrogym_server.errors import Damaged, InvalidInput
+from surrogym_server.errors import InvalidInput
 from surrogym_server.private import keep_private
 from surrogym_server.sampling.acquisition import ACQUISITIONS
 from surrogym_server.services.activity import Samplers
@@ -227,12 +227,7 @@ def _build_services(
 
 def _define(spec: dict[str, Any]) -> EnvironmentDefinition:
     """Of a specification as it is stored: the wire has checked what comes in."""
-    try:
-        return definition_from_spec(EnvironmentSpec.model_validate(spec))
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        raise Damaged(f"a stored specification can't be read: {where}: {first['msg']}") from error
+    return definition_from_spec(read_stored(EnvironmentSpec, "a stored specification", spec))
 
 
 def _complete(spec: dict[str, Any]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from surrogym_server.convert.numbers import as_tuple, with_lists
+from surrogym_server.convert.stored import read_stored
 from surrogym_server.sampling.uncertainty import UncertaintyResult
 from surrogym_server.services.models import Said
 from surrogym_server.services.queries import Claim
@@ -27,6 +28,8 @@ from surrogym_server.surrogate.describe import PointPrediction
 from surrogym_server.virtual.imagined import Imagined, ImaginedEpisode
 from surrogym_shared import spec as wire
 from surrogym_shared import wire as replies
+
+FIDELITY = "the fidelity of a model"  # in the error where it is damaged
 
 
 def surrogate_list(listed: Sequence[Listed], limit: int) -> replies.SurrogateList:
@@ -54,11 +57,11 @@ def _view_fields(status: SurrogateStatus) -> dict[str, Any]:
     record, model = status.record, status.model
     return {
         **_summary_fields(status),
-        "spec": wire.EnvironmentSpec.model_validate(record.spec),
+        "spec": read_stored(wire.EnvironmentSpec, "a stored specification", record.spec),
         "budget_left": status.budget_left,
         "tolerances": record.tolerances,
         "outputs": list(status.outputs),
-        "fidelity": None if model is None else replies.Fidelity.model_validate(model.fidelity),
+        "fidelity": None if model is None else read_stored(replies.Fidelity, FIDELITY, model.fidelity),
         "error": record.error,
     }
 
@@ -152,7 +155,8 @@ def sample_page(records: Sequence[SampleRecord], limit: int) -> replies.SamplePa
 
 
 def model_view(record: ModelRecord) -> replies.ModelView:
-    return replies.ModelView.model_validate(asdict(record))
+    fidelity = read_stored(replies.Fidelity, FIDELITY, record.fidelity)
+    return replies.ModelView.model_validate(asdict(record) | {"fidelity": fidelity})
 
 
 def uncertainty(said: Said[UncertaintyResult]) -> replies.Uncertainty:

@@ -75,14 +75,15 @@ def check_settable(definition: EnvironmentDefinition, q: Array) -> Array:
     """Coordinates (n, C) that the original environment can be set to.
 
     Raises:
-        InvalidInput: another shape, or beyond a bound at which the environment saturates.
+        InvalidInput: another shape, or beyond a bound of the environment or, on a side without one, beyond the
+            sampling range: a sampler sets its environment to nothing else.
     """
     q = check_coordinates(definition, "coordinates", q)
     for index, coordinate in enumerate(definition.coordinates):
-        beyond = (q[:, index] < coordinate.low) | (q[:, index] > coordinate.high)
+        low, high = coordinate.settable
+        beyond = (q[:, index] < low) | (q[:, index] > high)
         if beyond.any():
             raise InvalidInput(
-                f"coordinate {coordinate.name!r}: expected a value in [{coordinate.low:g}, {coordinate.high:g}], "
-                f"got {q[beyond, index][0]:g}"
+                f"coordinate {coordinate.name!r}: expected a value in [{low:g}, {high:g}], got {q[beyond, index][0]:g}"
             )
     return q

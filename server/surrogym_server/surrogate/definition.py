@@ -39,6 +39,12 @@ class CoordinateDefinition:
     def saturates(self) -> bool:
         return bool(np.isfinite(self.low) or np.isfinite(self.high))
 
+    @property
+    def settable(self) -> tuple[float, float]:
+        """What the original environment can be set to: its bounds, or the sampling range where it has none."""
+        low = self.low if np.isfinite(self.low) else self.sampling.low
+        return low, self.high if np.isfinite(self.high) else self.sampling.high
+
 
 @dataclass(frozen=True)
 class ActionDefinition:

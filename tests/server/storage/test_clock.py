@@ -10,7 +10,7 @@ import sqlalchemy as sa
 from surrogym_server.errors import LeaseExpired
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewDesign, NewSample
-from surrogym_server.storage.sql.tables import metadata
+from surrogym_server.storage.sql.tables import Checked, metadata
 
 DAY, LONG, SHORT = 86_400.0, 60.0, 0.05
 Until = Callable[[Callable[[], bool]], None]
@@ -30,7 +30,7 @@ def test_every_column_of_time_is_set_back_by_these_tests() -> None:
 
 
 def is_double(column: sa.Column[object]) -> bool:
-    return isinstance(column.type, sa.Double)
+    return isinstance(column.type, Checked) and isinstance(column.type.impl, sa.Double)
 
 
 def test_the_lease_of_a_dead_sampler_ends_though_the_clock_was_set_back(

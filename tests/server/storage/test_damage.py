@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -21,7 +22,8 @@ from surrogym_server.storage.sql import open_storage
 from surrogym_server.storage.sql.checks import check_pages
 from surrogym_server.storage.sql.database import connect
 from surrogym_server.storage.sql.migrate import SCRIPTS
-from surrogym_server.storage.sql.tables import models
+from surrogym_server.storage.sql.storage import SqlStorage
+from surrogym_server.storage.sql.tables import Checked, metadata, models
 
 NAME = "pendulum"
 READS: dict[str, Callable[[Storage], Any]] = {
@@ -251,3 +253,29 @@ def test_models_from_before_get_the_checksum_of_what_they_are(url: str, full: St
     with pytest.raises(Damaged):
         again.models.blob(NAME, 1)
     again.close()
+
+
+@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+def test_a_value_of_another_type_is_named_by_whatever_reads_it(file: Path) -> None:
+    """SQLite keeps text in a column of numbers, and bytes in a column of text."""
+    columns = [column for table in metadata.tables.values() for column in table.columns]
+    places = [f"{c.table.name}.{c.name}" for c in columns if isinstance(c.type, Checked) and not c.primary_key]
+    named = []
+    for place in places:
+        with closing(SqlStorage(connect(f"sqlite:///{changed_copy(file, place)}"))) as storage:
+            damage = [str(error) for error in all_read(storage) if isinstance(error, Damaged)]
+        assert not damage or any(f" in {place}, got b'" in said for said in damage), (place, damage)
+        named += [place] * bool(damage)
+    assert {"surrogates.budget", "queries.attempts", "samples.reward", "models.samples", "events.created_at"} <= {
+        *named
+    }
+
+
+def changed_copy(file: Path, place: str) -> Path:
+    """A copy of a database in which a column ("table.column") holds bytes that are neither text nor a number."""
+    table, column = place.split(".")
+    copy = file.with_name(f"{place}.db")
+    shutil.copy(file, copy)
+    with closing(sqlite3.connect(copy)) as connection, connection:
+        connection.execute(f"UPDATE {table} SET {column} = x'ff00' WHERE rowid = (SELECT min(rowid) FROM {table})")
+    return copy

@@ -191,6 +191,38 @@ def test_nothing_is_written_to_a_file_that_is_no_longer_in_its_place(
     assert change is replace_by_a_copy or not file.exists(), "no empty database in its place"
 
 
+@pytest.mark.parametrize("suffix", ["-wal", "-shm"])
+@pytest.mark.parametrize("replaced", [False, True])
+def test_deleting_the_write_ahead_log_loses_nothing(tmp_path: Path, suffix: str, replaced: bool) -> None:
+    """What was acknowledged before is there after a restart; nothing is acknowledged into a log that nobody finds."""
+    file = tmp_path / "surrogym.db"
+    storage = open_storage(f"sqlite:///{file}")
+    storage.surrogates.create(NewSurrogate("acknowledged", {}, 30, 0.9))
+    beside = file.with_name(file.name + suffix)
+    beside.unlink()
+    if replaced:
+        beside.write_bytes(b"")
+    with pytest.raises(Unavailable, match=f"{suffix} was moved, replaced or deleted .* stop the server"):
+        storage.surrogates.create(NewSurrogate("later", {}, 30, 0.9))
+    with pytest.raises(Unavailable, match="stop the server"):
+        storage.surrogates.summaries()
+    with pytest.raises(Unavailable, match="stop the server"):
+        storage.ping()
+    storage.close()
+    again = open_storage(f"sqlite:///{file}")
+    assert [summary.name for summary in again.surrogates.summaries()] == ["acknowledged"]
+    again.close()
+
+
+def test_a_replaced_file_is_not_read(tmp_path: Path) -> None:
+    file = tmp_path / "surrogym.db"
+    storage = open_storage(f"sqlite:///{file}")
+    replace_by_a_copy(file)
+    with pytest.raises(Unavailable, match="moved, replaced or deleted"):
+        storage.surrogates.summaries()
+    storage.close()
+
+
 def test_a_file_that_can_not_be_written_is_refused(tmp_path: Path) -> None:
     (tmp_path / "surrogym.db").mkdir()
     with pytest.raises(Unavailable, match=r"expected a file to read and write .*surrogym\.db"):

@@ -48,20 +48,41 @@ class Database:
         self._writing = engine.execution_options(begin="BEGIN IMMEDIATE")
         # SQLite's own waiting polls; a lock in this process wakes the next writer at once
         self._turn = threading.Lock() if engine.dialect.name == "sqlite" else None
+        self._held: Connection | None = None
+
+    def hold_open(self) -> None:
+        """Keep one connection to a SQLite file until ``close``, and watch the files that SQLite keeps beside it.
+
+        SQLite deletes its write-ahead log with the last connection. While this one is open, a log that is missing or
+        another one was changed by somebody else.
+        """
+        if self._lock is None:
+            return
+        with _translated():
+            self._held = self._engine.connect()
+            self._held.execute(sa.text("SELECT count(*) FROM sqlite_master"))
+            self._held.rollback()
+        self._lock.watch_beside()
 
     @contextlib.contextmanager
     def read(self) -> Iterator[Connection]:
+        self._require_in_place()
         with _translated(), self._engine.begin() as connection:
             yield connection
 
     @contextlib.contextmanager
     def write(self) -> Iterator[Connection]:
-        if self._lock is not None:
-            self._lock.require_in_place()
+        self._require_in_place()
         with self._take_turn(), _translated(), self._writing.begin() as connection:
             yield connection
 
+    def _require_in_place(self) -> None:
+        if self._lock is not None:
+            self._lock.require_in_place()
+
     def close(self) -> None:
+        if self._held is not None:
+            self._held.close()
         self._engine.dispose()
         if self._lock is not None:
             self._lock.close()

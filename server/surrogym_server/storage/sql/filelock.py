@@ -14,6 +14,8 @@ LOCKED_BYTE = 2**62  # beyond any database, and far from the bytes at 2**30 that
 WHOLE_DESCRIPTION = getattr(fcntl, "F_OFD_SETLK", None)  # Linux
 BUSY = (BlockingIOError, PermissionError)  # EAGAIN, EACCES
 
+BESIDE = ("-wal", "-shm")  # what SQLite puts behind the name of a database: its write-ahead log, and the log's index
+
 Identity = tuple[int, int]  # device and inode
 
 _held: set[Identity] = set()  # files that this process has locked
@@ -39,19 +41,26 @@ class FileLock:
             identity = _identity(path)
             assert identity is not None
             self._identity = identity
+            self._beside: dict[Path, Identity | None] = {}
             _held.add(identity)
 
+    def watch_beside(self) -> None:
+        """Note which write-ahead log and which index of it belong to the file from now on."""
+        resolved = self._path.resolve()  # SQLite keeps them where a symbolic link leads
+        paths = [resolved.with_name(resolved.name + suffix) for suffix in BESIDE]
+        self._beside = {path: _identity(path) for path in paths}
+
     def require_in_place(self) -> None:
-        """Check that the path still leads to the locked file.
+        """Check that the path still leads to the locked file, with the files beside it that were noted.
 
         Raises:
-            Unavailable: the file was moved, replaced or deleted.
+            Unavailable: one of them was moved, replaced or deleted.
         """
         if _identity(self._path) != self._identity:
-            raise Unavailable(
-                f"the database can't be used now: {self._path} was moved, replaced or deleted under the running "
-                "server; put it back to its place"
-            )
+            raise _displaced(self._path, "put it back to its place")
+        for path, identity in self._beside.items():
+            if _identity(path) != identity:
+                raise _displaced(path, "stop the server without killing it: then it saves what it still holds")
 
     def close(self) -> None:
         if self._descriptor is not None:
@@ -99,6 +108,12 @@ def _open(path: Path) -> int:
         return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except OSError as error:
         raise Unavailable(f"expected a file to read and write the database, got {path}: {error.strerror}") from None
+
+
+def _displaced(path: Path, way_out: str) -> Unavailable:
+    return Unavailable(
+        f"the database can't be used now: {path} was moved, replaced or deleted under the running server; {way_out}"
+    )
 
 
 def _taken(path: Path, error: OSError | None = None) -> Unavailable:

@@ -72,5 +72,6 @@ def _bring_up(database: Database) -> None:
         migrate(database)
         with database.read() as connection:
             check_tables(connection)
+        database.hold_open()
     except Damaged as error:
         raise Damaged(f"{error}; {database.way_out}") from error

@@ -85,6 +85,40 @@ class Word(sa.types.TypeDecorator[str]):
         return value
 
 
+PLAIN: dict[type[sa.types.TypeEngine[Any]], tuple[str, tuple[type, ...]]] = {
+    sa.Integer: ("a whole number", (int,)),
+    sa.BigInteger: ("a whole number", (int,)),
+    sa.Double: ("a number", (int, float)),
+    sa.Text: ("text", (str,)),
+}
+
+
+class Checked(sa.types.TypeDecorator[Any]):
+    """A number or a text. SQLite keeps any value in any column, so a damaged file may hold something else there."""
+
+    impl = sa.Text
+    cache_ok = True
+
+    def __init__(self, place: str, impl: sa.types.TypeEngine[Any]) -> None:
+        super().__init__()
+        self.place = place
+        self.impl = impl  # type: ignore[assignment]  # SQLAlchemy's stubs have the class, an object has an instance
+        self.expected, self.types = PLAIN[type(impl)]
+
+    def process_result_value(self, value: Any, dialect: Dialect) -> Any:  # noqa: ARG002
+        if value is not None and not isinstance(value, self.types):
+            raise damaged(f"expected {self.expected} in {self.place}, got {reprlib.repr(value)}")
+        return value
+
+
+def _check_plain_columns() -> None:
+    """Checks what is read from columns without a type of ours; not from ids, which only lead to rows."""
+    for table in metadata.tables.values():
+        for column in table.columns:
+            if type(column.type) in PLAIN and column.type is not Id:
+                column.type = Checked(f"{table.name}.{column.name}", column.type)
+
+
 def _id() -> sa.Column[int]:
     return sa.Column("id", Id, primary_key=True, autoincrement=True)
 
@@ -262,3 +296,5 @@ events = sa.Table(
     sa.Index(None, "surrogate_id", "id"),
     sqlite_autoincrement=True,
 )
+
+_check_plain_columns()

@@ -1,0 +1,30 @@
+"""Reads stored documents with the models that the wire checks requests with."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from surrogym_server.errors import Damaged
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def read_stored(model: type[M], what: str, stored: dict[str, Any]) -> M:
+    """A document as an instance of its model.
+
+    Args:
+        model: what it was written from.
+        what: its name in the error, with its article.
+        stored: what the database holds.
+
+    Raises:
+        Damaged: it is no such document; names the field.
+    """
+    try:
+        return model.model_validate(stored)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise Damaged(f"{what} can't be read: {where}: {first['msg']}") from error

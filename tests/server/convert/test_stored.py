@@ -1,0 +1,18 @@
+"""A stored document that is none is damage of the database, and not a bug or a bad request."""
+
+import pytest
+
+from support import pendulum
+from surrogym_server.convert.stored import read_stored
+from surrogym_server.errors import Damaged
+from surrogym_shared.spec import EnvironmentSpec
+
+
+def test_a_document_is_read_as_its_model():
+    assert read_stored(EnvironmentSpec, "a stored specification", pendulum.spec()).environment == "Pendulum-v1"
+
+
+def test_damage_names_the_document_and_the_field():
+    broken = pendulum.spec() | {"time_limit": "long"}
+    with pytest.raises(Damaged, match=r"^a stored specification can't be read: time_limit: Input should be a valid"):
+        read_stored(EnvironmentSpec, "a stored specification", broken)
