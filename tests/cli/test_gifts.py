@@ -87,3 +87,30 @@ def test_a_card_with_a_name_that_none_can_have_is_refused(surrogym, tmp_path, na
     ended = surrogym(*EVALUATE)
     assert ended.code == 1
     assert ended.err.startswith("error: policy.json is no card of a policy: surrogate: ")
+
+
+@pytest.mark.parametrize(
+    ("limit", "steps", "said"),
+    [
+        (20_000, 200, "the policy's card has a time limit of 20000 steps, that of Pendulum-v1 is 200"),
+        (None, 200, "the policy's card has a time limit of none, that of Pendulum-v1 is 200"),
+        (50, 50, ""),
+    ],
+)
+def test_a_card_may_only_shorten_the_environments_time_limit(surrogym, tmp_path, limit, steps, said):
+    """A limit of the card's own would let a gift take as many real steps as it wants."""
+    spec = pendulum().model_copy(update={"time_limit": limit})
+    network(tmp_path, spec=spec.model_dump(mode="json"))
+    ended = surrogym(*EVALUATE, "--json")
+    assert ended.code == 0, ended.err
+    assert ended.json["steps"] == steps
+    assert said in ended.err
+    assert bool(said) == ("time limit" in ended.err)
+
+
+def test_a_specification_that_a_person_gives_may_lengthen_the_time_limit(surrogym, tmp_path):
+    longer = pendulum().model_copy(update={"time_limit": 300})
+    network(tmp_path)
+    (tmp_path / "spec.json").write_text(longer.model_dump_json())
+    ended = surrogym(*EVALUATE, "--spec", "spec.json", "--json")
+    assert ended.json["steps"] == 300

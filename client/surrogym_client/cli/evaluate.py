@@ -87,7 +87,7 @@ def command(
     if wide and start_scale != 1:
         raise CommandError("expected --wide or --start-scale, got both")
     settings = EvaluationSettings(episodes, first_seed, wide, start_scale, perturb, parallel)
-    opener = _opener(env, read_spec(spec), card)
+    opener = _opener(env, read_spec(spec), card, quiet=quiet)
     ledger = _ledger(surrogate, server, card, card_path(policy), quiet=quiet)
     enter = partial(_enter, ledger, server, token_from(context, token, token_file), quiet=quiet)
     try:
@@ -107,8 +107,8 @@ def command(
     give(summary, lambda: _words(result), as_json=as_json)
 
 
-def _opener(env: str | None, given: EnvironmentSpec | None, card: PolicyCard) -> Callable[[], Episode]:
-    """How to open an episode. A card's word is taken for Gymnasium's own ids alone, never for a module."""
+def _opener(env: str | None, given: EnvironmentSpec | None, card: PolicyCard, *, quiet: bool) -> Callable[[], Episode]:
+    """Return what opens an episode. A card is believed for Gymnasium's own ids alone, never for a module."""
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.original.episodes import open_episode
     from surrogym_client.original.loading import is_known, make
@@ -117,12 +117,30 @@ def _opener(env: str | None, given: EnvironmentSpec | None, card: PolicyCard) ->
     name = env or (noted.environment if noted is not None else None)
     if name is None or (env is None and not is_known(name)):
         raise CommandError(f"expected --env with the original environment, got none (noted beside the policy: {name})")
-    spec = given or (noted if noted is not None and noted.environment == name else None)
     if ":" in name:
         bins = _bins(noted) if given is None else None
         return lambda: open_episode(name, given, lambda: make(name, spec=given, bins=bins))
-    spec = spec or make(name).spec()
+    if given is None and noted is not None and noted.environment == name and is_known(name):
+        given = _limited(noted, quiet=quiet)
+    spec = given or make(name).spec()
     return lambda: open_episode(name, spec, lambda: make(name, spec=spec))
+
+
+def _limited(noted: EnvironmentSpec, *, quiet: bool) -> EnvironmentSpec:
+    """Cut a card's time limit to that of the environment, which takes the real steps: a card may only shorten it."""
+    from surrogym_client.original.loading import own_time_limit
+    from surrogym_shared.terminal import say
+
+    own = own_time_limit(noted.environment)
+    if noted.time_limit is not None and noted.time_limit <= own:
+        return noted
+    asked = "none" if noted.time_limit is None else f"{noted.time_limit} steps"
+    say(
+        f"the policy's card has a time limit of {asked}, that of {noted.environment} is {own}: episodes end after "
+        f"{own} steps; --spec FILE chooses another limit",
+        quiet=quiet,
+    )
+    return noted.model_copy(update={"time_limit": own})
 
 
 def _bins(spec: EnvironmentSpec | None) -> int | None:

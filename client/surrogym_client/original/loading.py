@@ -16,6 +16,7 @@ from surrogym_shared.spec import BoxAction, EnvironmentSpec
 
 Preset = Literal["default", "paper"]
 Choose = Callable[[EnvironmentSpec], EnvironmentSpec]
+LONGEST_EPISODE = 1_000  # where nothing sets a time limit
 ATTRIBUTES = ("step_from", "reset", "step", "coordinates", "begin", "act", "picture", "close", "parallel")
 
 
@@ -64,6 +65,13 @@ def is_known(name: str) -> bool:
     from surrogym_client.original import classic, mujoco
 
     return name in classic.TASKS or mujoco.is_known(name)
+
+
+def own_time_limit(name: str) -> int:
+    """The time limit of a Gymnasium id in steps, as its registration has it; ``LONGEST_EPISODE`` without one."""
+    import gymnasium
+
+    return gymnasium.spec(name).max_episode_steps or LONGEST_EPISODE
 
 
 def with_choices(
