@@ -26,6 +26,7 @@ from torch.export import Dim, ExportedProgram
 from surrogym_client.errors import SurrogymClientError
 from surrogym_client.evaluate import Predict
 from surrogym_client.policy_file import load_learner
+from surrogym_client.policy_onnx import from_onnx
 from surrogym_shared.network import Network
 
 CHECKS = 1_000  # random observations that both forms are asked for
@@ -133,27 +134,6 @@ def to_onnx(program: ExportedProgram) -> bytes:
     assert converted is not None
     content: bytes = converted.model_proto.SerializeToString()
     return content
-
-
-def from_onnx(content: bytes) -> Predict:
-    """A policy in ONNX as a function of observations; nothing in it is code of Python.
-
-    Raises:
-        ModuleNotFoundError: without the extra ``export``.
-        NotExportable: no such policy.
-    """
-    import onnxruntime
-
-    try:
-        session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    except Exception as error:  # its own errors have no common base
-        raise NotExportable(f"expected a policy in ONNX, got {len(content)} bytes: {error}") from error
-
-    def predict(observations: NDArray[np.float32]) -> NDArray[Any]:
-        action: NDArray[Any] = session.run(["action"], {"observation": observations.astype(np.float32)})[0]
-        return action
-
-    return predict
 
 
 def _to_program(program: ExportedProgram) -> bytes:

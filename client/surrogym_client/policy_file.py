@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, RootModel, ValidationError
 
 from surrogym_client.errors import SurrogymClientError
 from surrogym_client.evaluate import Predict
+from surrogym_client.policy_onnx import load_onnx
 from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import SurrogateName
@@ -102,13 +103,12 @@ def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM, *, trust: bool =
 
     Raises:
         UnusablePolicy: no such algorithm, the file is none of its policies, or it needs ``trust``.
+        UnusableOnnx: the file is no policy in ONNX, or it could ask for more memory than a policy needs.
     """
     if Network.is_at(path):
         return _network(path)
     if path.suffix.lower() == ONNX:
-        from surrogym_client.policy_export import from_onnx
-
-        return from_onnx(path.read_bytes())
+        return load_onnx(path)
     model = load_learner(path, algorithm, trust=trust)
 
     def predict(observations: NDArray[np.float32]) -> NDArray[Any]:

@@ -18,6 +18,7 @@ from surrogym_client.original.classic import acrobot, pendulum
 from surrogym_client.policies import PaperPolicy
 from surrogym_client.policy_export import NotExportable, export_policy
 from surrogym_client.policy_file import UnusablePolicy, load_policy
+from surrogym_client.policy_onnx import UnusableOnnx
 from surrogym_shared.network import Network
 
 OBSERVED = spaces.Box(-np.inf, np.inf, (3,), np.float32)
@@ -124,5 +125,5 @@ def test_what_can_not_be_exported_is_refused_in_words(tmp_path: Path):
     with pytest.raises(UnusablePolicy, match="no policy of SAC"):
         export_policy(policy, tmp_path / "policy.pt2", "SAC", trust=True)
     (tmp_path / "junk.onnx").write_bytes(b"junk")
-    with pytest.raises(NotExportable, match="expected a policy in ONNX, got 4 bytes"):
+    with pytest.raises(UnusableOnnx, match="expected a policy in ONNX, got 4 bytes"):
         load_policy(tmp_path / "junk.onnx")
