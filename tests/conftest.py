@@ -16,8 +16,8 @@ import torch
 
 from support.server import ServerProcess, running_server
 from support.teaching import teach
-from surrogym_client.api import Api
 from surrogym_client.original.classic import pendulum
+from surrogym_client.transport import Api
 
 # The same examples in every run, on machines of any speed, and none kept in the checkout.
 hypothesis.settings.register_profile(

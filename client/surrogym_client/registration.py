@@ -13,12 +13,12 @@ SWING_UP_STEPS = 40  # of 0.1 s
 
 def register() -> None:
     """Enter this package's environments into Gymnasium's registry; doing it twice is harmless."""
-    for environment_id, module in ((ENVIRONMENT_ID, "remote"), (FILE_ID, "surrogate_file")):
+    for environment_id, module in ((ENVIRONMENT_ID, "gym_factories"), (FILE_ID, "file_factories")):
         if environment_id not in gymnasium.registry:
             gymnasium.register(
                 environment_id,
-                entry_point=f"surrogym_client.{module}:make_env",
-                vector_entry_point=f"surrogym_client.{module}:make_vector_env",
+                entry_point=f"surrogym_client.environments.{module}:make_env",
+                vector_entry_point=f"surrogym_client.environments.{module}:make_vector_env",
             )
     for environment_id, reward in ((SWING_UP, "smooth"), (SWING_UP_NARROW, "narrow")):
         if environment_id not in gymnasium.registry:

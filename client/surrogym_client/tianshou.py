@@ -8,10 +8,10 @@ from typing import Any, Self
 from tianshou.env import BaseVectorEnv
 from tianshou.env.worker import EnvWorker
 
-from surrogym_client.lane_calls import LaneCalls, Started, Stepped
-from surrogym_client.lanes import Lanes, session_request
-from surrogym_client.spaces import space
-from surrogym_client.transport import HttpSurrogate, Retries, Timeouts, Transport
+from surrogym_client.environments.lane_calls import LaneCalls, Started, Stepped
+from surrogym_client.environments.lanes import Lanes, session_request
+from surrogym_client.environments.spaces import space
+from surrogym_client.transport.http_surrogate import HttpSurrogate, Retries, Timeouts, Transport
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import SessionView
 

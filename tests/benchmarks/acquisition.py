@@ -29,10 +29,10 @@ matplotlib.use("Agg")
 from matplotlib.figure import Figure
 
 from support.real_steps import answer, join, random_steps
-from surrogym_client.evaluate import interquartile_mean
+from surrogym_client.evaluation.evaluator import interquartile_mean
+from surrogym_client.experiments.reproduce.statistics import bootstrap_interval, difference_interval
 from surrogym_client.original import make
-from surrogym_client.reproduce.statistics import bootstrap_interval, difference_interval
-from surrogym_client.versions import commit
+from surrogym_client.runtime.versions import commit
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.sampling.design import DesignState, Request, advance, initial_design
 from surrogym_server.sampling.outlook import Points

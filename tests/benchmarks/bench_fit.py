@@ -22,10 +22,9 @@ from bench_step import surrogym_server
 from common import figures, parser, ratio, started, write
 
 from support.teaching import answer
-from surrogym_client.api import Api
 from surrogym_client.original.classic import pendulum
 from surrogym_client.original.gymnasium import GymnasiumEnvironment
-from surrogym_client.transport import HttpSurrogate
+from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_shared import wire
 from surrogym_shared.wire import OpenSession
 

@@ -24,12 +24,11 @@ from servers import TRIVIAL
 from websockets.sync.client import connect
 
 from support.teaching import teach
-from surrogym_client.api import Api
-from surrogym_client.connection import Connection, Retries
-from surrogym_client.forms import BinaryForm, Form, JsonForm
 from surrogym_client.original.classic import pendulum
-from surrogym_client.stream import Stream
-from surrogym_client.transport import HttpSurrogate, Transport
+from surrogym_client.transport import Api, HttpSurrogate, Transport
+from surrogym_client.transport.connection import Connection, Retries
+from surrogym_client.transport.step_codecs import BinaryForm, Form, JsonForm
+from surrogym_client.transport.stream import Stream
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.surrogate.codec import from_bytes

@@ -14,8 +14,7 @@ from support.cutting_proxy import cutting_proxy
 from support.fault_proxy import fault_proxy
 from support.server import ServerProcess
 from support.walks import trajectory
-from surrogym_client.connection import Retries, Timeouts
-from surrogym_client.transport import HttpSurrogate, Transport
+from surrogym_client.transport import HttpSurrogate, Retries, Timeouts, Transport
 
 STEPS = times(short=200, full=10_000)
 QUICK = Retries(seconds=60, first_delay=0.001, longest_delay=0.01)

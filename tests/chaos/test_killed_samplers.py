@@ -13,7 +13,7 @@ import pytest
 from support.chaos import SEED, times
 from support.noting import NotingSamplers, Tally, create, finished, noting_samplers, until
 from support.server import running_server
-from surrogym_client.api import Api
+from surrogym_client.transport import Api
 
 KILLS = times(short=3, full=50)
 SAMPLERS, BUDGET, KILLS_A_RUN = 3, times(short=9, full=16), 10

@@ -12,7 +12,7 @@ import pytest
 from support.chaos import SEED, times
 from support.noting import Tally, create, finished, noting_samplers, until
 from support.server import RestartingServer
-from surrogym_client.api import Api
+from surrogym_client.transport import Api
 
 SAMPLERS, BUDGET, KILLS_A_RUN = 3, times(short=9, full=18), 10
 LONGEST_LIFE = 2.0

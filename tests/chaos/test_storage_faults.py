@@ -25,9 +25,8 @@ from support.chaos import times
 from support.postgresql import running_postgresql
 from support.server import ServerProcess, running_server
 from support.teaching import teach
-from surrogym_client.api import Api
 from surrogym_client.original.classic import pendulum
-from surrogym_client.transport import HttpSurrogate, Retries
+from surrogym_client.transport import Api, HttpSurrogate, Retries
 from surrogym_server.storage.sql.database import BUSY_SECONDS
 from surrogym_shared.wire import OpenSession
 

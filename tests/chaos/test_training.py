@@ -16,11 +16,10 @@ from stable_baselines3 import PPO
 from support.chaos import SEED, times
 from support.server import RestartingServer
 from support.teaching import teach
-from surrogym_client.api import Api
-from surrogym_client.cli.train_words import words_of_result
 from surrogym_client.original.classic import pendulum
-from surrogym_client.train import TrainProgress, TrainResult, TrainSettings, train
-from surrogym_client.transport import HttpSurrogate, Retries
+from surrogym_client.training.trainer import TrainProgress, TrainResult, TrainSettings, train
+from surrogym_client.training.words import words_of_result
+from surrogym_client.transport import Api, HttpSurrogate, Retries
 
 FAULTS = times(short=1, full=10)
 LANES, SMALL = 8, {"n_steps": 16, "batch_size": 64, "n_epochs": 2}

@@ -6,7 +6,7 @@ import pytest
 
 from support.terminal import on_terminal
 from surrogym_client.cli.columns import ENDLESS, columns, fitted
-from surrogym_client.reproduce.rows import Row, write_rows
+from surrogym_client.experiments.reproduce.rows import Row, write_rows
 
 ROWS = [("name", "a long heading"), ("pendulum", 0.123456), ("x", None)]
 MARKDOWN = """\

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from support.machine import Machine, diary_in
-from surrogym_client.api import Api
 from surrogym_client.original.loading import with_choices
-from surrogym_client.policy_file import PolicyCard
+from surrogym_client.policies import PolicyCard
+from surrogym_client.transport import Api
 
 OWN = """
 from surrogym_client.original import RealStep
@@ -184,7 +184,7 @@ def test_a_policy_of_bins_pushes_ones_own_machine_as_its_surrogate_was_pushed(su
     spec = with_choices(Machine.spec(None), {}, bins=5)
     (tmp_path / "policy.zip").write_bytes(b"")
     (tmp_path / "policy.json").write_text(PolicyCard(spec=spec).model_dump_json())
-    monkeypatch.setattr("surrogym_client.policy_file.load_policy", lambda *_, **__: lambda o: np.ones(len(o)))
+    monkeypatch.setattr("surrogym_client.policies.files.load_policy", lambda *_, **__: lambda o: np.ones(len(o)))
     with diary_in(tmp_path, monkeypatch) as diary:
         said = surrogym("evaluate", "policy.zip", "--env", "support.machine:Machine", "--episodes", "1")
         assert said.code == 0, said.err

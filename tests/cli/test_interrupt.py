@@ -9,10 +9,10 @@ import pytest
 
 from support.server import ServerProcess
 from support.terminal import Terminal, on_terminal
-from surrogym_client.api import Api
-from surrogym_client.evaluate import EvaluationInterrupted
+from surrogym_client.evaluation import EvaluationInterrupted
 from surrogym_client.original.errors import EvaluationFailed
-from surrogym_client.policy_file import load_policy
+from surrogym_client.policies import load_policy
+from surrogym_client.transport import Api
 
 INTERRUPTED = 130
 
@@ -73,8 +73,8 @@ def test_an_evaluation_that_does_not_end_enters_its_real_steps(
     def ends(*_):
         raise ending
 
-    monkeypatch.setattr("surrogym_client.policy_file.load_policy", lambda *_, **__: None)
-    monkeypatch.setattr("surrogym_client.evaluate.evaluate", ends)
+    monkeypatch.setattr("surrogym_client.policies.files.load_policy", lambda *_, **__: None)
+    monkeypatch.setattr("surrogym_client.evaluation.evaluator.evaluate", ends)
     ended = on_server("evaluate", "policy.zip", "--env", "Pendulum-v1")
     with Api(server_process.url) as api:
         assert api.surrogate(name).ledger.evaluation == 7

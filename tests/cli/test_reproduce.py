@@ -2,9 +2,9 @@
 
 import pytest
 
-from surrogym_client.demo.settings import DemoSettings
-from surrogym_client.reproduce.cells import Cell
-from surrogym_client.reproduce.rows import Row, read_rows, write_rows
+from surrogym_client.experiments.reproduce.cells import Cell
+from surrogym_client.experiments.reproduce.rows import Row, read_rows, write_rows
+from surrogym_client.experiments.settings import DemoSettings
 
 ROW = Row("pendulum", "default", 0, 14, 4, 5, 9, mean=-150.0, min=-400.0, reached=True, seconds=1.0)
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from surrogym_client.experiments.reproduce.paper_cases import QUICK, TASKS, WHOLE, Cell, Variation, cells
+from surrogym_client.experiments.reproduce.paper_measures import BiasedEpisode, Unseen, run_variation, some
+from surrogym_client.experiments.reproduce.paper_table import settling_time, table
+from surrogym_client.experiments.reproduce.table import markdown
 from surrogym_client.original import make
-from surrogym_client.reproduce.paper_cases import QUICK, TASKS, WHOLE, Cell, Variation, cells
-from surrogym_client.reproduce.paper_measures import BiasedEpisode, Unseen, run_variation, some
-from surrogym_client.reproduce.paper_table import settling_time, table
-from surrogym_client.reproduce.table import markdown
 from surrogym_shared.spec import Fixed
 
 

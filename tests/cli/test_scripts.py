@@ -12,7 +12,7 @@ import pytest
 
 from support.commands import command_line, options
 from support.server import ServerProcess
-from surrogym_client.reproduce.rows import Row, write_rows
+from surrogym_client.experiments.reproduce.rows import Row, write_rows
 
 ELSEWHERE = {
     "conformance": "tests/client/test_conformance.py",

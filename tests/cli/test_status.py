@@ -8,7 +8,7 @@ import pytest
 
 from support.scripted_server import lost_reply, reply, scripted_server
 from support.terminal import on_terminal
-from surrogym_client.api import Api
+from surrogym_client.transport import Api
 from surrogym_shared import wire
 
 EMPTY = reply(wire.SurrogateList(surrogates=[]).model_dump_json())

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from surrogym_client.cli.train_words import words_of, words_of_interruption, words_of_result
 from surrogym_client.training import TrainProgress, TrainResult
+from surrogym_client.training.words import words_of, words_of_interruption, words_of_result
 
 RESULT = TrainResult(Path("p.zip"), "PPO", 512, 1.0, -150.0, 0, {})
 

@@ -9,9 +9,7 @@ import pytest
 
 from support.scripted_server import ScriptedServer, lost_reply, problem, reply, scripted_server
 from surrogym_client import errors
-from surrogym_client.api import Api
-from surrogym_client.connection import Retries
-from surrogym_client.transport import HttpSurrogate
+from surrogym_client.transport import Api, HttpSurrogate, Retries
 from surrogym_shared import wire
 from surrogym_shared.codes import Code
 

@@ -9,11 +9,11 @@ from uuid import uuid4
 import pytest
 
 from support.server import ServerProcess, running_server
-from surrogym_client.api import Api
-from surrogym_client.budget import BudgetTooSmall, words_of_rounds
 from surrogym_client.cli import main
 from surrogym_client.errors import BeyondBudget
 from surrogym_client.original.classic import pendulum
+from surrogym_client.surrogates.budget import BudgetTooSmall, words_of_rounds
+from surrogym_client.transport import Api
 from surrogym_shared.spec import Design
 
 TOKENS = {role: f"the-token-to-{role}" for role in ("train", "admin")}

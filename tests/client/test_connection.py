@@ -9,7 +9,7 @@ import pytest
 
 from support.scripted_server import lost_reply, problem, reply, scripted_server
 from surrogym_client import errors
-from surrogym_client.connection import Connection, Retries, Timeouts
+from surrogym_client.transport.connection import Connection, Retries, Timeouts
 from surrogym_shared.codes import Code
 
 QUICK = Retries(seconds=2.0, first_delay=0.01, longest_delay=0.05)

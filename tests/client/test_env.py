@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from support.exact_pendulum import ExactEnv, ExactPendulum
-from surrogym_client.env import RemoteEnv
+from surrogym_client.environments import RemoteEnv, RemoteVectorEnv
 from surrogym_client.errors import NotReset
 from surrogym_client.sb3 import SurrogateVecEnv
-from surrogym_client.vector import RemoteVectorEnv
 
 ACTION = np.array([0.5], dtype=np.float32)
 

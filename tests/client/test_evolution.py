@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from support.real_steps import random_steps
-from surrogym_client.evolution import evolve
-from surrogym_client.imagined import imagined_returns
+from surrogym_client.evaluation import imagined_returns
 from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
-from surrogym_client.policy_file import load_policy
-from surrogym_client.train import TrainSettings, train
-from surrogym_client.training import TrainingInterrupted, prolongs
+from surrogym_client.policies import load_policy
+from surrogym_client.training.cma_es import evolve
+from surrogym_client.training.settings import TrainingInterrupted, prolongs
+from surrogym_client.training.trainer import TrainSettings, train
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.surrogate.learn import learn

@@ -16,14 +16,13 @@ import pytest
 from support.real_steps import random_steps
 from support.server import ServerProcess, running_server
 from support.teaching import answer
-from surrogym_client.api import Api
-from surrogym_client.improve import VISIT_LANES, ImproveSettings, explorer, shares, train_and_improve
 from surrogym_client.original.classic import pendulum
 from surrogym_client.original.gymnasium import GymnasiumEnvironment
-from surrogym_client.train import TrainProgress, TrainResult, TrainSettings, train
-from surrogym_client.training import DRAWS, chosen_for
-from surrogym_client.transport import HttpSurrogate
-from surrogym_client.waiting import wait_for_design
+from surrogym_client.surrogates.waiting import wait_for_design
+from surrogym_client.training.closed_loop import VISIT_LANES, ImproveSettings, explorer, shares, train_and_improve
+from surrogym_client.training.settings import DRAWS, chosen_for
+from surrogym_client.training.trainer import TrainProgress, TrainResult, TrainSettings, train
+from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.surrogate.learn import learn
@@ -84,7 +83,7 @@ def test_rounds_go_on_until_the_policys_region_is_known_or_the_design_is_ready(
         asked.append((settings.anew, settings.prolong))
         return train(port, out, replace(settings, prolong=False), progress)
 
-    monkeypatch.setattr("surrogym_client.improve.train", trained)
+    monkeypatch.setattr("surrogym_client.training.closed_loop.train", trained)
     settings = replace(SETTINGS, prolong=True)
     initial, unsure, ready = 4, tolerance < 1, budget > 4
     tolerances = dict.fromkeys(("theta", "speed", "reward"), tolerance)

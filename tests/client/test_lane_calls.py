@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from support.exact_pendulum import ExactEnv, ExactPendulum
-from surrogym_client.env import LOST
+from surrogym_client.environments.env import LOST
+from surrogym_client.environments.lane_calls import LaneCalls
+from surrogym_client.environments.lanes import Lanes, session_request
 from surrogym_client.errors import NotReset
-from surrogym_client.lane_calls import LaneCalls
-from surrogym_client.lanes import Lanes, session_request
 
 LANES = 4
 ALL = range(LANES)

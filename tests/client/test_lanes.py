@@ -5,10 +5,10 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from support.exact_pendulum import ExactPendulum
-from surrogym_client.env import LOST, RemoteEnv
+from surrogym_client.environments import RemoteVectorEnv
+from surrogym_client.environments.env import LOST, RemoteEnv
 from surrogym_client.errors import SessionExpired
 from surrogym_client.sb3 import SurrogateVecEnv
-from surrogym_client.vector import RemoteVectorEnv
 
 LANES = 3
 ZERO = np.zeros((LANES, 1), dtype=np.float32)

@@ -11,10 +11,10 @@ from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 from stable_baselines3.common.evaluation import evaluate_policy
 
 import surrogym_client
-from surrogym_client.env import LOST, RemoteEnv
+from surrogym_client.environments import RemoteVectorEnv
+from surrogym_client.environments.env import LOST, RemoteEnv
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.transport import HttpSurrogate
-from surrogym_client.vector import RemoteVectorEnv
 
 SEEDS = [5, 6, 7]
 ID = "surrogym/Remote-v0"

@@ -13,15 +13,14 @@ import pytest
 from gymnasium.wrappers import RecordVideo
 
 from support.exact_pendulum import ExactPendulum
-from surrogym_client.env import RemoteEnv
+from surrogym_client.environments import RemoteEnv, RemoteVectorEnv
+from surrogym_client.environments.pictures import Pictures, coordinates_from_observation, metadata_of
 from surrogym_client.original.classic import TASKS
 from surrogym_client.original.episodes import draw
 from surrogym_client.original.errors import NotRenderable
 from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
 from surrogym_client.original.terms import observe
-from surrogym_client.pictures import Pictures, coordinates_from_observation, metadata_of
 from surrogym_client.registration import SWING_UP
-from surrogym_client.vector import RemoteVectorEnv
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
 SPECS = {name: task.spec() for name, task in TASKS.items()} | {name: make() for name, make in SPECIFICATIONS.items()}

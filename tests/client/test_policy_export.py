@@ -13,12 +13,12 @@ import stable_baselines3
 import torch
 from gymnasium import spaces
 
-from surrogym_client import policy_export
 from surrogym_client.original.classic import acrobot, pendulum
-from surrogym_client.policies import PaperPolicy
-from surrogym_client.policy_export import NotExportable, export_policy
-from surrogym_client.policy_file import UnusablePolicy, load_policy
-from surrogym_client.policy_onnx import UnusableOnnx
+from surrogym_client.policies import UnusablePolicy, load_policy
+from surrogym_client.policies import export as policy_export
+from surrogym_client.policies.export import NotExportable, export_policy
+from surrogym_client.policies.networks import PaperPolicy
+from surrogym_client.policies.onnx_files import UnusableOnnx
 from surrogym_shared.network import Network
 
 OBSERVED = spaces.Box(-np.inf, np.inf, (3,), np.float32)

@@ -23,10 +23,8 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from support.exact_pendulum import ExactPendulum
 from support.gifts import LIMIT, Touches, changed, gift, pickled
-from surrogym_client.api import Api
-from surrogym_client.policies import PaperPolicy, Standardise, decaying
-from surrogym_client.policy_export import export_policy
-from surrogym_client.policy_file import (
+from surrogym_client.policies.export import export_policy
+from surrogym_client.policies.files import (
     MAX_CARD_BYTES,
     NotedAddress,
     PolicyCard,
@@ -37,9 +35,11 @@ from surrogym_client.policy_file import (
     save_policy,
     write_card,
 )
-from surrogym_client.policy_settings import MAX_EXPERIENCE_BYTES
-from surrogym_client.policy_structure import ENTRY, Structure, describe
-from surrogym_client.train import TrainSettings, train
+from surrogym_client.policies.networks import PaperPolicy, Standardise, decaying
+from surrogym_client.policies.saved_settings import MAX_EXPERIENCE_BYTES
+from surrogym_client.policies.structure import ENTRY, Structure, describe
+from surrogym_client.training.trainer import TrainSettings, train
+from surrogym_client.transport import Api
 from surrogym_shared.archives import read_entries, stored
 
 OBSERVED = spaces.Box(-np.inf, np.inf, (3,), np.float32)
@@ -240,7 +240,7 @@ def test_weights_that_would_inflate_are_refused(tmp_path: Path):
 
 
 def test_a_policy_that_would_inflate_is_refused(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("surrogym_client.policy_structure.MAX_BYTES", 2**20)
+    monkeypatch.setattr("surrogym_client.policies.structure.MAX_BYTES", 2**20)
     (tmp_path / "policy.zip").write_bytes(bomb("policy.pth"))
     with pytest.raises(UnusablePolicy, match=f"expected at most {2**20} bytes inside, got {2**25}"):
         load_policy(tmp_path / "policy.zip")

@@ -10,9 +10,8 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from surrogym_client import policy_onnx
-from surrogym_client.policy_file import load_policy
-from surrogym_client.policy_onnx import LANES, UnusableOnnx, from_onnx
+from surrogym_client.policies import load_policy, onnx_files
+from surrogym_client.policies.onnx_files import LANES, UnusableOnnx, from_onnx
 
 FLOAT = TensorProto.FLOAT
 OBSERVED = helper.make_tensor_value_info("observation", FLOAT, ["lanes", 3])
@@ -120,7 +119,7 @@ def test_a_file_without_bounds_is_refused_before_it_runs(
 
 
 def test_a_file_of_too_many_bytes_is_refused_and_not_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(policy_onnx, "MAX_BYTES", 1_000)
+    monkeypatch.setattr(onnx_files, "MAX_BYTES", 1_000)
     (tmp_path / "policy.onnx").write_bytes(bytes(10_000))
     with pytest.raises(UnusableOnnx, match="got 1001 bytes: expected at most 1000 bytes"):
         load_policy(tmp_path / "policy.onnx")

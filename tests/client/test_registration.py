@@ -19,7 +19,7 @@ def run(code: str) -> str:
 
 def test_importing_the_package_registers_the_environment():
     code = "import gymnasium, surrogym_client; print(gymnasium.spec('surrogym/Remote-v0').entry_point)"
-    assert run(code).strip() == "surrogym_client.remote:make_env"
+    assert run(code).strip() == "surrogym_client.environments.gym_factories:make_env"
 
 
 def test_the_id_may_name_the_package_to_import():
@@ -46,7 +46,9 @@ def test_registering_twice_is_harmless():
     assert surrogym_client.register is register
 
 
-@pytest.mark.parametrize("module", ["transport", "env", "vector", "remote", "api", "spaces"])
+@pytest.mark.parametrize(
+    "module", ["transport", "environments", "environments.gym_factories", "sampler", "policies", "training"]
+)
 def test_the_thin_client_needs_no_torch(module: str):
     code = f"import sys, surrogym_client.{module}; print(*sys.modules)"
     assert not {"torch", "stable_baselines3"} & set(run(code).split())

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from support.server import ServerProcess
-from surrogym_client.api import Api
 from surrogym_client.report.figures import draw_fidelity, svg
 from surrogym_client.report.maps import Cut, cuts
 from surrogym_client.report.page import page
+from surrogym_client.transport import Api
 from surrogym_shared.wire import ModelView, SampleView, SurrogateView
 
 SVG = "data:image/svg+xml;base64,"

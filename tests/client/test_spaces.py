@@ -3,7 +3,7 @@
 import gymnasium
 import numpy as np
 
-from surrogym_client.spaces import space
+from surrogym_client.environments.spaces import space
 from surrogym_shared.wire import BoxSpace, DiscreteSpace, MultiDiscreteSpace
 
 

@@ -14,7 +14,7 @@ from websockets.sync.server import ServerConnection, serve
 
 from support.scripted_server import lost_reply, problem, reply, scripted_server, upgrade
 from surrogym_client import errors
-from surrogym_client.stream import Stream, StreamLost, StreamUnavailable
+from surrogym_client.transport.stream import Stream, StreamLost, StreamUnavailable
 from surrogym_shared.codes import Code
 
 Handler = Callable[[ServerConnection], None]

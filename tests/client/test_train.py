@@ -9,15 +9,16 @@ import pytest
 from stable_baselines3 import PPO, SAC
 
 from support.real_steps import random_steps
-from surrogym_client import train as training
-from surrogym_client.checks import Checks
-from surrogym_client.imagined import imagined_returns
+from surrogym_client.evaluation import imagined_returns
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_client.original.loading import make
-from surrogym_client.policies import WIDER, PaperPolicy
-from surrogym_client.policy_file import UnusablePolicy, load_policy
+from surrogym_client.policies import UnusablePolicy, load_policy
+from surrogym_client.policies.networks import WIDER, PaperPolicy
 from surrogym_client.sb3 import SurrogateVecEnv
-from surrogym_client.train import (
+from surrogym_client.training import trainer as training
+from surrogym_client.training.early_stopping import Checks
+from surrogym_client.training.settings import prolongs
+from surrogym_client.training.trainer import (
     MAX_STEPS,
     TrainingInterrupted,
     TrainProgress,
@@ -30,7 +31,6 @@ from surrogym_client.train import (
     suggested_lanes,
     train,
 )
-from surrogym_client.training import prolongs
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.surrogate.learn import learn

@@ -10,8 +10,8 @@ import pytest
 
 from support.scripted_server import Answer, ScriptedServer, problem, reply, scripted_server, session_view, upgrade
 from surrogym_client import errors
-from surrogym_client.connection import Connection, Retries, Timeouts
 from surrogym_client.transport import HttpSurrogate
+from surrogym_client.transport.connection import Connection, Retries, Timeouts
 from surrogym_shared import frames, wire
 from surrogym_shared.codes import Code
 from surrogym_shared.messages import KEY_BYTES, header

@@ -8,8 +8,8 @@ from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from support.exact_pendulum import ExactEnv, ExactPendulum
+from surrogym_client.environments import RemoteVectorEnv
 from surrogym_client.errors import NotReset
-from surrogym_client.vector import RemoteVectorEnv
 
 SEEDS = [5, 6, 7, 8]
 

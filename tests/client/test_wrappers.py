@@ -10,9 +10,8 @@ from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from support.exact_pendulum import ExactEnv, ExactPendulum
-from surrogym_client.env import RemoteEnv
+from surrogym_client.environments import RemoteEnv, RemoteVectorEnv
 from surrogym_client.registration import ENVIRONMENT_ID
-from surrogym_client.vector import RemoteVectorEnv
 
 LANES = 3
 SEEDS = [5, 6, 7]

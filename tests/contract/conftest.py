@@ -10,8 +10,7 @@ import pytest
 
 import surrogym_client.errors
 import surrogym_server.errors
-from surrogym_client.api import Api
-from surrogym_client.transport import HttpSurrogate, Transport
+from surrogym_client.transport import Api, HttpSurrogate, Transport
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.surrogate.codec import from_bytes

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from support.teaching import teach
-from surrogym_client.api import Api
 from surrogym_client.original.classic import cartpole
-from surrogym_client.transport import HttpSurrogate
+from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.surrogate.codec import from_bytes

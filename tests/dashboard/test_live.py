@@ -12,10 +12,10 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from support.server import RestartingServer
-from surrogym_client.api import Api
 from surrogym_client.original.classic import pendulum
 from surrogym_client.original.gymnasium import GymnasiumEnvironment
 from surrogym_client.sampler import Sampler, SamplerSettings
+from surrogym_client.transport import Api
 
 Open = Callable[..., Page]
 TOKEN = "the-token-of-an-admin"

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from surrogym_client.reproduce.rows import row_of
+from surrogym_client.experiments.reproduce.rows import row_of
 
 pytestmark = [pytest.mark.e2e, pytest.mark.slow]
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from surrogym_client.demo.arms import ARMS
-from surrogym_client.demo.settings import DemoSettings
-from surrogym_client.demo.tasks import ROUNDS, TASKS, Outcome, Target, design_budget, queries_a_round
+from surrogym_client.experiments.arms import ARMS
+from surrogym_client.experiments.settings import DemoSettings
+from surrogym_client.experiments.tasks import ROUNDS, TASKS, Outcome, Target, design_budget, queries_a_round
 from surrogym_client.original.loading import is_known
 
 KNOWN = [name for name, task in TASKS.items() if is_known(task.environment)]

@@ -19,8 +19,8 @@ import pytest
 from support.examples import EXAMPLES, ROOT, run
 from support.server import ServerProcess, running_server
 from support.teaching import teach
-from surrogym_client.api import Api
 from surrogym_client.original.classic import pendulum
+from surrogym_client.transport import Api
 
 OWN_LINES = 30  # of an environment, blank ones left out
 PRINTED_URL = "http://127.0.0.1:8000"

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from surrogym_client.reproduce.page import present_section, section
-from surrogym_client.reproduce.rows import merge, read_rows
-from surrogym_client.reproduce.table import contrasts, summary, tasks_with_results
+from surrogym_client.experiments.reproduce.page import present_section, section
+from surrogym_client.experiments.reproduce.rows import merge, read_rows
+from surrogym_client.experiments.reproduce.table import contrasts, summary, tasks_with_results
 
 DOCS = Path(__file__).parents[2] / "docs"
 ROWS = read_rows(DOCS / "results" / "efficiency.csv")

@@ -8,7 +8,7 @@ import pytest
 
 from support.moody import Line
 from surrogym_client import original
-from surrogym_client.evaluate import (
+from surrogym_client.evaluation.evaluator import (
     EvaluationInterrupted,
     EvaluationSettings,
     decode_actions,

@@ -8,11 +8,11 @@ import pytest
 
 from support.machine import Machine, SettableMachine, Simulator, diary_in, most_at_once, note
 from surrogym_client import original
-from surrogym_client.evaluate import EvaluationInterrupted, EvaluationSettings, evaluate
-from surrogym_client.lifetime import terminations_as_interrupts
+from surrogym_client.evaluation import EvaluationInterrupted, EvaluationSettings, evaluate
 from surrogym_client.original.episodes import open_episode
 from surrogym_client.original.errors import EvaluationFailed, NotParallel, PolicyMisfit
 from surrogym_client.original.port import OriginalPort
+from surrogym_client.runtime.lifetime import terminations_as_interrupts
 from surrogym_shared.wire import OpenSession
 
 EPISODES = 3

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from support.examples import EXAMPLES, cells, run, surrogym
 from support.server import ServerProcess
-from surrogym_client.api import Api
+from surrogym_client.transport import Api
 
 ENVIRONMENT_LINES = 60  # of one's own environment, without blank ones
 

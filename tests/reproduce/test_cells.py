@@ -10,11 +10,11 @@ import pytest
 
 from support.commands import parse
 from support.metrics import METRICS
-from surrogym_client.demo.arms import ARMS
-from surrogym_client.demo.settings import DemoSettings
-from surrogym_client.demo.tasks import TASKS
-from surrogym_client.reproduce.cells import Cell, cells, demo_command, done_already, run_cells, study
-from surrogym_client.reproduce.rows import Row, read_rows, row_of
+from surrogym_client.experiments.arms import ARMS
+from surrogym_client.experiments.reproduce.cells import Cell, cells, demo_command, done_already, run_cells, study
+from surrogym_client.experiments.reproduce.rows import Row, read_rows, row_of
+from surrogym_client.experiments.settings import DemoSettings
+from surrogym_client.experiments.tasks import TASKS
 
 
 def stand_in(seconds=0.0, fails=()):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from support.metrics import METRICS
-from surrogym_client.reproduce.rows import Row, UnusableRows, merge, read_rows, row_of, write_rows
+from surrogym_client.experiments.reproduce.rows import Row, UnusableRows, merge, read_rows, row_of, write_rows
 
 ROW = Row("pendulum", "default", 0, 14, 4, 5, 9, mean=-150.123, success=0.97, reached=True, phase="ready")
 

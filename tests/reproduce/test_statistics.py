@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from surrogym_client.reproduce.statistics import bootstrap_interval, difference_interval
+from surrogym_client.experiments.reproduce.statistics import bootstrap_interval, difference_interval
 
 
 def test_the_interval_covers_the_truth_about_as_often_as_it_says():

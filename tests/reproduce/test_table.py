@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 
-from surrogym_client.reproduce.page import NoSuchPlace, present_section, section, update
-from surrogym_client.reproduce.pictures import draw_tasks
-from surrogym_client.reproduce.rows import Row
-from surrogym_client.reproduce.table import report
+from surrogym_client.experiments.reproduce.page import NoSuchPlace, present_section, section, update
+from surrogym_client.experiments.reproduce.pictures import draw_tasks
+from surrogym_client.experiments.reproduce.rows import Row
+from surrogym_client.experiments.reproduce.table import report
 
 ROW = Row(
     *("pendulum", "default", 0, 14, 4, 5, 9),

@@ -14,12 +14,12 @@ import pytest
 
 from support.rail import SPEC, HangsRight, Rail, RaisesRight
 from surrogym_client import original
-from surrogym_client.answers import reset_seed
-from surrogym_client.api import Api
 from surrogym_client.errors import InvalidInput
 from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.isolated import IsolatedEnvironment
 from surrogym_client.sampler import Sampler, SamplerSettings
+from surrogym_client.sampler.sample_conversion import reset_seed
+from surrogym_client.transport import Api
 from surrogym_shared.wire import NewSample
 
 RIGHT, LEFT = [1.0], [-1.0]
@@ -27,7 +27,7 @@ ONE = SamplerSettings(name="worker", batch=1, once=True, wait_seconds=5.0)
 KILLED = """
 import sys
 from support.rail import Slow
-from surrogym_client.api import Api
+from surrogym_client.transport import Api
 from surrogym_client.sampler import Sampler, SamplerSettings
 
 with Api(sys.argv[1]) as api:

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from support.real_steps import random_steps
-from surrogym_client.imagined import imagined_returns
+from surrogym_client.evaluation import imagined_returns
 from surrogym_client.original.classic import cartpole, pendulum
-from surrogym_client.policy_file import load_policy
+from surrogym_client.policies import load_policy
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
 from surrogym_server.gradients import GradientSettings, _evened, optimise

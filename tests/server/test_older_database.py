@@ -20,8 +20,8 @@ import pytest
 
 from support import pendulum
 from support.server import running_server
-from surrogym_client.api import Api
 from surrogym_client.errors import SpecConflict
+from surrogym_client.transport import Api
 from surrogym_shared.spec import EnvironmentSpec
 
 STORED = Path(__file__).with_name("stored")

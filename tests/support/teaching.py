@@ -6,8 +6,8 @@ import time
 
 import numpy as np
 
-from surrogym_client.api import Api
 from surrogym_client.original.gymnasium import GymnasiumEnvironment
+from surrogym_client.transport import Api
 from surrogym_shared import wire
 from surrogym_shared.spec import EnvironmentSpec
 

@@ -30,7 +30,7 @@ def command(
 
     Example: surrogym conformance --server http://127.0.0.1:8000
     """
-    from surrogym_client.conformance import conformance
+    from surrogym_client.diagnosis.conformance import conformance
     from surrogym_shared.terminal import give, on_interrupt, visible
 
     outcomes = []

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from surrogym_client.cli.options import ExitWithParent, Quiet
-from surrogym_client.demo.arms import ARMS
-from surrogym_client.demo.tasks import TASKS
+from surrogym_client.experiments.arms import ARMS
+from surrogym_client.experiments.tasks import TASKS
 
 if TYPE_CHECKING:
     Task = str
@@ -47,10 +47,10 @@ def command(
     Example: surrogym demo pendulum --seed 0 --json metrics.json
     """
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.demo.report import table
-    from surrogym_client.demo.run import run_demo
-    from surrogym_client.demo.settings import DemoSettings
-    from surrogym_client.lifetime import exit_with_parent as watch_parent
+    from surrogym_client.experiments.demo.report import table
+    from surrogym_client.experiments.demo.run import run_demo
+    from surrogym_client.experiments.settings import DemoSettings
+    from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
     from surrogym_shared.terminal import give
 
     if exit_with_parent:

@@ -22,7 +22,7 @@ from surrogym_client.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from surrogym_client.doctor import Finding
+    from surrogym_client.diagnosis.doctor import Finding
 
 
 def register(app: typer.Typer) -> None:
@@ -50,7 +50,7 @@ def command(
     """
     from dataclasses import asdict
 
-    from surrogym_client.doctor import environment, installation, service
+    from surrogym_client.diagnosis.doctor import environment, installation, service
     from surrogym_shared.terminal import give
 
     def findings() -> Iterator[Finding]:

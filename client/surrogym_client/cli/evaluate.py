@@ -23,9 +23,9 @@ from surrogym_client.cli.options import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from surrogym_client.evaluate import Evaluation, EvaluationSettings, Progress
+    from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, Progress
     from surrogym_client.original.episodes import Episode
-    from surrogym_client.policy_file import PolicyCard
+    from surrogym_client.policies.files import PolicyCard
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
 
@@ -77,10 +77,10 @@ def command(
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 100
     """
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.evaluate import EvaluationInterrupted, EvaluationSettings, evaluate
-    from surrogym_client.lifetime import terminations_as_interrupts
+    from surrogym_client.evaluation.evaluator import EvaluationInterrupted, EvaluationSettings, evaluate
     from surrogym_client.original.errors import EvaluationFailed
-    from surrogym_client.policy_file import card_path, load_policy, read_card
+    from surrogym_client.policies.files import card_path, load_policy, read_card
+    from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_shared.terminal import give, progress, say
 
     card = read_card(policy)
@@ -157,7 +157,7 @@ def _telling(update: Update, episodes: int) -> Progress:
 
 def _ledger(surrogate: str | None, server: str | None, card: PolicyCard, noted_in: Path, *, quiet: bool) -> str | None:
     """The surrogate whose ledger gets the real steps; None where a card alone names its server, which is not asked."""
-    from surrogym_client.connection import DEFAULT_URL
+    from surrogym_client.transport.connection import DEFAULT_URL
     from surrogym_shared.terminal import say
 
     if surrogate or server or card.server is None or str(card.server).rstrip("/") == DEFAULT_URL:

@@ -10,7 +10,7 @@ import typer
 from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, TokenFile, connect, token_from
 
 if TYPE_CHECKING:
-    from surrogym_client.api import Api
+    from surrogym_client.transport.api import Api
 
 
 def register(app: typer.Typer) -> None:
@@ -62,7 +62,7 @@ def _content(api: Api, surrogate: str, out: Path) -> bytes:
 
     match out.suffix.lower():
         case ".surrogate":
-            from surrogym_client.surrogate_file import export_surrogate
+            from surrogym_client.surrogates.transfer import export_surrogate
 
             return export_surrogate(api, surrogate).to_bytes()
         case ".csv":

@@ -35,14 +35,14 @@ def command(
 
     Example: surrogym export-policy policy.zip --out policy.onnx
     """
-    from surrogym_client.policy_file import read_card
+    from surrogym_client.policies.files import read_card
     from surrogym_shared.terminal import give, on_interrupt, progress
 
     card = read_card(policy)
     stays = "interrupted; no checked file was written, and the same command begins anew"
     with on_interrupt(lambda: stays), progress("export", quiet=quiet) as update:
         update(0.0, "converting and checking")
-        from surrogym_client.policy_export import CHECKS, export_policy
+        from surrogym_client.policies.export import CHECKS, export_policy
 
         largest = export_policy(policy, out, algorithm or card.algorithm, trust=trust_policy)
         update(1.0, "done")

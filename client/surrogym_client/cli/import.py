@@ -32,7 +32,7 @@ def command(
 
     Example: surrogym import pendulum.surrogate --name pendulum-2
     """
-    from surrogym_client.surrogate_file import import_surrogate
+    from surrogym_client.surrogates.transfer import import_surrogate
     from surrogym_shared.surrogate_file import SurrogateFile
     from surrogym_shared.terminal import give, on_interrupt, progress
 

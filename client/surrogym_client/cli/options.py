@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 if TYPE_CHECKING:
-    from surrogym_client.api import Api
+    from surrogym_client.transport.api import Api
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import SurrogateView
 
@@ -24,9 +24,9 @@ QUICK = 1.0  # seconds a person waits for a server that is not there
 
 def names_of_surrogates(ctx: typer.Context, incomplete: str) -> list[str]:
     """What a shell completes a surrogate's name to; nothing where no server answers within a second."""
-    from surrogym_client.api import Api
-    from surrogym_client.connection import Retries, Timeouts, token_in
     from surrogym_client.errors import SurrogymClientError
+    from surrogym_client.transport.api import Api
+    from surrogym_client.transport.connection import Retries, Timeouts, token_in
 
     limits, at_once = Timeouts(connect=QUICK, request=QUICK), Retries(seconds=0)
     try:
@@ -85,9 +85,9 @@ def connect(server: str | None, token: str | None, wait: float = 0.0, *, quiet: 
     Raises:
         SurrogymClientError: it does not, or it is none.
     """
-    from surrogym_client.api import Api
-    from surrogym_client.connection import Retries
     from surrogym_client.errors import ServerUnreachable
+    from surrogym_client.transport.api import Api
+    from surrogym_client.transport.connection import Retries
 
     api = Api(server, token, retries=Retries(seconds=QUICK))
     if wait > 0:
@@ -109,7 +109,7 @@ def token_from(context: typer.Context, token: str | None, file: Path | None) -> 
         UnusableToken: the file does not hold one.
     """
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.connection import token_in
+    from surrogym_client.transport.connection import token_in
     from surrogym_shared.secret_files import open_to_others
     from surrogym_shared.terminal import say
 
@@ -132,7 +132,7 @@ def awaited_surrogate(api: Api, name: str, wait: float, *, quiet: bool) -> Surro
         UnknownSurrogate: it is not.
     """
     from surrogym_client.errors import UnknownSurrogate
-    from surrogym_client.waiting import wait_for_surrogate
+    from surrogym_client.surrogates.waiting import wait_for_surrogate
 
     try:
         return api.surrogate(name)

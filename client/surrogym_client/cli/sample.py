@@ -30,9 +30,9 @@ from surrogym_client.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from surrogym_client.api import Api
     from surrogym_client.original.protocol import Factory
-    from surrogym_client.sampler import Outcome, SamplerReport
+    from surrogym_client.sampler.worker import Outcome, SamplerReport
+    from surrogym_client.transport.api import Api
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import Query
 
@@ -73,10 +73,10 @@ def command(
 
     Example: surrogym sample pendulum --until-done
     """
-    from surrogym_client.lifetime import exit_with_parent as watch_parent
-    from surrogym_client.lifetime import terminations
     from surrogym_client.original.isolated import IsolatedEnvironment
-    from surrogym_client.sampler import Sampler, SamplerSettings, worker_name
+    from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
+    from surrogym_client.runtime.lifetime import terminations
+    from surrogym_client.sampler.worker import Sampler, SamplerSettings, worker_name
     from surrogym_shared.terminal import give, on_interrupt
 
     if exit_with_parent:
@@ -136,7 +136,7 @@ def _telling(api: Api, surrogate: str, *, quiet: bool) -> Iterator[Tell | None]:
                 update(share_of_design(view), words_of_design(view))
 
         from surrogym_client.errors import SurrogymClientError
-        from surrogym_client.waiting import share_of_design, words_of_design
+        from surrogym_client.surrogates.waiting import share_of_design, words_of_design
 
         view = api.surrogate(surrogate)
         update(share_of_design(view), words_of_design(view))
@@ -158,7 +158,7 @@ def _tell(query: Query, outcome: Outcome, error: str) -> None:
 
 
 def _words(surrogate: str, report: SamplerReport) -> str:
-    from surrogym_client.waiting import FINISHED, IN_WORDS
+    from surrogym_client.surrogates.waiting import FINISHED, IN_WORDS
 
     others = {"failed": report.failed, "dropped": report.dropped, "refused": report.refused}
     apart = "".join(f", {count} {outcome}" for outcome, count in others.items() if count)

@@ -13,7 +13,7 @@ from surrogym_client.cli.options import AsJson, Server, Token, TokenFile, connec
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from surrogym_client.api import Api
+    from surrogym_client.transport.api import Api
     from surrogym_shared.wire import OutputFidelity, SurrogateSummary, SurrogateView
 
 Form = Literal["json", "short", "words"]

@@ -30,7 +30,7 @@ from surrogym_client.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from surrogym_client.train import TrainProgress, TrainResult, TrainSettings
+    from surrogym_client.training.trainer import TrainProgress, TrainResult, TrainSettings
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
     from surrogym_shared.wire import SurrogateView
@@ -151,10 +151,10 @@ def command(
 
     Example: surrogym train pendulum --out policy.zip --seed 0
     """
-    from surrogym_client.budget import words_of_rounds
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.cli.train_words import words_of_result
-    from surrogym_client.lifetime import exit_with_parent as watch_parent
+    from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
+    from surrogym_client.surrogates.budget import words_of_rounds
+    from surrogym_client.training.words import words_of_result
     from surrogym_shared.terminal import give, on_interrupt, progress, say
     from surrogym_shared.wire import OF_PARTICLES
 
@@ -183,7 +183,9 @@ def command(
             say(words_of_rounds(api, surrogate, improve, rounds), quiet=quiet)
     with on_interrupt(lambda: NOTHING_YET), progress("prepare", quiet=quiet) as update:
         update(None, "importing Stable-Baselines3")
-        from surrogym_client.train import TrainSettings  # torch; imported once there is something to train on
+        from surrogym_client.training.trainer import (
+            TrainSettings,  # torch; imported once there is something to train on
+        )
 
     settings = TrainSettings(
         algorithm=algorithm,
@@ -233,8 +235,8 @@ def _given(**options: Any) -> dict[str, Any]:
 @contextmanager
 def _keeping(write_card: Callable[[TrainResult], object], asked: str) -> Iterator[None]:
     """Say after Ctrl-C what there is to go on with; a policy that was saved gets its card."""
-    from surrogym_client.cli.train_words import words_of_interruption
-    from surrogym_client.training import TrainingInterrupted
+    from surrogym_client.training.settings import TrainingInterrupted
+    from surrogym_client.training.words import words_of_interruption
     from surrogym_shared.terminal import say
 
     try:
@@ -254,7 +256,7 @@ def _trainable(
 ) -> tuple[EnvironmentSpec, str]:
     """Specification and server of a surrogate whose design is done; with ``wait``, torch is imported meanwhile."""
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.waiting import (
+    from surrogym_client.surrogates.waiting import (
         FINISHED,
         share_of_design,
         wait_for_design,
@@ -265,7 +267,7 @@ def _trainable(
     with connect(server, token, wait, quiet=quiet) as api:
         view = awaited_surrogate(api, surrogate, wait, quiet=quiet)
         if wait > 0:
-            import surrogym_client.train  # noqa: F401
+            import surrogym_client.training.trainer  # noqa: F401
 
             stays = "interrupted while the design goes on at the server; the same command waits again"
             with on_interrupt(lambda: stays), progress("design", quiet=quiet) as update:
@@ -285,7 +287,7 @@ def _trainable(
 @contextmanager
 def _recording(path: Path | None, update: Update) -> Iterator[Record]:
     """Shows progress, and writes it to a file for those who watch from outside."""
-    from surrogym_client.cli.train_words import words_of
+    from surrogym_client.training.words import words_of
 
     started = time.monotonic()
     with path.open("a", encoding="utf-8") if path is not None else nullcontext() as file:
@@ -312,10 +314,10 @@ def _train(
     quiet: bool,
 ) -> TrainResult:
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.improve import ImproveSettings, train_and_improve
-    from surrogym_client.train import train
-    from surrogym_client.training import chosen_for
-    from surrogym_client.transport import Api, HttpSurrogate
+    from surrogym_client.training.closed_loop import ImproveSettings, train_and_improve
+    from surrogym_client.training.settings import chosen_for
+    from surrogym_client.training.trainer import train
+    from surrogym_client.transport.http_surrogate import Api, HttpSurrogate
     from surrogym_shared.terminal import progress
 
     with (
@@ -335,15 +337,15 @@ def _train(
 
 def _waiting(update: Update) -> Callable[[SurrogateView], None]:
     """Shows a round's real steps while a sampler takes them; the bar stays where the training left it."""
-    from surrogym_client.waiting import words_of_design
+    from surrogym_client.surrogates.waiting import words_of_design
 
     return lambda view: update(None, f"waiting for a sampler (surrogym sample {view.name}): {words_of_design(view)}")
 
 
 def _write_card(result: TrainResult, surrogate: str, spec: EnvironmentSpec, url: str, seed: int) -> dict[str, Any]:
     """Write the policy's card; gives back the result as JSON."""
-    from surrogym_client.policy_file import NotedAddress, PolicyCard, write_card
-    from surrogym_client.versions import versions
+    from surrogym_client.policies.files import NotedAddress, PolicyCard, write_card
+    from surrogym_client.runtime.versions import versions
 
     card = PolicyCard(
         algorithm=result.algorithm,

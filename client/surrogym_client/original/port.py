@@ -7,7 +7,7 @@ from itertools import count
 
 import numpy as np
 
-from surrogym_client.evaluate import LONGEST_EPISODE, decode_actions
+from surrogym_client.evaluation.evaluator import LONGEST_EPISODE, decode_actions
 from surrogym_client.original.episodes import Episode, Moment, draw
 from surrogym_client.original.errors import NotParallel
 from surrogym_client.original.protocol import Array

@@ -12,7 +12,7 @@ from typing import Any
 
 from surrogym_client.report.figures import draw_fidelity, draw_maps, draw_samples, svg
 from surrogym_client.report.maps import Cut
-from surrogym_client.versions import versions
+from surrogym_client.runtime.versions import versions
 from surrogym_shared.wire import ModelView, SampleView, SurrogateView
 
 STYLE = """

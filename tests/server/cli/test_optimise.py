@@ -9,7 +9,7 @@ import pytest
 
 from support.real_steps import random_steps
 from surrogym_client.original.classic import cartpole, pendulum
-from surrogym_client.policy_file import read_card
+from surrogym_client.policies import read_card
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.surrogate.codec import to_bytes
 from surrogym_server.surrogate.learn import learn

@@ -11,8 +11,8 @@ import typer
 from surrogym_client.cli.options import AsJson, Quiet
 
 if TYPE_CHECKING:
-    from surrogym_client.reproduce.cells import Progress
-    from surrogym_client.reproduce.rows import Row
+    from surrogym_client.experiments.reproduce.cells import Progress
+    from surrogym_client.experiments.reproduce.rows import Row
 
 
 STUDY = "study"
@@ -54,11 +54,11 @@ def command(
     """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.cli.reproduce.table import present
-    from surrogym_client.demo.arms import ARMS
-    from surrogym_client.demo.tasks import TASKS
-    from surrogym_client.lifetime import terminations_as_interrupts
-    from surrogym_client.reproduce.cells import cells, done_already, run_cells, study
-    from surrogym_client.reproduce.rows import read_rows
+    from surrogym_client.experiments.arms import ARMS
+    from surrogym_client.experiments.reproduce.cells import cells, done_already, run_cells, study
+    from surrogym_client.experiments.reproduce.rows import read_rows
+    from surrogym_client.experiments.tasks import TASKS
+    from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_shared.terminal import on_interrupt, progress, say
 
     named, numbers = _chosen("task", tasks, TASKS), range(first_seed, first_seed + seeds)

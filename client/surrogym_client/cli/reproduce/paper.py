@@ -39,8 +39,8 @@ def command(
 
     from surrogym_client.cli.columns import columns
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.reproduce.paper import run_cells, tables
-    from surrogym_client.reproduce.paper_cases import QUICK, TASKS, WHOLE, cells
+    from surrogym_client.experiments.reproduce.paper import run_cells, tables
+    from surrogym_client.experiments.reproduce.paper_cases import QUICK, TASKS, WHOLE, cells
     from surrogym_shared.terminal import give, on_interrupt, progress
 
     chosen = tasks.split(",")

@@ -11,7 +11,7 @@ import typer
 from surrogym_client.cli.options import AsJson, Quiet
 
 if TYPE_CHECKING:
-    from surrogym_client.reproduce.rows import Row
+    from surrogym_client.experiments.reproduce.rows import Row
 
 
 def register(app: typer.Typer) -> None:
@@ -35,8 +35,8 @@ def command(
     Example: surrogym reproduce table --rows night/rows.csv --rows day/rows.csv --out runs/table
     """
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.reproduce.page import update
-    from surrogym_client.reproduce.rows import merge, read_rows, write_rows
+    from surrogym_client.experiments.reproduce.page import update
+    from surrogym_client.experiments.reproduce.rows import merge, read_rows, write_rows
     from surrogym_shared.terminal import give
 
     if missing := [path for path in rows if not path.exists()]:
@@ -54,12 +54,12 @@ def command(
 def present(rows: Sequence[Row], out: Path, *, as_json: bool, quiet: bool) -> None:
     """Write table and pictures of rows, and show the table."""
     from surrogym_client.cli.columns import fitted
-    from surrogym_client.reproduce.table import report
+    from surrogym_client.experiments.reproduce.table import report
     from surrogym_shared.terminal import give, progress
 
     with progress("table", quiet=quiet) as update:
         update(0.0, f"drawing {len(rows)} rows")
-        from surrogym_client.reproduce.pictures import draw_tasks
+        from surrogym_client.experiments.reproduce.pictures import draw_tasks
 
         text = report(rows)
         (out / "efficiency.md").write_text(text, encoding="utf-8")

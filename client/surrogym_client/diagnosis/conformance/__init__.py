@@ -1,0 +1,50 @@
+"""What any server of this protocol must do, checked from outside: one small surrogate is made, used and deleted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from surrogym_client.diagnosis.conformance import leases, sessions
+from surrogym_client.diagnosis.conformance.target import Mismatch, Target
+from surrogym_client.errors import SurrogymClientError
+
+Check = Callable[[Target], None]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One check. ``failure`` says what was expected and what came; None where it passed."""
+
+    name: str
+    failure: str | None
+
+
+def conformance(url: str | None, token: str | None, surrogate: str) -> Iterator[Outcome]:
+    """Run every check in turn.
+
+    Args:
+        url: the server's address; default ``SURROGYM_URL``, then http://127.0.0.1:8000.
+        token: of the role admin, where the server has tokens.
+        surrogate: name that is free on the server; the surrogate is deleted at the end.
+
+    Raises:
+        SurrogymClientError: the name is taken, or the surrogate gets no model, so that nothing can be checked.
+    """
+    with Target(url, token, surrogate) as target:
+        for check in leases.CHECKS:
+            yield _outcome(check, target)
+        target.teach()
+        for check in sessions.CHECKS:
+            yield _outcome(check, target)
+
+
+def _outcome(check: Check, target: Target) -> Outcome:
+    name = check.__name__.replace("_", " ")
+    try:
+        check(target)
+    except (Mismatch, SurrogymClientError) as failure:
+        return Outcome(name, str(failure))
+    except (LookupError, TypeError, ValueError) as failure:  # a reply without the fields of the protocol
+        return Outcome(name, f"expected a reply of the protocol, got one that gives {failure!r}")
+    return Outcome(name, None)

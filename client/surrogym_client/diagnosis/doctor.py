@@ -1,0 +1,146 @@
+"""What stands between a person and a first step: one finding for each thing that has to be in place."""
+
+from __future__ import annotations
+
+import platform
+import statistics
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import version
+from importlib.util import find_spec
+
+import numpy as np
+
+from surrogym_client.cli.errors import EXTRAS, GIVE_TOKEN, START_SERVER
+from surrogym_client.errors import ProblemError, ProtocolMismatch, Refused, ServerUnreachable, SurrogymClientError
+from surrogym_client.original.episodes import draw
+from surrogym_client.original.errors import OriginalError, StepFailed
+from surrogym_client.original.isolated import IsolatedEnvironment
+from surrogym_client.original.protocol import Array, Factory, RealStep
+from surrogym_client.runtime.versions import versions
+from surrogym_client.sampler.sample_conversion import sample_of
+from surrogym_client.transport.api import Api
+from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_shared.wire import PROTOCOL, StepQuery
+
+ROUND_TRIPS = 20
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at. ``way_out`` says what to do about a problem; None where there is none."""
+
+    name: str
+    said: str
+    way_out: str | None = None
+
+
+def installation() -> Iterator[Finding]:
+    """Python, and the packages that this program was started with."""
+    yield Finding("python", f"{platform.python_version()} on {platform.system()} {platform.machine()}")
+    packages = ", ".join(f"{name} {number}" for name, number in versions().items() if name != "python")
+    lacking = [extra for extra, modules in EXTRAS.items() if not all(find_spec(module) for module in modules)]
+    without = f"; not installed: {', '.join(f'surrogym[{extra}]' for extra in lacking)}" if lacking else ""
+    yield Finding("packages", packages + without)
+
+
+def service(api: Api) -> Iterator[Finding]:
+    """The server: whether it answers, is ready, speaks this protocol, and lets this token in; and how far away it is.
+
+    What depends on a finding with a problem is left out.
+    """
+    try:
+        health = api.health()
+    except ProtocolMismatch as error:
+        yield Finding("server", str(error), f"install a surrogym of protocol {PROTOCOL} on both sides")
+        return
+    except ServerUnreachable as error:
+        yield Finding("server", str(error), START_SERVER)
+        return
+    ours = version("surrogym")
+    same = "" if health.version == ours else f"; this client is {ours}"
+    yield Finding("server", f"surrogym {health.version} at {api.url}, protocol {health.protocol}{same}")
+    try:
+        yield Finding("ready", f"storage {api.ready().storage}")
+    except (ProblemError, ServerUnreachable) as error:
+        yield Finding("ready", str(error), "its database does not answer: see the server's log")
+    yield _access(api)
+    yield _round_trip(api)
+
+
+def environment(factory: Factory, step_limit: float) -> Iterator[Finding]:
+    """The original environment: whether it can be made and takes a step; the step is real, and in no ledger."""
+    try:
+        with IsolatedEnvironment(factory, step_limit) as original:
+            spec = original.spec()
+            names = ", ".join(spec.coordinate_names)
+            yield Finding("environment", f"coordinates ({names}), {spec.action.kind} action, {spec.query} queries")
+            yield _one_step(original, spec)
+    except OriginalError as error:
+        yield Finding("environment", str(error), "see docs/how-to/own-environment.md for what an environment needs")
+
+
+def _access(api: Api) -> Finding:
+    try:
+        access = api.access()
+    except Refused as error:
+        return Finding("token", str(error), GIVE_TOKEN)
+    except SurrogymClientError as error:
+        return Finding("token", str(error), "bring server and client to the same version")
+    return Finding("token", f"role {access.role}" if access.tokens else "none needed: everybody is admin here")
+
+
+def _round_trip(api: Api) -> Finding:
+    try:
+        seconds = sorted(_timed(api) for _ in range(ROUND_TRIPS))
+    except SurrogymClientError as error:
+        return Finding("round trip", str(error), START_SERVER)
+    median, worst = 1_000 * statistics.median(seconds), 1_000 * seconds[-1]
+    return Finding("round trip", f"median {median:.2g} ms, longest {worst:.2g} ms of {ROUND_TRIPS}")
+
+
+def _timed(api: Api) -> float:
+    started = time.perf_counter()
+    api.health()
+    return time.perf_counter() - started
+
+
+def _one_step(original: IsolatedEnvironment, spec: EnvironmentSpec) -> Finding:
+    """A step from anywhere in the sampling range; from a reset where no state can be set."""
+    start, action = draw(spec, np.random.default_rng(0), wide=True), _middle(spec)
+    begun = time.perf_counter()
+    try:
+        if spec.query == "rollout":
+            start = original.begin(0)
+            step = original.act(action)
+        else:
+            step = original.step_from(start, action)
+        seconds = time.perf_counter() - begun
+        _check(step, start, action)
+    except StepFailed as error:
+        return Finding("step", str(error), "a sampler would fail in the same way: mend the environment first")
+    return Finding("step", f"one real step in {1_000 * seconds:.2g} ms, reward {float(step.reward):.4g}")
+
+
+def _check(step: RealStep, start: Array, action: Array) -> None:
+    """Raises ``StepFailed`` for a step that no sampler could hand in."""
+    query = StepQuery(
+        id=1,
+        number=0,
+        purpose="manual",
+        attempt=1,
+        lease_token="none",
+        lease_seconds=1.0,
+        coordinates=start.tolist(),
+        action=action.tolist(),
+    )
+    sample_of(query, step, len(start))
+
+
+def _middle(spec: EnvironmentSpec) -> Array:
+    """The action (F,) in the middle of the bounds; of discrete ones the first."""
+    if isinstance(spec.action, BoxAction):
+        middle: Array = (np.array(spec.action.low) + np.array(spec.action.high)) / 2
+        return middle
+    return np.zeros(spec.action.size)

@@ -1,0 +1,119 @@
+"""RemoteEnv: one lane of a surrogate as a Gymnasium environment."""
+
+from __future__ import annotations
+
+from typing import Any, SupportsFloat
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.environments.lanes import LaneReset, Lanes, LaneStep, session_request
+from surrogym_client.environments.pictures import RENDER_MODES, metadata_of, pictures_for
+from surrogym_client.environments.spaces import space
+from surrogym_client.original.rendering import Picture
+from surrogym_shared.port import SurrogatePort
+
+LOST = "surrogym_session_lost"
+
+Observation = NDArray[np.float32]
+
+
+class RemoteEnv(gymnasium.Env[Observation, Any]):
+    """A learned virtual environment, stepped like any Gymnasium environment.
+
+    ``reset(seed=s)`` starts episode 0 of the seed, ``reset()`` goes on to the next episode. The time
+    limit is the server's; it shows as ``truncated``. ``info`` carries ``model_version`` and, after a
+    step, ``reward_mean`` (the reward before the penalty) and ``deviation`` (O,) when asked for. In a
+    session with a trust region, ``untrusted`` says whether leaving it truncated the episode. When the
+    server has lost the session, the episode ends as truncated with the reason in
+    ``info["surrogym_session_lost"]``, and the next reset begins in a new session.
+
+    Args:
+        port: the surrogate.
+        deviations: ask for the deviation of each model output.
+        render_mode: None, or rgb_array: the state is shown by the original environment's renderer, if it is installed.
+        original: ``package.module:factory`` of one's own environment, to render it.
+        options: fields of ``OpenSession``: variant, seed, model, time_limit, penalty, ...
+
+    Raises:
+        TypeError: an unknown option.
+        ValueError: an option is out of range.
+        NotRenderable: no picture can be made.
+        SurrogymClientError: the session can't be opened.
+
+    Example:
+        >>> env = gymnasium.make("surrogym/Remote-v0", url="http://127.0.0.1:8000", surrogate="pendulum")
+        >>> observation, info = env.reset(seed=0)
+    """
+
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES}  # noqa: RUF012  as gymnasium.Env declares it
+
+    def __init__(
+        self,
+        port: SurrogatePort,
+        *,
+        deviations: bool = False,
+        render_mode: str | None = None,
+        original: str | None = None,
+        **options: Any,
+    ) -> None:
+        request, spec = session_request(1, "disabled", options), port.spec()
+        self.render_mode = render_mode
+        self._pictures = pictures_for(render_mode, spec, original)
+        self._shown: Observation | None = None
+        self.metadata = metadata_of(spec, original, self._pictures)
+        self._lanes = Lanes(port, request, deviations=deviations)
+        self.observation_space = space(self._lanes.view.observation_space)
+        self.action_space = space(self._lanes.view.action_space)
+
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,  # noqa: ARG002  a surrogate has none
+    ) -> tuple[Observation, dict[str, Any]]:
+        super().reset(seed=seed)
+        start = self._lanes.reset(seed)
+        self._shown = start.observation[0]
+        return self._shown, start_info(start, 0)
+
+    def step(self, action: Any) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
+        step = self._lanes.step(np.asarray(action)[None])
+        result = step.result
+        terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
+        self._shown = result.observation[0]
+        return self._shown, float(result.reward[0]), terminated, truncated, step_info(step, 0)
+
+    def render(self) -> Picture | None:
+        """The picture (height, width, 3) of the state that was last observed; None without a render mode."""
+        return None if self._pictures is None else self._pictures.of(self._shown)
+
+    def close(self) -> None:
+        if self._pictures is not None:
+            self._pictures.close()
+        self._lanes.close()
+
+
+def start_info(start: LaneReset, lane: int) -> dict[str, Any]:
+    """The info of one lane's reset."""
+    info: dict[str, Any] = {"model_version": int(start.model_version[lane])}
+    if start.lost is not None:
+        info[LOST] = start.lost
+    return info
+
+
+def step_info(step: LaneStep, lane: int) -> dict[str, Any]:
+    """The info of one lane's step."""
+    result = step.result
+    info: dict[str, Any] = {
+        "model_version": int(result.model_version[lane]),
+        "reward_mean": float(result.reward_mean[lane]),
+    }
+    if result.deviation is not None:
+        info["deviation"] = result.deviation[lane]
+    if result.untrusted is not None:
+        info["untrusted"] = bool(result.untrusted[lane])
+    if step.cut[lane]:
+        info[LOST] = step.lost
+    return info

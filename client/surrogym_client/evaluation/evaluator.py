@@ -1,0 +1,314 @@
+"""What a policy is worth in the original environment: real episodes, counted and judged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.original.episodes import Episode, Moment, draw
+from surrogym_client.original.errors import EvaluationFailed, PolicyMisfit
+from surrogym_client.original.terms import holds
+from surrogym_client.runtime.lifetime import signals_between_steps
+from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction, Success
+
+Array = NDArray[np.float64]
+Predict = Callable[[NDArray[np.float32]], NDArray[Any]]  # observations (N, D) -> actions (N,) or (N, F)
+
+Progress = Callable[[float, int], None]  # share done in [0, 1], episodes that terminated
+
+FIRST_SEED = 10_000
+LONGEST_EPISODE = 1_000  # where the specification has no time limit
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """How many episodes, from which starts, of how many machines.
+
+    ``wide`` starts anywhere in the sampling range, ``start_scale`` spreads the declared starts so many times as far
+    about their middle; ``perturb`` is the deviation of physical attributes. ``parallel`` is how many instances of the
+    environment are open at once; None takes one for each episode if the environment declares that it runs in parallel,
+    and a single one otherwise.
+    """
+
+    episodes: int = 100
+    first_seed: int = FIRST_SEED
+    wide: bool = False
+    start_scale: float = 1.0
+    perturb: float = 0.0
+    parallel: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1 or (self.parallel is not None and self.parallel < 1):
+            raise ValueError(f"expected 1 episode and 1 instance at least, got {self.episodes} and {self.parallel}")
+        if self.wide and self.start_scale != 1:
+            raise ValueError("expected starts over the whole range or scaled ones, got both")
+
+
+@dataclass(frozen=True)
+class Trace:
+    """The first episode, step by step."""
+
+    coordinates: Array  # (T + 1, C)
+    action: Array  # (T, F)
+    reward: Array  # (T,)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What N episodes gave."""
+
+    returns: Array  # (N,)
+    lengths: NDArray[np.int64]  # (N,)
+    success: NDArray[np.bool_] | None  # (N,); None where the specification has no criterion
+    trace: Trace
+
+    @property
+    def steps(self) -> int:
+        """Real steps taken."""
+        return int(self.lengths.sum())
+
+    @property
+    def success_rate(self) -> float | None:
+        return None if self.success is None else float(self.success.mean())
+
+    def summary(self) -> dict[str, Any]:
+        """As JSON: statistics of the return, and every episode."""
+        return {
+            "mean": float(self.returns.mean()),
+            "iqm": interquartile_mean(self.returns),
+            "min": float(self.returns.min()),
+            "max": float(self.returns.max()),
+            "std": float(self.returns.std()),
+            "episodes": len(self.returns),
+            "mean_length": float(self.lengths.mean()),
+            "success_rate": self.success_rate,
+            "steps": self.steps,
+            "per_episode": [float(r) for r in self.returns],
+        }
+
+
+class EvaluationInterrupted(KeyboardInterrupt):
+    """Ctrl-C came in an evaluation; ``steps`` real steps had been begun."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self.steps = steps
+
+
+def evaluate(
+    policy: Predict,
+    open_episode: Callable[[], Episode],
+    settings: EvaluationSettings | None = None,
+    progress: Progress | None = None,
+) -> Evaluation:
+    """Run N real episodes, each by one instance of the environment from its start to its end.
+
+    An environment that declares nothing has one instance, which runs the episodes one after the other. Where several
+    are open, the policy is asked once for all that are running. Ctrl-C takes effect between two steps, a second one at
+    once; every instance is closed on every way out.
+
+    Args:
+        policy: observations (N, D) to actions.
+        open_episode: opens one instance.
+        settings: how many, from which starts.
+        progress: called after every step.
+
+    Returns:
+        returns and successes by episode, in the order of their seeds. How many instances ran changes them only as far
+        as the policy answers a batch of observations otherwise than one by one, usually in the last bits.
+
+    Raises:
+        PolicyMisfit: the policy gave actions that are not the environment's; nothing was sent.
+        EvaluationFailed: the environment or the policy raised after real steps, which count all the same.
+        EvaluationInterrupted: Ctrl-C came; its real steps count all the same.
+    """
+    run = _Run(policy, settings or EvaluationSettings(), progress)
+    try:
+        with signals_between_steps() as heed, ExitStack() as instances:
+            return run.on(_open(open_episode, run.settings, instances), heed)
+    except KeyboardInterrupt:
+        raise EvaluationInterrupted(run.begun) from None
+    except Exception as error:
+        if run.begun == 0:
+            raise
+        raise EvaluationFailed(run.begun, error) from error
+
+
+def _open(open_episode: Callable[[], Episode], settings: EvaluationSettings, instances: ExitStack) -> list[Episode]:
+    """As many instances as may be open at once, at most one for each episode; ``instances`` closes them."""
+
+    def open_one() -> Episode:
+        episode = open_episode()
+        instances.callback(episode.close)
+        return episode
+
+    first = open_one()
+    allowed = settings.parallel or (settings.episodes if first.parallel else 1)
+    return [first, *(open_one() for _ in range(min(allowed, settings.episodes) - 1))]
+
+
+def interquartile_mean(values: Array) -> float:
+    """Mean of the middle half of values (n,)."""
+    cut = len(values) // 4
+    return float(np.sort(values)[cut : len(values) - cut].mean())
+
+
+def decode_actions(spec: EnvironmentSpec, raw: NDArray[Any], lanes: int) -> Array:
+    """A policy's actions as the environment takes them, (N, F); the bins of a continuous action are undone.
+
+    Raises:
+        ValueError: wrong shape.
+    """
+    rows = np.asarray(raw, dtype=np.float64)
+    if rows.size != lanes * spec.action.size:
+        raise ValueError(f"expected actions of shape ({lanes}, {spec.action.size}), got {np.shape(raw)}")
+    rows = rows.reshape(lanes, spec.action.size)
+    if isinstance(spec.action, BoxAction) and spec.action.bins is None:
+        if not np.isfinite(rows).all():
+            raise ValueError(f"expected finite actions, got {rows.tolist()}")
+        return np.clip(rows, spec.action.low, spec.action.high)
+    counts = np.array(_counts(spec.action))
+    if not ((rows >= 0) & (rows < counts) & (rows == np.round(rows))).all():
+        raise ValueError(f"expected whole numbers from 0 to below {counts.tolist()}, got {rows.tolist()}")
+    if not isinstance(spec.action, BoxAction):
+        return rows
+    low, high = np.array(spec.action.low), np.array(spec.action.high)
+    return np.asarray(low + rows * (high - low) / (counts - 1))
+
+
+def _counts(action: BoxAction | DiscreteAction | MultiDiscreteAction) -> tuple[int, ...]:
+    """How many values a policy chooses from in each dimension."""
+    match action:
+        case BoxAction(bins=bins):
+            return bins or ()
+        case DiscreteAction(n=n):
+            return (n,)
+        case MultiDiscreteAction(nvec=nvec):
+            return nvec
+
+
+@dataclass
+class _Tally:
+    """One episode's account, begun where ``episode`` stands."""
+
+    episode: Episode
+    moment: Moment
+    total: float = 0.0
+    length: int = 0
+    held: int = 0  # steps in a row for which the success criterion has held
+    limit: int = field(init=False)
+    path: list[Array] = field(default_factory=list)
+    actions: list[Array] = field(default_factory=list)
+    rewards: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.limit = self.episode.spec.time_limit or LONGEST_EPISODE
+        self.path.append(self.moment.coordinates)
+
+    @property
+    def over(self) -> bool:
+        return self.moment.terminated or self.moment.truncated or self.length >= self.limit
+
+    def step(self, action: Array) -> None:
+        """Take one real step."""
+        self.moment = moment = self.episode.step(action)
+        self.total += moment.reward
+        self.length += 1
+        self.held = self.held + 1 if _holds(self.episode.spec, moment.coordinates) else 0
+        self.path.append(moment.coordinates)
+        self.actions.append(action)
+        self.rewards.append(moment.reward)
+
+
+class _Run:
+    """Episodes in the order of their seeds, each begun as soon as an instance is free."""
+
+    def __init__(self, policy: Predict, settings: EvaluationSettings, progress: Progress | None) -> None:
+        self.settings = settings
+        self.begun = 0  # real steps: each was taken, or interrupted, or it failed
+        self._policy = policy
+        self._progress = progress
+        self._tallies: list[_Tally] = []
+
+    def on(self, instances: Sequence[Episode], between_steps: Callable[[], None]) -> Evaluation:
+        """Run all of them."""
+        free, running = list(instances), list[_Tally]()
+        while running or len(self._tallies) < self.settings.episodes:
+            running += self._begin(free)
+            self._step(running)
+            free = [tally.episode for tally in running if tally.over]
+            if free:
+                running = [tally for tally in running if not tally.over]
+            self._tell()
+            between_steps()
+        return _account(self._tallies)
+
+    def _begin(self, free: Sequence[Episode]) -> list[_Tally]:
+        """The next episodes, one by each free instance; none where all have begun."""
+        first = len(self._tallies)
+        begun = [
+            _Tally(episode, _start(episode, self.settings, first + i))
+            for i, episode in enumerate(free[: self.settings.episodes - first])
+        ]
+        self._tallies += begun
+        return begun
+
+    def _step(self, running: Sequence[_Tally]) -> None:
+        for tally, action in zip(running, self._actions(running), strict=True):
+            self.begun += 1
+            tally.step(action)
+
+    def _actions(self, running: Sequence[_Tally]) -> Array:
+        """The policy's actions (N, F)."""
+        observations = np.stack([tally.moment.observation for tally in running]).astype(np.float32)
+        try:
+            return decode_actions(running[0].episode.spec, self._policy(observations), len(running))
+        except ValueError as error:
+            raise PolicyMisfit(f"the policy does not fit the environment: {error}") from error
+
+    def _tell(self) -> None:
+        if self._progress is not None:
+            shares = (1.0 if tally.over else tally.length / tally.limit for tally in self._tallies)
+            terminated = sum(tally.moment.terminated for tally in self._tallies)
+            self._progress(sum(shares) / self.settings.episodes, terminated)
+
+
+def _start(episode: Episode, settings: EvaluationSettings, index: int) -> Moment:
+    seed = settings.first_seed + index
+    rng = np.random.default_rng(seed)
+    if settings.perturb > 0:
+        episode.perturb(rng, settings.perturb)
+    if settings.wide or settings.start_scale != 1:
+        return episode.place(draw(episode.spec, rng, wide=settings.wide, scale=settings.start_scale))
+    return episode.reset(seed)
+
+
+def _account(tallies: Sequence[_Tally]) -> Evaluation:
+    first, criterion = tallies[0], tallies[0].episode.spec.success
+    return Evaluation(
+        returns=np.array([t.total for t in tallies]),
+        lengths=np.array([t.length for t in tallies], dtype=np.int64),
+        success=None if criterion is None else np.array([_succeeds(criterion, t) for t in tallies]),
+        trace=Trace(np.stack(first.path), np.stack(first.actions), np.array(first.rewards)),
+    )
+
+
+def _holds(spec: EnvironmentSpec, coordinates: Array) -> bool:
+    if spec.success is None:
+        return False
+    return all(bool(holds(spec, inequality, coordinates[None])[0]) for inequality in spec.success.hold)
+
+
+def _succeeds(success: Success, tally: _Tally) -> bool:
+    """Every criterion that is given."""
+    return (
+        (not success.hold or tally.held >= success.hold_steps)
+        and (success.min_steps is None or tally.length >= success.min_steps)
+        and (success.terminated is None or tally.moment.terminated == success.terminated)
+        and (success.min_return is None or tally.total >= success.min_return)
+    )

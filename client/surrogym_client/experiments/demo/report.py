@@ -1,0 +1,123 @@
+"""What a demo found out: as JSON for programs, as a table for people."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from surrogym_client.evaluation.evaluator import Evaluation
+from surrogym_client.experiments.demo.judging import Judgement
+from surrogym_client.experiments.demo.learning import Learned
+from surrogym_client.experiments.settings import DemoSettings, fingerprint
+from surrogym_client.policies.files import PolicyCard, read_card
+from surrogym_client.runtime.versions import machine, versions
+from surrogym_client.surrogates.waiting import IN_WORDS
+
+BY_RUN = (
+    "seed",
+    "start_from",
+    "tensorboard",
+    "tensorboard_log",
+    "total_steps",
+    "tracker",
+)  # differ between runs of one kind
+
+
+def metrics_of(
+    settings: DemoSettings, learned: Learned, judgement: Judgement, seconds: dict[str, float]
+) -> dict[str, Any]:
+    """Every number of one run, JSON-able."""
+    card, real, also = read_card(learned.policy), judgement.real, judgement.also
+    return {
+        "task": settings.task,
+        "arm": settings.arm,
+        "seed": settings.seed,
+        "budget": settings.real_steps,
+        "environment": settings.demo_task.environment,
+        "real_queries": learned.real_queries,
+        "evaluation_steps": judgement.steps,
+        "confidence_index": learned.confidence_index,
+        "fidelity": learned.fidelity,
+        "phase": learned.phase,
+        "virtual_steps": card.virtual_steps,
+        "seconds": {phase: round(value, 3) for phase, value in seconds.items()},
+        "real_return": _returns(real),
+        "success_rate": real.success_rate,
+        "mean_length": float(real.lengths.mean()),
+        "imagined_return": card.imagined_return,
+        "returns": real.returns.tolist(),
+        "lengths": real.lengths.tolist(),
+        "also": None if also is None else {**_returns(also), "success_rate": also.success_rate},
+        "target": settings.demo_task.target.words,
+        "reached": judgement.reached,
+        "settings": {"algorithm": card.algorithm, **card.settings},
+        "demo": asdict(settings),
+        "specification": fingerprint(settings.asked()),
+        "configuration": fingerprint({"asked": settings.asked(), "training": _training(card)}),
+        "machine": machine(),
+        "versions": versions(),
+    }
+
+
+def table(metrics: dict[str, Any], folder: Path) -> str:
+    """The result for a person, two columns."""
+    real, returns, index = metrics["real_queries"], metrics["real_return"], metrics["confidence_index"]
+    design = IN_WORDS.get(metrics["phase"], metrics["phase"])
+    arm = "" if metrics["arm"] == "default" else f", arm {metrics['arm']}"
+    rows = [
+        ("task", f"{metrics['task']} ({metrics['environment']}), seed {metrics['seed']}{arm}"),
+        ("real queries", f"{real['total']}: {real['initial']} initial, {real['adaptive']} adaptive"),
+        ("real steps of evaluation", str(metrics["evaluation_steps"])),
+        (
+            "confidence index",
+            "-" if index is None else f"{index:.4f}, {design}",
+        ),
+        ("virtual steps", str(metrics["virtual_steps"])),
+        ("seconds", _seconds(metrics["seconds"])),
+        (
+            f"real return, {returns['episodes']} starts",
+            ", ".join(f"{key} {_number(returns[key])}" for key in ("mean", "iqm", "min", "max")),
+        ),
+        ("imagined return", _number(metrics["imagined_return"])),
+        ("success", _share(metrics["success_rate"])),
+        *_also(metrics),
+        ("target", f"{metrics['target']}: {'reached' if metrics['reached'] else 'not reached'}"),
+        ("run folder", str(folder)),
+    ]
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"  {name.ljust(width)}  {value}" for name, value in rows)
+
+
+def _returns(result: Evaluation) -> dict[str, Any]:
+    summary = result.summary()
+    return {key: summary[key] for key in ("mean", "iqm", "min", "max", "std", "episodes")}
+
+
+def _training(card: PolicyCard) -> dict[str, Any]:
+    return {name: value for name, value in card.settings.items() if name not in BY_RUN}
+
+
+def _also(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    from surrogym_client.experiments.tasks import TASKS
+
+    also, starts = metrics["also"], TASKS[metrics["task"]].also
+    if also is None or starts is None:
+        return []
+    return [(starts.words, f"mean {_number(also['mean'])}, success {_share(also['success_rate'])}")]
+
+
+def _seconds(seconds: dict[str, float]) -> str:
+    phases = [f"{seconds[phase]:.1f} {phase}" for phase in ("design", "train", "evaluate") if phase in seconds]
+    return f"{', '.join(phases)}, {seconds['total']:.1f} in all"
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.0f} %"
+
+
+def _number(value: float | None) -> str:
+    """A return as people read it: small ones keep their digits."""
+    if value is None:
+        return "-"
+    return f"{value:.1f}" if abs(value) >= 10 else f"{value:.3g}"

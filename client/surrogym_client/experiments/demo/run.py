@@ -1,0 +1,103 @@
+"""The demo from its first process to its run folder."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+from surrogym_client.cli.errors import CommandError
+from surrogym_client.experiments.demo.judging import Judgement, judge
+from surrogym_client.experiments.demo.learning import Learned, SurrogateRun
+from surrogym_client.experiments.demo.report import metrics_of
+from surrogym_client.experiments.processes import Children
+from surrogym_client.experiments.settings import DemoSettings
+from surrogym_client.runtime.lifetime import terminations_as_interrupts
+from surrogym_client.runtime.versions import commit
+from surrogym_shared.terminal import on_interrupt, say
+
+
+class Run(Protocol):
+    """One way to a policy."""
+
+    def learn(self) -> Learned:
+        """Learn a policy, and say what that took."""
+        ...
+
+    def keep(self, judgement: Judgement) -> None:
+        """Enter what the evaluation took, and put what there is to see into the run folder."""
+        ...
+
+    def linger(self) -> None:
+        """Leave running what a person may want to look at, until Ctrl-C."""
+        ...
+
+
+def run_demo(
+    settings: DemoSettings,
+    out: Path | None = None,
+    tell: Callable[[dict[str, Any], Path], None] | None = None,
+    *,
+    quiet: bool = False,
+) -> None:
+    """Run the whole loop, then ``tell`` the metrics, which also lie in the run folder, and where that is.
+
+    Raises:
+        CommandError: the folder is not empty, or a process ended badly; says which, its last words and its log.
+        SurrogymClientError: the server refused, or the design failed.
+    """
+    started, code = time.monotonic(), commit()
+    folder = _empty_folder(out or _new_folder(settings))
+    with terminations_as_interrupts(), on_interrupt(partial(_what_stays, folder)), Children(folder) as children:
+        run = _run(settings, folder, children, quiet=quiet)
+        learned = run.learn()
+        judging = time.monotonic()
+        judgement = judge(settings, learned.policy, quiet=quiet)
+        keeping = time.monotonic()
+        run.keep(judgement)
+        now = time.monotonic()
+        seconds = {"evaluate": keeping - judging, "report": now - keeping, "total": now - started}
+        metrics = metrics_of(settings, learned, judgement, learned.seconds | seconds)
+        metrics["commit"] = code if code == commit() else f"{code} to {commit()}"
+        (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+        if tell is not None:
+            tell(metrics, folder)
+        if settings.keep:
+            run.linger()
+        elif (database := _database(folder)).exists():
+            say(f"next: surrogym serve --database {database}, and look at its page", quiet=quiet)
+
+
+def _run(settings: DemoSettings, folder: Path, children: Children, *, quiet: bool) -> Run:
+    if settings.way.original:
+        from surrogym_client.experiments.demo.oracle import OriginalRun  # torch
+
+        return OriginalRun(settings, folder, quiet=quiet)
+    return SurrogateRun(settings, folder, children, quiet=quiet)
+
+
+def _new_folder(settings: DemoSettings) -> Path:
+    arm = "" if settings.arm == "default" else f"-{settings.arm}"
+    return Path("runs") / f"{settings.task}{arm}-seed{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def _empty_folder(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    if any(folder.iterdir()):
+        raise CommandError(f"expected an empty run folder, got {folder}, where there is something already")
+    return folder.resolve()
+
+
+def _what_stays(folder: Path) -> str:
+    """What there is to go on with after an interruption."""
+    database, policy = _database(folder), folder / "policy.zip"
+    kept = [f"the real samples (surrogym serve --database {database})"] if database.exists() else []
+    kept += [f"the policy so far ({policy})"] if policy.exists() else []
+    return f"interrupted; all processes have ended; kept in {folder}: {' and '.join(kept) or 'logs alone'}"
+
+
+def _database(folder: Path) -> Path:
+    return folder / "surrogym.db"

@@ -1,0 +1,231 @@
+"""Cells: one demo each, in processes of their own, several at once; a cell whose row is there is not run again."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surrogym_client.experiments.arms import ARMS
+from surrogym_client.experiments.reproduce.rows import Key, Row, merge, row_of, write_rows
+from surrogym_client.experiments.settings import DemoSettings, fingerprint
+from surrogym_client.experiments.tasks import TASKS
+from surrogym_client.runtime.versions import commit, machine
+
+COMPARED = ("pendulum", "cartpole", "mountaincar", "swingup")  # tasks that a study runs every arm on
+EVERY_SEED = ("latin_hypercube", "paper")  # arms that it runs with as many seeds as the default
+LOOK_SECONDS = 0.2
+ENDING_SECONDS = 30.0  # a demo ends its own processes first
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run of the demo."""
+
+    settings: DemoSettings
+
+    @property
+    def name(self) -> str:
+        s = self.settings
+        budget = "" if s.budget is None else f"-budget{s.budget}"
+        return f"{s.task}-{s.arm}{budget}-seed{s.seed}"
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        """Of ``surrogym demo``."""
+        s = self.settings
+        given = {"--seed": s.seed, "--arm": s.arm, "--budget": s.budget, "--steps": s.steps, "--episodes": s.episodes}
+        options = [word for name, value in given.items() if value is not None for word in (name, str(value))]
+        return (s.task, *options, *(() if s.pictures else ("--no-pictures",)))
+
+    @property
+    def key(self) -> Key:
+        """That of its row."""
+        s = self.settings
+        return s.task, s.arm, s.real_steps, s.seed
+
+    @property
+    def specification(self) -> str:
+        """Hash of what is asked, without the seed."""
+        return _specification(replace(self.settings, seed=0))
+
+
+Command = Callable[[Cell, Path], list[str]]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What is known while cells run; ``left_seconds`` is a guess, None before the first cell is done."""
+
+    done: int
+    of: int
+    running: tuple[str, ...]
+    left_seconds: float | None
+    last: Row | None = None  # the cell that has just ended
+
+
+def cells(
+    tasks: Sequence[str],
+    arms: Sequence[str],
+    seeds: Iterable[int],
+    *,
+    shares: Sequence[float] = (1.0,),
+    steps: int | None = None,
+    episodes: int = 100,
+) -> Iterator[Cell]:
+    """Every combination; a seed of everything comes before the next seed of anything.
+
+    Args:
+        tasks, arms, seeds: what to combine.
+        shares: of each task's budget of real steps.
+        steps: virtual steps; None takes the task's.
+        episodes: of each evaluation.
+    """
+    for seed, task, arm, share in product(seeds, tasks, arms, shares):
+        budget = None if share == 1 else max(2, round(share * TASKS[task].budget))
+        yield Cell(DemoSettings(task, seed, arm, budget, steps, episodes, pictures=False))
+
+
+def study(tasks: Sequence[str], seeds: Sequence[int], **chosen: Any) -> Iterator[Cell]:
+    """What docs/results.md shows: the default on every task; on those that are ``COMPARED`` a hypercube and the paper's
+    preset as well, and the other arms on the first half of the seeds. ``chosen`` as for ``cells``."""
+    compared = [task for task in tasks if task in COMPARED]
+    others = [arm for arm in ARMS if arm not in ("default", *EVERY_SEED)]
+    for place, seed in enumerate(seeds):
+        yield from cells(tasks, ["default"], [seed], **chosen)
+        yield from cells(compared, [*EVERY_SEED, *(others if 2 * place < len(seeds) else ())], [seed], **chosen)
+
+
+def done_already(cell: Cell, rows: Iterable[Row]) -> bool:
+    """Whether a row answers a cell: the same cell, asked for the same, and not ended badly."""
+    return any(row.key == cell.key and row.specification == cell.specification and not row.error for row in rows)
+
+
+def demo_command(cell: Cell, run: Path) -> list[str]:
+    """The command line that runs a cell into a run folder."""
+    demo = [sys.executable, "-m", "surrogym_client", "demo"]
+    return [*demo, *cell.arguments, "--out", str(run), "--exit-with-parent"]
+
+
+def run_cells(
+    todo: Sequence[Cell],
+    rows: Sequence[Row],
+    folder: Path,
+    jobs: int,
+    tell: Callable[[Progress], None],
+    command: Command = demo_command,
+) -> list[Row]:
+    """Run cells, several at once; ``rows.csv`` in the folder is written after each.
+
+    Args:
+        todo: what to run.
+        rows: what is there already.
+        folder: of rows, logs and run folders.
+        jobs: cells at once.
+        tell: called with every look.
+        command: runs a cell into a run folder, where it leaves ``metrics.json``.
+
+    Returns:
+        All rows, old and new. A run that ended badly has one too, with its error.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    known, waiting, running = list(rows), list(todo), list[Job]()
+    new: list[Row] = []
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                running.append(Job(waiting.pop(0), folder, command))
+            for job in [job for job in running if job.over]:
+                running.remove(job)
+                new.append(job.row())
+                known = merge(known, new[-1:])
+                write_rows(folder / "rows.csv", known)
+                tell(_progress(new, todo, running, jobs, new[-1]))
+            tell(_progress(new, todo, running, jobs))
+            time.sleep(LOOK_SECONDS)
+    finally:
+        for job in running:
+            job.end()
+        for job in running:
+            job.wait()
+    return known
+
+
+class Job:
+    """A cell that runs."""
+
+    def __init__(self, cell: Cell, folder: Path, command: Command) -> None:
+        self.cell = cell
+        run, logs = folder / "runs" / cell.name, folder / "logs"
+        self._metrics, self._log = run / "metrics.json", logs / f"{cell.name}.log"
+        shutil.rmtree(run, ignore_errors=True)
+        logs.mkdir(exist_ok=True)
+        with self._log.open("wb") as log:
+            self._process = subprocess.Popen(
+                command(cell, run),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env=os.environ | ONE_THREAD,
+                start_new_session=True,  # Ctrl-C reaches it through end() alone
+            )
+
+    @property
+    def over(self) -> bool:
+        return self._process.poll() is not None
+
+    def row(self) -> Row:
+        """What the run gave."""
+        if self._process.returncode == 0:
+            return row_of(json.loads(self._metrics.read_text(encoding="utf-8")))
+        said = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines() or ["it said nothing"]
+        task, arm, budget, seed = self.cell.key
+        return Row(
+            *(task, arm, seed, budget),
+            commit=commit(),
+            specification=self.cell.specification,
+            machine=machine(),
+            error=f"exit code {self._process.returncode}: {said[-1][:300]}",
+        )
+
+    def end(self) -> None:
+        """Ask it to end; it ends its own processes."""
+        self._process.terminate()
+
+    def wait(self) -> None:
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(ENDING_SECONDS)
+        self._process.kill()
+        self._process.wait()
+
+
+def _progress(
+    new: Sequence[Row], todo: Sequence[Cell], running: Sequence[Job], jobs: int, last: Row | None = None
+) -> Progress:
+    names = tuple(job.cell.name for job in running)
+    seconds = {(row.task, row.arm): row.seconds for row in new if row.seconds is not None}
+    if not seconds:
+        return Progress(len(new), len(todo), names, None, last)
+    usual = float(np.mean(list(seconds.values())))
+    finished = {row.key for row in new}
+    left = [cell for cell in todo if cell.key not in finished]
+    guess = sum(seconds.get(cell.key[:2], usual) for cell in left) / jobs
+    return Progress(len(new), len(todo), names, guess, last)
+
+
+@cache
+def _specification(settings: DemoSettings) -> str:
+    return fingerprint(settings.asked())

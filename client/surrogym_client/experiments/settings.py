@@ -1,0 +1,77 @@
+"""What one run is asked to do, and the specification that follows from it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from surrogym_client.experiments.arms import ARMS, Arm
+from surrogym_client.experiments.tasks import TASKS, DemoTask, design_budget, queries_a_round
+from surrogym_client.original import make
+from surrogym_client.original.loading import with_choices
+from surrogym_client.training.settings import SUGGESTED_STEPS, TrainSettings, prolongs
+from surrogym_shared.spec import EnvironmentSpec
+
+
+@dataclass(frozen=True)
+class DemoSettings:
+    """None takes the task's own."""
+
+    task: str = "pendulum"
+    seed: int = 0
+    arm: str = "default"
+    budget: int | None = None  # real steps
+    steps: int | None = None  # virtual steps, all rounds together
+    episodes: int = 100
+    pictures: bool = True
+    keep: bool = False
+
+    @property
+    def demo_task(self) -> DemoTask:
+        return TASKS[self.task]
+
+    @property
+    def way(self) -> Arm:
+        return ARMS[self.arm]
+
+    @property
+    def real_steps(self) -> int:
+        """The budget."""
+        return self.budget or self.demo_task.budget
+
+    @property
+    def virtual_steps(self) -> int | None:
+        """Where the default has rounds before its last training, those that have none learn for as long as it may."""
+        alone = not self.way.closed_loop and not self.way.original and queries_a_round(self.real_steps) > 0
+        return self.steps or self.demo_task.steps or (SUGGESTED_STEPS if alone else None)
+
+    @property
+    def prolong(self) -> bool:
+        """Whether a training that still gains takes as many virtual steps again: as ``prolongs`` where a task or an arm
+        chose their number, and not where each is a real one."""
+        return not self.way.original and prolongs(TrainSettings(total_steps=self.steps), self.spec())
+
+    def spec(self) -> EnvironmentSpec:
+        """The environment's specification with the design of this arm."""
+        plain = make(self.demo_task.environment, preset=self.way.preset, seed=self.seed).spec()
+        budget = design_budget(self.real_steps) if self.way.closed_loop else self.real_steps
+        design = self.way.design(budget, len(plain.observation) + plain.action.size)
+        return with_choices(plain, design, None)
+
+    def judged_by(self) -> EnvironmentSpec:
+        """The original environment as every arm is judged by it, also one that learns another form of it."""
+        return make(self.demo_task.environment).spec()
+
+    def asked(self) -> dict[str, Any]:
+        """All that a result depends on and that is known before the run, but the seed; JSON-able."""
+        spec = self.spec().model_dump(mode="json")
+        spec["design"].pop("seed")
+        names = ("task", "real_steps", "virtual_steps", "prolong", "episodes")
+        return {"spec": spec, "arm": self.way.fields(), **{name: getattr(self, name) for name in names}}
+
+
+def fingerprint(content: Any) -> str:
+    """Twelve hexadecimal digits for JSON-able content."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:12]

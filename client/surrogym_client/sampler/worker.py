@@ -1,0 +1,317 @@
+"""The worker beside the original environment: claims queries, takes the real step, hands in what happened."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal, TypeVar
+
+import numpy as np
+
+from surrogym_client.errors import InvalidInput, LeaseExpired, NotThere
+from surrogym_client.original.errors import QueryRefused, StepFailed
+from surrogym_client.original.protocol import Environment, OriginalEnvironment, RolloutEnvironment
+from surrogym_client.original.rollouts import answering
+from surrogym_client.sampler.leases import AWAY, LeaseEnded, Leases
+from surrogym_client.sampler.query_limits import check_environment, check_query
+from surrogym_client.sampler.sample_conversion import reset_seed, sample_of
+from surrogym_client.transport.api import Api
+from surrogym_client.transport.connection import Retries
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, StepQuery
+
+FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "failed")
+PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)  # with a server or a storage that is away
+LOOK_SECONDS = 0.1  # how often a worker that waits looks whether it was stopped
+LAST_SECONDS = 5.0  # a sampler that was stopped asks on for so long, with a real step that is not handed in yet
+AGAIN_SECONDS = 1.0  # until the next claim, after one in which no query could be begun
+STOPPED = "the sampler was stopped"
+
+T = TypeVar("T")
+Outcome = Literal["answered", "failed", "dropped", "refused"]
+
+
+def worker_name() -> str:
+    """A name that tells this worker from others in the ledger."""
+    return f"{socket.gethostname()}-{os.getpid()}"[:128]
+
+
+@dataclass(frozen=True)
+class SamplerSettings:
+    """How a worker works.
+
+    ``batch``: queries claimed at once. ``until_done``: stop when the design has reached its target or its budget;
+    ``once``: stop after the first claim that gives any; ``max_queries`` and ``time_limit`` (seconds) stop it too. No
+    query is begun beyond either of them.
+    """
+
+    name: str = field(default_factory=worker_name)
+    batch: int = 4
+    wait_seconds: float = 20.0
+    lease_seconds: float = 60.0
+    once: bool = False
+    until_done: bool = False
+    max_queries: int | None = None
+    time_limit: float | None = None
+
+
+@dataclass(frozen=True)
+class SamplerReport:
+    """What a worker did. ``dropped`` counts queries whose lease ended before a real step, ``refused`` those that the
+    environment's own specification does not allow; ``phase`` is the last that the server gave."""
+
+    answered: int
+    failed: int
+    dropped: int
+    refused: int
+    steps: int  # real ones, handed in
+    seconds: float
+    phase: Phase | None
+
+
+class Sampler:
+    """Answers the queries of one surrogate.
+
+    A step that fails gives its query back with the error; in a rollout, the steps before it are the answer. A server
+    that is away is waited for, and an answer is not given up meanwhile.
+
+    No real step is begun after the lease of its query has ended, as it has when the machine was suspended: another
+    sampler may have taken it. A step that is under way then is finished and handed in.
+
+    The server is not trusted with the environment: each query is checked against the environment's own specification,
+    and one that lies outside is given back as not begun before anything is sent to the environment.
+
+    Args:
+        api: the server.
+        surrogate: its name there.
+        environment: the original environment; wrap it into ``IsolatedEnvironment`` where it may hang or crash.
+        settings: when to stop, how much to claim.
+        report: called after every query with it, what became of it, and the error if there was one.
+
+    Example:
+        >>> with Api("http://127.0.0.1:8000") as api:
+        ...     Sampler(api, "pendulum", original.make("Pendulum-v1")).run()
+    """
+
+    def __init__(
+        self,
+        api: Api,
+        surrogate: str,
+        environment: Environment,
+        settings: SamplerSettings | None = None,
+        report: Callable[[Query, Outcome, str], None] | None = None,
+    ) -> None:
+        self._api = api
+        self._surrogate = surrogate
+        self._environment = environment
+        self._settings = settings or SamplerSettings()
+        self._report = report
+        self._counts: dict[Outcome, int] = {"answered": 0, "failed": 0, "dropped": 0, "refused": 0}
+        self._refused: set[int] = set()  # ids; the server offers these queries again
+        self._steps = 0
+        self._phase: Phase | None = None
+        self._spec: EnvironmentSpec
+        self._own: EnvironmentSpec
+        self._leases: Leases
+        self._started = time.monotonic()
+        self._stopping = False  # no Event: a signal handler that sets one may wait for itself
+
+    def stop(self) -> None:
+        """End ``run`` after the step that is under way; for another thread, or a signal handler. A server that is away
+        is waited for no longer, but some seconds with a real step that it has not got yet; what ``api`` itself repeats
+        of one request (``Retries``) comes on top."""
+        self._stopping = True
+
+    def run(self) -> SamplerReport:
+        """Work until a setting says stop, ``stop`` is called, or Ctrl-C comes.
+
+        Raises:
+            UnknownSurrogate: there is none of this name, or it was deleted.
+            ServerUnreachable, Unavailable: the server, or its storage, stayed away for too long.
+            UnknownEnvironment: the environment can't be made, or is another one than the surrogate's.
+        """
+        self._started = time.monotonic()
+        self._check()
+        with Leases(self._api, self._surrogate, self._settings.lease_seconds) as self._leases:
+            while not self._stopped() and (limit := self._limit()) > 0:
+                try:
+                    claimed, since = self._patiently(partial(self._claim, limit))
+                except AWAY:
+                    if self._stopped():
+                        break
+                    raise
+                self._phase = claimed.phase
+                self._work(claimed.queries, since)
+                if self._enough(claimed):
+                    break
+                if claimed.queries and self._none_allowed(claimed):
+                    self._pause(AGAIN_SECONDS)
+        return self.summary()
+
+    def summary(self) -> SamplerReport:
+        """What was done so far."""
+        seconds = time.monotonic() - self._started
+        return SamplerReport(**self._counts, steps=self._steps, seconds=seconds, phase=self._phase)
+
+    def _check(self) -> None:
+        """Refuse an environment that does not fit the surrogate."""
+        self._environment = answering(self._environment)
+        self._spec, self._own = self._api.surrogate(self._surrogate).spec, self._environment.spec()
+        check_environment(self._surrogate, self._spec, self._own)
+
+    def _claim(self, limit: int) -> tuple[ClaimedQueries, float]:
+        """Queries, and when they were asked for by the leases' clock."""
+        s, since = self._settings, self._leases.clock()
+        waits = not (s.until_done and (self._phase is None or self._phase in FINISHED))
+        left = s.wait_seconds if s.time_limit is None else min(s.wait_seconds, max(0.0, self._time_left()))
+        claimed = self._api.claim(
+            self._surrogate,
+            s.name,
+            max_queries=limit,
+            wait_seconds=left if waits else 0.0,
+            lease_seconds=s.lease_seconds,
+        )
+        return claimed, since
+
+    def _work(self, queries: list[Query], since: float) -> None:
+        """Answer queries one by one; those left when a person interrupts or the time is over are given back."""
+        left, begun = list(queries), None
+        self._leases.hold(left, since)
+        try:
+            while left and not self._stopped() and not self._out_of_time():
+                begun = left[0]
+                self._answer(begun)
+                self._leases.release(left.pop(0))
+        finally:
+            for query in left:
+                self._leases.release(query)
+                self._give_back(query, STOPPED, begun=query is begun)
+
+    def _answer(self, query: Query) -> None:
+        taken: list[NewSample] = []
+        error = ""
+        outcome: Outcome = "failed"  # where no step was taken
+        try:
+            check_query(self._own, query)
+            self._take(query, taken)
+        except QueryRefused as refused:
+            outcome, error = "refused", str(refused)
+        except LeaseEnded as ended:
+            outcome, error = "dropped", str(ended)
+        except StepFailed as failed:
+            error = str(failed) or "no reason given"
+        except Exception as raised:  # an environment that is not isolated may raise anything
+            error = f"{type(raised).__name__}: {raised}"
+        except BaseException:  # a person interrupts: what was done to the original environment is told all the same
+            self._hand_in(taken)
+            raise
+        try:
+            self._hand_in(taken)
+        except InvalidInput as invalid:
+            taken, outcome, error = [], "failed", str(invalid)
+        if not taken:
+            begun = bool(error) and outcome == "failed"
+            self._patiently(lambda: self._give_back(query, error or STOPPED, begun=begun), LAST_SECONDS)
+        self._count(query, "answered" if taken else outcome, error)
+
+    def _take(self, query: Query, taken: list[NewSample]) -> None:
+        """Take the real steps of a query, and put each into ``taken`` as soon as it is done."""
+        environment, size = self._environment, len(self._spec.coordinates)
+        if isinstance(query, StepQuery):
+            assert isinstance(environment, OriginalEnvironment)
+            self._leases.check(query)
+            step = environment.step_from(np.array(query.coordinates), np.array(query.action))
+            taken.append(sample_of(query, step, size))
+            return
+        assert isinstance(environment, RolloutEnvironment)
+        self._leases.check(query)
+        environment.begin(reset_seed(query, self._spec.design.seed))
+        for number, action in enumerate(query.actions):
+            if self._stopped():
+                return
+            self._leases.check(query)
+            step = environment.act(np.array(action))
+            taken.append(sample_of(query, step, size, number))
+            if step.terminated or step.truncated:
+                return
+
+    def _hand_in(self, samples: list[NewSample]) -> None:
+        if samples:
+            self._patiently(lambda: self._api.add_samples(self._surrogate, self._settings.name, samples), LAST_SECONDS)
+            self._steps += len(samples)
+
+    def _patiently(self, request: Callable[[], T], once_stopped: float = 0.0) -> T:
+        """Ask until the server and its storage are back; every request here may be repeated.
+
+        Raises:
+            ServerUnreachable, Unavailable: they stayed away for longer than ``PATIENCE``, or than ``once_stopped``
+                seconds after ``stop``.
+        """
+        delays, stopped = PATIENCE.delays(), None
+        while True:
+            try:
+                return request()
+            except AWAY:
+                pause = next(delays, None)
+                if pause is None:
+                    raise
+                self._pause(pause)
+                if self._stopped():
+                    stopped = stopped or time.monotonic()
+                    if time.monotonic() - stopped >= once_stopped:
+                        raise
+                    time.sleep(pause)
+
+    def _stopped(self) -> bool:
+        return self._stopping
+
+    def _pause(self, seconds: float) -> None:
+        """Wait for so long, or until this worker is stopped."""
+        until = time.monotonic() + seconds
+        while not self._stopped() and (left := until - time.monotonic()) > 0:
+            time.sleep(min(left, LOOK_SECONDS))
+
+    def _give_back(self, query: Query, error: str, *, begun: bool) -> None:
+        try:
+            self._api.fail(self._surrogate, query.id, query.lease_token, error[:4_000], begun=begun)
+        except (LeaseExpired, NotThere):
+            return  # the query has gone to the next one already
+
+    def _count(self, query: Query, outcome: Outcome, error: str) -> None:
+        if outcome == "refused":
+            if query.id in self._refused:
+                return
+            self._refused.add(query.id)
+        self._counts[outcome] += 1
+        if self._report is not None:
+            self._report(query, outcome, error)
+
+    def _limit(self) -> int:
+        """How many queries to claim next; 0 when it is time to stop. Dropped ones were not this worker's to answer."""
+        s = self._settings
+        if self._out_of_time():
+            return 0
+        return s.batch if s.max_queries is None else min(s.batch, s.max_queries - self._done)
+
+    @property
+    def _done(self) -> int:
+        return self._counts["answered"] + self._counts["failed"] + self._counts["refused"]
+
+    def _out_of_time(self) -> bool:
+        return self._settings.time_limit is not None and self._time_left() <= 0
+
+    def _time_left(self) -> float:
+        return self._started + (self._settings.time_limit or 0.0) - time.monotonic()
+
+    def _enough(self, claimed: ClaimedQueries) -> bool:
+        if self._settings.once and claimed.queries:
+            return True
+        return self._settings.until_done and self._none_allowed(claimed) and claimed.phase in FINISHED
+
+    def _none_allowed(self, claimed: ClaimedQueries) -> bool:
+        """Whether a claim gave nothing but queries that the environment does not allow, or nothing."""
+        return all(query.id in self._refused for query in claimed.queries)

@@ -1,0 +1,105 @@
+"""A surrogate from a server into one file, and from a file into a server."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from surrogym_client.errors import SpecConflict, SurrogymClientError
+from surrogym_client.transport.api import Api
+from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
+from surrogym_shared.wire import NewSample, SurrogateView
+
+BATCH = 1_024  # samples in a request
+PURPOSES = ("initial", "adaptive", "manual", "evaluation")
+
+
+class NotImportable(SurrogymClientError):
+    """The surrogate can't go where it should."""
+
+
+def export_surrogate(api: Api, name: str) -> SurrogateFile:
+    """A surrogate with its latest model and all its samples.
+
+    Raises:
+        NoModel: nothing has been fitted yet.
+        SurrogymClientError: as every request.
+    """
+    latest, view = api.model(name), api.surrogate(name)
+    return SurrogateFile(
+        name,
+        view.spec,
+        api.export_model(name, latest.version),
+        _samples(api, name),
+        tolerances={output.name: output.tolerance for output in latest.fidelity.outputs},
+        ledger=view.ledger.model_dump(include=set(PURPOSES)),
+    )
+
+
+def import_surrogate(
+    api: Api, file: SurrogateFile, name: str | None = None, progress: Callable[[float], None] = lambda _: None
+) -> SurrogateView:
+    """Make a surrogate of a file: it serves the same model at once, judged by the same tolerances.
+
+    Its design is paused, and its samples count as manual ones. Where anything fails, or Ctrl-C is pressed, nothing of
+    it stays; a surrogate that another request created is never touched.
+
+    Args:
+        api: the server; needs the role admin.
+        file: the surrogate.
+        name: of the new surrogate; None takes the file's.
+        progress: called with the share of the samples that has been taken, in [0, 1].
+
+    Raises:
+        NotImportable: there is a surrogate of this name.
+        InvalidInput: the model is none of the specification.
+        SurrogymClientError: as every request.
+    """
+    name = name or file.name
+    if not _created(api, name, file):
+        raise NotImportable(f"expected a name that is free, got {name!r}: give another by --name")
+    try:
+        api.patch_surrogate(name, paused=True, tolerances=file.tolerances or None)
+        api.import_model(name, file.model)
+        samples = [_sample(file.samples, i) for i in range(len(file.samples))]
+        for first in range(0, len(samples), BATCH):
+            progress(first / len(samples))
+            api.add_samples(name, "import", samples[first : first + BATCH])
+        progress(1.0)
+        return api.surrogate(name)
+    except BaseException:
+        api.delete_surrogate(name)
+        raise
+
+
+def _created(api: Api, name: str, file: SurrogateFile) -> bool:
+    """Create the surrogate; whether the name was free. The server decides, so that of two imports one creates it."""
+    try:
+        return api.create_surrogate(name, file.spec).created
+    except SpecConflict:
+        return False
+
+
+def _samples(api: Api, name: str) -> RealSamples:
+    spec, views = api.surrogate(name).spec, list(api.samples(name))
+    c, f = len(spec.coordinates), spec.action.size
+    return RealSamples(
+        coordinates=np.array([view.coordinates for view in views], dtype=np.float64).reshape(-1, c),
+        action=np.array([view.action for view in views], dtype=np.float64).reshape(-1, f),
+        next_coordinates=np.array([view.next_coordinates for view in views], dtype=np.float64).reshape(-1, c),
+        reward=np.array([view.reward for view in views], dtype=np.float64),
+        terminated=np.array([view.terminated for view in views], dtype=np.bool_),
+        truncated=np.array([view.truncated for view in views], dtype=np.bool_),
+    )
+
+
+def _sample(samples: RealSamples, i: int) -> NewSample:
+    return NewSample(
+        coordinates=samples.coordinates[i].tolist(),
+        action=samples.action[i].tolist(),
+        next_coordinates=samples.next_coordinates[i].tolist(),
+        reward=float(samples.reward[i]),
+        terminated=bool(samples.terminated[i]),
+        truncated=bool(samples.truncated[i]),
+    )

@@ -1,0 +1,101 @@
+"""Waiting for what another process brings about: a surrogate that is registered, a design that is done."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from surrogym_client.errors import ServerUnreachable, SurrogymClientError, UnknownSurrogate
+from surrogym_client.transport.api import Api
+from surrogym_shared.wire import Phase, SurrogateView
+
+FINISHED: tuple[Phase, ...] = ("ready", "over_budget")
+LOOK_SECONDS = 0.25
+IN_WORDS: dict[Phase, str] = {  # of the phases in which a sampler stops
+    "ready": "the design is ready",
+    "over_budget": "the budget is spent, and the design is not sure of its model",
+    "failed": "the design has failed",
+}
+
+
+def share_of_design(view: SurrogateView) -> float:
+    """How much of a design is done, in [0, 1]: all of it when it ended, else by its budget."""
+    return 1.0 if view.phase in FINISHED else min(1.0, view.ledger.total / view.budget)
+
+
+def words_of_design(view: SurrogateView) -> str:
+    """One look at a design."""
+    ledger = view.ledger
+    fidelity = "" if view.fidelity is None else f", confidence index {view.fidelity.confidence_index:.4f}"
+    return f"{ledger.total} of {view.budget} real steps ({ledger.adaptive} adaptive){fidelity}"
+
+
+class DesignUnfinished(SurrogymClientError):
+    """The design has failed, or was not done in time; ``surrogym status`` says more."""
+
+
+def wait_for_surrogate(api: Api, name: str, seconds: float) -> SurrogateView:
+    """The surrogate, once it is registered.
+
+    Raises:
+        UnknownSurrogate: it was not within ``seconds``.
+    """
+    deadline = time.monotonic() + seconds
+    while True:
+        try:
+            return api.surrogate(name)
+        except UnknownSurrogate:
+            if time.monotonic() >= deadline:
+                raise
+            time.sleep(LOOK_SECONDS)
+
+
+def wait_for_design(
+    api: Api,
+    name: str,
+    seconds: float,
+    progress: Callable[[SurrogateView], None] | None = None,
+    *,
+    after_round: int = 0,
+) -> SurrogateView:
+    """The surrogate, once its design has reached the target or the budget.
+
+    Args:
+        api: the server; it may be away for a while.
+        name: the surrogate.
+        seconds: how long to wait.
+        progress: called with every look.
+        after_round: the design counts as done only when it has had more rounds than these.
+
+    Raises:
+        DesignUnfinished: the design failed, or was not done within ``seconds``.
+        UnknownSurrogate: there is none of this name.
+    """
+    deadline = time.monotonic() + seconds
+    while True:
+        view = _look(api, name, deadline)
+        if view is not None:
+            if progress is not None:
+                progress(view)
+            if view.phase in FINISHED and view.round > after_round and not _under_way(view):
+                return view
+            if view.phase == "failed":
+                raise DesignUnfinished(f"the design of {name!r} failed: {view.error}")
+        if time.monotonic() >= deadline:
+            phase = "unknown" if view is None else view.phase
+            raise DesignUnfinished(f"the design of {name!r} was not done after {seconds:g} s: its phase is {phase}")
+        time.sleep(LOOK_SECONDS)
+
+
+def _look(api: Api, name: str, deadline: float) -> SurrogateView | None:
+    try:
+        return api.surrogate(name)
+    except ServerUnreachable:
+        if time.monotonic() >= deadline:
+            raise
+        return None
+
+
+def _under_way(view: SurrogateView) -> bool:
+    """Queries that were asked for after the design was done."""
+    return view.queries.pending + view.queries.leased > 0

@@ -1,0 +1,79 @@
+"""Where the curves of a training go: TensorBoard, Weights & Biases or MLflow, each by what fits Stable-Baselines3."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import KVWriter
+
+from surrogym_client.training.settings import TrainSettings
+
+PROJECT = "surrogym"  # where Weights & Biases and MLflow put the runs
+FOLDER = "tensorboard"  # beside the policy
+
+
+def with_folder(settings: TrainSettings, out: Path) -> TrainSettings:
+    """The settings with the folder of TensorBoard's files, where the tracker has some: beside the policy by default."""
+    if settings.tensorboard is not None or settings.tracker not in ("tensorboard", "wandb"):
+        return settings
+    return replace(settings, tensorboard=out.parent / FOLDER)
+
+
+@contextmanager
+def tracking(settings: TrainSettings, out: Path) -> Iterator[list[BaseCallback]]:
+    """The callbacks of a training's tracker; its run ends with the context. TensorBoard's needs none.
+
+    Addresses and keys are those the trackers look for, such as ``WANDB_MODE`` and ``MLFLOW_TRACKING_URI``.
+
+    Raises:
+        ModuleNotFoundError: the tracker is not installed.
+    """
+    config = {name: str(value) for name, value in asdict(settings).items() if value not in (None, {})}
+    if settings.tracker == "wandb":
+        import wandb
+        from wandb.integration.sb3 import WandbCallback
+
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with wandb.init(project=PROJECT, name=out.stem, config=config, dir=out.parent, sync_tensorboard=True):
+            yield [WandbCallback()]
+    elif settings.tracker == "mlflow":
+        import mlflow
+
+        mlflow.set_experiment(PROJECT)
+        with mlflow.start_run(run_name=out.stem):
+            mlflow.log_params(config)
+            yield [Mlflow()]
+    else:
+        yield []
+
+
+class Mlflow(BaseCallback):
+    """Hands what the algorithm logs to the active run of MLflow."""
+
+    def _on_training_start(self) -> None:
+        self.logger.output_formats.append(MlflowWriter())
+
+    def _on_step(self) -> bool:
+        return True
+
+
+class MlflowWriter(KVWriter):
+    """An output format of Stable-Baselines3's logger: its numbers become metrics."""
+
+    def write(self, key_values: dict[str, Any], key_excluded: Mapping[str, Any], step: int = 0) -> None:
+        import mlflow
+
+        numbers = {
+            name: float(value)
+            for name, value in key_values.items()
+            if isinstance(value, int | float) and "mlflow" not in (key_excluded[name] or ())
+        }
+        mlflow.log_metrics(numbers, step=step)
+
+    def close(self) -> None:
+        """The context of the run closes it."""

@@ -1,0 +1,60 @@
+"""What ``surrogym train`` says, while it runs and at its end."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from surrogym_client.training.settings import TrainResult
+
+
+def words_of_result(result: TrainResult, *, closed_loop: bool = False, server: str | None = None) -> str:
+    """What a training gave, and what is next; ``server`` is an address that the next command has to be given too."""
+    on_server = "" if server is None else f" --server {shlex.quote(server)}"
+    lost = result.lost_episodes
+    cut = f"; {lost} episode{'s' * (lost > 1)} cut short, lost with the server's sessions" if lost else ""
+    return (
+        f"{result.path}: {result.virtual_steps} virtual steps in {result.seconds:.1f} s"
+        f"{_imagined(result.imagined_return)}{cut}{_loop(result.visited_confidence) if closed_loop else ''}"
+        f"{_given_up(result.networks - 1)}{_gaining(result)}; next: surrogym evaluate {result.path}{on_server}"
+    )
+
+
+def words_of_interruption(result: TrainResult, asked: str) -> str:
+    """What Ctrl-C left, and how to go on; ``asked`` is the surrogate, with the options that were given."""
+    return (
+        f"interrupted after {result.virtual_steps} virtual steps; the policy so far is in {result.path}; to go on: "
+        f"surrogym train {asked} --start-from {result.path} --out {result.path}"
+    )
+
+
+def words_of(now: dict[str, Any]) -> str:
+    """One look at the training, from the fields of ``TrainProgress``."""
+    penalty = f", penalty {now['episode_penalty']:.1f} an episode" if now["episode_penalty"] else ""
+    known = _known(now.get("visited_confidence"))
+    return f"{now['steps']} of {now['total_steps']} virtual steps{_imagined(now['imagined_return'])}{penalty}{known}"
+
+
+def _given_up(networks: int) -> str:
+    return f"; {networks} network{'s' * (networks > 1)} that learned too little given up" if networks else ""
+
+
+def _gaining(result: TrainResult) -> str:
+    return f"; it still got better at the end, --start-from {result.path} goes on" if result.gaining else ""
+
+
+def _loop(rounds: Sequence[float | None]) -> str:
+    """How the closed loop went, from the confidence index of each round."""
+    if not rounds:
+        return "; the design was ready, no round was needed"
+    return f"; {len(rounds)} round{'s' * (len(rounds) > 1)}{_known(rounds[-1])}"
+
+
+def _known(index: float | None) -> str:
+    return "" if index is None else f", confidence index {index:.4f} where the policy went"
+
+
+def _imagined(value: float | None) -> str:
+    return "" if value is None else f", imagined return {value:.1f} (in the surrogate)"

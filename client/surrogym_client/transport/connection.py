@@ -1,0 +1,311 @@
+"""One server, reached by HTTP: time-outs, retries and errors, the same for every request."""
+
+from __future__ import annotations
+
+import os
+import random
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Any, Self, TypeVar
+from urllib.request import getproxies, proxy_bypass
+
+import httpx
+from pydantic import ValidationError
+
+from surrogym_client.errors import (
+    ProtocolMismatch,
+    RequestTimeout,
+    ServerUnreachable,
+    SurrogymClientError,
+    Unavailable,
+    UnusableToken,
+    error_from_problem,
+)
+from surrogym_client.transport.stream import Stream, StreamUnavailable
+from surrogym_shared.codes import Problem
+from surrogym_shared.secret_files import tokens_in
+
+T = TypeVar("T")
+
+JSON = "application/json"
+DEFAULT_URL = "http://127.0.0.1:8000"
+URL_VARIABLE = "SURROGYM_URL"
+TOKEN_VARIABLE = "SURROGYM_TOKEN"
+TOKEN_FILE_VARIABLE = "SURROGYM_TOKEN_FILE"
+
+_NOT_SENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout, StreamUnavailable)
+_TIMEOUTS = (httpx.TimeoutException, TimeoutError)
+_GATEWAY_STATUSES = (502, 503, 504)
+_KEEPALIVE_SECONDS = 3.0  # shorter than the server's 5 s, so that a request rarely meets a closing connection
+
+
+@dataclass(frozen=True)
+class Timeouts:
+    """Seconds without an answer after which a request is given up and tried again."""
+
+    connect: float = 5.0
+    request: float = 30.0
+    step: float = 60.0
+    rollout: float = 600.0
+
+
+@dataclass(frozen=True)
+class Retries:
+    """How long a request is tried again: pauses grow by ``factor``, and each is drawn from its upper half.
+
+    ``seconds`` counts from the first failure; 0 gives up at once.
+    """
+
+    seconds: float = 30.0
+    first_delay: float = 0.05
+    longest_delay: float = 2.0
+    factor: float = 2.0
+
+    def delays(self) -> Iterator[float]:
+        """Pauses between attempts; ends when the budget is spent."""
+        if self.seconds <= 0:
+            return
+        deadline = time.monotonic() + self.seconds
+        delay = self.first_delay
+        while (left := deadline - time.monotonic()) > 0:
+            yield min(left, delay * random.uniform(0.5, 1.0))
+            delay = min(self.longest_delay, delay * self.factor)
+
+
+class Connection:
+    """Sends requests to one server; safe to share between threads, and pickles (the copy connects anew).
+
+    Args:
+        url: the server's address; default ``SURROGYM_URL``, then http://127.0.0.1:8000.
+        token: bearer token; default ``SURROGYM_TOKEN``, then the one in the file ``SURROGYM_TOKEN_FILE``.
+        timeouts: seconds per kind of request.
+        retries: how long to go on after lost connections, lost replies and 503.
+
+    Raises:
+        ServerUnreachable: the address is none.
+        UnusableToken: the file of the token can't be used.
+    """
+
+    def __init__(
+        self,
+        url: str | None = None,
+        token: str | None = None,
+        timeouts: Timeouts | None = None,
+        retries: Retries | None = None,
+    ) -> None:
+        self.url = _checked(url or os.environ.get(URL_VARIABLE) or DEFAULT_URL)
+        self.timeouts = timeouts or Timeouts()
+        self.retries = retries or Retries()
+        self._token = token if token is not None else _token_of_environment()
+        self._client = _new_client(self.url, self._token)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in self.__dict__.items() if key != "_client"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._client = _new_client(self.url, self._token)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the sockets. Sessions and leases on the server stay, and a later request connects anew."""
+        self._client.close()
+
+    def send(
+        self,
+        method: str,
+        path: str,
+        body: bytes | None = None,
+        *,
+        params: Mapping[str, str | int] | None = None,
+        timeout: float | None = None,
+        media_type: str = JSON,
+        repeatable: bool = True,
+        retries: Retries | None = None,
+    ) -> bytes:
+        """Send a request until it is answered; give back the body of the answer.
+
+        Args:
+            method: HTTP method.
+            path: route, with its leading slash.
+            body: bytes of the media type.
+            params: query parameters.
+            timeout: seconds to wait for the answer; None takes ``timeouts.request``.
+            media_type: of the body.
+            repeatable: carrying it out twice does no harm, so that it may be sent again after a lost reply.
+            retries: another retry budget than the connection's.
+
+        Raises:
+            ServerUnreachable: no connection, or every reply was lost, within the retry budget.
+            RequestTimeout: the last attempt was not answered in time.
+            ProtocolMismatch: what answered is no Surrogym server.
+            ProblemError: the server refused; its subclass says why.
+        """
+        attempt = self.attempt(method, path, body, params=params, timeout=timeout, media_type=media_type)
+        return self.persist(attempt, repeatable=repeatable, retries=retries)
+
+    def attempt(
+        self,
+        method: str,
+        path: str,
+        body: bytes | None = None,
+        *,
+        params: Mapping[str, str | int] | None = None,
+        timeout: float | None = None,
+        media_type: str = JSON,
+    ) -> Callable[[], bytes]:
+        """One try of a request, for ``persist``; the arguments are those of ``send``."""
+
+        def send_once() -> bytes:
+            client = self._open_client()
+            request = client.build_request(
+                method,
+                self.url + path,
+                content=body,
+                params=params,
+                headers={"Content-Type": media_type, "Accept": media_type},
+                timeout=self._timeout(timeout),
+            )
+            return _body(client.send(request))
+
+        return send_once
+
+    def persist(self, attempt: Callable[[], T], *, repeatable: bool = True, retries: Retries | None = None) -> T:
+        """Try until it succeeds, is refused, or the retry budget is spent. Raises as ``send``."""
+        delays: Iterator[float] | None = None
+        while True:
+            try:
+                return attempt()
+            except (httpx.TransportError, OSError, Unavailable) as failure:
+                # A failed request's connection is closed with it, so a late reply answers nobody.
+                delays = (retries or self.retries).delays() if delays is None else delays
+                pause = next(delays, None) if _may_repeat(failure, repeatable) else None
+                if pause is None:
+                    raise _given_up(failure, self.url) from failure
+                time.sleep(pause)
+
+    @property
+    def proxied(self) -> bool:
+        """Whether a proxy of the environment stands between; it carries HTTP alone."""
+        url = httpx.URL(self.url)
+        return not _is_loopback(self.url) and url.scheme in getproxies() and not proxy_bypass(url.host)
+
+    def stream_to(self, path: str) -> Stream:
+        """A stream of messages with this server, not connected yet."""
+        return Stream(self.url + path, self._token, self.timeouts.connect)
+
+    @contextmanager
+    def stream(self, path: str, headers: Mapping[str, str], idle_seconds: float) -> Iterator[Iterator[str]]:
+        """Open a stream of text lines; ``idle_seconds`` without one count as a lost connection.
+
+        Raises:
+            ServerUnreachable: no connection, or it broke.
+            ProblemError: the server refused.
+        """
+        timeout = self._timeout(idle_seconds)
+        try:
+            url, client = self.url + path, self._open_client()
+            with client.stream("GET", url, headers=dict(headers), timeout=timeout) as response:
+                if response.is_error:
+                    response.read()
+                    _body(response)
+                yield response.iter_lines()
+        except httpx.TransportError as failure:
+            raise _given_up(failure, self.url) from failure
+
+    def _open_client(self) -> httpx.Client:
+        if self._client.is_closed:
+            self._client = _new_client(self.url, self._token)
+        return self._client
+
+    def _timeout(self, seconds: float | None) -> httpx.Timeout:
+        return httpx.Timeout(seconds or self.timeouts.request, connect=self.timeouts.connect)
+
+
+def token_in(path: Path) -> str:
+    """The token in a file, of the form that ``surrogym serve --token-file`` takes too, with one line.
+
+    Raises:
+        UnusableToken: it can't be read, or does not hold one token.
+    """
+    try:
+        tokens = tokens_in(path)
+    except OSError as error:
+        raise UnusableToken(f"the token file {str(path)!r} can't be read: {error.strerror}") from error
+    except ValueError as error:
+        raise UnusableToken(f"the token file {str(path)!r}: {error}") from None
+    if len(tokens) != 1:
+        raise UnusableToken(f"the token file {str(path)!r}: expected one token, got {len(tokens)}")
+    return next(iter(tokens))
+
+
+def _token_of_environment() -> str | None:
+    file = os.environ.get(TOKEN_FILE_VARIABLE)
+    return os.environ.get(TOKEN_VARIABLE) or (token_in(Path(file)) if file else None)
+
+
+def _checked(url: str) -> str:
+    try:
+        parsed = httpx.URL(url)
+    except httpx.InvalidURL as error:
+        raise ServerUnreachable(f"expected a server address like {DEFAULT_URL}, got {url!r}: {error}") from error
+    if parsed.scheme not in ("http", "https") or not parsed.host:
+        raise ServerUnreachable(f"expected a server address like {DEFAULT_URL}, got {url!r}")
+    if parsed.userinfo:  # it would be written into cards and reports, and sent in the place of the token
+        raise ServerUnreachable(f"expected an address without user and password, got one with them at {parsed.host!r}")
+    return url.rstrip("/")
+
+
+def _new_client(url: str, token: str | None) -> httpx.Client:
+    headers = {"Authorization": f"Bearer {token}"} if token else {}
+    limits = httpx.Limits(keepalive_expiry=_KEEPALIVE_SECONDS)
+    trusted = httpx.create_ssl_context()  # SSL_CERT_FILE counts for this machine too, where its proxies don't
+    return httpx.Client(headers=headers, limits=limits, verify=trusted, trust_env=not _is_loopback(url))
+
+
+def _is_loopback(url: str) -> bool:
+    """A proxy of the environment must never stand between two programs of one machine."""
+    host = httpx.URL(url).host
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _body(response: httpx.Response) -> bytes:
+    kind = response.headers.get("content-type", "")
+    if response.is_success and not kind.startswith("text/html"):
+        return response.content
+    try:
+        problem = Problem.model_validate_json(response.content)
+    except ValidationError:
+        if response.status_code in _GATEWAY_STATUSES:
+            raise httpx.RemoteProtocolError(f"a gateway answered {response.status_code}") from None
+        raise ProtocolMismatch(
+            f"expected a Surrogym server at {response.url}, got status {response.status_code} "
+            f"of type {kind or 'unknown'!r}"
+        ) from None
+    raise error_from_problem(problem)
+
+
+def _may_repeat(failure: Exception, repeatable: bool) -> bool:
+    return repeatable or isinstance(failure, (*_NOT_SENT, Unavailable))
+
+
+def _given_up(failure: Exception, url: str) -> SurrogymClientError:
+    if isinstance(failure, SurrogymClientError):
+        return failure
+    if isinstance(failure, _NOT_SENT):
+        return ServerUnreachable(f"no Surrogym server answers at {url} ({failure})")
+    if isinstance(failure, _TIMEOUTS):
+        return RequestTimeout(f"the server at {url} did not answer in time")
+    return ServerUnreachable(f"the connection to {url} was lost ({failure})")

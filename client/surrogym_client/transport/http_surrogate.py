@@ -1,0 +1,250 @@
+"""HttpSurrogate: the SurrogatePort of a server, over a stream of frames, or HTTP with frames or JSON."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Literal, Self, TypeVar, get_args
+
+import numpy as np
+
+from surrogym_client.errors import ProtocolMismatch, SessionLost
+from surrogym_client.transport import routes
+from surrogym_client.transport.api import Api, check_protocol, new_key, parse
+from surrogym_client.transport.connection import Connection, Retries, Timeouts
+from surrogym_client.transport.step_codecs import UNREADABLE, BinaryForm, Form, JsonForm
+from surrogym_client.transport.stream import Stream, StreamLost, StreamUnavailable
+from surrogym_shared import wire
+from surrogym_shared.frames import Shape
+from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult
+from surrogym_shared.spec import EnvironmentSpec
+
+__all__ = ["Api", "HttpSurrogate", "Retries", "Timeouts", "Transport"]
+
+Transport = Literal["auto", "stream", "binary", "json"]
+T = TypeVar("T")
+
+_UPGRADE_PAUSE_SECONDS = 60.0  # until a stream is asked for again where none got through, or broke before any answer
+
+
+@dataclass
+class _Live:
+    """What is known of a session; ``seq`` is the last one answered."""
+
+    route: str
+    shape: Shape
+    seq: int
+    stream: Stream
+
+
+class HttpSurrogate:
+    """One surrogate of a server; see ``SurrogatePort`` for the laws it keeps.
+
+    A lost reply, a time-out or a dropped connection is answered by sending the same request with the same
+    seq, so a step happens once. A session is an id, not a connection: any HttpSurrogate may go on with
+    it, and this one pickles and connects anew. Two can't step one session at once: the second to try gets
+    ``SeqConflict``.
+
+    Args:
+        url: the server's address; default ``SURROGYM_URL``, then http://127.0.0.1:8000.
+        surrogate: name of the surrogate.
+        token: bearer token; default ``SURROGYM_TOKEN``, then the one in the file ``SURROGYM_TOKEN_FILE``.
+        timeouts: seconds per kind of request.
+        retries: how long to go on after lost connections, lost replies and 503.
+        transport: how reset, step and rollout travel. ``stream`` is the fastest: frames over a WebSocket;
+            ``binary`` is frames over HTTP, ``json`` what a person can read. ``auto`` takes the stream, and
+            HTTP with frames where the stream does not get through: refused, or opened and never answering.
+
+    Raises:
+        ValueError: a transport there is none of.
+        SurrogymClientError: every method; see ``surrogym_client.errors``.
+
+    Example:
+        >>> with HttpSurrogate(None, "pendulum") as surrogate:
+        ...     session = surrogate.open(OpenSession(num_envs=4, seed=0))
+        ...     start = surrogate.reset(session.id)
+        ...     result = surrogate.step(session.id, np.zeros((4, 1)))
+    """
+
+    def __init__(
+        self,
+        url: str | None,
+        surrogate: str,
+        token: str | None = None,
+        *,
+        timeouts: Timeouts | None = None,
+        retries: Retries | None = None,
+        transport: Transport = "auto",
+    ) -> None:
+        if transport not in get_args(Transport):
+            raise ValueError(f"transport: expected one of {', '.join(get_args(Transport))}, got {transport!r}")
+        self.surrogate = surrogate
+        self.connection = Connection(url, token, timeouts, retries)
+        self.transport: Transport = transport
+        self._form: Form = JsonForm() if transport == "json" else BinaryForm()
+        self._live: dict[str, _Live] = {}
+        self._upgrade_after = math.inf if self.connection.proxied else 0.0  # by time.monotonic
+        self._streamed = False  # some stream has brought an answer
+        self._spec: EnvironmentSpec | None = None
+
+    def __repr__(self) -> str:
+        return f"HttpSurrogate({self.connection.url!r}, {self.surrogate!r})"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.disconnect()
+
+    def disconnect(self) -> None:
+        """Close the sockets. Sessions stay, until ``close`` or their expiry; a later request connects anew."""
+        for live in list(self._live.values()):
+            live.stream.close()
+        self.connection.close()
+
+    def spec(self) -> EnvironmentSpec:
+        if self._spec is None:
+            self._spec = parse(wire.SurrogateView, self.connection.send("GET", self._route), self._route).spec
+        return self._spec
+
+    def open(self, request: wire.OpenSession) -> wire.SessionView:
+        if request.idempotency_key is None:
+            request = request.model_copy(update={"idempotency_key": new_key()})
+        route = f"{self._route}/sessions"
+        content = self.connection.send("POST", route, request.model_dump_json().encode())
+        view = parse(wire.SessionView, content, route)
+        check_protocol(view.protocol, self.connection.url)
+        self._know(view)
+        return view
+
+    def reset(self, session: str, *, seed: int | Sequence[int] | None = None, mask: Bools | None = None) -> ResetResult:
+        return self._in_sequence(
+            session,
+            "reset",
+            lambda seq, shape: self._form.reset(seq, seed, mask, shape),
+            self._form.read_reset,
+            self.connection.timeouts.step,
+        )
+
+    def step(
+        self, session: str, action: Floats | Ints, *, mask: Bools | None = None, deviations: bool = False
+    ) -> StepResult:
+        return self._in_sequence(
+            session,
+            "step",
+            lambda seq, shape: self._form.step(seq, action, mask, deviations, shape),
+            self._form.read_step,
+            self.connection.timeouts.step,
+        )
+
+    def rollout(self, session: str, actions: Floats | Ints) -> list[StepResult]:
+        return self._in_sequence(
+            session,
+            "rollout",
+            lambda seq, shape: self._form.rollout(seq, np.asarray(actions), shape),
+            self._form.read_rollout,
+            self.connection.timeouts.rollout,
+        )
+
+    def submit_occupancy(self, session: str, checkpoint: str) -> wire.SubmittedOccupancy:
+        route = f"{routes.session(session)}/occupancy"
+        body = wire.SubmitOccupancy(checkpoint=checkpoint).model_dump_json().encode()
+        return parse(wire.SubmittedOccupancy, self.connection.send("POST", route, body), route)
+
+    def close(self, session: str) -> None:
+        """End the session; with the last one, the sockets are closed too."""
+        self._forget(session)
+        try:
+            with suppress(SessionLost):
+                self.connection.send("DELETE", routes.session(session), retries=Retries(seconds=0))
+        finally:
+            if not self._live:
+                self.disconnect()
+
+    @property
+    def _route(self) -> str:
+        return routes.surrogate(self.surrogate)
+
+    def _in_sequence(
+        self,
+        session: str,
+        what: str,
+        write: Callable[[int, Shape], bytes],
+        read: Callable[[bytes, Shape], tuple[int, T]],
+        timeout: float,
+    ) -> T:
+        """Send a request that changes the session under its next seq; an error leaves the seq as it was."""
+        live = self._live.get(session) or self._look_up(session)
+        content = write(live.seq + 1, live.shape)
+        attempt = self._attempt(live, what, content, timeout)
+        try:
+            seq, result = self.connection.persist(lambda: read(attempt(), live.shape))
+        except SessionLost:
+            self._forget(session)
+            raise
+        except UNREADABLE as error:
+            live.stream.close()
+            raise ProtocolMismatch(f"unexpected answer of {live.route}/{what}: {error}") from error
+        if seq != live.seq + 1:
+            live.stream.close()
+            raise ProtocolMismatch(f"expected the answer to seq {live.seq + 1} of {session}, got {seq}")
+        live.seq = seq
+        return result
+
+    def _attempt(self, live: _Live, what: str, content: bytes, timeout: float) -> Callable[[], bytes]:
+        """One try to get a request answered, to be called again after a failure."""
+        if self.transport == "stream":
+            return lambda: live.stream.exchange(content, timeout)
+        by_http = self.connection.attempt(
+            "POST", f"{live.route}/{what}", content, timeout=timeout, media_type=self._form.media_type
+        )
+        if self.transport != "auto" or time.monotonic() < self._upgrade_after:
+            return by_http
+        first = True
+
+        def stream_first() -> bytes:
+            """A repeat goes by HTTP: what broke the stream may break it again, and HTTP says what it was."""
+            nonlocal first
+            if not first:
+                return by_http()
+            first = False
+            try:
+                answer = live.stream.exchange(content, timeout)
+                self._streamed = True
+            except StreamUnavailable:
+                answer = by_http()
+                self._avoid_stream(_UPGRADE_PAUSE_SECONDS)
+            except StreamLost:
+                if not self._streamed:
+                    self._avoid_stream(_UPGRADE_PAUSE_SECONDS)
+                raise
+            except TimeoutError:
+                if (
+                    not self._streamed
+                ):  # something on the way lets the upgrade through alone: it would wait as long again
+                    self._avoid_stream(math.inf)
+                raise
+            return answer
+
+        return stream_first
+
+    def _avoid_stream(self, seconds: float) -> None:
+        self._upgrade_after = time.monotonic() + seconds
+
+    def _look_up(self, session: str) -> _Live:
+        """A session that another client opened."""
+        route = routes.session(session)
+        return self._know(parse(wire.SessionView, self.connection.send("GET", route), route))
+
+    def _know(self, view: wire.SessionView) -> _Live:
+        route = routes.session(view.id)
+        stream = self.connection.stream_to(f"{route}/stream")
+        self._live[view.id] = _Live(route, Shape.of(view), view.seq, stream)
+        return self._live[view.id]
+
+    def _forget(self, session: str) -> None:
+        if live := self._live.pop(session, None):
+            live.stream.close()
