@@ -42,14 +42,15 @@ from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_q
 from surrogym_server.engine.fits import Fits
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import MEBIBYTE, Limits, LiveSessions, Threads
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
 from surrogym_server.private import keep_private
 from surrogym_server.sampling.acquisition import ACQUISITIONS
 from surrogym_server.services.activity import Samplers
-from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import Designer
 from surrogym_server.services.events import EventService
+from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.models import ModelService, load_model
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.queries import QueryService
@@ -60,7 +61,6 @@ from surrogym_server.services.sweeper import Sweeper
 from surrogym_server.settings import LOCAL_NAMES, Settings
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import open_storage
-from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_shared.spec import EnvironmentSpec
 
 logger = logging.getLogger(__name__)
@@ -122,7 +122,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
         known = ", ".join(f"{role} {fingerprint(token)}" for token, role in settings.tokens.items())
         logger.info("fingerprints of the tokens: %s", known)
     app.state.notices = None
-    app.state.counts = Counts()
+    app.state.metrics = ProcessMetrics()
     problems.install(app)
     openapi.install(app)
     app.add_middleware(steps.StepDoor)
@@ -130,7 +130,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     app.add_middleware(OwnPages, public_url=settings.public_url)
     if settings.loopback and not settings.tokens:
         app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", *settings.host_names}))
-    app.add_middleware(Observed, counts=app.state.counts)
+    app.add_middleware(Observed, metrics=app.state.metrics)
     app.router.routes.extend(steps.router.routes)  # tried first, and directly: an included router is another search
     for room in (sessions, service, metrics, surrogates, queries, samples, models, events):
         app.include_router(room.router)
@@ -155,7 +155,7 @@ async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: 
     torch.set_num_threads(settings.threads)
     engine = _build_engine(settings, design)
     app.state.notices = engine.notices
-    services, sweeper = _build_services(settings, design, storage, engine, app.state.counts)
+    services, sweeper = _build_services(settings, design, storage, engine, app.state.metrics)
     logger.info("acquisitions: %s", ", ".join(ACQUISITIONS.names))
     engine.fits.start()
     restored = services.sessions.restore()
@@ -189,7 +189,7 @@ def _build_engine(settings: Settings, design: DesignPort) -> _Engine:
 
 
 def _build_services(
-    settings: Settings, design: DesignPort, storage: Storage, engine: _Engine, counts: Counts
+    settings: Settings, design: DesignPort, storage: Storage, engine: _Engine, metrics: ProcessMetrics
 ) -> tuple[Services, Sweeper]:
     definitions = Definitions(storage, _define)
     cache = ModelCache(
@@ -202,7 +202,7 @@ def _build_services(
         engine.fits,
         cache,
         engine.notices,
-        counts,
+        metrics,
         owner=uuid4().hex,
         threads=settings.threads,
         look_seconds=settings.sweep_seconds,
@@ -216,13 +216,13 @@ def _build_services(
         samples=SampleService(storage, definitions, engine.notices, samplers),
         models=ModelService(storage, definitions, cache, engine.notices),
         sessions=SessionService(
-            storage, definitions, cache, engine.live, settings.max_lanes, counts, torch.device(settings.device)
+            storage, definitions, cache, engine.live, settings.max_lanes, metrics, torch.device(settings.device)
         ),
         designer=designer,
         events=EventService(storage, engine.notices),
         storage=storage,
     )
-    return services, Sweeper(storage, engine.live, cache, settings.sweep_seconds, counts)
+    return services, Sweeper(storage, engine.live, cache, settings.sweep_seconds, metrics)
 
 
 def _define(spec: dict[str, Any]) -> EnvironmentDefinition:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from surrogym_server.errors import InvalidInput
 from surrogym_server.local import LocalSurrogate
-from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
 from surrogym_server.virtual import LaneState, VirtualSettings, create, reset
 from surrogym_shared.network import Network
 from surrogym_shared.spec import BoxAction
@@ -195,7 +195,7 @@ def _evened(gradient: Tensor) -> Tensor:
     return evened
 
 
-def _step(model: SurrogateModel, q: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _step(model: GaussianProcessModel, q: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Mean next state (N, C), mean reward (N,) and whether the episode ended (N,)."""
     moved = model.transition(q, u)
     over = model.terminated(moved.q_next)

@@ -19,11 +19,11 @@ from surrogym_server.engine.session import (
     reset_session,
     step_session,
 )
+from surrogym_server.environment.actions import policy_actions
 from surrogym_server.errors import InvalidInput, NotReset, UnknownModel, UnknownSession
+from surrogym_server.models.gaussian_process.codec.model import from_bytes
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
 from surrogym_server.services.sessions import resolved
-from surrogym_server.surrogate.actions import policy_actions
-from surrogym_server.surrogate.codec import from_bytes
-from surrogym_server.surrogate.model import SurrogateModel
 from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import SurrogateFile
@@ -44,7 +44,7 @@ class LocalSurrogate:
         >>> env = SurrogateVecEnv.from_port(surrogate, num_envs=16)
     """
 
-    def __init__(self, spec: EnvironmentSpec, model: SurrogateModel) -> None:
+    def __init__(self, spec: EnvironmentSpec, model: GaussianProcessModel) -> None:
         self._spec = spec
         self._model = model
         self._sessions: dict[str, Session] = {}
@@ -77,7 +77,7 @@ class LocalSurrogate:
         return self._spec
 
     @property
-    def model(self) -> SurrogateModel:
+    def model(self) -> GaussianProcessModel:
         """What the steps are computed with."""
         return self._model
 
@@ -146,6 +146,6 @@ class LocalSurrogate:
             raise UnknownSession(f"no session {session!r}: open a new one")
         return self._sessions[session]
 
-    def _version(self, version: int) -> SurrogateModel:
+    def _version(self, version: int) -> GaussianProcessModel:
         del version  # there is one
         return self._model

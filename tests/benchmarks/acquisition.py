@@ -34,11 +34,11 @@ from surrogym_client.experiments.reproduce.statistics import bootstrap_interval,
 from surrogym_client.original import make
 from surrogym_client.runtime.versions import commit
 from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.samples import Samples
+from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
 from surrogym_server.sampling.design import DesignState, Request, advance, initial_design
 from surrogym_server.sampling.outlook import Points
-from surrogym_server.surrogate.learn import learn
-from surrogym_server.surrogate.model import SurrogateModel
-from surrogym_server.surrogate.samples import Samples
 from surrogym_shared.spec import Design, EnvironmentSpec
 
 TASKS = {"pendulum": "Pendulum-v1", "acrobot": "Acrobot-v1", "mountaincar": "MountainCarContinuous-v0"}
@@ -99,7 +99,7 @@ def cell(task: str, representation: str, criterion: str, seed: int) -> Iterator[
         yield Row(task, representation, criterion, seed, queries, float(f"{error(model, test):.4g}"), commit())
 
 
-def designed(spec: EnvironmentSpec, counts: Sequence[int]) -> Iterator[tuple[SurrogateModel, int]]:
+def designed(spec: EnvironmentSpec, counts: Sequence[int]) -> Iterator[tuple[GaussianProcessModel, int]]:
     """Models of ever more queries. A hypercube is made anew for each number: it can't be added to."""
     definition = definition_from_spec(spec)
     if definition.design.acquisition.name == "latin_hypercube":
@@ -119,7 +119,7 @@ def designed(spec: EnvironmentSpec, counts: Sequence[int]) -> Iterator[tuple[Sur
         samples, state = join(samples, answer(spec, made.q, made.u)), made.state
 
 
-def error(model: SurrogateModel, test: Samples) -> float:
+def error(model: GaussianProcessModel, test: Samples) -> float:
     """Root mean square over points and outputs, in deviations of each output's change."""
     observe, predicted = model.definition.observe, model.transition(test.q, test.u)
     truth = torch.cat([observe(test.q_next), test.reward[:, None]], -1)

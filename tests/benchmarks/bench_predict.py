@@ -28,9 +28,10 @@ from owned import Child, installed
 from support.real_steps import random_steps
 from surrogym_client.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.gp import Hyperparameters, Output, Posterior, Serving, condition, in_blocks
-from surrogym_server.surrogate.learn import learn
-from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.gp import Hyperparameters, Output, Posterior, Serving, condition
+from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.tensors import in_blocks
 from surrogym_server.virtual import VirtualSettings, create, reset, step
 
 POINTS, OUTPUTS, INPUTS = 125, 4, 4
@@ -142,24 +143,24 @@ def growth(points: int, seconds: float) -> Row:
     return {"n": points, **measure(subjects, seconds)}
 
 
-def pendulum_model() -> SurrogateModel:
+def pendulum_model() -> GaussianProcessModel:
     return learn(definition_from_spec(pendulum()), random_steps(pendulum(), SAMPLES, seed=0)).model
 
 
-def stepping(model: SurrogateModel, lanes: int, **chosen: Any) -> Call:
+def stepping(model: GaussianProcessModel, lanes: int, **chosen: Any) -> Call:
     settings = VirtualSettings(lanes, **chosen)
     state, _ = reset(model.definition, settings, create(model.definition, settings, 0))
     u = np.random.default_rng(0).uniform(-2, 2, (lanes, 1))
     return lambda: step(model, settings, state, u)
 
 
-def steps(model: SurrogateModel, lanes: int, seconds: float) -> Row:
+def steps(model: GaussianProcessModel, lanes: int, seconds: float) -> Row:
     subjects = {"AUR-D": timed(stepping(model, lanes)), "AUR-D, penalty": timed(stepping(model, lanes, penalty=3.0))}
     made = measure(subjects, seconds)
     return {"N": lanes, **made, "AUR-D, us a lane": 1e3 * made["AUR-D"] / lanes}
 
 
-def particles(model: SurrogateModel, count: int, seconds: float) -> Row:
+def particles(model: GaussianProcessModel, count: int, seconds: float) -> Row:
     stages = [stage.serving for stage in model._stages if stage is not None]
     bare = [products(s, PARTICLE_LANES * count, list(s.processes)) for s in stages]
     subjects = {
@@ -173,7 +174,7 @@ def particles(model: SurrogateModel, count: int, seconds: float) -> Row:
 AUR_P = {"variant": "probabilistic", "penalty": 3.0}
 
 
-def two_threads(model: SurrogateModel, seconds: float) -> Iterator[Row]:
+def two_threads(model: GaussianProcessModel, seconds: float) -> Iterator[Row]:
     """Large work on one thread of torch and on two, which need two cores that nothing else uses."""
     serving = compiled(processes(POINTS))
     at = torch.from_numpy(np.random.default_rng(1).normal(size=(8_192, INPUTS)))

@@ -14,7 +14,7 @@ from surrogym_client.training.settings import TrainingInterrupted, prolongs
 from surrogym_client.training.trainer import TrainSettings, train
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
-from surrogym_server.surrogate.learn import learn
+from surrogym_server.models.gaussian_process.learning.learn import learn
 from surrogym_shared.network import Network
 
 SMALL = {"population": 8, "starts": 2, "units": 4}

@@ -25,7 +25,7 @@ from surrogym_client.training.trainer import TrainProgress, TrainResult, TrainSe
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
-from surrogym_server.surrogate.learn import learn
+from surrogym_server.models.gaussian_process.learning.learn import learn
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import Design, EnvironmentSpec
 

@@ -18,7 +18,7 @@ from surrogym_client.original.classic import pendulum
 from surrogym_client.training.trainer import TrainSettings, train
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
-from surrogym_server.surrogate.learn import learn
+from surrogym_server.models.gaussian_process.learning.learn import learn
 
 HYPERPARAMETERS = {"n_steps": 16, "batch_size": 32, "n_epochs": 1}
 

@@ -33,7 +33,7 @@ from surrogym_client.training.trainer import (
 )
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
-from surrogym_server.surrogate.learn import learn
+from surrogym_server.models.gaussian_process.learning.learn import learn
 
 SMALL = {"n_steps": 16, "batch_size": 32, "n_epochs": 2}
 

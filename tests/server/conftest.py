@@ -1,4 +1,4 @@
-"""A real server, its client, and a surrogate with a model."""
+"""A real server, its client, and a surrogate with a model; definitions of known tasks, and real steps of them."""
 
 from __future__ import annotations
 
@@ -7,9 +7,15 @@ from typing import Any
 
 import httpx
 import pytest
+import torch
 
 from support import pendulum
+from support.real_steps import answer, random_steps
 from support.server import ServerProcess
+from surrogym_client.original import classic
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.samples import Samples
 
 Post = Callable[..., httpx.Response]
 
@@ -61,3 +67,32 @@ def open_session(client: httpx.Client, taught: str) -> Iterator[Callable[..., di
 def session(open_session: Callable[..., dict[str, Any]]) -> str:
     """Id of a session of two lanes, not reset yet."""
     return str(open_session(num_envs=2)["id"])
+
+
+@pytest.fixture
+def pendulum_definition() -> EnvironmentDefinition:
+    return definition_from_spec(classic.pendulum())
+
+
+@pytest.fixture
+def cartpole_definition() -> EnvironmentDefinition:
+    return definition_from_spec(classic.cartpole())
+
+
+@pytest.fixture
+def mountain_car_definition() -> EnvironmentDefinition:
+    return definition_from_spec(classic.mountain_car_continuous())
+
+
+@pytest.fixture(scope="session")
+def pendulum_samples() -> Samples:
+    return random_steps(classic.pendulum(), 20, seed=0)
+
+
+@pytest.fixture(scope="session")
+def half_saturated() -> Samples:
+    """Pendulum steps close to the speed limit, where half of them end."""
+    rng = torch.Generator().manual_seed(0)
+    angle, side, torque = (2 * torch.rand(20, generator=rng, dtype=torch.float64) - 1 for _ in range(3))
+    q = torch.stack([torch.pi * angle, 7.6 * side.sign()], -1)
+    return answer(classic.pendulum(), q, 2 * torque[:, None])

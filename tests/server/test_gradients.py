@@ -14,7 +14,7 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
 from surrogym_server.gradients import GradientSettings, _evened, optimise
 from surrogym_server.local import LocalSurrogate
-from surrogym_server.surrogate.learn import learn
+from surrogym_server.models.gaussian_process.learning.learn import learn
 from surrogym_shared.wire import OpenSession
 
 SMALL = GradientSettings(updates=12, lanes=16, horizon=20, units=8)

@@ -1,4 +1,4 @@
-"""Models whose predictions are known exactly, in the shape of SurrogateModel, for the virtual environment."""
+"""Models whose predictions are known exactly, in the shape of GaussianProcessModel, for the virtual environment."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from torch import Tensor
 
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.surrogate.model import Transition, settle
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.step_rules import settle
+from surrogym_server.models.gaussian_process.prediction.model import Transition
 
 
 @dataclass(frozen=True)

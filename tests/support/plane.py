@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from surrogym_server.surrogate.samples import Samples
+from surrogym_server.environment.samples import Samples
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Reward, Term, Uniform
 
 Pay = Callable[[Tensor, Tensor], Tensor]

@@ -11,8 +11,8 @@ from torch import Tensor
 from surrogym_client.original import RealStep
 from surrogym_client.original.gymnasium import GymnasiumEnvironment
 from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.samples import Samples
 from surrogym_server.sampling.latin_hypercube import random_points
-from surrogym_server.surrogate.samples import Samples
 from surrogym_shared.spec import EnvironmentSpec
 
 

@@ -21,7 +21,7 @@ from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.problems import documented
 from surrogym_server.api.series import exposition
 from surrogym_server.api.state import Services, Use
-from surrogym_server.services.counts import Counts, Durations
+from surrogym_server.services.metrics import Durations, ProcessMetrics
 from surrogym_shared.codes import Code
 
 router = APIRouter(tags=["service"], route_class=DoorRoute)
@@ -37,7 +37,7 @@ router = APIRouter(tags=["service"], route_class=DoorRoute)
 def metrics(request: Request, use: Use) -> Response:
     """Requests, steps, fits and expiries since the start of this process; samples, queries and fidelity as stored."""
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(_Reading(request.app.version, use, request.app.state.counts))
+    registry.register(_Reading(request.app.version, use, request.app.state.metrics))
     text = generate_latest(registry) + exposition(use.storage.surrogates.summaries())
     return Response(text, media_type=CONTENT_TYPE_LATEST)
 
@@ -45,21 +45,21 @@ def metrics(request: Request, use: Use) -> Response:
 class _Reading:
     """A collector that is asked once."""
 
-    def __init__(self, version: str, use: Services, counts: Counts) -> None:
+    def __init__(self, version: str, use: Services, metrics: ProcessMetrics) -> None:
         self._version = version
         self._use = use
-        self._counts = counts
+        self._metrics = metrics
 
     def collect(self) -> Iterator[Metric]:
         yield InfoMetricFamily("surrogym_build", "Version of the server.", {"version": self._version})
-        counts = self._counts
-        yield _requests(counts)
-        yield _durations("surrogym_step_seconds", "Of a request that steps a session, waiting included.", counts.steps)
-        yield _durations("surrogym_fit_seconds", "Of a fit with the choice of the next queries.", counts.fits)
-        yield CounterMetricFamily("surrogym_lane_steps", "Virtual environment steps.", counts.lane_steps)
-        yield CounterMetricFamily("surrogym_failed_fits", "Fits that failed.", counts.failed_fits)
-        yield CounterMetricFamily("surrogym_expired_leases", "Leases that ended unanswered.", counts.expired_leases)
-        yield CounterMetricFamily("surrogym_expired_sessions", "Sessions idle for too long.", counts.expired_sessions)
+        metrics = self._metrics
+        yield _requests(metrics)
+        yield _durations("surrogym_step_seconds", "Of a request that steps a session, waiting included.", metrics.steps)
+        yield _durations("surrogym_fit_seconds", "Of a fit with the choice of the next queries.", metrics.fits)
+        yield CounterMetricFamily("surrogym_lane_steps", "Virtual environment steps.", metrics.lane_steps)
+        yield CounterMetricFamily("surrogym_failed_fits", "Fits that failed.", metrics.failed_fits)
+        yield CounterMetricFamily("surrogym_expired_leases", "Leases that ended unanswered.", metrics.expired_leases)
+        yield CounterMetricFamily("surrogym_expired_sessions", "Sessions idle for too long.", metrics.expired_sessions)
         sessions, lanes = self._use.sessions.alive()
         yield GaugeMetricFamily("surrogym_sessions", "Open sessions.", sessions)
         yield GaugeMetricFamily("surrogym_lanes", "Lanes of all open sessions.", lanes)
@@ -67,11 +67,11 @@ class _Reading:
         yield GaugeMetricFamily("surrogym_session_requests", "Of sessions, at work or waiting.", requests)
 
 
-def _requests(counts: Counts) -> Metric:
+def _requests(metrics: ProcessMetrics) -> Metric:
     family = HistogramMetricFamily(
         "surrogym_request_seconds", "Of a request over HTTP.", labels=("method", "route", "status")
     )
-    for (method, route, status), durations in sorted(counts.requests.items()):
+    for (method, route, status), durations in sorted(metrics.requests.items()):
         family.add_metric([method, route, str(status)], list(durations.cumulative()), durations.sum)
     return family
 

@@ -15,7 +15,7 @@ from surrogym_server.api.caller import caller
 from surrogym_server.api.headers import raw_header
 from surrogym_server.api.problems import REQUEST_HEADER
 from surrogym_server.logs import REQUEST_ID
-from surrogym_server.services.counts import Counts, Durations
+from surrogym_server.services.metrics import Durations, ProcessMetrics
 
 logger = logging.getLogger("surrogym_server.requests")
 
@@ -46,9 +46,9 @@ _PROCESS, _NUMBERS = secrets.token_hex(4), count(1)  # drawing each id is a call
 class Observed:
     """The outermost middleware: what it sees is what the caller sees."""
 
-    def __init__(self, app: ASGIApp, counts: Counts) -> None:
+    def __init__(self, app: ASGIApp, metrics: ProcessMetrics) -> None:
         self._app = app
-        self._counts = counts
+        self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
@@ -77,9 +77,9 @@ class Observed:
         method = method if method in METHODS else "other"
         route = getattr(scope.get("route"), "path", UNKNOWN_ROUTE)
         key = (method, route, status)
-        durations = self._counts.requests.get(key)
+        durations = self._metrics.requests.get(key)
         if durations is None:
-            durations = self._counts.requests[key] = Durations()
+            durations = self._metrics.requests[key] = Durations()
         durations.observe(seconds)
         told = status >= 400 or (method in CHANGING and route not in FREQUENT)
         level = logging.WARNING if status >= FAILED else logging.INFO if told else logging.DEBUG

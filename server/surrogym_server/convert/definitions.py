@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
+from surrogym_server.environment import conditions, declared_reward, distributions, terms
+from surrogym_server.environment import definition as core
+from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.errors import InvalidSpec
 from surrogym_server.sampling.acquisition import acquisition_of
-from surrogym_server.surrogate import conditions, declared, distributions, terms
-from surrogym_server.surrogate import definition as core
-from surrogym_server.surrogate.recover import ObservationInverse
 from surrogym_shared import spec as wire
 
 PENALTY = {"default": 0.0, "paper": 3.0}  # k of eq. 14
@@ -148,12 +148,12 @@ def _penalty(spec: wire.EnvironmentSpec) -> float:
     return _or(spec.reward.penalty, PENALTY[spec.design.preset])
 
 
-def _declared_reward(spec: wire.EnvironmentSpec) -> declared.DeclaredReward | None:
+def _declared_reward(spec: wire.EnvironmentSpec) -> declared_reward.DeclaredReward | None:
     if not isinstance(spec.reward, wire.DeclaredReward):
         return None
     names = spec.coordinate_names
     reward_terms = tuple(
-        declared.RewardTerm(
+        declared_reward.RewardTerm(
             term.weight,
             term.shape,
             tuple(_quantity(quantity, spec) for quantity in term.of),
@@ -161,12 +161,12 @@ def _declared_reward(spec: wire.EnvironmentSpec) -> declared.DeclaredReward | No
         )
         for term in spec.reward.terms
     )
-    return declared.DeclaredReward(reward_terms, spec.reward.timing == "after", spec.reward.terminal, len(names))
+    return declared_reward.DeclaredReward(reward_terms, spec.reward.timing == "after", spec.reward.terminal, len(names))
 
 
-def _quantity(quantity: wire.Quantity, spec: wire.EnvironmentSpec) -> declared.Quantity:
+def _quantity(quantity: wire.Quantity, spec: wire.EnvironmentSpec) -> declared_reward.Quantity:
     term = terms.Term(()) if quantity.term is None else _term(quantity.term, spec.coordinate_names)
-    return declared.Quantity(term, quantity.action or (0.0,) * spec.action.size)
+    return declared_reward.Quantity(term, quantity.action or (0.0,) * spec.action.size)
 
 
 def _inequality(inequality: wire.Inequality, names: tuple[str, ...]) -> conditions.Inequality:

@@ -24,8 +24,8 @@ from surrogym_server.storage.records import (
     QueryRecord,
     SampleRecord,
 )
-from surrogym_server.surrogate.describe import PointPrediction
 from surrogym_server.virtual.imagined import Imagined, ImaginedEpisode
+from surrogym_server.virtual.single_step import PointPrediction
 from surrogym_shared import spec as wire
 from surrogym_shared import wire as replies
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_server.engine.session import Answer, Session
+from surrogym_server.environment import definition as core
 from surrogym_server.services.activity import SessionActivity
 from surrogym_server.services.sessions import Opening
-from surrogym_server.surrogate import definition as core
 from surrogym_server.virtual import VirtualSettings
 from surrogym_shared import frames
 from surrogym_shared import wire as replies

@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.sampling.confidence import OutputConfidence, confidence, deviations
 from surrogym_server.sampling.design import monte_carlo, usual_tolerances
-from surrogym_server.surrogate.model import OutputModel, SurrogateModel
 
 
 def fidelity_fields(
-    model: SurrogateModel, confidences: Sequence[OutputConfidence], tolerances: Sequence[float], target: float
+    model: GaussianProcessModel, confidences: Sequence[OutputConfidence], tolerances: Sequence[float], target: float
 ) -> dict[str, Any]:
     """The fields of ``wire.Fidelity``, from the confidence and tolerance of each output, (O,) each."""
     rows = [
@@ -28,7 +29,7 @@ def fidelity_fields(
     }
 
 
-def fidelity_of(model: SurrogateModel, usual: Sequence[float], target: float) -> dict[str, Any]:
+def fidelity_of(model: GaussianProcessModel, usual: Sequence[float], target: float) -> dict[str, Any]:
     """The fields of ``wire.Fidelity`` of any model of the surrogate.
 
     Args:
@@ -45,7 +46,7 @@ def fidelity_of(model: SurrogateModel, usual: Sequence[float], target: float) ->
     return fidelity_fields(model, confidences, tolerances, target)
 
 
-def _outputs(model: SurrogateModel) -> tuple[OutputModel, ...]:
+def _outputs(model: GaussianProcessModel) -> tuple[OutputModel, ...]:
     return (*model.transitions, model.reward)
 
 

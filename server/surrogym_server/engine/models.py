@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from threading import Lock
 
 from surrogym_server.errors import Damaged, NoModel
-from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
 
 CAPACITY = 64
 
@@ -20,7 +20,7 @@ class ModelCache:
 
     def __init__(
         self,
-        load: Callable[[int, int], SurrogateModel],
+        load: Callable[[int, int], GaussianProcessModel],
         newest: Callable[[], Mapping[int, int]],
         capacity: int = CAPACITY,
     ) -> None:
@@ -33,11 +33,11 @@ class ModelCache:
         self._load = load
         self._newest = newest
         self._capacity = capacity
-        self._models: OrderedDict[tuple[int, int], SurrogateModel] = OrderedDict()
+        self._models: OrderedDict[tuple[int, int], GaussianProcessModel] = OrderedDict()
         self._latest: dict[int, int] = {}
         self._lock = Lock()
 
-    def get(self, surrogate: int, version: int) -> SurrogateModel:
+    def get(self, surrogate: int, version: int) -> GaussianProcessModel:
         """The model of a version. Raises ``UnknownModel``, ``UnknownSurrogate`` or ``Damaged``."""
         with self._lock:
             if model := self._models.get((surrogate, version)):
@@ -104,7 +104,7 @@ class ModelCache:
             for key in [key for key in self._models if key[0] == surrogate]:
                 del self._models[key]
 
-    def _keep(self, surrogate: int, version: int, model: SurrogateModel) -> None:
+    def _keep(self, surrogate: int, version: int, model: GaussianProcessModel) -> None:
         with self._lock:
             self._models[surrogate, version] = model
             while len(self._models) > self._capacity:

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from surrogym_server.engine.occupancy import Reservoir
 from surrogym_server.engine.session import Answer, Fingerprint, Outcome, Session
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import Damaged, InvalidInput, UnknownSession
-from surrogym_server.gp import placed
-from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.tensors import to_device
 from surrogym_server.virtual import LaneState, VirtualSettings
 from surrogym_shared.port import ResetResult, StepResult
 
@@ -89,7 +89,7 @@ def _read(definition: EnvironmentDefinition, data: bytes, surrogate_id: int) -> 
         settings=VirtualSettings(**header["settings"]),
         seed=header["seed"],
         model=header["model"],
-        lanes=placed(LaneState.from_arrays(_unprefixed("lanes", arrays)), definition.device),
+        lanes=to_device(LaneState.from_arrays(_unprefixed("lanes", arrays)), definition.device),
         versions=arrays["versions"],
         answer=_answer(header, arrays),
         visited=_visited(header, arrays),

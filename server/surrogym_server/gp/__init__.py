@@ -15,19 +15,15 @@ beta      ``weights`` (n,)        (K + sigma_n^2 I)^-1 y
 ========  ======================  =========================================================
 """
 
-from surrogym_server.gp.blocks import in_blocks
 from surrogym_server.gp.fit import FitOptions, Fitted, fit
 from surrogym_server.gp.joint import Joint
-from surrogym_server.gp.kept import kept
 from surrogym_server.gp.kernel import Hyperparameters, Reflection
 from surrogym_server.gp.pathwise import Pathwise
-from surrogym_server.gp.placing import CPU, placed
 from surrogym_server.gp.posterior import Posterior, Sparse, condition
 from surrogym_server.gp.serving import Output, Serving
 from surrogym_server.gp.sparse import condition_sparse, spread
 
 __all__ = [
-    "CPU",
     "FitOptions",
     "Fitted",
     "Hyperparameters",
@@ -41,8 +37,5 @@ __all__ = [
     "condition",
     "condition_sparse",
     "fit",
-    "in_blocks",
-    "kept",
-    "placed",
     "spread",
 ]

@@ -22,9 +22,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogym_server.gp.kept import kept
 from surrogym_server.gp.kernel import covariance
 from surrogym_server.gp.posterior import Posterior
+from surrogym_server.tensors import cached
 
 FREQUENCIES = 256  # S
 
@@ -59,7 +59,7 @@ class Pathwise:
             return measured @ self._sparse_noise
         return math.sqrt(posterior.hyper.noise_variance + posterior.jitter) * measured
 
-    @kept
+    @cached
     def _sparse_noise(self) -> Tensor:
         """Square root (n, n) of the noise that is left at inducing points, F F^T - k(Z, Z)."""
         posterior = self.posterior

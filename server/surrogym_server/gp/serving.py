@@ -23,10 +23,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surrogym_server.gp.blocks import in_blocks
 from surrogym_server.gp.kernel import Hyperparameters, to_mirror
-from surrogym_server.gp.placing import CPU
 from surrogym_server.gp.posterior import Posterior
+from surrogym_server.tensors import CPU, in_blocks
 
 BLOCK = 262_144  # covariances held at once: they stay in the cache, and memory is bounded at any batch size
 MIN_ROWS = 64

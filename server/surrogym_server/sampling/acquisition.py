@@ -21,12 +21,12 @@ from typing import ClassVar
 
 from torch import Tensor
 
+from surrogym_server.environment.definition import AcquisitionChoice
 from surrogym_server.errors import InvalidSpec
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
 from surrogym_server.plugins import Registry
 from surrogym_server.sampling.confidence import log_model_uncertainty
 from surrogym_server.sampling.outlook import Points
-from surrogym_server.surrogate.definition import AcquisitionChoice
-from surrogym_server.surrogate.model import SurrogateModel
 
 GROUP = "surrogym.acquisitions"
 
@@ -35,7 +35,7 @@ GROUP = "surrogym.acquisitions"
 class CandidateView:
     """What an acquisition may know of m candidates, for the sake of one output."""
 
-    model: SurrogateModel
+    model: GaussianProcessModel
     points: Points  # m states and actions
     output: int  # number of the output, in the order of the definition
     tolerance: float  # of the output, in its unit

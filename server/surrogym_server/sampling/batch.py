@@ -7,18 +7,18 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.features import FeatureMap, encode
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
 from surrogym_server.sampling.acquisition import CandidateView, acquisition_of
 from surrogym_server.sampling.candidates import Candidates
 from surrogym_server.sampling.outlook import Outlook, OutputOutlook, Points
-from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.surrogate.features import FeatureMap, encode
-from surrogym_server.surrogate.model import SurrogateModel
 
 NEAR = 0.02  # queries closer than this, in deviations of the sampling range, are near-duplicates
 
 
 def choose(
-    model: SurrogateModel,
+    model: GaussianProcessModel,
     candidates: Candidates,
     taken: Points,
     assumed: Points,
@@ -67,7 +67,7 @@ def choose(
 
 
 def candidate_view(
-    model: SurrogateModel,
+    model: GaussianProcessModel,
     candidates: Candidates,
     column: int,
     output: OutputOutlook,

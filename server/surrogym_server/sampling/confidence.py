@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surrogym_server.surrogate.model import OutputModel, SurrogateModel
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
 SUREST = 1e9  # tolerances over a deviation: what is known better counts as known so well
 
@@ -26,7 +27,7 @@ class OutputConfidence:
     leave_one_out_within_two: float  # 0.95
 
 
-def deviations(model: SurrogateModel, q: Tensor, u: Tensor) -> Tensor:
+def deviations(model: GaussianProcessModel, q: Tensor, u: Tensor) -> Tensor:
     """Latent deviation of every output, the reward last, at q (m, C) and u (m, F): (m, O)."""
     transition = model.transition(q, u, deviations=True, reward_deviation=True)
     assert transition.deviation is not None

@@ -12,6 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.samples import Samples, increments
+from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
 from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.batch import choose
 from surrogym_server.sampling.candidates import Candidates, candidates_of
@@ -20,10 +24,6 @@ from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
 from surrogym_server.sampling.outlook import Points
 from surrogym_server.sampling.rollouts import Aim, first_rollouts, plan_round
-from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.surrogate.learn import learn
-from surrogym_server.surrogate.model import SurrogateModel
-from surrogym_server.surrogate.samples import Samples, increments
 
 Verdict = Literal["continue", "ready", "over_budget"]
 SHORTEST_ROUND = 4  # real steps
@@ -67,7 +67,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Decision:
-    model: SurrogateModel
+    model: GaussianProcessModel
     confidences: tuple[OutputConfidence, ...]  # per output
     tolerances: tuple[float, ...]  # per output, those that it was judged by
     state: DesignState
@@ -158,7 +158,7 @@ def judge(
 
 
 def _choose(
-    model: SurrogateModel,
+    model: GaussianProcessModel,
     samples: Samples,
     candidates: Candidates,
     confidences: tuple[OutputConfidence, ...],
@@ -178,7 +178,7 @@ def _choose(
 
 
 def _plan(
-    model: SurrogateModel,
+    model: GaussianProcessModel,
     samples: Samples,
     confidences: tuple[OutputConfidence, ...],
     tolerances: tuple[float, ...],

@@ -7,16 +7,16 @@ from collections.abc import Iterator
 
 from torch import Tensor
 
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.samples import Samples
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
 from surrogym_server.sampling.outlook import Points
-from surrogym_server.surrogate.model import SurrogateModel
-from surrogym_server.surrogate.regions import unexplored
-from surrogym_server.surrogate.samples import Samples
 
 FRONTIER = 0.1  # of what was seen of the coordinates: a shorter way beyond it is not worth a query
 DOUBT = 0.005  # chance of a wrong ending, averaged over the candidates, that is good enough
 
 
-def ending(model: SurrogateModel, samples: Samples, points: Points) -> Tensor | None:
+def ending(model: GaussianProcessModel, samples: Samples, points: Points) -> Tensor | None:
     """Which of m points to take a query from for the sake of the episodes' end, (m,) bool; None if none is needed.
 
     Declared: those predicted to end one, as long as no sample has. Learned: those most in doubt, until little doubt is
@@ -36,13 +36,13 @@ def ending(model: SurrogateModel, samples: Samples, points: Points) -> Tensor | 
     return beyond >= 0.9 * beyond.max() if float(beyond.max()) > FRONTIER else None
 
 
-def in_doubt(model: SurrogateModel, q_next: Tensor) -> Tensor:
+def in_doubt(model: GaussianProcessModel, q_next: Tensor) -> Tensor:
     """Chance that the model errs about an ending at q_next (m, C), (m,); 0 where termination is declared."""
     probability = model.termination_probability(q_next)
     return probability.minimum(1 - probability)
 
 
-def edge_in_doubt(model: SurrogateModel, q: Tensor, q_next: Tensor) -> Tensor:
+def edge_in_doubt(model: GaussianProcessModel, q: Tensor, q_next: Tensor) -> Tensor:
     """Chance that the model errs about the side of a reward's edge, the largest of all edges, for steps from q (m, C)
     to q_next (m, C), (m,)."""
     doubt = q.new_zeros(len(q))
@@ -51,7 +51,7 @@ def edge_in_doubt(model: SurrogateModel, q: Tensor, q_next: Tensor) -> Tensor:
     return doubt
 
 
-def _edges(model: SurrogateModel, points: Points, q_next: Tensor) -> Tensor | None:
+def _edges(model: GaussianProcessModel, points: Points, q_next: Tensor) -> Tensor | None:
     """Where it is most in doubt on which side of a reward's edge points lie."""
     for doubt in _edge_doubts(model, points.q, q_next):
         if float(doubt.mean()) > DOUBT:
@@ -59,7 +59,7 @@ def _edges(model: SurrogateModel, points: Points, q_next: Tensor) -> Tensor | No
     return None
 
 
-def _edge_doubts(model: SurrogateModel, q: Tensor, q_next: Tensor) -> Iterator[Tensor]:
+def _edge_doubts(model: GaussianProcessModel, q: Tensor, q_next: Tensor) -> Iterator[Tensor]:
     """For each edge of the reward the chance that the model errs about the side, (m,)."""
     state = q_next if model.reward.feature_map.after else q
     for jump in model.jumps:
@@ -67,6 +67,18 @@ def _edge_doubts(model: SurrogateModel, q: Tensor, q_next: Tensor) -> Iterator[T
         yield inside.minimum(1 - inside)
 
 
-def _predicted(model: SurrogateModel, points: Points, q_next: Tensor) -> Tensor | None:
+def _predicted(model: GaussianProcessModel, points: Points, q_next: Tensor) -> Tensor | None:
     ends = model.terminated(q_next) & ~model.terminated(points.q)
     return ends if bool(ends.any()) else None
+
+
+def unexplored(definition: EnvironmentDefinition, seen: Tensor, q: Tensor) -> Tensor:
+    """How far q (m, C) lies beyond the states seen (n, C), (m,): the sum over both ends of every moving coordinate, in
+    units of what was seen of it. Before any ending was seen, that is where one may be."""
+    columns = list(definition.moving)
+    if not len(seen):
+        return q.new_ones(len(q))
+    low, high = seen[:, columns].amin(0), seen[:, columns].amax(0)
+    width = (high - low).clamp_min(1e-12)
+    at = q[:, columns]
+    return (((at - high) / width).clamp_min(0) + ((low - at) / width).clamp_min(0)).clamp_max(1).sum(-1)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 from torch import Tensor
 
-from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.environment.definition import EnvironmentDefinition
 
 Array = NDArray[np.float64]
 REDRAWS = 100

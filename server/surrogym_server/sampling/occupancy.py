@@ -11,8 +11,8 @@ import math
 import torch
 from torch import Tensor
 
-from surrogym_server.surrogate.definition import CoordinateDefinition, EnvironmentDefinition
-from surrogym_server.surrogate.distributions import scaling
+from surrogym_server.environment.definition import CoordinateDefinition, EnvironmentDefinition
+from surrogym_server.environment.distributions import scaling
 
 FLOOR = 0.1  # share of the uniform density
 BLOCK = 2**17  # kernels at once, which stay in a core's cache

@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from surrogym_server.environment.features import encode, leading
 from surrogym_server.gp import Joint
-from surrogym_server.surrogate.features import encode, leading
-from surrogym_server.surrogate.learn import usable
-from surrogym_server.surrogate.model import OutputModel, SurrogateModel
+from surrogym_server.models.gaussian_process.learning.learn import usable
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Outlook:
     outputs: tuple[OutputOutlook | None, ...]  # None: an output that never varied
 
     @classmethod
-    def of(cls, model: SurrogateModel, candidates: Points, reference: Points, assumed: Points) -> Outlook:
+    def of(cls, model: GaussianProcessModel, candidates: Points, reference: Points, assumed: Points) -> Outlook:
         """The outlook once the queries ``assumed`` are answered."""
         everywhere = Points.joined([candidates, reference, assumed])
         q_next = model.transition(everywhere.q, everywhere.u).q_next
@@ -104,14 +105,14 @@ class OutputOutlook:
         return replace(self, joint=joint, shared=torch.addr(self.shared, row[m : m + r], row[:m], alpha=-1))
 
 
-def inputs_of(model: SurrogateModel, output: OutputModel, points: Points, q_next: Tensor) -> Tensor:
+def inputs_of(model: GaussianProcessModel, output: OutputModel, points: Points, q_next: Tensor) -> Tensor:
     """What one output's process reads at points whose predicted next coordinates are q_next (m, C): (m, d)."""
     after = output.feature_map.after
     lead = q_next[:, leading(model.definition)]
     return encode(model.definition, output.feature_map, q_next if after else points.q, points.u, lead)
 
 
-def counts_of(model: SurrogateModel, column: int, q_next: Tensor) -> Tensor:
+def counts_of(model: GaussianProcessModel, column: int, q_next: Tensor) -> Tensor:
     """Which samples that end at q_next (m, C) an output would learn from, (m,) bool."""
     definition = model.definition
     if column == len(model.transitions):

@@ -22,13 +22,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.distributions import scaling
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.sampling.acquisition import PathView, acquisition_of
 from surrogym_server.sampling.endings import edge_in_doubt, in_doubt
 from surrogym_server.sampling.occupancy import log_occupancy
 from surrogym_server.sampling.outlook import Points, counts_of, inputs_of
-from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.surrogate.distributions import scaling
-from surrogym_server.surrogate.model import OutputModel, SurrogateModel
 
 STARTS = 6  # drawn from the start distribution for each plan
 POPULATION = 48  # action sequences compared at once
@@ -76,7 +77,7 @@ def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random
 
 
 def plan_round(
-    model: SurrogateModel, aim: Aim, steps: int, pending: Sequence[Tensor], rng: np.random.Generator
+    model: GaussianProcessModel, aim: Aim, steps: int, pending: Sequence[Tensor], rng: np.random.Generator
 ) -> list[Tensor]:
     """Sequences that take ``steps`` real steps in all, each as if those before it and the pending were answered."""
     rollouts: list[Tensor] = []
@@ -91,7 +92,7 @@ def plan_round(
     return rollouts
 
 
-def plan_rollout(model: SurrogateModel, aim: Aim, rng: np.random.Generator) -> Tensor:
+def plan_rollout(model: GaussianProcessModel, aim: Aim, rng: np.random.Generator) -> Tensor:
     """The sequence (T, F), 1 <= T <= ``aim.longest``, that gives most per expected real step: shooting, refined by
     varying the best."""
     starts = start_points(model.definition, STARTS, rng)
@@ -105,14 +106,14 @@ def plan_rollout(model: SurrogateModel, aim: Aim, rng: np.random.Generator) -> T
     return torch.from_numpy(population[best, : int(length[best])])
 
 
-def as_if_done(model: SurrogateModel, actions: Tensor, rng: np.random.Generator) -> SurrogateModel:
+def as_if_done(model: GaussianProcessModel, actions: Tensor, rng: np.random.Generator) -> GaussianProcessModel:
     """The model as if a sequence (T, F) had been answered along a predicted path: variances shrink, means stay."""
     path = predict_paths(model, start_points(model.definition, 1, rng), actions[None])
     outputs = [_extended(model, column, path) for column in range(len(model.transitions) + 1)]
     return replace(model, transitions=tuple(outputs[:-1]), reward=outputs[-1])
 
 
-def _extended(model: SurrogateModel, column: int, path: Paths) -> OutputModel:
+def _extended(model: GaussianProcessModel, column: int, path: Paths) -> OutputModel:
     output, posterior = output_of(model, column), output_of(model, column).posterior
     if posterior is not None:
         x, learns = _inputs(model, column, path)
@@ -141,7 +142,7 @@ def random_sequences(definition: EnvironmentDefinition, count: int, length: int,
     return sequences
 
 
-def predict_paths(model: SurrogateModel, starts: Tensor, actions: Tensor) -> Paths:
+def predict_paths(model: GaussianProcessModel, starts: Tensor, actions: Tensor) -> Paths:
     """Mean paths from starts (b, C) under actions (b, T, F)."""
     spread = [scaling(c.sampling)[1] for c in (model.definition.coordinates[i] for i in model.definition.moving)]
     q, running, drift = starts, starts.new_ones(len(starts)), starts.new_zeros(len(starts))
@@ -156,7 +157,7 @@ def predict_paths(model: SurrogateModel, starts: Tensor, actions: Tensor) -> Pat
     return Paths(*(torch.stack(column, 1) for column in zip(*steps, strict=True)))
 
 
-def path_values(model: SurrogateModel, aim: Aim, paths: Paths) -> Tensor:
+def path_values(model: GaussianProcessModel, aim: Aim, paths: Paths) -> Tensor:
     """What the acquisition gives for each beginning of paths (b, T), summed over the outputs of the aim: (b, T)."""
     acquisition = acquisition_of(model.definition.design.acquisition)
     weight = _weights(model.definition, aim, paths)
@@ -188,11 +189,11 @@ def _information(output: OutputModel, x: Tensor, weight: Tensor, tolerance: floa
     return torch.cat([_log_determinants(ratio * output.posterior.joint_covariance(b), w) for b, w in blocks])
 
 
-def output_of(model: SurrogateModel, column: int) -> OutputModel:
+def output_of(model: GaussianProcessModel, column: int) -> OutputModel:
     return (*model.transitions, model.reward)[column]
 
 
-def _worth(model: SurrogateModel, aim: Aim, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:
+def _worth(model: GaussianProcessModel, aim: Aim, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:
     """Information per expected real step of the best beginning of each sequence (k, T, F), and its length, (k,)."""
     count, lanes = len(sequences), len(starts)
     actions = torch.from_numpy(sequences).repeat_interleave(lanes, 0)
@@ -205,7 +206,7 @@ def _worth(model: SurrogateModel, aim: Aim, starts: Tensor, sequences: Sequences
     return best.values, best.indices + 1
 
 
-def _endings(model: SurrogateModel, aim: Aim, paths: Paths) -> Tensor:
+def _endings(model: GaussianProcessModel, aim: Aim, paths: Paths) -> Tensor:
     """The chance that the model was wrong about an end or the side of a reward's edge on the way, (b, T); also whether
     paths have ended, where ends are declared and none was seen."""
     q, q_next = paths.q.flatten(0, 1), paths.q_next.flatten(0, 1)
@@ -226,7 +227,7 @@ def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tenso
     return weight * (density / density.max()).sqrt()
 
 
-def _inputs(model: SurrogateModel, column: int, paths: Paths) -> tuple[Tensor, Tensor]:
+def _inputs(model: GaussianProcessModel, column: int, paths: Paths) -> tuple[Tensor, Tensor]:
     """What one output's process reads along paths, (b, T, d), and whether it would learn from it, (b, T) bool."""
     points, q_next = Points(paths.q.flatten(0, 1), paths.u.flatten(0, 1)), paths.q_next.flatten(0, 1)
     x = inputs_of(model, output_of(model, column), points, q_next)

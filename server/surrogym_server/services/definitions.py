@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_server.environment.actions import model_actions
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
 from surrogym_server.storage.port import Storage
-from surrogym_server.surrogate.actions import model_actions
-from surrogym_server.surrogate.definition import EnvironmentDefinition
 
 Array = NDArray[np.float64]
 Define = Callable[[dict[str, Any]], EnvironmentDefinition]

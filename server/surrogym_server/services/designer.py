@@ -12,8 +12,8 @@ import numpy as np
 from surrogym_server.engine.design_job import DesignJob, DesignResult
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.errors import Damaged, InvalidInput, LeaseExpired, SurrogymError, Unavailable, UnknownSurrogate
-from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
+from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import (
@@ -46,7 +46,7 @@ class Designer:
         fits: FitRunner,
         models: ModelCache,
         notices: Notices,
-        counts: Counts,
+        metrics: ProcessMetrics,
         *,
         owner: str,
         threads: int,
@@ -59,7 +59,7 @@ class Designer:
             fits: where jobs are done.
             models: told of each new version.
             notices: wake this designer, and are posted after each fit.
-            counts: of this process.
+            metrics: of this process.
             owner: name of this server in the right to fit.
             threads: of torch in a fit.
             look_seconds: how often to look for what no notice told.
@@ -69,7 +69,7 @@ class Designer:
         self._fits = fits
         self._models = models
         self._notices = notices
-        self._counts = counts
+        self._metrics = metrics
         self._owner = owner
         self._threads = threads
         self._look_seconds = look_seconds
@@ -125,7 +125,7 @@ class Designer:
         try:
             result = await self._fits.run(await asyncio.to_thread(self._job, lease))
             await asyncio.to_thread(self._commit, lease, result)
-            self._counts.fits.observe(result.seconds)
+            self._metrics.fits.observe(result.seconds)
             self._unavailable.pop(name, None)
         except asyncio.CancelledError:
             self._abort(lease, None)
@@ -133,7 +133,7 @@ class Designer:
         except LeaseExpired:
             logger.info("the fit of %s is made again: it was changed, or another server fits it", name)
         except Exception as error:
-            self._counts.failed_fits += 1
+            self._metrics.failed_fits += 1
             logger.warning("the fit of %s failed: %s", name, error, exc_info=not isinstance(error, SurrogymError))
             again = isinstance(error, Unavailable) and self._may_try_again(name)
             await asyncio.to_thread(self._abort, lease, None if again else f"the fit failed: {error}")

@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 
 from surrogym_server.engine.fidelity import fidelity_of
 from surrogym_server.engine.models import ModelCache
+from surrogym_server.environment.actions import model_actions
 from surrogym_server.errors import Damaged, InvalidInput
+from surrogym_server.models.gaussian_process.codec.model import from_bytes
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
 from surrogym_server.sampling.uncertainty import UncertaintyResult, query_uncertainty
 from surrogym_server.services.definitions import Definitions, check_coordinates, check_points
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import ModelRecord, NewModel
-from surrogym_server.surrogate.actions import model_actions
-from surrogym_server.surrogate.codec import from_bytes
-from surrogym_server.surrogate.describe import PointPrediction, predict_points
-from surrogym_server.surrogate.model import SurrogateModel
 from surrogym_server.virtual.imagined import Imagined, imagine
+from surrogym_server.virtual.single_step import PointPrediction, predict_points
 
 logger = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ class Said(Generic[T]):
     result: T
 
 
-def load_model(storage: Storage, definitions: Definitions, surrogate: int, version: int) -> SurrogateModel:
+def load_model(storage: Storage, definitions: Definitions, surrogate: int, version: int) -> GaussianProcessModel:
     """A stored model of a surrogate's id, ready to predict.
 
     Raises:
@@ -138,7 +138,7 @@ class ModelService:
         actions = model_actions(model.definition.action, u)
         return Said(version, model.definition.outputs, imagine(model, start, actions, draws=draws, seed=seed))
 
-    def _model(self, name: str, version: int | None) -> tuple[int, SurrogateModel]:
+    def _model(self, name: str, version: int | None) -> tuple[int, GaussianProcessModel]:
         surrogate = self._storage.surrogates.get(name).id
         version = self._models.refresh(surrogate) if version is None else version
         return version, self._models.get(surrogate, version)

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from surrogym_server.environment.actions import model_actions
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions, check_coordinates
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LedgerRecord, NewSample, SampleRecord
-from surrogym_server.surrogate.actions import model_actions
-from surrogym_server.surrogate.definition import EnvironmentDefinition
 
 PAGE = 10_000
 

@@ -29,16 +29,16 @@ from surrogym_server.engine.session import (
     step_session,
 )
 from surrogym_server.engine.sessions import LiveSessions, Work
+from surrogym_server.environment.actions import policy_actions
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import Damaged, InvalidInput, NotReset, SurrogymError, TooLarge
-from surrogym_server.gp import CPU
 from surrogym_server.sampling.uncertainty import visited_confidence
 from surrogym_server.services.activity import SessionActivity, Tallies
-from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
+from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import SavedSession
-from surrogym_server.surrogate.actions import policy_actions
-from surrogym_server.surrogate.definition import EnvironmentDefinition
+from surrogym_server.tensors import CPU
 from surrogym_server.virtual import VirtualSettings, expected_bytes
 
 logger = logging.getLogger(__name__)
@@ -72,7 +72,7 @@ class SessionService:
         models: ModelCache,
         live: LiveSessions,
         max_lanes: int,
-        counts: Counts,
+        metrics: ProcessMetrics,
         device: torch.device = CPU,
     ) -> None:
         """``device`` is where sessions are stepped; what comes in and goes out is not on it."""
@@ -81,7 +81,7 @@ class SessionService:
         self._models = models
         self._live = live
         self._max_lanes = max_lanes
-        self._counts = counts
+        self._metrics = metrics
         self._device = device
         self._tallies = Tallies()
         self._opening = asyncio.Lock()
@@ -234,9 +234,9 @@ class SessionService:
     async def _counted(self, id: str, seq: int | None, request: Fingerprint, work: Work, steps: int) -> Answer:
         started = time.perf_counter()
         answer = await self._live.advance(id, seq, request, work, steps, self._deadline)
-        self._counts.steps.observe(time.perf_counter() - started)
+        self._metrics.steps.observe(time.perf_counter() - started)
         self._tallies.of(id).stepped(answer)
-        self._counts.lane_steps += steps * self._live.get(id).settings.num_envs
+        self._metrics.lane_steps += steps * self._live.get(id).settings.num_envs
         return answer
 
     def _check_size(self, settings: VirtualSettings) -> None:

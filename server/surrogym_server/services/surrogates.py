@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import LiveSessions
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput, NoModel, SpecConflict
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Define
@@ -26,7 +27,6 @@ from surrogym_server.storage.records import (
     SurrogateRecord,
     SurrogateSummary,
 )
-from surrogym_server.surrogate.definition import EnvironmentDefinition
 
 Array = NDArray[np.float64]
 Plan = Callable[[EnvironmentDefinition, int], tuple[dict[str, Any], Array, Array, tuple[Array, ...]]]

@@ -8,7 +8,7 @@ import logging
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import LiveSessions
 from surrogym_server.errors import SurrogymError
-from surrogym_server.services.counts import Counts
+from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.storage.port import Storage
 
 logger = logging.getLogger(__name__)
@@ -16,13 +16,13 @@ logger = logging.getLogger(__name__)
 
 class Sweeper:
     def __init__(
-        self, storage: Storage, live: LiveSessions, models: ModelCache, seconds: float, counts: Counts
+        self, storage: Storage, live: LiveSessions, models: ModelCache, seconds: float, metrics: ProcessMetrics
     ) -> None:
         self._storage = storage
         self._live = live
         self._models = models
         self._seconds = seconds
-        self._counts = counts
+        self._metrics = metrics
 
     async def run(self) -> None:
         """Sweep every so many seconds, for ever; ends by cancellation."""
@@ -34,10 +34,10 @@ class Sweeper:
         """Sweep once. A lease that ends here leaves its query to the next sampler, or sets it aside; a session whose
         surrogate another server has deleted ends."""
         for id in self._live.sweep():
-            self._counts.expired_sessions += 1
+            self._metrics.expired_sessions += 1
             logger.info("session %s was idle and has expired", id)
         try:
-            self._counts.expired_leases += await asyncio.to_thread(self._storage.queries.sweep_expired)
+            self._metrics.expired_leases += await asyncio.to_thread(self._storage.queries.sweep_expired)
             for surrogate in await asyncio.to_thread(self._models.look):
                 self._live.close_all_of(surrogate)
         except SurrogymError as error:

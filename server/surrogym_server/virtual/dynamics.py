@@ -8,8 +8,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.surrogate.model import SurrogateModel, paid
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.step_rules import paid
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
 
 Weighting = Literal["inverse_variance", "uniform"]
 WEIGHT_FLOOR = 1e-12  # of the reward's variance, so that a certain particle's weight stays finite
@@ -28,7 +29,7 @@ class Moved:
 
 
 def move_mean(
-    model: SurrogateModel,
+    model: GaussianProcessModel,
     q: Tensor,
     u: Tensor,
     penalty: float,
@@ -52,7 +53,7 @@ def move_mean(
 
 
 def move_particles(
-    model: SurrogateModel,
+    model: GaussianProcessModel,
     particles: Tensor,
     u: Tensor,
     penalty: float,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
 from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
 
 
-def with_paths(model: SurrogateModel, lanes: LaneState) -> LaneState:
+def with_paths(model: GaussianProcessModel, lanes: LaneState) -> LaneState:
     """Lanes whose functions are drawn: those in the first step of their episode draw it now, under its model.
 
     A draw is a pure function of model, seed, lane and episode. It is kept in the state all the same: solving for other

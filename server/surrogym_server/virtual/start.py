@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.surrogate.model import settle
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.step_rules import settle
 from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise, uniform_noise
 

@@ -12,13 +12,13 @@ from support import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
 from surrogym_server.engine.session import Session, open_session
-from surrogym_server.surrogate.codec import from_bytes
-from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.models.gaussian_process.codec.model import from_bytes
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
 from surrogym_server.virtual import VirtualSettings
 from surrogym_shared.spec import EnvironmentSpec
 
-Fitted = Callable[[int], SurrogateModel]
+Fitted = Callable[[int], GaussianProcessModel]
 
 
 @pytest.fixture(scope="session")
@@ -29,9 +29,9 @@ def definition() -> EnvironmentDefinition:
 @pytest.fixture(scope="session")
 def fitted(definition: EnvironmentDefinition) -> Fitted:
     """A model of n samples; each is fitted once."""
-    made: dict[int, SurrogateModel] = {}
+    made: dict[int, GaussianProcessModel] = {}
 
-    def fit(samples: int) -> SurrogateModel:
+    def fit(samples: int) -> GaussianProcessModel:
         if samples not in made:
             made[samples] = from_bytes(definition, _design(definition, samples).model)
         return made[samples]

@@ -20,13 +20,13 @@ from surrogym_server.engine.session import (
     reset_session,
     step_session,
 )
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import Damaged, InvalidInput, SeqConflict
-from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
 from surrogym_shared.port import StepResult
 
 Open = Callable[..., Session]
-Fitted = Callable[[int], SurrogateModel]
+Fitted = Callable[[int], GaussianProcessModel]
 VERSIONS = {1: 4, 2: 9}  # samples of each version's model
 ARRAYS = ("observation", "reward", "terminated", "truncated", "final_lanes", "final_observation", "deviation")
 ARRAYS += ("untrusted",)

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from surrogym_server.gp import Hyperparameters, Output, Posterior, Serving, condition, placed, serving
+from surrogym_server.gp import Hyperparameters, Output, Posterior, Serving, condition, serving
+from surrogym_server.tensors import to_device
 
 DIGITS = 60
 NOISE = 1e-8
@@ -61,7 +62,7 @@ def test_ill_conditioned(rng, monkeypatch, device, length, linear, quadratic):
     hyper = Hyperparameters(length * torch.tensor([1.0, 1.5], dtype=torch.float64), 1.3, linear, quadratic, NOISE)
     with mpmath.workdps(DIGITS):
         mean, variance, prior = reference(hyper, x, y, at).T
-    posterior = placed(condition(hyper, torch.from_numpy(x), torch.from_numpy(y)), device)
+    posterior = to_device(condition(hyper, torch.from_numpy(x), torch.from_numpy(y)), device)
     assert posterior.jitter == 0
     points = torch.from_numpy(at).to(device)
     predictions = [posterior.mean_and_variance(points), served(posterior, points)]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from surrogym_server.gp import Hyperparameters, Output, Serving, condition, in_blocks, placed, serving
+from surrogym_server.gp import Hyperparameters, Output, Serving, condition, serving
+from surrogym_server.tensors import in_blocks, to_device
 
 INPUTS = ((0, 1, 2), (3, 1, 0), (2, 4, 3))
 WIDTH, COLUMNS, CONSTANT = 5, 5, 4
@@ -33,7 +34,7 @@ def at(rng) -> torch.Tensor:
 def test_every_output_is_its_posterior(outputs, at, monkeypatch, device, tolerance):
     monkeypatch.setattr(serving, "MEAN_TOLERANCE", tolerance)
     monkeypatch.setattr(serving, "VARIANCE_TOLERANCE", tolerance)
-    compiled = Serving.of(placed(tuple(outputs), device), COLUMNS, WIDTH, device)
+    compiled = Serving.of(to_device(tuple(outputs), device), COLUMNS, WIDTH, device)
     mean, deviation = (values.cpu() for values in compiled.mean_and_deviation(at.to(device), range(COLUMNS)))
     torch.testing.assert_close(compiled.mean(at.to(device)).cpu(), mean, rtol=0, atol=0)
     assert (mean[:, 2] == 0).all()

@@ -8,11 +8,11 @@ import torch
 from support.real_steps import answer, random_steps
 from surrogym_client.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.samples import Samples
+from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
 from surrogym_server.sampling.design import initial_design
-from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.surrogate.learn import learn
-from surrogym_server.surrogate.model import SurrogateModel
-from surrogym_server.surrogate.samples import Samples
 
 
 @pytest.fixture(scope="session")
@@ -27,7 +27,7 @@ def few(definition: EnvironmentDefinition) -> Samples:
 
 
 @pytest.fixture(scope="session")
-def model(definition: EnvironmentDefinition, few: Samples) -> SurrogateModel:
+def model(definition: EnvironmentDefinition, few: Samples) -> GaussianProcessModel:
     return learn(definition, few).model
 
 

@@ -9,19 +9,19 @@ from scipy.stats import norm
 
 from surrogym_client.original.classic import cartpole
 from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.definition import AcquisitionChoice
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
 from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.batch import NEAR, candidate_view, choose, nearest
 from surrogym_server.sampling.candidates import Candidates
 from surrogym_server.sampling.confidence import deviations
 from surrogym_server.sampling.outlook import Outlook, Points
-from surrogym_server.surrogate.definition import AcquisitionChoice
-from surrogym_server.surrogate.model import SurrogateModel
 
 TOLERANCES = (0.01, 0.02, 0.1)
 CRITERIA = ("uncertainty_index", "variance", "integrated_variance")
 
 
-def by(model: SurrogateModel, criterion: str) -> SurrogateModel:
+def by(model: GaussianProcessModel, criterion: str) -> GaussianProcessModel:
     design = replace(model.definition.design, acquisition=AcquisitionChoice(criterion))
     return replace(model, definition=replace(model.definition, design=design))
 
@@ -33,7 +33,7 @@ def candidates(points) -> Candidates:
     return Candidates(Points(*points), log_p, Points(*points), weights)
 
 
-def value(model: SurrogateModel, candidates: Candidates, criterion: str, column: int) -> torch.Tensor:
+def value(model: GaussianProcessModel, candidates: Candidates, criterion: str, column: int) -> torch.Tensor:
     points = candidates.points
     outlook = Outlook.of(model, points, candidates.reference, points[:0])
     output, distance = outlook.outputs[column], torch.ones(len(points), dtype=torch.float64)

@@ -9,14 +9,14 @@ import torch
 from support.real_steps import random_steps
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.definition import AcquisitionChoice
+from surrogym_server.environment.samples import Samples
+from surrogym_server.models.gaussian_process.learning.learn import learn
 from surrogym_server.sampling import candidates as candidates_room
 from surrogym_server.sampling.candidates import OCCUPIED, candidates_of, input_probability
 from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.occupancy import log_occupancy
 from surrogym_server.sampling.outlook import Points
-from surrogym_server.surrogate.definition import AcquisitionChoice
-from surrogym_server.surrogate.learn import learn
-from surrogym_server.surrogate.samples import Samples
 from surrogym_shared.spec import Design
 
 

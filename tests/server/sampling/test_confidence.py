@@ -12,8 +12,11 @@ import torch
 from scipy.stats import norm
 
 from support.real_steps import join
+from surrogym_server.environment.features import FeatureMap
 from surrogym_server.gp import Hyperparameters, condition
 from surrogym_server.gp.kernel import covariance
+from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.sampling.confidence import (
     certainty,
     confidence,
@@ -23,9 +26,6 @@ from surrogym_server.sampling.confidence import (
 )
 from surrogym_server.sampling.occupancy import log_occupancy
 from surrogym_server.sampling.uncertainty import query_uncertainty, visited_confidence
-from surrogym_server.surrogate.features import FeatureMap
-from surrogym_server.surrogate.learn import learn
-from surrogym_server.surrogate.model import OutputModel
 
 TIGHT = [1e-6, 1e-6, 1e-6]
 

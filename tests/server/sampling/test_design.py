@@ -11,6 +11,8 @@ import torch
 from support.real_steps import answer, join, random_steps
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.definition import EnvironmentDefinition, wrap
+from surrogym_server.environment.samples import Samples
 from surrogym_server.sampling import batch
 from surrogym_server.sampling.batch import NEAR, nearest
 from surrogym_server.sampling.confidence import OutputConfidence
@@ -26,8 +28,6 @@ from surrogym_server.sampling.design import (
     usual_tolerances,
 )
 from surrogym_server.sampling.outlook import Points
-from surrogym_server.surrogate.definition import EnvironmentDefinition, wrap
-from surrogym_server.surrogate.samples import Samples
 from surrogym_shared.spec import Design, EnvironmentSpec
 
 NEVER = DesignState(1, (1e-12,) * 3)  # tolerances that no model reaches

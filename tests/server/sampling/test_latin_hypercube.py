@@ -12,9 +12,9 @@ from scipy.stats import truncnorm
 
 from surrogym_client.original.classic import acrobot, pendulum
 from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.definition import ActionDefinition, CoordinateDefinition
+from surrogym_server.environment.distributions import Distribution, Fixed, Normal, Uniform
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
-from surrogym_server.surrogate.definition import ActionDefinition, CoordinateDefinition
-from surrogym_server.surrogate.distributions import Distribution, Fixed, Normal, Uniform
 
 PENDULUM = definition_from_spec(pendulum())
 

@@ -9,12 +9,13 @@ import torch
 from support.real_steps import random_steps
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.features import encode
+from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.sampling.confidence import deviations
 from surrogym_server.sampling.latin_hypercube import random_points
 from surrogym_server.sampling.outlook import Outlook, Points
-from surrogym_server.surrogate.features import encode
-from surrogym_server.surrogate.learn import learn
-from surrogym_server.surrogate.model import OutputModel, SurrogateModel
 from surrogym_shared.spec import Reward
 
 NOTHING = slice(0)
@@ -30,7 +31,7 @@ def reference(definition) -> Points:
     return Points(*random_points(definition, 25, np.random.default_rng(5)))
 
 
-def answered(model: SurrogateModel, query: Points) -> SurrogateModel:
+def answered(model: GaussianProcessModel, query: Points) -> GaussianProcessModel:
     """The model as if one query had been answered as predicted: every process has one more point."""
     lead = model.transition(query.q, query.u).q_next[:, 1:]
 

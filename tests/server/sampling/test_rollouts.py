@@ -12,6 +12,10 @@ from support.plane import drifting, plane
 from support.real_steps import join, roll
 from surrogym_client.original.classic import acrobot, cartpole, pendulum
 from surrogym_server.convert import default_budget, definition_from_spec
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.samples import Samples
+from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
 from surrogym_server.sampling.confidence import deviations
 from surrogym_server.sampling.design import DesignState, Request, advance, initial_rollouts
 from surrogym_server.sampling.outlook import Points
@@ -26,10 +30,6 @@ from surrogym_server.sampling.rollouts import (
     random_sequences,
     start_points,
 )
-from surrogym_server.surrogate.definition import EnvironmentDefinition
-from surrogym_server.surrogate.learn import learn
-from surrogym_server.surrogate.model import SurrogateModel
-from surrogym_server.surrogate.samples import Samples
 from surrogym_shared.spec import EnvironmentSpec, Uniform
 
 NOTHING = Points(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 1, dtype=torch.float64))
@@ -59,12 +59,12 @@ def begun(swinging: EnvironmentDefinition) -> Samples:
 
 
 @pytest.fixture(scope="module")
-def model(swinging: EnvironmentDefinition, begun: Samples) -> SurrogateModel:
+def model(swinging: EnvironmentDefinition, begun: Samples) -> GaussianProcessModel:
     return learn(swinging, begun).model
 
 
 @pytest.fixture(scope="module")
-def aim(model: SurrogateModel) -> Aim:
+def aim(model: GaussianProcessModel) -> Aim:
     outputs = (*model.transitions, model.reward)
     return Aim(ALL, [0.05 * output.scale for output in outputs], longest=12)
 
@@ -94,7 +94,7 @@ def test_starts_are_the_declared_ones_and_stratified(swinging: EnvironmentDefini
     assert bool((starts[:, 1].abs() <= 1).all())
 
 
-def test_a_predicted_path_goes_on_where_it_was(model: SurrogateModel):
+def test_a_predicted_path_goes_on_where_it_was(model: GaussianProcessModel):
     actions = torch.from_numpy(random_sequences(model.definition, 5, 7, rng()))
     paths = predict_paths(model, start_points(model.definition, 5, rng()), actions)
     torch.testing.assert_close(paths.q[:, 1:], paths.q_next[:, :-1])
@@ -102,7 +102,7 @@ def test_a_predicted_path_goes_on_where_it_was(model: SurrogateModel):
     assert bool((paths.drift.diff(dim=1) >= 0).all())
 
 
-def test_information_is_that_of_points_each_after_those_before_it(model: SurrogateModel, aim: Aim):
+def test_information_is_that_of_points_each_after_those_before_it(model: GaussianProcessModel, aim: Aim):
     """Against the chain rule: 1/2 log(1 + var / tau^2) of each point, given those before with noise tau^2."""
     paths = predict_paths(model, start_points(model.definition, 1, rng()), torch.zeros(1, 6, 1, dtype=torch.float64))
     paths = replace(paths, drift=torch.zeros_like(paths.drift))
@@ -127,7 +127,7 @@ def _reward_inputs(model, q, u, q_next):
     return inputs_of(model, model.reward, Points(q, u), q_next)
 
 
-def test_a_point_seen_twice_on_a_path_gives_almost_nothing_the_second_time(model: SurrogateModel, aim: Aim):
+def test_a_point_seen_twice_on_a_path_gives_almost_nothing_the_second_time(model: GaussianProcessModel, aim: Aim):
     paths = predict_paths(model, start_points(model.definition, 1, rng()), torch.ones(1, 4, 1, dtype=torch.float64))
     stuck = {name: getattr(paths, name)[:, :1].expand(-1, 4, -1) for name in ("q", "u", "q_next")}
     gain = path_values(model, aim, replace(paths, **stuck, drift=torch.zeros_like(paths.drift)))[0]
@@ -135,7 +135,7 @@ def test_a_point_seen_twice_on_a_path_gives_almost_nothing_the_second_time(model
     assert max(later) < 0.35 * first
 
 
-def test_what_lies_outside_the_sampling_range_or_after_an_end_counts_nothing(model: SurrogateModel, aim: Aim):
+def test_what_lies_outside_the_sampling_range_or_after_an_end_counts_nothing(model: GaussianProcessModel, aim: Aim):
     paths = predict_paths(model, start_points(model.definition, 1, rng()), torch.ones(1, 4, 1, dtype=torch.float64))
     away = torch.tensor([0.0, 30.0], dtype=torch.float64)
     outside = replace(paths, q=torch.cat([paths.q[:, :2], (paths.q + away)[:, 2:]], 1))
@@ -146,13 +146,13 @@ def test_what_lies_outside_the_sampling_range_or_after_an_end_counts_nothing(mod
         torch.testing.assert_close(gain[2:], gain[1].expand(2))
 
 
-def test_a_step_counts_less_the_worse_it_can_be_predicted(model: SurrogateModel, aim: Aim):
+def test_a_step_counts_less_the_worse_it_can_be_predicted(model: GaussianProcessModel, aim: Aim):
     paths = predict_paths(model, start_points(model.definition, 3, rng()), torch.ones(3, 4, 1, dtype=torch.float64))
     known, lost = (replace(paths, drift=torch.full_like(paths.drift, d)) for d in (0.0, 20.0))
     assert bool((path_values(model, aim, lost) < 0.01 * path_values(model, aim, known)).all())
 
 
-def test_occupancy_draws_the_plan_to_where_policies_go(model: SurrogateModel, aim: Aim):
+def test_occupancy_draws_the_plan_to_where_policies_go(model: GaussianProcessModel, aim: Aim):
     paths = predict_paths(model, start_points(model.definition, 8, rng()), torch.ones(8, 2, 1, dtype=torch.float64))
     near = 0.1 * torch.randn(200, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + paths.q[5, 0]
     plain, drawn = (path_values(model, replace(aim, states=states), paths)[:, 0] for states in (None, near))
@@ -179,11 +179,11 @@ def test_a_planned_rollout_gives_more_per_step_than_random_ones():
     assert worth(actions) > 1.1 * float(np.median(others))
 
 
-def test_the_same_plan_again_for_the_same_seed(model: SurrogateModel, aim: Aim):
+def test_the_same_plan_again_for_the_same_seed(model: GaussianProcessModel, aim: Aim):
     torch.testing.assert_close(plan_rollout(model, aim, rng(3)), plan_rollout(model, aim, rng(3)))
 
 
-def test_a_rollout_that_is_pending_leaves_less_to_learn(model: SurrogateModel, aim: Aim):
+def test_a_rollout_that_is_pending_leaves_less_to_learn(model: GaussianProcessModel, aim: Aim):
     actions = torch.full((6, 1), 2.0, dtype=torch.float64)
     done = as_if_done(model, actions, rng())
     paths = predict_paths(model, start_points(model.definition, 1, rng()), actions[None])
@@ -195,7 +195,7 @@ def test_a_rollout_that_is_pending_leaves_less_to_learn(model: SurrogateModel, a
     torch.testing.assert_close(done.transition(q, u).q_next, model.transition(q, u).q_next, rtol=0, atol=1e-6)
 
 
-def test_a_round_takes_its_steps_and_no_more(model: SurrogateModel, aim: Aim):
+def test_a_round_takes_its_steps_and_no_more(model: GaussianProcessModel, aim: Aim):
     rollouts = plan_round(model, replace(aim, longest=3), 7, [torch.ones(2, 1, dtype=torch.float64)], rng())
     assert sum(len(actions) for actions in rollouts) == 7
     assert max(len(actions) for actions in rollouts) <= 3

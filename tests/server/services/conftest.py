@@ -10,11 +10,11 @@ import pytest
 from support import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.engine.design_job import initial_queries
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSample, NewSurrogate
 from surrogym_server.storage.sql import open_storage
-from surrogym_server.surrogate.definition import EnvironmentDefinition
 from surrogym_shared.spec import EnvironmentSpec
 
 NAME = "pendulum"

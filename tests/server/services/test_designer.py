@@ -16,9 +16,9 @@ from support import pendulum
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.errors import InvalidInput, NoModel, NumericalFailure, Unavailable
-from surrogym_server.services.counts import Counts
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import ATTEMPTS, Designer, phase_after
+from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.models import load_model
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
@@ -67,7 +67,7 @@ def designer(storage: Storage, definitions: Definitions, cache: ModelCache, runn
 
     def make() -> Designer:
         return Designer(
-            storage, definitions, runner, cache, Notices(), Counts(), owner="here", threads=1, look_seconds=0.05
+            storage, definitions, runner, cache, Notices(), ProcessMetrics(), owner="here", threads=1, look_seconds=0.05
         )
 
     return make

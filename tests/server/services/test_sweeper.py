@@ -10,7 +10,7 @@ import pytest
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import Limits, LiveSessions, Threads
 from surrogym_server.errors import Unavailable
-from surrogym_server.services.counts import Counts
+from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.sweeper import Sweeper
 from surrogym_server.storage.port import Storage
 
@@ -24,17 +24,17 @@ def test_a_sweep_that_fails_is_followed_by_the_next(storage: Storage, monkeypatc
         return 3
 
     async def run() -> int:
-        counts = Counts()
+        metrics = ProcessMetrics()
         with ThreadPoolExecutor(1) as threads:
             live = LiveSessions(Threads(threads, 1), Threads(threads, 1), limits=Limits(), idle_seconds=60.0)
             models = ModelCache(lambda *_: pytest.fail("nothing is in use"), storage.models.newest)
-            sweeper = asyncio.create_task(Sweeper(storage, live, models, 0.001, counts).run())
+            sweeper = asyncio.create_task(Sweeper(storage, live, models, 0.001, metrics).run())
             while met:
                 await asyncio.sleep(0.001)
-            while not counts.expired_leases and not sweeper.done():
+            while not metrics.expired_leases and not sweeper.done():
                 await asyncio.sleep(0.001)
             sweeper.cancel()
-        return counts.expired_leases
+        return metrics.expired_leases
 
     monkeypatch.setattr(storage.queries, "sweep_expired", sweep_expired)
     assert asyncio.run(asyncio.wait_for(run(), 10)) == 3

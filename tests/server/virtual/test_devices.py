@@ -13,9 +13,10 @@ from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 from support.real_steps import random_steps
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.gp import CPU, placed, serving
-from surrogym_server.surrogate.learn import learn
-from surrogym_server.surrogate.model import SurrogateModel
+from surrogym_server.gp import serving
+from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.tensors import CPU, to_device
 from surrogym_server.virtual import LaneState, Transition, VirtualSettings, create, environment, reset, step
 
 LANES, STEPS = 6, 4
@@ -28,7 +29,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 @pytest.fixture(scope="module", params=["pendulum", "learned ending", "paper"])
-def model(request: pytest.FixtureRequest) -> SurrogateModel:
+def model(request: pytest.FixtureRequest) -> GaussianProcessModel:
     spec = cartpole() if request.param == "learned ending" else pendulum()
     if request.param == "paper":
         spec = spec.model_copy(update={"design": spec.design.model_copy(update={"preset": "paper"})})
@@ -37,7 +38,7 @@ def model(request: pytest.FixtureRequest) -> SurrogateModel:
     return learn(definition_from_spec(spec), random_steps(spec, 14, seed=0)).model
 
 
-def run(model: SurrogateModel, settings: VirtualSettings) -> tuple[LaneState, list[Transition]]:
+def run(model: GaussianProcessModel, settings: VirtualSettings) -> tuple[LaneState, list[Transition]]:
     """Some steps from a seeded reset, some lanes of which are reset again."""
     definition, rng = model.definition, np.random.default_rng(0)
     low, high = definition.action.limits if definition.action.low else (0, np.array(definition.action.nvec) - 1)
@@ -82,7 +83,7 @@ def test_nothing_of_a_step_is_made_on_the_cpu(model, variant, differences, monke
     with FakeTensorMode(allow_non_fake_inputs=True):
         with pytest.raises(RuntimeError, match="same device"):
             torch.zeros(2) + torch.zeros(2, device="meta")
-        there = placed(model, torch.device("meta"))
+        there = to_device(model, torch.device("meta"))
         lanes, _ = reset(there.definition, settings, create(there.definition, settings, 0), seed=1)
         if settings.variant == "pathwise":
             lanes = replace(lanes, path=there.draw(lanes.q.new_zeros(LANES, there.path_size)))

@@ -9,9 +9,9 @@ import torch
 from support.real_steps import random_steps
 from surrogym_client.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.surrogate.learn import learn
-from surrogym_server.surrogate.model import SurrogateModel
-from surrogym_server.surrogate.samples import Samples
+from surrogym_server.environment.samples import Samples
+from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
 from surrogym_server.virtual import LaneState, step
 
 ARRAYS = ("observation", "reward", "terminated", "truncated")
@@ -24,12 +24,12 @@ def samples() -> Samples:
 
 
 @pytest.fixture(scope="module")
-def model(samples: Samples) -> SurrogateModel:
+def model(samples: Samples) -> GaussianProcessModel:
     return learn(definition_from_spec(pendulum()), samples).model
 
 
 @pytest.fixture(scope="module")
-def better() -> SurrogateModel:
+def better() -> GaussianProcessModel:
     return learn(definition_from_spec(pendulum()), random_steps(pendulum(), 12, seed=3)).model
 
 

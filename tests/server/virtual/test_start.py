@@ -8,8 +8,8 @@ import pytest
 import torch
 from scipy.stats import kstest
 
+from surrogym_server.environment.distributions import Fixed, Normal
 from surrogym_server.errors import InvalidInput
-from surrogym_server.surrogate.distributions import Fixed, Normal
 from surrogym_server.virtual import VirtualSettings, create, reset
 
 

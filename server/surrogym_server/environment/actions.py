@@ -1,0 +1,85 @@
+"""Actions: what a policy sends, what the model is fed, and the check at the door between them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_server.environment.definition import ActionDefinition
+from surrogym_server.errors import InvalidInput
+
+Array = NDArray[np.float64]
+FLOAT32_SLACK = 1e-6
+
+
+def policy_actions(action: ActionDefinition, raw: NDArray[Any], lanes: int) -> Array:
+    """Check a policy's actions, (N, F) or (N,) where F = 1, and give the model's, (N, F).
+
+    Raises:
+        InvalidInput: wrong shape, not finite, not an integer, or out of bounds.
+    """
+    rows = _rows(raw, (lanes, action.size))
+    if counts := action.policy_counts:
+        _require_counts(rows, counts)
+        return decode_bins(action, rows) if action.bins else rows
+    return _in_box(action, rows)
+
+
+def model_actions(action: ActionDefinition, raw: NDArray[Any]) -> Array:
+    """Check actions as queries and samples carry them, (n, F): continuous values, or numbers of discrete actions.
+
+    Raises:
+        InvalidInput: wrong shape, not finite, not an integer, or out of bounds.
+    """
+    rows = _rows(raw, (len(raw), action.size))
+    if action.nvec:
+        _require_counts(rows, action.nvec)
+        return rows
+    return _in_box(action, rows)
+
+
+def decode_bins(action: ActionDefinition, rows: Array) -> Array:
+    """Continuous values (n, F) of equally spaced bins, numbers (n, F)."""
+    low, high = action.limits
+    values: Array = low + rows * (high - low) / (np.array(action.bins) - 1)
+    return values
+
+
+def _rows(raw: NDArray[Any], expected: tuple[int, int]) -> Array:
+    rows = np.array(raw, dtype=np.float64)  # a frame's array is a view, neither aligned nor writable
+    if rows.ndim == 1 and expected[1] == 1:
+        rows = rows[:, None]
+    if rows.shape != expected:
+        raise InvalidInput(f"action: expected shape {expected}, got {np.shape(raw)}")
+    if not np.isfinite(rows).all():
+        raise InvalidInput("action: expected finite numbers, got NaN or infinity")
+    return rows
+
+
+def _require_counts(rows: Array, counts: tuple[int, ...]) -> None:
+    if (rows != np.floor(rows)).any():
+        raise InvalidInput(f"action: expected integers, got {rows[rows != np.floor(rows)][0]:g}")
+    bad = (rows < 0) | (rows >= np.array(counts))
+    if bad.any():
+        row, entry = np.argwhere(bad)[0]
+        raise InvalidInput(
+            f"action: expected entry {entry} in 0..{counts[entry] - 1}, got {rows[row, entry]:g} in row {row}"
+        )
+
+
+def _in_box(action: ActionDefinition, rows: Array) -> Array:
+    low, high = action.limits
+    if ((rows >= low) & (rows <= high)).all():
+        return rows
+    slack = FLOAT32_SLACK * (high - low)  # a policy's float32 bound may round to just outside
+    bad = (rows < low - slack) | (rows > high + slack)
+    if bad.any():
+        row, entry = np.argwhere(bad)[0]
+        raise InvalidInput(
+            f"action: expected entry {entry} in [{low[entry]:g}, {high[entry]:g}], "
+            f"got {rows[row, entry]:g} in row {row}"
+        )
+    inside: Array = rows.clip(low, high)
+    return inside

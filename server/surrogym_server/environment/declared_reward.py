@@ -1,0 +1,84 @@
+"""A reward that is known: a sum of weighted shapes of quantities of state and action. Data, never code."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.conditions import Conditions, Inequality
+from surrogym_server.environment.terms import Term, TermSet, compile_terms
+from surrogym_server.tensors import CPU, cached, to_device
+
+Shape = Literal["one", "linear", "absolute", "square", "bump"]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """x = term(q) + action . u."""
+
+    term: Term
+    action: tuple[float, ...]  # (F,)
+
+
+@dataclass(frozen=True)
+class RewardTerm:
+    """weight * shape(x_1, x_2, ...) where every inequality in ``when`` holds, else 0.
+
+    ``one``: 1. ``linear``: sum x_i. ``absolute``: sum |x_i|. ``square``: sum x_i^2. ``bump``: exp(-1/2 sum x_i^2).
+    """
+
+    weight: float
+    shape: Shape
+    of: tuple[Quantity, ...]
+    when: tuple[Inequality, ...]
+
+
+@dataclass(frozen=True)
+class DeclaredReward:
+    """The sum of its terms at the state before the step, or after it, and the action."""
+
+    terms: tuple[RewardTerm, ...]
+    after: bool
+    terminal: float  # what a step that ends the episode pays beyond
+    coordinates: int
+    device: torch.device = CPU  # where its tensors are
+
+    def __call__(self, q: Tensor, u: Tensor) -> Tensor:
+        """Reward (m,) of the state q (m, C) that counts and the action u (m, F)."""
+        values, weights, conditions = self._compiled
+        x = values(q) + u @ weights
+        holds = conditions(q)
+        total = q.new_zeros(len(q))
+        begin = 0
+        for index, term in enumerate(self.terms):
+            own = x[:, begin : begin + len(term.of)]
+            begin += len(term.of)
+            total = total + term.weight * _shaped(term.shape, own) * holds[:, index]
+        return total
+
+    @cached
+    def _compiled(self) -> tuple[TermSet, Tensor, Conditions]:
+        """All quantities' terms and action weights (F, X), and when each term counts."""
+        quantities = [quantity for term in self.terms for quantity in term.of]
+        weights = torch.tensor([quantity.action for quantity in quantities], dtype=torch.float64)
+        terms = compile_terms([quantity.term for quantity in quantities], self.coordinates)
+        conditions = Conditions.of([term.when for term in self.terms], self.coordinates)
+        compiled = terms, weights.T if quantities else weights.reshape(1, 0), conditions
+        return to_device(compiled, self.device)
+
+
+def _shaped(shape: Shape, x: Tensor) -> Tensor:
+    match shape:
+        case "one":
+            return x.new_ones(len(x))
+        case "linear":
+            return x.sum(-1)
+        case "absolute":
+            return x.abs().sum(-1)
+        case "square":
+            return x.square().sum(-1)
+        case "bump":
+            return torch.exp(-0.5 * x.square().sum(-1))

@@ -1,0 +1,254 @@
+"""EnvironmentDefinition: the core's own frozen view of an environment. Specifications are converted at the edge."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from surrogym_server.environment.conditions import Conditions, Inequality
+from surrogym_server.environment.declared_reward import DeclaredReward
+from surrogym_server.environment.distributions import Distribution
+from surrogym_server.environment.terms import Term, TermSet, compile_terms
+from surrogym_server.tensors import CPU, cached, to_device
+
+REWARD = "reward"
+REACH = 1e6
+SCALING_POINTS = 4_096
+Array = NDArray[np.float64]
+Kind = Literal["linear", "angle", "constant"]
+
+
+@dataclass(frozen=True)
+class CoordinateDefinition:
+    name: str
+    kind: Kind
+    sampling: Distribution
+    start: Distribution
+    low: float = -np.inf  # saturation bounds
+    high: float = np.inf
+    stops: int | None = None  # index of the coordinate that a bound sets to zero
+
+    @property
+    def saturates(self) -> bool:
+        return bool(np.isfinite(self.low) or np.isfinite(self.high))
+
+    @property
+    def settable(self) -> tuple[float, float]:
+        """What the original environment can be set to: its bounds, or the sampling range where it has none."""
+        low = self.low if np.isfinite(self.low) else self.sampling.low
+        return low, self.high if np.isfinite(self.high) else self.sampling.high
+
+
+@dataclass(frozen=True)
+class ActionDefinition:
+    """A box (low, high), offered to policies as ``bins`` where given, or discrete counts ``nvec``."""
+
+    kind: Literal["box", "discrete", "multi_discrete"]
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
+    bins: tuple[int, ...] | None = None
+    nvec: tuple[int, ...] = ()
+
+    @cached_property
+    def limits(self) -> tuple[Array, Array]:
+        """``low`` and ``high`` as arrays, (F,) each, made once: every step of a policy is checked against them."""
+        return np.array(self.low), np.array(self.high)
+
+    @property
+    def size(self) -> int:
+        return len(self.low) or len(self.nvec)
+
+    @property
+    def policy_counts(self) -> tuple[int, ...]:
+        """How many values a policy chooses from in each entry; empty for a continuous policy."""
+        return self.nvec or self.bins or ()
+
+
+@dataclass(frozen=True)
+class LearningDefinition:
+    """What a model is made of, every default resolved.
+
+    Attributes:
+        moves: what the transition outputs are increments of; under ``observation`` the coordinates are read back from
+            the observation, as the paper has it.
+        kernel: of every process; ``composite`` adds a linear part, and for the reward a quadratic one.
+        reward_jumps: whether the reward may jump where a learned region begins.
+        symmetry: ``auto`` compares feature maps that are their own mirror image with the others.
+    """
+
+    moves: Literal["coordinates", "observation"]
+    kernel: Literal["composite", "squared_exponential"]
+    reward_jumps: bool
+    symmetry: Literal["auto", "none"]
+
+
+@dataclass(frozen=True)
+class AcquisitionChoice:
+    """An acquisition by its name in the registry, and its settings."""
+
+    name: str
+    settings: tuple[tuple[str, float | bool | str], ...] = ()
+
+
+@dataclass(frozen=True)
+class DesignDefinition:
+    """Settings of the adaptive design, every default resolved.
+
+    Attributes:
+        initial: queries of the initial design.
+        hypercube_tries: Latin hypercubes to choose the most spread one from.
+        acquisition: criterion of the adaptive queries.
+        tolerance: ``relative`` to an output's deviation over the initial design, or ``raw``: 1 in the output's unit.
+        monte_carlo: points that estimate the confidence index (eq. 8).
+        visited_candidates: whether visited states join the candidates and the reference.
+        input_probability: P_i (eq. 11) while no policy has visited anything: ``uniform``, or the density of the
+            ``predicted`` next states, as printed.
+        stopping: ``confidence`` stops at the target of the index, as printed; ``tested_confidence`` also asks
+            leave-one-out errors within the tolerances and adaptive queries that tried to disprove it.
+        seed: of all random choices of the design.
+    """
+
+    initial: int
+    hypercube_tries: int
+    acquisition: AcquisitionChoice
+    tolerance: Literal["relative", "raw"]
+    monte_carlo: int
+    visited_candidates: bool
+    input_probability: Literal["uniform", "predicted"]
+    stopping: Literal["confidence", "tested_confidence"]
+    seed: int
+
+
+@dataclass(frozen=True)
+class EnvironmentDefinition:
+    """One environment. C coordinates, D observation entries, F action entries."""
+
+    coordinates: tuple[CoordinateDefinition, ...]
+    observation_names: tuple[str, ...]
+    observation_terms: tuple[Term, ...]
+    observation_low: tuple[float, ...]
+    observation_high: tuple[float, ...]
+    action: ActionDefinition
+    termination_groups: tuple[tuple[Inequality, ...], ...]
+    time_limit: int | None
+    reward_timing: Literal["before", "after", "auto"]
+    penalty: float
+    tolerances: tuple[tuple[str, float], ...]
+    learning: LearningDefinition
+    design: DesignDefinition
+    learns_termination: bool = False  # from samples; no groups are declared then
+    declared_reward: DeclaredReward | None = None
+    max_rollout: int | None = None  # longest action sequence from a reset; None where any state can be set
+    device: torch.device = CPU  # where its tensors are, and those of states and actions that it is given
+
+    def on(self, device: torch.device) -> EnvironmentDefinition:
+        """The same for states on another device."""
+        return self if device == self.device else to_device(self, device)
+
+    def tolerances_over(self, usual: Sequence[float]) -> tuple[float, ...]:
+        """Tolerance of each output: the declared one, else the usual one of these (O,)."""
+        declared = dict(self.tolerances)
+        return tuple(declared.get(name, value) for name, value in zip(self.outputs, usual, strict=True))
+
+    def with_tolerances(self, tolerances: Mapping[str, float]) -> EnvironmentDefinition:
+        """The same with these tolerances, by output, in the place of its own."""
+        return replace(self, tolerances=tuple((dict(self.tolerances) | dict(tolerances)).items()))
+
+    @property
+    def moves_observation(self) -> bool:
+        """Whether the transition outputs are increments of the observation, not of the coordinates."""
+        return self.learning.moves == "observation"
+
+    @cached_property
+    def coordinate_names(self) -> tuple[str, ...]:
+        return tuple(c.name for c in self.coordinates)
+
+    @cached_property
+    def moving(self) -> tuple[int, ...]:
+        """Indices of the coordinates that the dynamics move."""
+        return tuple(i for i, c in enumerate(self.coordinates) if c.kind != "constant")
+
+    @cached_property
+    def outputs(self) -> tuple[str, ...]:
+        """Modelled outputs by name: the moving coordinates or the observation entries, then the reward."""
+        if self.moves_observation:
+            return (*self.observation_names, REWARD)
+        return (*(self.coordinates[i].name for i in self.moving), REWARD)
+
+    @cached
+    def observe(self) -> TermSet:
+        """Observation of coordinates: q (..., C) -> o (..., D)."""
+        return to_device(compile_terms(self.observation_terms, len(self.coordinates)), self.device)
+
+    @cached_property
+    def observation_combines(self) -> bool:
+        """Whether an observation entry says more than one coordinate, its cosine or its sine does."""
+        terms = self.observation_terms
+        return any(len(t.parts) > 1 or any(np.count_nonzero(p.weights) > 1 for p in t.parts) for t in terms)
+
+    @cached
+    def observation_scaling(self) -> tuple[Tensor, Tensor]:
+        """Mean and deviation of the observation over the sampling range, (D,) each; an entry that never varies has
+        deviation 1."""
+        drawn = np.random.default_rng(0).uniform(size=(SCALING_POINTS, len(self.coordinates)))
+        p = torch.from_numpy(drawn).to(self.device)
+        q = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(self.coordinates)], -1)
+        shown = self.observe(q)
+        deviation = shown.std(0, correction=0)
+        return shown.mean(0), torch.where(deviation > 1e-9, deviation, 1.0)
+
+    @cached
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Saturation bounds, (C,) each."""
+        low, high = self._columns([(c.low, c.high) for c in self.coordinates])
+        return low, high
+
+    @cached
+    def reach(self) -> tuple[Tensor, Tensor]:
+        """Saturation bounds, (C,) each; where there is none, ``REACH`` widths of the sampling range beyond it, so that
+        a model that diverges stays finite."""
+        low, high = self.bounds
+        begin, end = self._sampled
+        room = REACH * (end - begin)
+        return torch.maximum(low, begin - room), torch.minimum(high, end + room)
+
+    def in_range(self, q: Tensor) -> Tensor:
+        """Whether states q (n, C) lie in the sampling range, (n,) bool."""
+        low, high = self._sampled
+        inside: Tensor = ((q >= low) & (q <= high)).all(-1)
+        return inside
+
+    @cached_property
+    def angles(self) -> tuple[int, ...]:
+        return tuple(i for i, c in enumerate(self.coordinates) if c.kind == "angle")
+
+    def terminated(self, q: Tensor) -> Tensor:
+        """Whether an episode ends at q (..., C) as declared, shape (...): any group all of whose inequalities hold."""
+        if not self.termination_groups:
+            return torch.zeros(q.shape[:-1], dtype=torch.bool, device=q.device)
+        return self._termination(q).any(-1)
+
+    @cached
+    def _termination(self) -> Conditions:
+        return Conditions.of(self.termination_groups, len(self.coordinates), self.device)
+
+    @cached
+    def _sampled(self) -> tuple[Tensor, Tensor]:
+        """Ends of the sampling range, (C,) each."""
+        low, high = self._columns([(c.sampling.low, c.sampling.high) for c in self.coordinates])
+        return low, high
+
+    def _columns(self, rows: Sequence[tuple[float, ...]]) -> tuple[Tensor, ...]:
+        return torch.tensor(rows, dtype=torch.float64, device=self.device).T.contiguous().unbind()
+
+
+def wrap(angle: Tensor) -> Tensor:
+    """Angle in [-pi, pi)."""
+    return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi

@@ -1,0 +1,203 @@
+"""Inputs of models: encodings of coordinates and action, scaled so that each feature has deviation near 1."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition, wrap
+from surrogym_server.environment.distributions import scaling
+
+State = Literal["cos_sin", "wrapped", "both", "observation", "none"]
+Encoding = Literal["value", "one_hot"]  # of discrete actions
+Parity = Literal["", "odd", "even"]
+Drift = tuple[tuple[float, ...], ...]  # weights (C,) of q for each angle
+
+
+@dataclass(frozen=True)
+class FeatureMap:
+    """How (q, u) is shown to one output's process.
+
+    ``state``: angles as cos and sin, as the wrapped angle, or both; or the observation: as it is in the paper,
+    standardised elsewhere; or none of coordinates and action, but the lead alone.
+    ``action``: discrete actions as evenly spaced values, or one-hot. ``lead``: the predicted, clipped next value of
+    saturating coordinates is an input as well, so that what follows from it (an angle from its speed) sees no kink.
+    ``after``: the state that the step led to is shown, not the one it began in; only for the reward. ``drift``: weights
+    (C,) of q for each angle; cos and sin of where the angle turns to by them are inputs as well. ``parity``: what the
+    output does when every coordinate and the action change their sign: nothing in particular, or it does so too
+    (odd), or it stays (even).
+    """
+
+    state: State = "cos_sin"
+    action: Encoding = "value"
+    lead: bool = False
+    after: bool = False
+    drift: Drift = ()
+    parity: Parity = ""
+
+    def __str__(self) -> str:
+        extras = [name for name in ("lead", "after", "drift") if getattr(self, name)]
+        return ", ".join([self.state, f"action {self.action}", *extras, *([self.parity] if self.parity else [])])
+
+
+def leading(definition: EnvironmentDefinition) -> tuple[int, ...]:
+    """Coordinates that saturate on both sides without being a wall: limited speeds. They are predicted first."""
+    return tuple(
+        i
+        for i in definition.moving
+        if (c := definition.coordinates[i]).stops is None and math.isfinite(c.low) and math.isfinite(c.high)
+    )
+
+
+class Feature(NamedTuple):
+    """One input: a function of one entry of [q, u], of the lead, of weights . q, or one observation entry."""
+
+    function: Literal["affine", "cos", "sin", "turned_cos", "turned_sin", "wrapped", "equal", "observed", "lead"]
+    entry: int
+    centre: float = 0.0  # "equal": the value it is compared with
+    scale: float = 1.0
+    weights: tuple[float, ...] = ()  # (C,), "turned"
+
+
+def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tuple[Feature, ...]:
+    """The features of a map, in their order."""
+    made = [] if feature_map.state == "none" else _of_point(definition, feature_map)
+    if feature_map.lead:
+        made += [
+            Feature("lead", place, *scaling(definition.coordinates[index].sampling))
+            for place, index in enumerate(leading(definition))
+        ]
+    return tuple(made)
+
+
+def encode(
+    definition: EnvironmentDefinition, feature_map: FeatureMap, q: Tensor, u: Tensor, lead: Tensor | None = None
+) -> Tensor:
+    """Features of coordinates q (..., C), actions u (..., F) and, if the map reads it, the lead (..., L): (..., d)."""
+    encoder = Encoder.of(definition, (feature_map,))
+    x = encoder(q, u)
+    if feature_map.lead:
+        assert lead is not None
+        x = encoder.with_lead(x, lead)
+    return x[..., list(encoder.inputs(feature_map))]
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """The features of several maps, each computed once and all of a function together."""
+
+    definition: EnvironmentDefinition
+    groups: tuple[tuple[str, slice | Tensor, Tensor, Tensor], ...]  # function, entries (weights), centres, scales
+    columns: Mapping[Feature, int]
+
+    @classmethod
+    def of(cls, definition: EnvironmentDefinition, maps: Iterable[FeatureMap]) -> Encoder:
+        """Compile maps: their features by function, the lead's last."""
+        wanted = {feature for feature_map in maps for feature in features(definition, feature_map)}
+        ordered = sorted(wanted, key=lambda f: (f.function == "lead", f))
+        groups = tuple(
+            (function, *_group(tuple(same), definition.device))
+            for function, same in groupby(ordered, lambda f: f.function)
+        )
+        return cls(definition, groups, {feature: column for column, feature in enumerate(ordered)})
+
+    def inputs(self, feature_map: FeatureMap) -> tuple[int, ...]:
+        """Columns of a map's features, in the map's order."""
+        return tuple(self.columns[feature] for feature in features(self.definition, feature_map))
+
+    def width(self, lead: bool) -> int:
+        """How many features there are, with or without the lead's."""
+        return sum(lead or feature.function != "lead" for feature in self.columns)
+
+    def __call__(self, q: Tensor, u: Tensor) -> Tensor:
+        """All features of coordinates q (..., C) and actions u (..., F) but those of the lead."""
+        raw = torch.cat([q, u], -1)
+        values = [self._values(*group, raw) for group in self.groups if group[0] != "lead"]
+        return torch.cat(values, -1) if values else raw[..., :0]
+
+    def with_lead(self, x: Tensor, lead: Tensor) -> Tensor:
+        """All features: x (..., d) of a call, and those of the lead (..., L)."""
+        return torch.cat([x, *(self._values(*group, lead) for group in self.groups if group[0] == "lead")], -1)
+
+    def _values(self, function: str, entries: slice | Tensor, centre: Tensor, scale: Tensor, raw: Tensor) -> Tensor:
+        match function:
+            case "observed":
+                shown = self.definition.observe(raw[..., : len(self.definition.coordinates)])[..., entries]
+                return (shown - centre) / scale
+            case "cos":
+                return raw[..., entries].cos()
+            case "sin":
+                return raw[..., entries].sin()
+            case "turned_cos":
+                return self._turned(entries, raw).cos()
+            case "turned_sin":
+                return self._turned(entries, raw).sin()
+            case "wrapped":
+                return wrap(raw[..., entries]) * (math.sqrt(3) / math.pi)
+            case "equal":
+                return (raw[..., entries] == centre).to(raw.dtype)
+            case _:
+                return (raw[..., entries] - centre) / scale
+
+    def _turned(self, weights: slice | Tensor, raw: Tensor) -> Tensor:
+        assert isinstance(weights, Tensor)
+        return raw[..., : len(self.definition.coordinates)] @ weights
+
+
+def _of_point(definition: EnvironmentDefinition, feature_map: FeatureMap) -> list[Feature]:
+    """Features of coordinates and action, without the lead's."""
+    made: list[Feature] = []
+    if feature_map.state == "observation":
+        made += _of_observation(definition)
+    else:
+        for index in range(len(definition.coordinates)):
+            made += _of_coordinate(definition, feature_map, index)
+    for index, weights in zip(definition.angles, feature_map.drift, strict=False):
+        turned = tuple(w + (i == index) for i, w in enumerate(weights))
+        made += [Feature("turned_cos", index, weights=turned), Feature("turned_sin", index, weights=turned)]
+    for entry in range(definition.action.size):
+        made += _of_action(definition, feature_map, entry)
+    return made
+
+
+def _of_observation(definition: EnvironmentDefinition) -> list[Feature]:
+    if definition.moves_observation:
+        return [Feature("observed", entry) for entry in range(len(definition.observation_names))]
+    centres, scales = (values.tolist() for values in definition.observation_scaling)
+    return [Feature("observed", entry, *scaling) for entry, scaling in enumerate(zip(centres, scales, strict=True))]
+
+
+def _of_coordinate(definition: EnvironmentDefinition, feature_map: FeatureMap, index: int) -> list[Feature]:
+    coordinate = definition.coordinates[index]
+    if coordinate.kind != "angle":
+        return [Feature("affine", index, *scaling(coordinate.sampling))]
+    circle = [Feature("cos", index), Feature("sin", index)] if feature_map.state in ("cos_sin", "both") else []
+    return circle + ([Feature("wrapped", index)] if feature_map.state in ("wrapped", "both") else [])
+
+
+def _of_action(definition: EnvironmentDefinition, feature_map: FeatureMap, entry: int) -> list[Feature]:
+    action, place = definition.action, len(definition.coordinates) + entry
+    if action.kind == "box":
+        low, high = action.low[entry], action.high[entry]
+        return [Feature("affine", place, (low + high) / 2, (high - low) / math.sqrt(12))]
+    count = action.nvec[entry]
+    if feature_map.action == "one_hot" and count > 2:
+        return [Feature("equal", place, float(value)) for value in range(count)]
+    return [Feature("affine", place, (count - 1) / 2, math.sqrt((count**2 - 1) / 12))]
+
+
+def _group(same: tuple[Feature, ...], device: torch.device) -> tuple[slice | Tensor, Tensor, Tensor]:
+    """Entries, as a slice where they are neighbours, or weights (C, k); centres and scales."""
+    centre, scale = torch.tensor([(f.centre, f.scale) for f in same], dtype=torch.float64, device=device).T
+    if same[0].weights:
+        return torch.tensor([f.weights for f in same], dtype=torch.float64, device=device).T, centre, scale
+    entries = [feature.entry for feature in same]
+    neighbours = entries == list(range(entries[0], entries[0] + len(entries)))
+    index = slice(entries[0], entries[-1] + 1) if neighbours else torch.tensor(entries, device=device)
+    return index, centre, scale

@@ -1,0 +1,61 @@
+"""Coordinates read back from an observation, where the outputs move the observation itself.
+
+An angle needs both its cosine and its sine among the entries (their mean leaves the circle, the angle does not);
+a linear coordinate needs an entry that is the coordinate itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.terms import Part
+from surrogym_server.errors import InvalidSpec
+
+
+@dataclass(frozen=True)
+class ObservationInverse:
+    """For each moving coordinate the entries it is read from: (value,) or (cos, sin)."""
+
+    sources: tuple[tuple[int, tuple[int, ...]], ...]
+
+    @classmethod
+    def of(cls, definition: EnvironmentDefinition) -> ObservationInverse:
+        """Raises InvalidSpec where the observation does not determine a coordinate."""
+        return cls(tuple((i, _source(definition, i)) for i in definition.moving))
+
+    def __call__(self, o: Tensor, q: Tensor) -> Tensor:
+        """Coordinates (m, C) of observations o (m, D); constants are kept from q (m, C)."""
+        recovered = q.clone()
+        for index, entries in self.sources:
+            if len(entries) == 2:
+                recovered[..., index] = torch.atan2(o[..., entries[1]], o[..., entries[0]])
+            else:
+                recovered[..., index] = o[..., entries[0]]
+        return recovered
+
+
+def _source(definition: EnvironmentDefinition, index: int) -> tuple[int, ...]:
+    coordinate = definition.coordinates[index]
+    unit = tuple(float(i == index) for i in range(len(definition.coordinates)))
+    direct = _entry(definition, Part("linear", 1.0, unit), coordinate.sampling.low, coordinate.sampling.high)
+    if direct is not None:
+        return (direct,)
+    cosine, sine = (_entry(definition, Part(f, 1.0, unit), -1.0, 1.0) for f in ("cos", "sin"))
+    if coordinate.kind == "angle" and cosine is not None and sine is not None:
+        return (cosine, sine)
+    raise InvalidSpec(
+        f"preset 'paper' moves the observation, and coordinate {coordinate.name!r} can't be read back from it: "
+        "expected an entry that is the coordinate, or for an angle both its cos and its sin; use preset 'default'"
+    )
+
+
+def _entry(definition: EnvironmentDefinition, part: Part, low: float, high: float) -> int | None:
+    """Where the observation has this part by itself, not clipped within [low, high]."""
+    for position, term in enumerate(definition.observation_terms):
+        if term.parts == (part,) and term.low <= low and term.high >= high:
+            return position
+    return None

@@ -1,0 +1,51 @@
+"""Samples: the real steps a model is learned from."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.angle_unwrapping import angle_increments
+from surrogym_server.environment.definition import EnvironmentDefinition
+
+
+@dataclass(frozen=True)
+class Samples:
+    """n real steps, float64."""
+
+    q: Tensor  # (n, C) coordinates
+    u: Tensor  # (n, F) actions
+    q_next: Tensor  # (n, C)
+    reward: Tensor  # (n,)
+    terminated: Tensor  # (n,) bool
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    @property
+    def digest(self) -> str:
+        """Hash of the data, byte for byte: two models of equal digest saw the same samples."""
+        sha = hashlib.sha256()
+        for tensor in (self.q, self.u, self.q_next, self.reward, self.terminated):
+            sha.update(tensor.cpu().contiguous().numpy().tobytes())
+        return sha.hexdigest()
+
+
+def increments(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
+    """Targets of the transition outputs, (n, M): q' - q of the moving coordinates, angles by what they turned; or
+    o' - o where the outputs move the observation."""
+    if definition.moves_observation:
+        return definition.observe(samples.q_next) - definition.observe(samples.q)
+    change = samples.q_next - samples.q
+    change[:, definition.angles] = angle_increments(definition, samples.q, samples.q_next)
+    return change[:, definition.moving]
+
+
+def saturated(definition: EnvironmentDefinition, q_next: Tensor) -> Tensor:
+    """Which samples (n,) ended at a declared bound: their increments were cut, and say little about the dynamics."""
+    low, high = definition.bounds
+    slack = 1e-9 * torch.where(torch.isfinite(high - low), high - low, 1.0)
+    return ((q_next <= low + slack) | (q_next >= high - slack)).any(-1)

@@ -1,0 +1,1 @@
+"""The family of exact Gaussian processes: feature maps and structure chosen by evidence."""

@@ -1,0 +1,154 @@
+"""One output of a model as header and tensors, and back, every number and shape checked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from typing import Any, get_args
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.features import Encoding, FeatureMap, Parity, State, encode
+from surrogym_server.errors import InvalidInput
+from surrogym_server.gp import Hyperparameters, Posterior, Sparse
+from surrogym_server.models.gaussian_process.feature_maps import reflection
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
+
+KNOWN_MAPS = frozenset(
+    FeatureMap(state, action, lead, after, parity=parity)
+    for state in get_args(State)
+    for action in get_args(Encoding)
+    for lead, after in ((False, False), (True, False), (False, True))
+    for parity in get_args(Parity)
+    if lead or state != "none"
+)
+
+
+def output_tensors(output: OutputModel, prefix: str) -> dict[str, Tensor]:
+    """The arrays of an output by name, each name after a prefix; none for one that never varied."""
+    if (posterior := output.posterior) is None:
+        return {}
+    arrays = {"x": posterior.x, "y": posterior.y, "factor": posterior.factor, "weights": posterior.weights}
+    arrays["lengthscale"] = posterior.hyper.lengthscale
+    return {f"{prefix}.{name}": tensor.contiguous() for name, tensor in arrays.items()}
+
+
+def require_output(definition: EnvironmentDefinition, output: OutputModel) -> None:
+    """Raises InvalidInput: arrays of other shapes than the environment's, or numbers that no process has."""
+    _require_drift(definition, output)
+    _require_shapes(definition, output)
+    _require_numbers(output)
+
+
+def output_header(output: OutputModel) -> dict[str, Any]:
+    """All of an output but its arrays, as JSON."""
+    entry: dict[str, Any] = {
+        "name": output.name,
+        "feature_map": asdict(output.feature_map),
+        "centre": output.centre,
+        "scale": output.scale,
+        "left_out": output.left_out,
+        "scores": output.scores,
+        "posterior": None,
+    }
+    if (posterior := output.posterior) is not None:
+        hyper = posterior.hyper
+        entry["posterior"] = {
+            "signal_variance": hyper.signal_variance,
+            "linear_variance": hyper.linear_variance,
+            "quadratic_variance": hyper.quadratic_variance,
+            "noise_variance": hyper.noise_variance,
+            "jitter": posterior.jitter,
+        }
+        if posterior.sparse is not None:
+            entry["posterior"]["sparse"] = asdict(posterior.sparse)
+    return entry
+
+
+def read_output(
+    definition: EnvironmentDefinition, entry: dict[str, Any], tensors: Mapping[str, Tensor], prefix: str
+) -> OutputModel:
+    """The output of a header's entry. Raises LookupError, TypeError or ValueError where it is none."""
+    feature_map = _feature_map(entry["feature_map"])
+    if replace(feature_map, drift=()) not in KNOWN_MAPS:
+        raise ValueError(f"unknown feature map {feature_map}")
+    mirror = reflection(definition, feature_map)
+    if feature_map.parity and mirror is None:
+        raise ValueError(f"feature map {feature_map}: the environment's inputs have no mirror image")
+    posterior = None
+    if (stored := entry["posterior"]) is not None:
+        arrays = {n: tensors[f"{prefix}.{n}"] for n in ("x", "y", "factor", "weights", "lengthscale")}
+        hyper = Hyperparameters(
+            arrays["lengthscale"],
+            float(stored["signal_variance"]),
+            float(stored["linear_variance"]),
+            float(stored["quadratic_variance"]),
+            float(stored["noise_variance"]),
+            mirror,
+        )
+        x, y, factor, weights = (arrays[name] for name in ("x", "y", "factor", "weights"))
+        jitter, sparse = float(stored["jitter"]), _sparse(stored.get("sparse"))
+        posterior = Posterior(hyper, x, y, factor, weights, jitter, sparse)
+    scores = tuple((name, score) for name, score in entry["scores"])
+    centre, scale = float(entry["centre"]), float(entry["scale"])
+    return OutputModel(str(entry["name"]), feature_map, posterior, centre, scale, int(entry["left_out"]), scores)
+
+
+def _sparse(entry: dict[str, Any] | None) -> Sparse | None:
+    return None if entry is None else Sparse(int(entry["points"]), float(entry["unexplained"]))
+
+
+def _feature_map(entry: dict[str, Any]) -> FeatureMap:
+    drift = tuple(tuple(float(w) for w in row) for row in entry.get("drift", ()))
+    return FeatureMap(**{**entry, "drift": drift})
+
+
+def _require_drift(definition: EnvironmentDefinition, output: OutputModel) -> None:
+    if not (drift := output.feature_map.drift):
+        return
+    shape = (len(definition.angles), len(definition.coordinates))
+    if len(drift) != shape[0] or any(len(row) != shape[1] or not all(map(math.isfinite, row)) for row in drift):
+        raise InvalidInput(f"output {output.name!r}: expected a drift of shape {shape}, finite, got {drift}")
+
+
+def _require_numbers(output: OutputModel) -> None:
+    """Every number finite, and positive where only that makes sense."""
+    finite, positive, least_zero, tensors = [output.centre], [output.scale], [0.0], []
+    if (posterior := output.posterior) is not None:
+        hyper = posterior.hyper
+        tensors = [posterior.x, posterior.y, posterior.factor, posterior.weights]
+        positive += [hyper.signal_variance, hyper.noise_variance, *hyper.lengthscale.tolist()]
+        positive += posterior.factor.diagonal().tolist()
+        least_zero += [hyper.linear_variance, hyper.quadratic_variance, posterior.jitter]
+        if posterior.sparse is not None:
+            least_zero += [posterior.sparse.points - len(posterior.y), posterior.sparse.unexplained]
+    if not (
+        all(math.isfinite(v) for v in (*finite, *positive, *least_zero))
+        and min(positive) > 0
+        and min(least_zero) >= 0
+        and all(bool(torch.isfinite(t).all()) for t in tensors)
+    ):
+        raise InvalidInput(f"output {output.name!r}: expected finite numbers, scales and variances above 0")
+
+
+def _require_shapes(definition: EnvironmentDefinition, output: OutputModel) -> None:
+    if (posterior := output.posterior) is None:
+        return
+    q = torch.zeros(1, len(definition.coordinates), dtype=torch.float64)
+    u = torch.zeros(1, definition.action.size, dtype=torch.float64)
+    lead = q.new_zeros(1, len(definition.coordinates))
+    width, n = encode(definition, output.feature_map, q, u, lead).shape[1], posterior.y.numel()
+    expected = {
+        "x": (posterior.x, (n, width)),
+        "y": (posterior.y, (n,)),
+        "factor": (posterior.factor, (n, n)),
+        "weights": (posterior.weights, (n,)),
+        "lengthscale": (posterior.hyper.lengthscale, (width,)),
+    }
+    for name, (tensor, shape) in expected.items():
+        if tuple(tensor.shape) != shape or tensor.dtype != torch.float64:
+            got = f"{tensor.dtype} {tuple(tensor.shape)}"
+            raise InvalidInput(f"output {output.name!r}: expected {name} of torch.float64 {shape}, got {got}")

@@ -1,0 +1,119 @@
+"""A learned region as header and tensors, and back, every number checked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.errors import InvalidInput
+from surrogym_server.models.gaussian_process.codec.outputs import (
+    output_header,
+    output_tensors,
+    read_output,
+    require_output,
+)
+from surrogym_server.models.gaussian_process.prediction.regions import (
+    Axes,
+    Classifier,
+    Cut,
+    Form,
+    Jump,
+    Region,
+    Thresholds,
+)
+
+
+def region_header(region: Region) -> dict[str, Any]:
+    """All of a region but its arrays, as JSON."""
+    return {"forms": [[weight, _form_header(form)] for weight, form in region.forms], "scores": region.scores}
+
+
+def region_tensors(region: Region, prefix: str) -> dict[str, Tensor]:
+    """The arrays of a region by name, each name after a prefix."""
+    tensors: dict[str, Tensor] = {}
+    for index, (_, form) in enumerate(region.forms):
+        if isinstance(form, Classifier):
+            tensors |= output_tensors(form.process, f"{prefix}.{index}")
+    return tensors
+
+
+def read_region(
+    definition: EnvironmentDefinition, entry: Any, tensors: Mapping[str, Tensor], prefix: str
+) -> Region | None:
+    """The region of a header's entry, None if it has none. Raises LookupError, TypeError or ValueError."""
+    if entry is None:
+        return None
+    forms = tuple(
+        (float(weight), _read_form(definition, form, tensors, f"{prefix}.{index}"))
+        for index, (weight, form) in enumerate(entry["forms"])
+    )
+    return Region(forms, tuple((str(name), float(score)) for name, score in entry["scores"]))
+
+
+def read_jumps(
+    definition: EnvironmentDefinition, entries: Any, tensors: Mapping[str, Tensor], prefix: str
+) -> tuple[Jump, ...]:
+    """The jumps of a header's entries. Raises LookupError, TypeError or ValueError."""
+    jumps = []
+    for index, (size, entry) in enumerate(entries):
+        region = read_region(definition, entry, tensors, f"{prefix}.{index}")
+        if region is None:
+            raise ValueError("a jump without a region")
+        jumps.append(Jump(region, float(size)))
+    return tuple(jumps)
+
+
+def require_region(region: Region) -> None:
+    """Raises InvalidInput: weights that are none, processes that are none, axes that aren't there, gaps of no width."""
+    weights = [weight for weight, _ in region.forms]
+    if not weights or min(weights) <= 0 or not math.isclose(sum(weights), 1, abs_tol=1e-6):
+        raise InvalidInput(f"expected forms of a region with weights that add up to 1, got {weights[:4]}")
+    for _, form in region.forms:
+        if isinstance(form, Classifier):
+            _require_classifier(form)
+        else:
+            _require_thresholds(form)
+
+
+def _form_header(form: Form) -> dict[str, Any]:
+    match form:
+        case Thresholds(rules=rules, complement=complement):
+            return {"rules": [[list(vars(cut).values()) for cut in rule] for rule in rules], "complement": complement}
+        case Classifier(process=process):
+            return {"process": output_header(process)}
+
+
+def _read_form(definition: EnvironmentDefinition, entry: Any, tensors: Mapping[str, Tensor], prefix: str) -> Form:
+    if "process" in entry:
+        return Classifier(definition, read_output(definition, entry["process"], tensors, prefix))
+    rules = tuple(tuple(_cut(*cut) for cut in rule) for rule in entry["rules"])
+    return Thresholds(definition, rules, bool(entry["complement"]))
+
+
+def _require_classifier(classifier: Classifier) -> None:
+    if classifier.process.feature_map.lead:
+        raise InvalidInput("expected a classifier of states, got one that reads the lead")
+    require_output(classifier.definition, classifier.process)
+
+
+def _require_thresholds(thresholds: Thresholds) -> None:
+    axes = len(Axes.of(thresholds.definition))
+    cuts = [cut for rule in thresholds.rules for cut in rule]
+    sound = all(
+        0 <= cut.axis < axes
+        and math.isfinite(cut.outside)
+        and math.isfinite(cut.inside)
+        and cut.outside < cut.inside
+        and 0 < cut.weight <= 1
+        for cut in cuts
+    )
+    if not (sound and thresholds.rules and all(thresholds.rules)):
+        raise InvalidInput(f"expected thresholds on axes 0 to {axes - 1} with gaps and weights above 0, got {cuts[:4]}")
+
+
+def _cut(axis: Any, outside: Any, inside: Any, weight: Any) -> Cut:
+    return Cut(int(axis), float(outside), float(inside), float(weight))

@@ -1,0 +1,75 @@
+"""Feature maps worth comparing by evidence, and the mirror image of each; nothing here knows a task."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import torch
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.features import Drift, Encoding, Feature, FeatureMap, Parity, State, features, leading
+from surrogym_server.gp import Reflection
+
+CENTRED = 1e-9  # of its scale: how far from 0 the middle of a range may be
+
+
+def reward_candidates(definition: EnvironmentDefinition) -> tuple[FeatureMap, ...]:
+    """Maps worth comparing for the reward: of the state before the step, after it, or both, as its timing says.
+
+    Rewards are often told by what the observation combines, such as the way from a tip to its target.
+    """
+    timings = {"before": (False,), "after": (True,), "auto": (False, True)}[definition.reward_timing]
+    maps = candidates(definition, follows=False, parity="even")
+    if definition.observation_combines and not definition.moves_observation:
+        maps += tuple(FeatureMap("observation", action) for action in dict.fromkeys(m.action for m in maps))
+    return tuple(replace(m, after=after) for after in timings for m in maps)
+
+
+def candidates(
+    definition: EnvironmentDefinition, follows: bool, drift: Drift = (), parity: Parity = "odd"
+) -> tuple[FeatureMap, ...]:
+    """Maps worth comparing for one output; ``follows`` says that it may read the lead, ``drift`` how angles turn,
+    ``parity`` which one it has if the environment is its own mirror image."""
+    if definition.moves_observation:
+        return (FeatureMap(state="observation"),)
+    states: list[State] = ["cos_sin"]
+    if definition.angles:
+        states += ["wrapped", "both"]
+    actions: list[Encoding] = ["value"]
+    if any(n > 2 for n in definition.action.nvec):
+        actions.append("one_hot")
+    leads = [False, True] if follows and leading(definition) else [False]
+    maps = tuple(FeatureMap(s, a, lead) for s, a, lead in product(states, actions, leads))
+    maps += tuple(replace(m, drift=drift) for m in maps if drift and m.state == "cos_sin")
+    maps += (FeatureMap("none", lead=True),) if any(leads) else ()
+    if definition.learning.symmetry == "none":
+        return maps
+    mirrored = (replace(m, parity=parity) for m in maps)
+    return maps + tuple(m for m in mirrored if reflection(definition, m) is not None)
+
+
+def reflection(definition: EnvironmentDefinition, feature_map: FeatureMap) -> Reflection | None:
+    """What a map's features do when every coordinate and the action change their sign, for its parity; None without
+    one, or where they have no such rule: ranges that are not centred at 0, one-hot actions, observations."""
+    if not feature_map.parity:
+        return None
+    signs = [_sign(definition, feature) for feature in features(definition, feature_map)]
+    if not all(signs):
+        return None
+    parity = 1 if feature_map.parity == "even" else -1
+    return Reflection(torch.tensor(signs, dtype=torch.float64, device=definition.device), parity)
+
+
+def _sign(definition: EnvironmentDefinition, feature: Feature) -> int:
+    """1: the feature stays when all signs change; -1: it changes its own; 0: neither."""
+    match feature.function:
+        case "cos" | "turned_cos":
+            return 1
+        case "sin" | "turned_sin" | "wrapped":
+            return -1
+        case "affine" if feature.entry >= len(definition.coordinates) and definition.action.nvec:
+            return -1  # numbers of discrete actions count from one end; reversed they are each other's mirror image
+        case "affine" | "lead":
+            return -1 if abs(feature.centre) <= CENTRED * feature.scale else 0
+    return 0

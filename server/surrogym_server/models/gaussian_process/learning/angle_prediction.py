@@ -1,0 +1,32 @@
+"""Drift: where an angle turns to within a step under the motion it has, learned from samples.
+
+A step of a fast pole takes it far round. What pulls on it underway depends on where it goes, not only on where it is,
+so cosine and sine of angle + drift are better inputs than those of the angle alone; what they are is linear regression.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from surrogym_server.environment.angle_unwrapping import angle_increments
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.distributions import scaling
+from surrogym_server.environment.features import Drift
+from surrogym_server.environment.samples import Samples
+
+POINTS_A_WEIGHT = 3
+
+
+def learn_drift(definition: EnvironmentDefinition, samples: Samples) -> Drift:
+    """For each angle the weights (C,) with which linear coordinates turn it, increment = w . q + constant, by least
+    squares; empty where there is nothing to turn, or too little to learn it from."""
+    moved_by = [i for i in definition.moving if definition.coordinates[i].kind == "linear"]
+    if not definition.angles or not moved_by or len(samples) < POINTS_A_WEIGHT * (len(moved_by) + 1):
+        return ()
+    centre, scale = torch.tensor([scaling(definition.coordinates[i].sampling) for i in moved_by], dtype=torch.float64).T
+    basis = torch.cat([torch.ones(len(samples), 1, dtype=torch.float64), (samples.q[:, moved_by] - centre) / scale], 1)
+    change = angle_increments(definition, samples.q, samples.q_next)
+    fitted = torch.linalg.lstsq(basis, change, driver="gelsd").solution
+    weights = torch.zeros(len(definition.angles), len(definition.coordinates), dtype=torch.float64)
+    weights[:, moved_by] = fitted[1:].T / scale
+    return tuple(tuple(row) for row in weights.tolist())

@@ -1,0 +1,109 @@
+"""Finding where a reward jumps: a split of its values that leaves a process more likely than the unsplit one.
+
+Both are compared as densities of the same rewards, in the same unit: the plain evidence against the evidence outside,
+times the probability of what was paid inside given one unknown size, times that of the labels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import REWARD
+from surrogym_server.environment.features import FeatureMap
+from surrogym_server.environment.samples import Samples
+from surrogym_server.models.gaussian_process.learning.output_learner import CONSTANT, OutputLearner
+from surrogym_server.models.gaussian_process.learning.region import learn_region
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
+from surrogym_server.models.gaussian_process.prediction.regions import Jump, Region
+
+EDGE = "reward edge"
+MAX_JUMPS = 3
+SPLITS = 3  # the widest gaps of the sorted rewards are tried ...
+GAP = 0.2  # ... if they are wider than this share of their range
+MARGIN = 2.0  # log odds for every sample that a jump must win by: smooth bumps reached 1.5, jumps began at 2.9
+WORTH = 5.0  # log odds that one more jump must win by
+SIZE = 3.0  # a priori deviation of a jump, in deviations of the reward
+FLOOR = 1e-4  # deviation of the noise of what never varied
+
+Split = tuple[float, Region, OutputModel, Tensor]
+
+
+def with_jumps(
+    learner: OutputLearner, samples: Samples, inputs: Mapping[FeatureMap, Tensor], going: Tensor, plain: OutputModel
+) -> tuple[OutputModel, tuple[Jump, ...]]:
+    """The reward's process and its jumps, from the samples ``going`` (n,), given the process without any."""
+    best, process, total, rest = (0.0, plain, 0), plain, 0.0, going
+    regions: list[tuple[Region, Tensor]] = []
+    while process.posterior is not None and len(regions) < MAX_JUMPS:
+        splits = list(_splits(learner, samples, inputs, rest, process))
+        if not splits:
+            break
+        gain, edge, process, outside = max(splits, key=lambda split: split[0])
+        regions.append((edge, rest & ~outside))
+        total, rest = total + gain, outside
+        if total > max(MARGIN * int(going.sum()), best[0] + WORTH):  # one jump of two may win little, both together
+            best = (total, process, len(regions))
+    _, process, count = best
+    residual = samples.reward - process.mean(inputs[process.feature_map])
+    return process, tuple(Jump(edge, float(residual[inside].mean())) for edge, inside in regions[:count])
+
+
+def _splits(
+    learner: OutputLearner, samples: Samples, inputs: Mapping[FeatureMap, Tensor], going: Tensor, plain: OutputModel
+) -> Iterator[Split]:
+    """Every split worth a look: its gain, the region, the process outside it and the samples (n,) outside.
+
+    One sample alone is a jump only where all others are paid the same: elsewhere it may as well be a slope.
+    """
+    same = replace(plain.feature_map, after=False)
+    inputs = {m: x for m, x in inputs.items() if replace(m, after=False) == same}
+    for level in _levels(samples.reward[going]):
+        above = samples.reward > level
+        few = 2 * int((above & going).sum()) <= int(going.sum())
+        inside = going & (above if few else ~above)
+        outside = going & ~inside
+        level_outside = float(samples.reward[outside].std(correction=0)) <= CONSTANT * plain.scale
+        if int(outside.sum()) < 2 or (int(inside.sum()) < 2 and not level_outside):
+            continue
+        process = learner.output(REWARD, samples.reward, inputs, outside, outside)
+        x = inputs[process.feature_map][inside]
+        mean, deviation = process.mean_and_deviation(x)
+        residual, spread = (samples.reward[inside] - mean) / plain.scale, deviation / plain.scale
+        gain = _evidence(process, int(outside.sum()), plain.scale) + _paid_inside(residual, spread)
+        gain -= _evidence(plain, int(going.sum()), plain.scale)
+        if gain < 0:
+            continue
+        state = (samples.q_next if process.feature_map.after else samples.q)[going]
+        edge = learn_region(learner, EDGE, state, inside[going])
+        gain += max(score for _, score in edge.scores)
+        yield gain, edge, process, outside
+
+
+def _levels(reward: Tensor) -> list[float]:
+    """Where to split rewards (n,): the middles of the widest gaps between them."""
+    ordered = reward.sort().values
+    gaps = ordered.diff()
+    wide = [int(i) for i in gaps.argsort(descending=True)[:SPLITS] if gaps[i] > GAP * (ordered[-1] - ordered[0])]
+    return [float(ordered[i] + ordered[i + 1]) / 2 for i in wide]
+
+
+def _evidence(process: OutputModel, points: int, unit: float) -> float:
+    """Log density of the points a process was fitted to, as multiples of ``unit``."""
+    if process.posterior is None:
+        return -points * (math.log(FLOOR) + 0.5 * math.log(2 * math.pi))
+    return dict(process.scores)[str(process.feature_map)] - points * math.log(process.scale / unit)
+
+
+def _paid_inside(residual: Tensor, spread: Tensor) -> float:
+    """Log density of residuals (i,) that share one normal size and deviate from it by spread (i,)."""
+    shared = SIZE**2 * torch.ones(len(residual), len(residual), dtype=residual.dtype)
+    covariance = shared + torch.diag(spread.square() + FLOOR**2)
+    factor = torch.linalg.cholesky(covariance)
+    whitened = torch.linalg.solve_triangular(factor, residual[:, None], upper=False)
+    normaliser = float(factor.diagonal().log().sum()) + 0.5 * len(residual) * math.log(2 * math.pi)
+    return -0.5 * float(whitened.square().sum()) - normaliser

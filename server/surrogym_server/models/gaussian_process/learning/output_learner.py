@@ -1,0 +1,76 @@
+"""Fitting one output: its scaling, and the choice of its feature map by evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
+from surrogym_server.environment.features import FeatureMap
+from surrogym_server.gp import FitOptions, Fitted, condition_sparse, fit, spread
+from surrogym_server.models.gaussian_process.feature_maps import reflection
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
+
+Thetas = Mapping[str, NDArray[np.float64]]  # "output|feature map" -> hyperparameters, for warm starts
+# Log odds of maps before any data. A map that reads the lead fits no better where nothing was cut, and alone is right
+# where something is; few samples look like noise over the lead alone; and what is seen of one side alone says nothing
+# of the other, mirrored or not.
+LEAD_ODDS, ALONE_ODDS, PARITY_ODDS = 3.0, -6.0, -3.0
+CONSTANT = 1e-9  # an output whose deviation is below this share of its own size never varied
+
+
+@dataclass
+class OutputLearner:
+    """Fits processes, each from its warm start, and keeps their hyperparameters."""
+
+    definition: EnvironmentDefinition
+    warm: Thetas
+    thetas: dict[str, NDArray[np.float64]]
+
+    def output(
+        self, name: str, target: Tensor, inputs: Mapping[FeatureMap, Tensor], keep: Tensor, keep_lead: Tensor
+    ) -> OutputModel:
+        """The best of the feature maps ``inputs`` (n, d) for one output's targets (n,).
+
+        ``keep`` (n,) marks the samples that count. Maps that read the lead may use more, ``keep_lead``; all are
+        compared on the same points.
+        """
+        centre, scale = float(target[keep].mean()), float(target[keep].std(correction=0))
+        if scale <= CONSTANT * abs(centre):
+            return OutputModel(name, next(iter(inputs)), None, centre, 1.0, int((~keep).sum()))
+        around = {m: 0.0 if m.parity == "odd" else centre for m in inputs}
+        fits = {m: self._fit(name, m, x[keep], (target[keep] - around[m]) / scale) for m, x in inputs.items()}
+        best = max(fits, key=lambda m: fits[m].score + _odds(m))
+        chosen, used, centre = fits[best], keep, around[best]
+        y = (target - centre) / scale
+        if best.lead and bool((keep_lead & ~keep).any()):
+            used = keep_lead
+            chosen = self._fit(name, best, inputs[best][used], y[used], "|all")
+        scores = tuple((str(m), f.score) for m, f in fits.items())
+        posterior = chosen.posterior
+        if len(posterior.y) < int(used.sum()):
+            posterior = condition_sparse(posterior.hyper, inputs[best][used], y[used])
+        return OutputModel(name, best, posterior, centre, scale, int((~used).sum()), scores)
+
+    def _fit(self, name: str, feature_map: FeatureMap, x: Tensor, y: Tensor, also: str = "") -> Fitted:
+        """Fit to all points; of very many, to some of them, and score as if all were alike."""
+        key, rows = f"{name}|{feature_map}{also}", spread(len(y))
+        mirror = reflection(self.definition, feature_map)
+        fitted = fit(x[rows], y[rows], self._options(name), self.warm.get(key), mirror)
+        self.thetas[key] = fitted.theta
+        return replace(fitted, score=fitted.score * len(y) / len(rows))
+
+    def _options(self, name: str) -> FitOptions:
+        """Dynamics tend to be near linear, costs to be quadratic."""
+        if self.definition.learning.kernel == "squared_exponential":
+            return FitOptions(linear=False)
+        return FitOptions(quadratic=name == REWARD)
+
+
+def _odds(feature_map: FeatureMap) -> float:
+    alone = feature_map.state == "none"
+    return LEAD_ODDS * feature_map.lead + ALONE_ODDS * alone + PARITY_ODDS * bool(feature_map.parity)

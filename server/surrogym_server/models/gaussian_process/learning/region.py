@@ -1,0 +1,52 @@
+"""Learning a region from labelled states; above all where episodes end, from samples that say whether they did."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.features import encode
+from surrogym_server.environment.samples import Samples
+from surrogym_server.models.gaussian_process.feature_maps import candidates
+from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
+from surrogym_server.models.gaussian_process.learning.thresholds import log_probability, thresholds
+from surrogym_server.models.gaussian_process.prediction.regions import TERMINATION, Classifier, Form, Region, likely
+
+HANDICAP = 3.0  # log odds against the classifier, whose hyperparameters have seen the labels that are left out
+FAINT = 0.05  # a form of less weight beside the best one's is dropped
+
+
+def learn_termination(learner: OutputLearner, samples: Samples) -> Region:
+    """Where episodes end. As long as no sample ended, nothing does."""
+    return learn_region(learner, TERMINATION, samples.q_next, samples.terminated)
+
+
+def learn_region(learner: OutputLearner, name: str, q: Tensor, inside: Tensor) -> Region:
+    """Which of q (n, C) lie inside (n,): thresholds and a classifier, weighed by how well they foretell left-out
+    labels."""
+    found: list[tuple[Form, float]] = [_classifier(learner, name, q, inside)]
+    found += thresholds(learner.definition, q, inside)
+    names = [str(form.description.get("inside", "classifier")) for form, _ in found]
+    scores = torch.tensor([score for _, score in found], dtype=torch.float64)
+    weights = torch.where(scores - scores.max() > math.log(FAINT), scores, -torch.inf).softmax(0).tolist()
+    forms = tuple((w, form) for w, (form, _) in zip(weights, found, strict=True) if w > 0)
+    return Region(forms, tuple(zip(names, scores.tolist(), strict=True)))
+
+
+def _classifier(learner: OutputLearner, name: str, q: Tensor, inside: Tensor) -> tuple[Classifier, float]:
+    definition = learner.definition
+    everything, u = torch.ones_like(inside), q.new_zeros(len(q), definition.action.size)
+    maps = [m for m in candidates(definition, follows=False, parity="") if m.action == "value"]
+    inputs = {m: encode(definition, m, q, u) for m in maps}
+    process = learner.output(name, 2 * inside.double() - 1, inputs, everything, everything)
+    if process.posterior is None:
+        return Classifier(definition, process), 0.0
+    if process.posterior.sparse is None:
+        mean, variance = process.posterior.leave_one_out()
+    else:  # one point of thousands hardly counts
+        mean, latent = process.posterior.mean_and_variance(inputs[process.feature_map])
+        variance = latent + process.posterior.hyper.noise_variance
+    probability = likely(process.centre + process.scale * mean, process.scale * variance.sqrt())
+    return Classifier(definition, process), log_probability(probability, inside) - HANDICAP

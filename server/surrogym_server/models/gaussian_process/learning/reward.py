@@ -1,0 +1,47 @@
+"""The reward: declared, or a process of the steps that go on and what a step that ends the episode pays beyond it."""
+
+from __future__ import annotations
+
+import torch
+
+from surrogym_server.environment.declared_reward import DeclaredReward
+from surrogym_server.environment.definition import REWARD
+from surrogym_server.environment.features import FeatureMap, encode
+from surrogym_server.environment.samples import Samples
+from surrogym_server.models.gaussian_process.feature_maps import reward_candidates
+from surrogym_server.models.gaussian_process.learning.jumps import with_jumps
+from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
+from surrogym_server.models.gaussian_process.prediction.regions import Jump, jumped
+
+FEW = 2  # steps that go on: fewer tell nothing without those that end
+
+
+def learn_reward(learner: OutputLearner, samples: Samples) -> tuple[OutputModel, float, tuple[Jump, ...]]:
+    """The reward process of steps that go on, what a step that ends the episode pays beyond it, and its jumps."""
+    definition = learner.definition
+    if (known := definition.declared_reward) is not None:
+        return _declared(known, samples), known.terminal, ()
+    inputs = {
+        m: encode(definition, m, samples.q_next if m.after else samples.q, samples.u)
+        for m in reward_candidates(definition)
+    }
+    going = ~samples.terminated if int((~samples.terminated).sum()) >= FEW else torch.ones_like(samples.terminated)
+    output = learner.output(REWARD, samples.reward, inputs, going, going)
+    jumps: tuple[Jump, ...] = ()
+    if definition.learning.reward_jumps:
+        output, jumps = with_jumps(learner, samples, inputs, going, output)
+    ended = ~going
+    if not bool(ended.any()):
+        return output, 0.0, jumps
+    state = samples.q_next if output.feature_map.after else samples.q
+    bonus = (samples.reward - output.mean(inputs[output.feature_map]) - jumped(jumps, state)[0])[ended]
+    return output, float(bonus.mean()), jumps
+
+
+def _declared(known: DeclaredReward, samples: Samples) -> OutputModel:
+    """No process; its score is how far a sample's reward was off at most."""
+    paid = known(samples.q_next if known.after else samples.q, samples.u) + known.terminal * samples.terminated
+    off = float((samples.reward - paid).abs().max())
+    scores = (("declared, largest error over the samples", off),)
+    return OutputModel(REWARD, FeatureMap(after=known.after), None, 0.0, 1.0, 0, scores)

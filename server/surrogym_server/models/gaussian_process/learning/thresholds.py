@@ -1,0 +1,114 @@
+"""Finding thresholds from labelled states: the fewest axes that explain what lies inside, and their rivals.
+
+A level that is a priori uniform over an axis' range explains labels that it separates with probability gap / range:
+the weight of a cut among those that explain the same samples.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.models.gaussian_process.prediction.regions import Axes, Cut, Thresholds
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Rules = tuple[tuple[Cut, ...], ...]
+SLACK = 1e-9  # of an axis' range: closer values are the same
+RIVALS = 4
+FAINT = 0.05  # rivals of less weight are dropped
+LEFT_OUT = 100  # samples left out, one by one, to score a rule
+
+
+def thresholds(definition: EnvironmentDefinition, q: Tensor, inside: Tensor) -> list[tuple[Thresholds, float]]:
+    """Thresholds that explain which of q (n, C) lie inside (n,), and their leave-one-out log probabilities.
+
+    A union of them, a complement of a union of two or more (of one would be the same again), both or none.
+    """
+    values, labels = Axes.of(definition)(q).numpy(), inside.numpy()
+    found = []
+    for complement in (False, True):
+        wanted = ~labels if complement else labels
+        rules = explain(values, wanted)
+        if len(rules) > complement:
+            found.append((Thresholds(definition, rules, complement), _left_out(definition, values, wanted)))
+    return found
+
+
+def explain(values: Floats, inside: Bools) -> Rules:
+    """Rules for the labels inside (n,) of samples with axis values (n, A); none if no union of thresholds fits."""
+    if inside.all() or not inside.any():
+        return ()
+    width = np.maximum(values.max(0) - values.min(0), 1e-300)
+    outside = values[~inside].max(0)
+    reached = values[inside] > outside + SLACK * width  # (i, A)
+    share = np.where(reached, (values[inside] - outside) / width, np.inf)
+    chosen = _cover(reached, share)
+    if not chosen:
+        return ()
+    assigned = _assign(reached, share, chosen)
+    free = [axis for axis in range(values.shape[1]) if axis not in chosen]
+    return tuple(
+        _rivals(values[inside], outside, width, assigned == place, [axis, *free])
+        for place, axis in enumerate(chosen)
+        if (assigned == place).any()
+    )
+
+
+def log_probability(probability: Tensor, inside: Tensor) -> float:
+    """Log probability of labels inside (n,), none surer than the rule of succession, 1 / (n + 2), allows."""
+    right = torch.where(inside, probability, 1 - probability)
+    return float(right.clamp(1 / (len(right) + 2), 1).log().sum())
+
+
+def _cover(reached: Bools, share: Floats) -> list[int]:
+    """Axes that together reach every sample, greedily; of those that reach as many the one with the widest gap."""
+    chosen: list[int] = []
+    left = np.ones(len(reached), dtype=bool)
+    while left.any():
+        counts = reached[left].sum(0)
+        if counts.max() == 0:
+            return []
+        gap = np.where(counts == counts.max(), np.where(reached[left], share[left], np.inf).min(0), -np.inf)
+        chosen.append(int(gap.argmax()))
+        left &= ~reached[:, chosen[-1]]
+    return chosen
+
+
+def _assign(reached: Bools, share: Floats, chosen: list[int]) -> NDArray[np.int64]:
+    """Which of the chosen axes explains each sample (i,): the only one that can, or the one it lies farthest beyond,
+    relative to what others are surely explained by it."""
+    able, distance = reached[:, chosen], share[:, chosen]
+    sole = able.sum(1) == 1
+    nearest = np.where(sole[:, None] & able, distance, np.inf).min(0, initial=np.inf)
+    ratio = np.where(able, distance / np.where(np.isfinite(nearest), nearest, 1.0), -np.inf)
+    return np.asarray(ratio.argmax(1))
+
+
+def _rivals(inner: Floats, outside: Floats, width: Floats, own: Bools, axes: list[int]) -> tuple[Cut, ...]:
+    """Cuts along ``axes`` that explain a rule's own samples, by weight."""
+    inside = inner[own].min(0)
+    weights = {axis: max(0.0, float((inside[axis] - outside[axis]) / width[axis])) for axis in axes}
+    weights = {axis: weight for axis, weight in weights.items() if weight > SLACK}
+    best = sorted(weights, key=lambda axis: -weights[axis])[:RIVALS]
+    total = sum(weights[axis] for axis in best)
+    best = [axis for axis in best if weights[axis] >= FAINT * total]
+    total = sum(weights[axis] for axis in best)
+    return tuple(Cut(axis, float(outside[axis]), float(inside[axis]), weights[axis] / total) for axis in best)
+
+
+def _left_out(definition: EnvironmentDefinition, values: Floats, inside: Bools) -> float:
+    """Leave-one-out log probability of the labels; of more than ``LEFT_OUT`` samples, an even share stands for all."""
+    count, rows = len(inside), torch.from_numpy(values)
+    picked = np.unique(np.linspace(0, count - 1, min(count, LEFT_OUT)).astype(int))
+    probabilities = torch.full((len(picked),), float(inside.mean() > 0.5), dtype=torch.float64)
+    for place, index in enumerate(picked):
+        others = np.arange(count) != index
+        rules = explain(values[others], inside[others])
+        if rules:
+            probabilities[place] = Thresholds(definition, rules).at(rows[index : index + 1])[0]
+    score = log_probability(probabilities, torch.from_numpy(inside[picked]))
+    return score * count / len(picked)

@@ -1,0 +1,1 @@
+"""A fitted model, ready to predict."""

@@ -1,0 +1,76 @@
+"""Outputs predicted at once, from one set of features: their means, and what moves them away from it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.features import Encoder
+from surrogym_server.gp import Output, Pathwise, Serving
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Where the draws of one output's function are read and written. W weights of all outputs of a model."""
+
+    column: int
+    span: slice  # of the W weights
+    inputs: Tensor  # columns of x
+    scale: float
+    pathwise: Pathwise
+
+
+@dataclass(frozen=True)
+class OutputGroup:
+    """Some outputs of a model; it fills their columns of O and leaves the others 0."""
+
+    encoder: Encoder
+    serving: Serving
+    noise_deviation: Tensor  # (O,) learned noise, in each output's unit
+    drawn: tuple[Drawn, ...]  # by output; a constant one has no function to draw
+    end: int  # of its draws' weights
+
+    @classmethod
+    def of(cls, encoder: Encoder, outputs: Sequence[Output], columns: int, *, lead: bool, begin: int) -> OutputGroup:
+        """Compile outputs for ``columns`` of them; their draws' weights start at ``begin``."""
+        device = encoder.definition.device
+        noise, drawn = torch.zeros(columns, dtype=torch.float64, device=device), []
+        for output in outputs:
+            if output.posterior is None:
+                continue
+            noise[output.column] = output.scale * math.sqrt(output.posterior.hyper.noise_variance)
+            pathwise = Pathwise(output.posterior)
+            span = slice(begin, begin := begin + pathwise.size)
+            drawn.append(Drawn(output.column, span, torch.tensor(output.inputs, device=device), output.scale, pathwise))
+        return cls(encoder, Serving.of(outputs, columns, encoder.width(lead), device), noise, tuple(drawn), begin)
+
+    def predict(
+        self, x: Tensor, wanted: tuple[int, ...], kick: Tensor | None, process: Tensor | None, paths: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Values at features x (m, d) and the latent deviations of the columns wanted, (m, O) each.
+
+        A value is the posterior's mean; with ``kick`` (m, O) so many latent deviations away, with ``process`` (m, O) so
+        many deviations of the noise, and with ``paths`` (m, W) that of a function drawn whole, one a row.
+        """
+        if wanted:
+            value, spread = self.serving.mean_and_deviation(x, wanted)
+        else:
+            value, spread = self.serving.mean(x), x.new_zeros(len(x), 0)
+        if kick is not None:
+            value = torch.addcmul(value, spread, kick)
+        if process is not None:
+            value = torch.addcmul(value, self.noise_deviation, process)
+        if paths is not None:
+            value = value + self._residuals(x, paths)
+        return value, spread
+
+    def _residuals(self, x: Tensor, paths: Tensor) -> Tensor:
+        residuals = x.new_zeros(len(x), len(self.noise_deviation))
+        for one in self.drawn:
+            residual = one.pathwise.residual(x[:, one.inputs], paths[:, one.span])
+            residuals[:, one.column] = one.scale * residual
+        return residuals

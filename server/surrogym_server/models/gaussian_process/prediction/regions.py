@@ -1,0 +1,190 @@
+"""Sets of states learned from labelled ones: where episodes end, where a reward jumps.
+
+A region is a mixture of forms, of two kinds. ``Thresholds``: levels of single axes found from data, joined by *or*
+(their complement by *and*), each known up to a gap between the last state seen outside and the first seen inside.
+``Classifier``: a process on labels +-1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.features import encode
+from surrogym_server.environment.terms import Part, Term, TermSet, compile_terms
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
+from surrogym_server.tensors import cached, to_device
+
+TERMINATION = "termination"  # name of the region where episodes end
+Side = Literal["above", "below", "beyond"]  # t > level, -t > level, |t| > level
+SIDES: tuple[Side, ...] = ("above", "below", "beyond")
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Every way to order states: coordinates and observation entries, from each side: A = 3 T axes."""
+
+    names: tuple[str, ...]  # (T,)
+    terms: TermSet
+
+    @classmethod
+    def of(cls, definition: EnvironmentDefinition) -> Axes:
+        """Moving coordinates, and observation entries that are not one of them."""
+        size, found = len(definition.coordinates), {}
+        for index in definition.moving:
+            weights = tuple(float(i == index) for i in range(size))
+            found[Term((Part("linear", 1.0, weights),))] = definition.coordinates[index].name
+        for name, term in zip(definition.observation_names, definition.observation_terms, strict=True):
+            found.setdefault(term, name)
+        return cls(tuple(found.values()), to_device(compile_terms(list(found), size), definition.device))
+
+    def __len__(self) -> int:
+        return 3 * len(self.names)
+
+    def __call__(self, q: Tensor) -> Tensor:
+        """Values of all axes at q (m, C), (m, A)."""
+        value = self.terms(q)
+        return torch.cat([value, -value, value.abs()], -1)
+
+    def describe(self, axis: int, level: float) -> str:
+        """The inequality that ``axis`` and its ``level`` are, for people."""
+        name, side = self.names[axis % len(self.names)], SIDES[axis // len(self.names)]
+        return {"above": f"{name} > {level:.6g}", "below": f"{name} < {-level:.6g}"}.get(
+            side, f"|{name}| > {level:.6g}"
+        )
+
+
+@dataclass(frozen=True)
+class Cut:
+    """Inside from a level of one axis on, which lies anywhere between ``outside`` and ``inside``."""
+
+    axis: int
+    outside: float
+    inside: float
+    weight: float  # how likely this axis is the one, among those that explain the same samples
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Inside where any of the rules says so; each rule is the cuts that might explain what it was found from."""
+
+    definition: EnvironmentDefinition
+    rules: tuple[tuple[Cut, ...], ...]
+    complement: bool = False  # inside where none says so
+
+    def probability(self, q: Tensor) -> Tensor:
+        """Probability that q (m, C) lies inside, (m,), levels being uniform within their gaps."""
+        return self.at(self._axes(q))
+
+    def at(self, values: Tensor) -> Tensor:
+        """The same at values of all axes (m, A)."""
+        columns, outside, width, membership = self._compiled
+        reached = ((values[:, columns] - outside) / width).clamp(0, 1)
+        union = 1 - (1 - reached @ membership).clamp(0, 1).prod(-1)
+        return 1 - union if self.complement else union
+
+    @property
+    def description(self) -> Mapping[str, Any]:
+        """Rules in words, with the widths of their gaps."""
+        rules = [
+            [
+                {
+                    "rule": self._axes.describe(cut.axis, (cut.outside + cut.inside) / 2),
+                    "gap": cut.inside - cut.outside,
+                    "weight": cut.weight,
+                }
+                for cut in rule
+            ]
+            for rule in self.rules
+        ]
+        joined = "none of" if self.complement else "any of"
+        return {"kind": "thresholds", "inside": joined, "rules": rules}
+
+    @cached
+    def _axes(self) -> Axes:
+        return Axes.of(self.definition)
+
+    @cached
+    def _compiled(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Axis, outside and width of every cut, (K,) each, and each cut's weight in its rule, (K, R)."""
+        cuts = [(row, cut) for row, rule in enumerate(self.rules) for cut in rule]
+        outside = torch.tensor([cut.outside for _, cut in cuts], dtype=torch.float64)
+        inside = torch.tensor([cut.inside for _, cut in cuts], dtype=torch.float64)
+        membership = outside.new_zeros(len(cuts), len(self.rules))
+        for place, (row, cut) in enumerate(cuts):
+            membership[place, row] = cut.weight
+        compiled = torch.tensor([cut.axis for _, cut in cuts]), outside, inside - outside, membership
+        return to_device(compiled, self.definition.device)
+
+
+@dataclass(frozen=True)
+class Classifier:
+    """A process on labels +-1 (least-squares classification, Rasmussen and Williams (2006), section 6.5)."""
+
+    definition: EnvironmentDefinition
+    process: OutputModel
+
+    def probability(self, q: Tensor) -> Tensor:
+        """Probability that q (m, C) lies inside, (m,): that of the latent value being above 0."""
+        u = q.new_zeros(len(q), self.definition.action.size)
+        mean, deviation = self.process.mean_and_deviation(encode(self.definition, self.process.feature_map, q, u))
+        return likely(mean, deviation)
+
+    @property
+    def description(self) -> Mapping[str, Any]:
+        """How it is represented."""
+        return {"kind": "classifier", "inputs": str(self.process.feature_map)}
+
+
+Form = Thresholds | Classifier
+
+
+@dataclass(frozen=True)
+class Region:
+    """Forms that explain the labels, each with its weight: where they disagree, the region is in doubt."""
+
+    forms: tuple[tuple[float, Form], ...]  # weights add up to 1
+    scores: tuple[tuple[str, float], ...]  # leave-one-out log probability of every form compared
+
+    def probability(self, q: Tensor) -> Tensor:
+        """Probability that q (m, C) lies inside, (m,)."""
+        return torch.stack([weight * form.probability(q) for weight, form in self.forms]).sum(0)
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """Every form in words, and how it was judged."""
+        forms = [{"weight": weight, **form.description} for weight, form in self.forms]
+        return {"forms": forms, "scores": dict(self.scores)}
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A reward that is higher by ``size`` (lower, if negative) inside a region."""
+
+    region: Region
+    size: float
+
+
+def jumped(jumps: Sequence[Jump], q: Tensor) -> tuple[Tensor, Tensor]:
+    """What jumps add to the reward of states q (m, C), and its variance from their doubtful edges, (m,) each.
+
+    Of jumps whose regions overlap the first one counts.
+    """
+    added, variance, free = q.new_zeros(len(q)), q.new_zeros(len(q)), q.new_ones(len(q), dtype=torch.bool)
+    for jump in jumps:
+        inside = jump.region.probability(q)
+        added = added + jump.size * ((inside > 0.5) & free)
+        variance = variance + jump.size**2 * inside * (1 - inside) * free
+        free = free & (inside <= 0.5)
+    return added, variance
+
+
+def likely(mean: Tensor, deviation: Tensor) -> Tensor:
+    """Probability (m,) that a latent value of this mean and deviation is above 0."""
+    probability: Tensor = torch.special.ndtr(mean / deviation.clamp_min(1e-9))
+    return probability

@@ -1,1 +1,0 @@
-"""From samples to a model of one environment: terms, coordinates, features, targets, reward, termination."""

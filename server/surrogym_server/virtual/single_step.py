@@ -1,0 +1,35 @@
+"""The stateless transition, as numpy for the edge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from surrogym_server.environment.step_rules import paid
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PointPrediction:
+    next_coordinates: Array  # (n, C)
+    next_observation: Array  # (n, D)
+    reward: Array  # (n,) mean, without the penalty
+    reward_deviation: Array  # (n,)
+    terminated: NDArray[Any]  # (n,) bool
+
+
+def predict_points(model: GaussianProcessModel, q: Array, u: Array) -> PointPrediction:
+    """One mean step from each of q (n, C) under u (n, F)."""
+    at, action = torch.from_numpy(q), torch.from_numpy(u)
+    predicted = model.transition(at, action, reward_deviation=True)
+    q_next, deviation = predicted.q_next, predicted.reward_deviation
+    assert deviation is not None
+    over = model.terminated(q_next)
+    reward, observation = paid(model.terminal_reward, predicted.reward, over), model.definition.observe(q_next)
+    return PointPrediction(*(t.numpy() for t in (q_next, observation, reward, deviation, over)))

@@ -1,0 +1,73 @@
+"""The door for actions: what a policy may send, what the model gets, and every refusal."""
+
+import numpy as np
+import pytest
+
+from surrogym_server.environment.actions import model_actions, policy_actions
+from surrogym_server.environment.definition import ActionDefinition
+from surrogym_server.errors import InvalidInput
+
+BOX = ActionDefinition("box", low=(-2.0, 0.0), high=(2.0, 1.0))
+TORQUE = ActionDefinition("box", low=(-2.0,), high=(2.0,))
+BINS = ActionDefinition("box", low=(-2.0, 0.0), high=(2.0, 1.0), bins=(5, 3))
+DISCRETE = ActionDefinition("discrete", nvec=(3,))
+SEVERAL = ActionDefinition("multi_discrete", nvec=(3, 2))
+
+
+def test_bins_are_equally_spaced_values_between_the_bounds():
+    numbers = np.array([[0, 0], [1, 1], [2, 2], [4, 0]])
+    np.testing.assert_array_equal(policy_actions(BINS, numbers, 4), [[-2, 0], [-1, 0.5], [0, 1], [2, 0]])
+
+
+def test_queries_and_samples_carry_continuous_values_whatever_the_bins():
+    np.testing.assert_array_equal(model_actions(BINS, np.array([[0.3, 0.7]])), [[0.3, 0.7]])
+
+
+def test_one_entry_may_come_without_its_axis():
+    np.testing.assert_array_equal(policy_actions(TORQUE, np.array([1.0, -1.0]), 2), [[1.0], [-1.0]])
+    np.testing.assert_array_equal(policy_actions(DISCRETE, np.array([2, 0]), 2), [[2.0], [0.0]])
+
+
+def test_discrete_numbers_pass_as_they_are():
+    np.testing.assert_array_equal(policy_actions(SEVERAL, np.array([[2, 1], [0, 0]]), 2), [[2, 1], [0, 0]])
+    np.testing.assert_array_equal(model_actions(SEVERAL, np.array([[2.0, 1.0]])), [[2, 1]])
+
+
+def test_a_float32_bound_may_round_to_just_outside_and_is_clipped():
+    tenth = ActionDefinition("box", low=(-0.1,), high=(0.1,))
+    rounded = np.array([[np.float32(0.1)]], dtype=np.float64)
+    assert rounded[0, 0] > 0.1
+    assert policy_actions(tenth, rounded, 1)[0, 0] == 0.1
+    with pytest.raises(InvalidInput, match=r"entry 0 in \[-0.1, 0.1\], got 0.10001"):
+        policy_actions(tenth, np.array([[0.10001]]), 1)
+
+
+@pytest.mark.parametrize("count", [-1, 3])
+def test_numbers_out_of_range(count):
+    with pytest.raises(InvalidInput, match=rf"entry 0 in 0\.\.2, got {count} in row 1"):
+        policy_actions(DISCRETE, np.array([[0], [count]]), 2)
+
+
+@pytest.mark.parametrize(
+    ("action", "raw", "complaint"),
+    [
+        (BOX, np.zeros((2, 3)), r"expected shape \(2, 2\), got \(2, 3\)"),
+        (BOX, np.zeros((3, 2)), r"expected shape \(2, 2\), got \(3, 2\)"),
+        (BOX, np.zeros(2), r"expected shape \(2, 2\), got \(2,\)"),
+        (BOX, np.array([[0, np.nan], [0, 0]]), "finite"),
+        (BOX, np.array([[0, np.inf], [0, 0]]), "finite"),
+        (BOX, np.array([[0, 0.5], [0, -0.1]]), r"entry 1 in \[0, 1\], got -0.1 in row 1"),
+        (BINS, np.array([[0, 0], [5, 0]]), r"entry 0 in 0\.\.4, got 5 in row 1"),
+        (BINS, np.array([[0, 0], [0.5, 0]]), "expected integers, got 0.5"),
+        (SEVERAL, np.array([[0, 0], [0, 2]]), r"entry 1 in 0\.\.1, got 2 in row 1"),
+    ],
+)
+def test_what_is_refused(action, raw, complaint):
+    with pytest.raises(InvalidInput, match=complaint):
+        policy_actions(action, raw, 2)
+
+
+def test_samples_are_checked_as_policies_are():
+    for action, raw in ((BINS, [[2.5, 0]]), (DISCRETE, [[1.5]]), (DISCRETE, [[3]]), (BOX, [[np.nan, 0]])):
+        with pytest.raises(InvalidInput):
+            model_actions(action, np.array(raw))

@@ -1,0 +1,40 @@
+"""Quantiles of coordinates, the truncated normal's against SciPy, and the scaling of features."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import truncnorm
+
+from surrogym_server.environment.distributions import Fixed, Normal, Uniform, scaling
+
+P = torch.linspace(0, 1, 501, dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("mean", "std", "low", "high"),
+    [(0, 1, -3, 3), (2, 0.5, 1.5, 4), (0, 1, 1, 2), (-1, 3, -2, 17), (0, 1, -5.9, -4)],
+)
+def test_truncated_normal(mean, std, low, high):
+    reference = truncnorm((low - mean) / std, (high - mean) / std, loc=mean, scale=std)
+    values = Normal(mean, std, low, high).quantile(P).numpy()
+    np.testing.assert_allclose(values, reference.ppf(P.numpy()), rtol=0, atol=1e-8 * std)
+    assert np.all(np.diff(values) > 0)
+    assert low <= values.min() < values.max() <= high
+
+
+def test_uniform_and_fixed():
+    torch.testing.assert_close(Uniform(-2, 6).quantile(P), -2 + 8 * P)
+    torch.testing.assert_close(Fixed(1.5).quantile(P), torch.full_like(P, 1.5))
+    assert (Fixed(1.5).low, Fixed(1.5).high) == (1.5, 1.5)
+
+
+@pytest.mark.parametrize("distribution", [Uniform(-2, 6), Normal(1, 0.5, -0.5, 2.5), Normal(0, 2, -6, 6)])
+def test_scaling_gives_mean_zero_and_deviation_near_one(distribution):
+    centre, scale = scaling(distribution)
+    scaled = (distribution.quantile((P[:-1] + P[1:]) / 2) - centre) / scale
+    assert float(scaled.mean()) == pytest.approx(0, abs=1e-9)
+    assert float(scaled.std()) == pytest.approx(1, abs=0.05)
+
+
+def test_a_fixed_value_is_scaled_to_zero():
+    assert scaling(Fixed(4.0)) == (4.0, 1.0)

@@ -1,0 +1,86 @@
+"""Where an angle turns to by itself is learned, offered to the speeds, and stored with the model."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from support.real_steps import random_steps
+from surrogym_client.original.classic import acrobot, cartpole
+from surrogym_client.original.swingup import swing_up
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.features import FeatureMap, encode
+from surrogym_server.environment.samples import Samples, increments
+from surrogym_server.errors import InvalidInput
+from surrogym_server.models.gaussian_process.codec.model import from_bytes, to_bytes
+from surrogym_server.models.gaussian_process.feature_maps import candidates
+from surrogym_server.models.gaussian_process.learning.angle_prediction import learn_drift
+from surrogym_server.models.gaussian_process.learning.learn import learn
+
+
+@pytest.fixture(scope="module")
+def definition():
+    return definition_from_spec(swing_up())
+
+
+@pytest.fixture(scope="module")
+def model(definition):
+    return learn(definition, random_steps(swing_up(), 40, seed=0)).model
+
+
+def test_a_speed_turns_its_angle_by_the_time_of_a_step(definition):
+    ((x, velocity, angle, omega),) = learn_drift(definition, random_steps(swing_up(), 200, seed=0))
+    assert omega == pytest.approx(0.1, rel=0.05)
+    assert (abs(x) + abs(velocity) + abs(angle)) < 0.02
+
+
+def test_turns_of_more_than_half_a_circle_are_not_mistaken_for_short_ones(definition):
+    samples = random_steps(swing_up(), 100, seed=0)
+    fast = samples.q.clone()
+    fast[:, 3] *= 1.5
+    angle = fast[:, 2] + 0.25 * fast[:, 3]
+    moved = fast.clone()
+    moved[:, 2] = torch.atan2(angle.sin(), angle.cos())
+    assert (0.25 * fast[:, 3]).abs().max() > math.pi
+    ((*_, omega),) = learn_drift(definition, Samples(fast, samples.u, moved, samples.reward, samples.terminated))
+    assert omega == pytest.approx(0.25, rel=1e-6)
+
+
+def test_there_is_none_without_angles_or_from_too_few_samples(definition):
+    assert learn_drift(definition_from_spec(cartpole()), random_steps(cartpole(), 40, seed=0)) == ()
+    assert learn_drift(definition, random_steps(swing_up(), 11, seed=0)) == ()
+
+
+def test_inputs_are_cosine_and_sine_of_where_each_angle_turns_to():
+    definition = definition_from_spec(acrobot())
+    drift = ((0.0, 0.0, 0.2, 0.0), (0.0, 0.0, 0.0, 0.3))
+    q, u = torch.tensor([[0.5, -1.0, 2.0, -3.0]], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
+    plain, drifted = (encode(definition, m, q, u)[0].tolist() for m in (FeatureMap(), FeatureMap(drift=drift)))
+    turned = [math.cos(0.9), math.sin(0.9), math.cos(-1.9), math.sin(-1.9)]
+    assert sorted(drifted) == pytest.approx(sorted(plain + turned))
+    assert FeatureMap(drift=drift) in candidates(definition, follows=False, drift=drift)
+
+
+def test_evidence_prefers_it_where_a_pole_turns_fast_and_errors_agree(definition, model):
+    omega = model.transitions[3]
+    assert omega.feature_map.drift
+    test = random_steps(swing_up(), 300, seed=1)
+    error = (model.means(test.q, test.u)[:, :4] - increments(definition, test)).square().mean(0).sqrt()
+    assert error[3] / omega.scale < 0.3  # 0.36 without
+
+
+def test_it_is_stored_with_the_model(definition, model):
+    loaded = from_bytes(definition, to_bytes(model))
+    assert loaded.transitions[3].feature_map == model.transitions[3].feature_map
+
+
+@pytest.mark.parametrize("drift", [((0.1, 0.1),), ((0.0, 0.0, 0.0, math.inf),), ((0.0,) * 4,) * 2])
+def test_another_shape_is_refused(definition, model, drift):
+    changed = [
+        replace(o, feature_map=replace(o.feature_map, drift=drift)) if o.feature_map.drift else o
+        for o in model.transitions
+    ]
+    data = to_bytes(replace(model, transitions=tuple(changed)))
+    with pytest.raises(InvalidInput, match="expected a drift of shape"):
+        from_bytes(definition, data)

@@ -1,0 +1,178 @@
+"""Declared rewards: the sums they say, no process, no deviation, no code."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from pydantic import ValidationError
+
+from support.real_steps import random_steps
+from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_client.original.swingup import LENGTH, WIDTH, swing_up_narrow
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.errors import InvalidInput
+from surrogym_server.models.gaussian_process.codec.model import from_bytes, to_bytes
+from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.sampling.confidence import deviations
+from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Inequality, Quantity, RewardTerm, Term
+
+ANGLE, SPEED = Quantity(term=Term.linear(theta=1)), Quantity(term=Term.linear(speed=1))
+COST = DeclaredReward(
+    kind="declared",
+    terms=(
+        RewardTerm(weight=-1.0, shape="square", of=(ANGLE,)),
+        RewardTerm(weight=-0.1, shape="square", of=(SPEED,)),
+        RewardTerm(weight=-0.001, shape="square", of=(Quantity(action=(1.0,)),)),
+    ),
+)
+PENDULUM = pendulum().model_copy(update={"reward": COST})
+
+
+def paying(*terms: RewardTerm, **options: Any) -> EnvironmentSpec:
+    reward = DeclaredReward(kind="declared", terms=terms, **options)
+    return EnvironmentSpec.model_validate(pendulum().model_copy(update={"reward": reward}).model_dump())
+
+
+def value(spec: EnvironmentSpec, q: list[float], u: list[float]) -> float:
+    known = definition_from_spec(spec).declared_reward
+    assert known is not None
+    return float(known(torch.tensor([q]).double(), torch.tensor([u]).double()))
+
+
+@pytest.fixture(scope="module")
+def model() -> GaussianProcessModel:
+    return learn(definition_from_spec(PENDULUM), random_steps(PENDULUM, 12, seed=0)).model
+
+
+def test_pendulums_reward_is_what_it_declares(model):
+    steps = random_steps(PENDULUM, 100, seed=1)
+    predicted = model.transition(steps.q, steps.u, reward_deviation=True)
+    torch.testing.assert_close(predicted.reward, steps.reward, rtol=0, atol=1e-6)
+    assert float(predicted.reward_deviation.max()) == 0
+    torch.testing.assert_close(model.means(steps.q, steps.u)[:, -1], steps.reward, rtol=0, atol=1e-6)
+    assert float(deviations(model, steps.q, steps.u)[:, -1].max()) == 0
+    described = model.description["outputs"][-1]
+    assert described["kernel"] == "declared"
+    assert described["scores"]["declared, largest error over the samples"] < 1e-6
+
+
+def test_samples_that_contradict_the_declaration_show(model):
+    steps = random_steps(PENDULUM, 12, seed=0)
+    off = learn(model.definition, replace(steps, reward=steps.reward + 2)).model
+    assert off.description["outputs"][-1]["scores"]["declared, largest error over the samples"] == pytest.approx(2)
+
+
+def test_shapes():
+    x, push = Quantity(term=Term.linear(speed=2)), Quantity(term=Term.constant(1), action=(3.0,))
+    q, u = [0.0, -0.5], [1.0]  # x = -1, push = 4
+    assert value(paying(RewardTerm(shape="one", weight=2)), q, u) == 2
+    assert value(paying(RewardTerm(shape="linear", of=(x, push))), q, u) == 3
+    assert value(paying(RewardTerm(shape="absolute", of=(x, push))), q, u) == 5
+    assert value(paying(RewardTerm(shape="square", of=(x, push))), q, u) == 17
+    bump = RewardTerm(shape="bump", weight=2, of=(x, Quantity(action=(2.0,))))
+    assert value(paying(bump), q, u) == pytest.approx(2 * math.exp(-0.5 * (1 + 4)))
+    assert value(paying(bump, RewardTerm(shape="one", weight=-1)), q, u) == pytest.approx(2 * math.exp(-2.5) - 1)
+
+
+def test_a_term_counts_only_when_its_conditions_hold():
+    near = Inequality(term=Term.linear(theta=1), relation=">=", value=0.5)
+    slow = Inequality(term=Term.linear(speed=1), relation="<", value=1)
+    spec = paying(RewardTerm(shape="one", weight=5, when=(near, slow)), RewardTerm(shape="one", weight=-1))
+    assert [value(spec, q, [0.0]) for q in ([0.5, 0.0], [0.4, 0.0], [0.5, 1.0])] == [4, -1, -1]
+
+
+def test_after_reads_the_next_state_and_an_ending_pays_beyond():
+    end = Inequality(term=Term.linear(x=1), relation=">", value=2.4)
+    reward = DeclaredReward(
+        kind="declared",
+        timing="after",
+        terminal=-10,
+        terms=(RewardTerm(shape="linear", of=(Quantity(term=Term.linear(x=1)),)),),
+    )
+    spec = cartpole().model_copy(update={"reward": reward, "termination": ((end,),)})
+    model = learn(definition_from_spec(spec), random_steps(spec, 12, seed=0)).model
+    q = torch.tensor([[1.0, 2.0, 0, 0], [2.39, 3.0, 0, 0]], dtype=torch.float64)
+    u = torch.ones(2, 1, dtype=torch.float64)
+    predicted = model.transition(q, u)
+    torch.testing.assert_close(predicted.reward, predicted.q_next[:, 0])
+    assert model.means(q, u)[:, -1].tolist() == pytest.approx((predicted.q_next[:, 0] - torch.tensor([0, 10])).tolist())
+
+
+def test_pilcos_narrow_reward_can_be_declared():
+    """exp(-d^2 / (2 width^2)), d from the pole's tip to where it stands above the origin."""
+    width, length = WIDTH["narrow"], LENGTH
+    across = Quantity(term=(1 / width) * (Term.linear(x=1) + length * Term.sin(angle=1)))
+    below = Quantity(term=(length / width) * (Term.constant(1) + Term.cos(angle=1)))
+    bump = RewardTerm(shape="bump", of=(across, below))
+    reward = DeclaredReward(kind="declared", timing="after", terms=(bump,))
+    spec = swing_up_narrow().model_copy(update={"reward": reward})
+    steps = random_steps(spec, 100, seed=0)
+    known = definition_from_spec(spec).declared_reward
+    assert known is not None
+    torch.testing.assert_close(known(steps.q_next, steps.u), steps.reward)
+    assert float(steps.reward.max()) > 0.1
+
+
+def test_a_declared_reward_survives_storage_and_refuses_a_learned_one(model, pendulum_model):
+    loaded = from_bytes(model.definition, to_bytes(model))
+    assert loaded.description == model.description
+    with pytest.raises(InvalidInput, match="without a reward of its own"):
+        from_bytes(model.definition, to_bytes(pendulum_model))
+
+
+def test_a_specification_with_one_survives_json():
+    assert EnvironmentSpec.model_validate_json(PENDULUM.model_dump_json()) == PENDULUM
+    old = pendulum().model_dump(mode="json")
+    del old["reward"]["kind"]
+    assert EnvironmentSpec.model_validate(old) == pendulum()
+
+
+SQUARE = {"shape": "square", "of": [{"action": [1.0]}]}
+
+
+@pytest.mark.parametrize(
+    ("reward", "said"),
+    [
+        ({"kind": "guessed"}, "'learned', 'declared'"),
+        ({"kind": "declared"}, "Field required"),
+        ({"kind": "declared", "terms": []}, "at least 1 item"),
+        ({"kind": "declared", "terms": [{"shape": "square"}]}, "needs quantities to measure"),
+        ({"kind": "declared", "terms": [{**SQUARE, "shape": "one"}]}, "takes no quantities"),
+        ({"kind": "declared", "terms": [{**SQUARE, "shape": "lambda q: q"}]}, "'one', 'linear'"),
+        ({"kind": "declared", "terms": [{**SQUARE, "weight": math.nan}]}, "finite number"),
+        ({"kind": "declared", "terms": [{**SQUARE, "of": [{}]}]}, "needs a term or weights"),
+        ({"kind": "declared", "terms": [{**SQUARE, "of": [{"action": [1.0, 2.0]}]}]}, "expected 1 weights"),
+        ({"kind": "declared", "terms": [SQUARE], "timing": "auto"}, "'before' or 'after'"),
+        ({"kind": "declared", "terms": [SQUARE], "penalty": 1.0}, "Extra inputs"),
+        ({"kind": "declared", "terms": [SQUARE], "code": "1"}, "Extra inputs"),
+        (
+            {"kind": "declared", "terms": [{"shape": "square", "of": [{"term": Term.linear(y=1).model_dump()}]}]},
+            r"unknown \['y'\]",
+        ),
+    ],
+)
+def test_rewards_that_cannot_be_are_refused(reward, said):
+    with pytest.raises(ValidationError, match=said):
+        EnvironmentSpec.model_validate(pendulum().model_dump() | {"reward": reward})
+
+
+def test_the_papers_preset_learns_its_reward():
+    design = {"preset": "paper"}
+    with pytest.raises(ValidationError, match="learns its reward"):
+        EnvironmentSpec.model_validate(PENDULUM.model_dump() | {"design": design})
+
+
+@pytest.mark.parametrize("termination", ["guessed", "import os", [["learned"]], [[]], None])
+def test_termination_is_learned_or_groups(termination):
+    with pytest.raises(ValidationError, match="termination"):
+        EnvironmentSpec.model_validate(pendulum().model_dump() | {"termination": termination})
+
+
+def test_a_learned_termination_declares_no_groups():
+    learned = EnvironmentSpec.model_validate(pendulum().model_dump() | {"termination": "learned"})
+    assert learned.termination == "learned"
+    assert learned.termination_groups == ()
+    assert EnvironmentSpec.model_validate_json(learned.model_dump_json()) == learned

@@ -1,0 +1,164 @@
+"""Learning: structure by evidence, samples cut by bounds left out, constants, and what an ending pays."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from support.real_steps import join, random_steps
+from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.samples import Samples
+from surrogym_server.environment.step_rules import paid
+from surrogym_server.errors import InvalidInput
+from surrogym_server.gp import sparse
+from surrogym_server.models.gaussian_process.codec.model import from_bytes, to_bytes
+from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_shared.spec import Design
+
+PAPER = pendulum().model_copy(update={"design": Design(preset="paper")})
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_reward_of_the_squared_angle_is_given_the_wrapped_angle(pendulum_definition, seed):
+    steps = random_steps(pendulum(), 24, seed=seed)
+    squared = replace(steps, reward=-steps.q[:, 0].square())
+    reward = learn(pendulum_definition, squared).model.reward
+    assert reward.feature_map.state == "wrapped"
+    scores = dict(reward.scores)
+    assert max(scores, key=scores.get) == str(reward.feature_map)
+
+
+def test_a_reward_of_the_cosine_is_given_cos_and_sin(pendulum_definition):
+    steps = random_steps(pendulum(), 24, seed=0)
+    reward = learn(pendulum_definition, replace(steps, reward=3 * steps.q[:, 0].cos() - 1)).model.reward
+    assert reward.feature_map.state == "cos_sin"
+
+
+@pytest.mark.parametrize("task", [pendulum, cartpole])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_body_that_is_its_own_mirror_image_is_found_to_be_so(task, seed):
+    model = learn(definition_from_spec(task()), random_steps(task(), 12, seed=seed)).model
+    assert {output.feature_map.parity for output in model.transitions} == {"odd"}
+    assert all(output.centre == 0 for output in model.transitions)
+
+
+@pytest.mark.parametrize("task", [pendulum, mountain_car_continuous])
+@pytest.mark.parametrize("seed", range(2))
+def test_what_its_next_speed_alone_moves_is_found_from_six_steps(task, seed):
+    """Both environments move by the speed after the step: no bound has to be met to know how far that goes."""
+    model = learn(definition_from_spec(task()), random_steps(task(), 6, seed=seed)).model
+    angle, speed = model.transitions
+    assert (angle.feature_map.state, angle.feature_map.lead) == ("none", True)
+    assert speed.feature_map.state != "none"
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_reward_that_is_even_is_found_to_be_so(pendulum_definition, seed):
+    assert learn(pendulum_definition, random_steps(pendulum(), 12, seed=seed)).model.reward.feature_map.parity == "even"
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_torque_that_pulls_to_one_side_is_no_mirror_image(pendulum_definition, seed):
+    """The same steps, said to have been taken with a tenth of the largest torque less."""
+    steps = random_steps(pendulum(), 16, seed=seed)
+    _, speed = learn(pendulum_definition, replace(steps, u=steps.u - 0.2)).model.transitions
+    assert speed.feature_map.parity == ""
+
+
+@pytest.mark.parametrize("after", [False, True])
+@pytest.mark.parametrize("seed", range(2))
+def test_the_rewards_timing_is_found_by_evidence(pendulum_definition, after, seed):
+    steps = random_steps(pendulum(), 24, seed=seed)
+    state = steps.q_next if after else steps.q
+    paying = replace(steps, reward=-state[:, 0].square() - 0.1 * state[:, 1].square())
+    reward = learn(replace(pendulum_definition, reward_timing="auto"), paying).model.reward
+    assert reward.feature_map.after == after
+    scores = dict(reward.scores)
+    assert {", after" in name for name in scores} == {False, True}
+    assert max(scores, key=scores.get) == str(reward.feature_map)
+
+
+def test_cut_increments_are_left_out_of_the_dynamics_and_kept_for_the_reward(pendulum_definition, half_saturated):
+    cut = int((half_saturated.q_next[:, 1].abs() >= 8).sum())
+    assert cut >= 5
+    model = learn(pendulum_definition, half_saturated).model
+    angle, speed = model.transitions
+    assert speed.left_out == cut
+    assert len(speed.posterior.y) == len(half_saturated) - cut
+    assert angle.feature_map.lead
+    assert angle.left_out == 0, "an angle that reads the clipped speed sees no kink"
+    assert model.reward.left_out == 0
+
+
+def test_where_every_sample_was_cut_they_are_all_that_is_known(pendulum_definition, half_saturated):
+    cut = half_saturated.q_next[:, 1].abs() >= 8
+    only = Samples(*(getattr(half_saturated, name)[cut] for name in half_saturated.__dataclass_fields__))
+    model = learn(pendulum_definition, only).model
+    assert [o.left_out for o in model.transitions] == [0, 0]
+
+
+def test_a_constant_output_has_no_process_and_no_deviation(cartpole_model):
+    assert cartpole_model.reward.posterior is None
+    mean, deviation = cartpole_model.reward.mean_and_deviation(torch.zeros(3, 5, dtype=torch.float64))
+    assert mean.tolist() == [1.0] * 3
+    assert deviation.tolist() == [0.0] * 3
+
+
+def test_an_ending_pays_what_it_paid_beyond_the_reward_process(cartpole_definition):
+    steps = random_steps(cartpole(), 60, seed=0)
+    assert bool(steps.terminated.any())
+    assert bool((~steps.terminated).any())
+    failing = replace(steps, reward=torch.where(steps.terminated, -9.0, 1.0).double())
+    few = Samples(*(getattr(failing, name)[:30] for name in failing.__dataclass_fields__))
+    model = learn(cartpole_definition, few).model
+    assert model.terminal_reward == pytest.approx(-10.0)
+    reward = model.transition(few.q[:2], few.u[:2]).reward
+    assert paid(model.terminal_reward, reward, torch.tensor([True, False])).tolist() == pytest.approx([-9.0, 1.0])
+
+
+def test_without_an_ending_there_is_no_terminal_reward(pendulum_model):
+    assert pendulum_model.terminal_reward == 0.0
+
+
+def test_the_papers_preset_models_the_observation_by_squared_exponentials():
+    steps = random_steps(PAPER, 30, seed=0)
+    model = learn(definition_from_spec(PAPER), steps).model
+    assert [o.name for o in (*model.transitions, model.reward)] == ["cos", "sin", "speed", "reward"]
+    assert {o.posterior.hyper.kernel for o in (*model.transitions, model.reward)} == {"squared exponential"}
+    q_next = model.transition(steps.q, steps.u).q_next
+    assert float((q_next - steps.q_next)[:, 1].abs().max()) < 0.5
+
+
+def test_a_model_needs_two_samples(pendulum_definition):
+    steps = random_steps(pendulum(), 1, seed=0)
+    with pytest.raises(InvalidInput, match="at least 2 samples, got 1"):
+        learn(pendulum_definition, steps)
+    assert learn(pendulum_definition, join(steps, random_steps(pendulum(), 1, seed=1))).model.samples == 2
+
+
+def test_learning_the_same_samples_gives_the_same_model(pendulum_definition, pendulum_samples, pendulum_model):
+    again = learn(pendulum_definition, pendulum_samples).model
+    assert again.digest == pendulum_model.digest == pendulum_samples.digest
+    assert again.description == pendulum_model.description
+
+
+@pytest.mark.parametrize(("points", "through"), [(40, False), (41, True)])
+def test_beyond_a_number_of_samples_a_model_is_sparse_and_says_so(
+    pendulum_definition, points: int, through: bool, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sparse, "MAX_EXACT", 40)
+    monkeypatch.setattr(sparse, "FITTED", 30)
+    monkeypatch.setattr(sparse, "INDUCING", 25)
+    steps, later = random_steps(pendulum(), points, seed=0), random_steps(pendulum(), 100, seed=1)
+    model = learn(pendulum_definition, steps).model
+    reward = model.description["outputs"][-1]  # learned from all; transitions leave saturated samples out
+    assert ("inducing_points" in reward) == through
+    if through:
+        assert (reward["points"], reward["inducing_points"] <= 25) == (points, True)
+        assert 0 <= reward["unexplained_deviation"] < 0.05
+        again = from_bytes(pendulum_definition, to_bytes(model))
+        assert again.description == model.description
+    inside = later.q_next[:, 1].abs() < 8
+    error = (model.transition(later.q, later.u).q_next - later.q_next)[inside, 1]
+    assert float(error.abs().max()) < 0.05

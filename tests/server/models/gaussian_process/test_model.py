@@ -1,0 +1,149 @@
+"""A model moves coordinates as the environment does: bounds, walls, the lead first, draws, and the reward's timing."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from support.real_steps import random_steps
+from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.definition import wrap
+from surrogym_server.environment.features import encode
+from surrogym_server.environment.step_rules import settle
+from surrogym_server.gp import serving
+from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_server.virtual.single_step import predict_points
+
+
+def test_settling_wraps_angles_and_clips_speeds(pendulum_definition):
+    q = torch.tensor([[4.0, 9.0], [-4.0, -9.0], [1.0, 1.0]], dtype=torch.float64)
+    expected = torch.tensor([[4 - 2 * torch.pi, 8], [2 * torch.pi - 4, -8], [1, 1]], dtype=torch.float64)
+    torch.testing.assert_close(settle(pendulum_definition, q), expected)
+
+
+def test_a_wall_stops_what_runs_into_it_and_nothing_else(mountain_car_definition):
+    q = torch.tensor([[-1.3, -0.03], [-1.2, -0.01], [-1.3, 0.02], [-1.0, -0.03], [0.7, 0.09]], dtype=torch.float64)
+    expected = [[-1.2, 0], [-1.2, 0], [-1.2, 0.02], [-1.0, -0.03], [0.7, 0.07]]
+    before = q.clone()
+    torch.testing.assert_close(settle(mountain_car_definition, q), torch.tensor(expected, dtype=torch.float64))
+    torch.testing.assert_close(q, before, rtol=0, atol=0)
+
+
+def test_a_learned_mountain_car_stops_at_its_wall():
+    spec = mountain_car_continuous()
+    model = learn(definition_from_spec(spec), random_steps(spec, 12, seed=1)).model
+    at = torch.tensor([[-1.19, -0.06], [-0.5, 0.01]], dtype=torch.float64)
+    q_next = model.transition(at, torch.zeros(2, 1, dtype=torch.float64)).q_next
+    assert q_next[0].tolist() == [pytest.approx(-1.2), 0.0]
+    assert q_next[1, 0] == pytest.approx(-0.49, abs=2e-3)
+
+
+def test_the_pendulum_is_predicted_where_it_was_not_sampled(pendulum_model):
+    unseen = random_steps(pendulum(), 100, seed=5)
+    q_next = pendulum_model.transition(unseen.q, unseen.u).q_next
+    error = torch.stack([wrap(q_next[:, 0] - unseen.q_next[:, 0]), q_next[:, 1] - unseen.q_next[:, 1]], -1)
+    assert float(error[:, 0].abs().max()) < 0.02
+    assert float(error[:, 1].abs().max()) < 0.2
+    assert q_next[:, 1].abs().max() <= 8
+
+
+def test_a_draw_is_the_mean_plus_deviations(pendulum_model):
+    q = torch.tensor([[0.5, 1.0], [2.0, -3.0]], dtype=torch.float64)
+    u, noise = torch.zeros(2, 1, dtype=torch.float64), torch.tensor([[1.0, -2.0], [0.0, 0.5]], dtype=torch.float64)
+    mean = pendulum_model.transition(q, u, deviations=True)
+    drawn = pendulum_model.transition(q, u, noise=noise)
+    speed = mean.q_next[:, 1] + mean.deviation[:, 1] * noise[:, 1]
+    torch.testing.assert_close(drawn.q_next[:, 1], speed)
+    assert drawn.deviation is None
+    assert mean.deviation.shape == (2, 2)
+    quiet = pendulum_model.transition(q, u, noise=torch.zeros_like(noise))
+    torch.testing.assert_close(quiet.q_next, mean.q_next)
+
+
+@pytest.mark.parametrize("timing", ["before", "after"])
+def test_a_step_in_blocks_of_rows_is_a_step_of_each(pendulum_model, monkeypatch, timing):
+    feature_map = replace(pendulum_model.reward.feature_map, after=timing == "after")
+    model = replace(pendulum_model, reward=replace(pendulum_model.reward, feature_map=feature_map))
+    points = random_steps(pendulum(), 20, seed=3)
+    noise = torch.randn(20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    asked = {"deviations": True, "reward_deviation": True}
+    whole = model.transition(points.q, points.u, noise=noise, **asked)
+    monkeypatch.setattr(serving, "BLOCK", 1)
+    monkeypatch.setattr(serving, "MIN_ROWS", 7)
+    blocks = model.transition(points.q, points.u, noise=noise, **asked)
+    singles = [
+        model.transition(points.q[i : i + 1], points.u[i : i + 1], noise=noise[i : i + 1], **asked) for i in range(20)
+    ]
+    for name in ("q_next", "reward", "deviation", "reward_deviation"):
+        torch.testing.assert_close(getattr(blocks, name), getattr(whole, name), rtol=0, atol=1e-7)
+        alone = torch.cat([getattr(single, name) for single in singles])
+        torch.testing.assert_close(alone, getattr(whole, name), rtol=0, atol=1e-7)
+
+
+def test_a_model_predicts_what_its_processes_do(pendulum_model):
+    """Compiled, each output is the posterior that was fitted."""
+    points = random_steps(pendulum(), 50, seed=3)
+    predicted = pendulum_model.transition(points.q, points.u, deviations=True, reward_deviation=True)
+    angle, speed = pendulum_model.transitions
+    lead = predicted.q_next[:, 1:]
+    for output, change, deviation in (
+        (angle, wrap(predicted.q_next[:, 0] - points.q[:, 0]), predicted.deviation[:, 0]),
+        (speed, predicted.q_next[:, 1] - points.q[:, 1], predicted.deviation[:, 1]),
+        (pendulum_model.reward, predicted.reward, predicted.reward_deviation),
+    ):
+        x = encode(pendulum_model.definition, output.feature_map, points.q, points.u, lead)
+        mean, expected = output.mean_and_deviation(x)
+        inside = lead[:, 0].abs() < 8
+        torch.testing.assert_close(change[inside], mean[inside], rtol=0, atol=1e-7 * output.scale)
+        torch.testing.assert_close(deviation, expected, rtol=1e-3, atol=1e-4 * output.scale)
+
+
+def test_an_angle_that_reads_the_lead_follows_the_drawn_speed(pendulum_definition, half_saturated):
+    """Where speeds were cut the lead alone tells how far the angle goes."""
+    model = learn(pendulum_definition, half_saturated).model
+    angle, speed = model.transitions
+    assert angle.feature_map.lead
+    assert not speed.feature_map.lead
+    q, u = torch.tensor([[0.5, 1.0]], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
+    deviation = model.transition(q, u, deviations=True).deviation
+    kick = torch.tensor([[0.0, 1.0]], dtype=torch.float64) / deviation
+    pushed = model.transition(q, u, noise=kick).q_next
+    rest = model.transition(q, u, noise=torch.zeros_like(kick)).q_next
+    change = pushed - rest
+    assert float(change[0, 1]) == pytest.approx(1)
+    assert float(change[0, 0]) == pytest.approx(0.05, rel=0.05)
+
+
+@pytest.mark.parametrize("timing", ["before", "after"])
+def test_the_reward_reads_the_state_that_its_timing_names(pendulum_model, timing):
+    feature_map = replace(pendulum_model.reward.feature_map, after=timing == "after")
+    model = replace(pendulum_model, reward=replace(pendulum_model.reward, feature_map=feature_map))
+    q, u = torch.tensor([[0.0, 6.0]], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
+    predicted = model.transition(q, u, reward_deviation=True)
+    angle, speed = (q if timing == "before" else predicted.q_next)[0].tolist()
+    assert abs(predicted.q_next[0, 0] - q[0, 0]) > 0.2
+    assert float(predicted.reward) == pytest.approx(-(angle**2 + 0.1 * speed**2), abs=0.05)
+    assert float(predicted.reward_deviation) > 0
+    assert model.transition(q, u).reward_deviation is None
+
+
+def test_predicted_points_are_complete(pendulum_model, cartpole_model):
+    points = predict_points(
+        cartpole_model, torch.tensor([[2.39, 3.0, 0, 0]]).double().numpy(), torch.ones(1, 1).numpy()
+    )
+    assert points.terminated.tolist() == [True]
+    steps = random_steps(cartpole(), 1, seed=3)
+    points = predict_points(cartpole_model, steps.q.numpy(), steps.u.numpy())
+    assert points.next_coordinates[0] == pytest.approx(steps.q_next[0].numpy(), abs=0.02)
+    assert points.reward.tolist() == [1.0]
+    points = predict_points(pendulum_model, torch.tensor([[0.5, 1.0]]).double().numpy(), torch.ones(1, 1).numpy())
+    assert points.next_observation.shape == (1, 3)
+    assert float((points.next_observation[:, :2] ** 2).sum()) == pytest.approx(1)
+
+
+def test_a_model_describes_itself_for_people(pendulum_model):
+    outputs = {o["name"]: o for o in pendulum_model.description["outputs"]}
+    assert list(outputs) == ["theta", "speed", "reward"]
+    assert outputs["speed"]["points"] + outputs["speed"]["left_out"] == pendulum_model.samples
+    assert len(outputs["reward"]["lengthscale"]) in (3, 4, 5)
