@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from support.scripted_server import problem, reply, scripted_server
-from surrogym_client.cli.errors import EXTRAS
+from surrogym_client.runtime.ways_out import EXTRAS
 from surrogym_shared import wire
 from surrogym_shared.codes import Code
 

@@ -23,18 +23,16 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from support.exact_pendulum import ExactPendulum
 from support.gifts import LIMIT, Touches, changed, gift, pickled
-from surrogym_client.policies.export import export_policy
-from surrogym_client.policies.files import (
+from surrogym_client.policies.card import (
     MAX_CARD_BYTES,
     NotedAddress,
     PolicyCard,
     UnusablePolicy,
-    load_learner,
-    load_policy,
     read_card,
-    save_policy,
     write_card,
 )
+from surrogym_client.policies.export import export_policy
+from surrogym_client.policies.files import load_learner, load_policy, save_policy
 from surrogym_client.policies.networks import PaperPolicy, Standardise, decaying
 from surrogym_client.policies.saved_settings import MAX_EXPERIENCE_BYTES
 from surrogym_client.policies.structure import ENTRY, Structure, describe

@@ -11,10 +11,10 @@ from surrogym_client import original
 from surrogym_client.evaluation.evaluator import (
     EvaluationInterrupted,
     EvaluationSettings,
-    decode_actions,
     evaluate,
     interquartile_mean,
 )
+from surrogym_client.original.actions import decode_actions
 from surrogym_client.original.episodes import open_episode
 from surrogym_client.original.errors import NotPerturbable
 from surrogym_shared.spec import Success

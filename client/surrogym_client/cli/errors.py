@@ -4,19 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from surrogym_client.runtime.ways_out import GIVE_TOKEN, START_SERVER, missing
+
 if TYPE_CHECKING:
     from surrogym_client.errors import SurrogymClientError
-
-EXTRAS = {
-    "server": ("alembic", "fastapi", "psycopg", "safetensors", "scipy", "sqlalchemy", "starlette", "uvicorn"),
-    "train": ("matplotlib", "stable_baselines3", "tensorboard", "torch"),
-    "export": ("onnx", "onnxruntime", "onnxscript"),
-    "render": ("moviepy", "pygame"),
-    "trackers": ("mlflow", "wandb"),
-    "mujoco": ("mujoco", "imageio"),
-}
-START_SERVER = "start one with surrogym serve, or name another by --server or SURROGYM_URL"
-GIVE_TOKEN = "give a token of this server by SURROGYM_TOKEN or --token-file"
 
 
 class CommandError(Exception):
@@ -37,7 +28,7 @@ def sentence(error: Exception) -> str | None:
         case CommandError() | OriginalError() | NotASurrogateFile():
             return str(error)
         case ModuleNotFoundError(name=str(name)):
-            return _missing(name.partition(".")[0])
+            return missing(name.partition(".")[0])
         case ValidationError():
             return invalid(error)
         case OSError(filename=str(path), strerror=str(reason)):
@@ -77,10 +68,3 @@ def invalid(error: Exception) -> str:
     where = ".".join(str(part) for part in first["loc"])
     message = first["msg"].removeprefix("Value error, ")
     return f"{where}: {message}" if where else message
-
-
-def _missing(module: str) -> str | None:
-    for extra, modules in EXTRAS.items():
-        if module in modules:
-            return f"this needs {module}, which is not installed: pip install 'surrogym[{extra}]'"
-    return None

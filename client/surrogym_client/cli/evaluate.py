@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, Progress
     from surrogym_client.original.episodes import Episode
-    from surrogym_client.policies.files import PolicyCard
+    from surrogym_client.policies.card import PolicyCard
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
 
@@ -79,7 +79,8 @@ def command(
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.evaluation.evaluator import EvaluationInterrupted, EvaluationSettings, evaluate
     from surrogym_client.original.errors import EvaluationFailed
-    from surrogym_client.policies.files import card_path, load_policy, read_card
+    from surrogym_client.policies.card import card_path, read_card
+    from surrogym_client.policies.files import load_policy
     from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_shared.terminal import give, progress, say
 

@@ -35,7 +35,7 @@ def command(
 
     Example: surrogym export-policy policy.zip --out policy.onnx
     """
-    from surrogym_client.policies.files import read_card
+    from surrogym_client.policies.card import read_card
     from surrogym_shared.terminal import give, on_interrupt, progress
 
     card = read_card(policy)

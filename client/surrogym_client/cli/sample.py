@@ -158,11 +158,11 @@ def _tell(query: Query, outcome: Outcome, error: str) -> None:
 
 
 def _words(surrogate: str, report: SamplerReport) -> str:
-    from surrogym_client.surrogates.waiting import FINISHED, IN_WORDS
+    from surrogym_client.surrogates.phases import COMPLETED, IN_WORDS
 
     others = {"failed": report.failed, "dropped": report.dropped, "refused": report.refused}
     apart = "".join(f", {count} {outcome}" for outcome, count in others.items() if count)
     said = f"{report.answered} queries answered with {report.steps} real steps{apart} in {report.seconds:.1f} s"
     if report.phase in IN_WORDS:
         said += f"; {IN_WORDS[report.phase]}"
-    return f"{said}; next: surrogym train {surrogate}" if report.phase in FINISHED else said
+    return f"{said}; next: surrogym train {surrogate}" if report.phase in COMPLETED else said

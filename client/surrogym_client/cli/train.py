@@ -256,8 +256,8 @@ def _trainable(
 ) -> tuple[EnvironmentSpec, str]:
     """Specification and server of a surrogate whose design is done; with ``wait``, torch is imported meanwhile."""
     from surrogym_client.cli.errors import CommandError
+    from surrogym_client.surrogates.phases import COMPLETED
     from surrogym_client.surrogates.waiting import (
-        FINISHED,
         share_of_design,
         wait_for_design,
         words_of_design,
@@ -279,7 +279,7 @@ def _trainable(
                 f"{surrogate!r} has no model yet, its phase is {view.phase}: "
                 f"run surrogym sample {surrogate}, or give --wait SECONDS"
             )
-        if view.phase not in FINISHED and not view.paused:
+        if view.phase not in COMPLETED and not view.paused:
             typer.echo(f"the design of {surrogate!r} goes on; training starts on model {view.model_version}", err=True)
         return view.spec, api.url
 
@@ -344,7 +344,7 @@ def _waiting(update: Update) -> Callable[[SurrogateView], None]:
 
 def _write_card(result: TrainResult, surrogate: str, spec: EnvironmentSpec, url: str, seed: int) -> dict[str, Any]:
     """Write the policy's card; gives back the result as JSON."""
-    from surrogym_client.policies.files import NotedAddress, PolicyCard, write_card
+    from surrogym_client.policies.card import NotedAddress, PolicyCard, write_card
     from surrogym_client.runtime.versions import versions
 
     card = PolicyCard(

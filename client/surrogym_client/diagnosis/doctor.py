@@ -12,13 +12,13 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from surrogym_client.cli.errors import EXTRAS, GIVE_TOKEN, START_SERVER
 from surrogym_client.errors import ProblemError, ProtocolMismatch, Refused, ServerUnreachable, SurrogymClientError
 from surrogym_client.original.episodes import draw
 from surrogym_client.original.errors import OriginalError, StepFailed
 from surrogym_client.original.isolated import IsolatedEnvironment
 from surrogym_client.original.protocol import Array, Factory, RealStep
 from surrogym_client.runtime.versions import versions
+from surrogym_client.runtime.ways_out import EXTRAS, GIVE_TOKEN, START_SERVER
 from surrogym_client.sampler.sample_conversion import sample_of
 from surrogym_client.transport.api import Api
 from surrogym_shared.spec import BoxAction, EnvironmentSpec

@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_client.original.actions import decode_actions
 from surrogym_client.original.episodes import Episode, Moment, draw
 from surrogym_client.original.errors import EvaluationFailed, PolicyMisfit
+from surrogym_client.original.protocol import LONGEST_EPISODE
 from surrogym_client.original.terms import holds
+from surrogym_client.policies.predict import Predict
 from surrogym_client.runtime.lifetime import signals_between_steps
-from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction, Success
+from surrogym_shared.spec import EnvironmentSpec, Success
 
 Array = NDArray[np.float64]
-Predict = Callable[[NDArray[np.float32]], NDArray[Any]]  # observations (N, D) -> actions (N,) or (N, F)
-
 Progress = Callable[[float, int], None]  # share done in [0, 1], episodes that terminated
 
 FIRST_SEED = 10_000
-LONGEST_EPISODE = 1_000  # where the specification has no time limit
 
 
 @dataclass(frozen=True)
@@ -156,40 +156,6 @@ def interquartile_mean(values: Array) -> float:
     """Mean of the middle half of values (n,)."""
     cut = len(values) // 4
     return float(np.sort(values)[cut : len(values) - cut].mean())
-
-
-def decode_actions(spec: EnvironmentSpec, raw: NDArray[Any], lanes: int) -> Array:
-    """A policy's actions as the environment takes them, (N, F); the bins of a continuous action are undone.
-
-    Raises:
-        ValueError: wrong shape.
-    """
-    rows = np.asarray(raw, dtype=np.float64)
-    if rows.size != lanes * spec.action.size:
-        raise ValueError(f"expected actions of shape ({lanes}, {spec.action.size}), got {np.shape(raw)}")
-    rows = rows.reshape(lanes, spec.action.size)
-    if isinstance(spec.action, BoxAction) and spec.action.bins is None:
-        if not np.isfinite(rows).all():
-            raise ValueError(f"expected finite actions, got {rows.tolist()}")
-        return np.clip(rows, spec.action.low, spec.action.high)
-    counts = np.array(_counts(spec.action))
-    if not ((rows >= 0) & (rows < counts) & (rows == np.round(rows))).all():
-        raise ValueError(f"expected whole numbers from 0 to below {counts.tolist()}, got {rows.tolist()}")
-    if not isinstance(spec.action, BoxAction):
-        return rows
-    low, high = np.array(spec.action.low), np.array(spec.action.high)
-    return np.asarray(low + rows * (high - low) / (counts - 1))
-
-
-def _counts(action: BoxAction | DiscreteAction | MultiDiscreteAction) -> tuple[int, ...]:
-    """How many values a policy chooses from in each dimension."""
-    match action:
-        case BoxAction(bins=bins):
-            return bins or ()
-        case DiscreteAction(n=n):
-            return (n,)
-        case MultiDiscreteAction(nvec=nvec):
-            return nvec
 
 
 @dataclass

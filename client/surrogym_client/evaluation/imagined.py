@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.environments.lanes import Lanes, session_request
+from surrogym_client.original.protocol import LONGEST_EPISODE
 from surrogym_shared.port import SurrogatePort
 
 WHOLE = {"start_box": 0.0, "trust": None}  # an episode cut short would earn more where rewards are costs
-LONGEST_EPISODE = 1_000  # where the specification has no time limit
 STATISTICS_LANES = 1_024
 
 

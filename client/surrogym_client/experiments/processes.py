@@ -14,11 +14,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from surrogym_client.cli.errors import CommandError
+from surrogym_client.errors import SurrogymClientError
 
 STARTING_SECONDS = 120.0
 STOPPING_SECONDS = 10.0
 LOOK_SECONDS = 0.05
+
+
+class RunFailed(SurrogymClientError):
+    """A process of a run ended badly or did not start, or there is no place for the run."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +34,10 @@ class Child:
     log: Path
 
     def check(self) -> None:
-        """Raises CommandError if the process has ended badly."""
+        """Raises RunFailed if the process has ended badly."""
         code = self.process.poll()
         if code:
-            raise CommandError(f"the {self.name} ended with exit code {code}: {self.last_words()} (log: {self.log})")
+            raise RunFailed(f"the {self.name} ended with exit code {code}: {self.last_words()} (log: {self.log})")
 
     def last_words(self) -> str:
         """The last line it has written."""
@@ -65,7 +69,7 @@ class Children:
         return child
 
     def check(self) -> None:
-        """Raises CommandError if any of them has ended badly."""
+        """Raises RunFailed if any of them has ended badly."""
         for child in self._children:
             child.check()
 
@@ -91,12 +95,12 @@ def await_file(child: Child, path: Path) -> str:
     """What a child writes into a file once it is ready.
 
     Raises:
-        CommandError: it ended instead, or took too long.
+        RunFailed: it ended instead, or took too long.
     """
     deadline = time.monotonic() + STARTING_SECONDS
     while not path.exists():
         if child.process.poll() is not None or time.monotonic() > deadline:
-            raise CommandError(f"the {child.name} did not start: {child.last_words()} (log: {child.log})")
+            raise RunFailed(f"the {child.name} did not start: {child.last_words()} (log: {child.log})")
         time.sleep(LOOK_SECONDS)
     return path.read_text(encoding="utf-8").strip()
 

@@ -10,13 +10,12 @@ from functools import partial
 from typing import Any, Literal
 
 from surrogym_client.original.errors import UnknownEnvironment
-from surrogym_client.original.protocol import Environment
+from surrogym_client.original.protocol import LONGEST_EPISODE, Environment
 from surrogym_client.original.rollouts import answering
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 
 Preset = Literal["default", "paper"]
 Choose = Callable[[EnvironmentSpec], EnvironmentSpec]
-LONGEST_EPISODE = 1_000  # where nothing sets a time limit
 ATTRIBUTES = ("step_from", "reset", "step", "coordinates", "begin", "act", "picture", "close", "parallel")
 
 
@@ -62,9 +61,10 @@ def make(
 
 def is_known(name: str) -> bool:
     """Whether a built-in adapter knows this Gymnasium id; only such names are taken from a server."""
-    from surrogym_client.original import classic, mujoco
+    from surrogym_client.original import mujoco
+    from surrogym_client.original.classic import TASKS
 
-    return name in classic.TASKS or mujoco.is_known(name)
+    return name in TASKS or mujoco.is_known(name)
 
 
 def own_time_limit(name: str) -> int:
@@ -114,20 +114,21 @@ def load_factory(name: str) -> Any:
 
 
 def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str) -> Environment:
-    from surrogym_client.original import classic, mujoco
+    from surrogym_client.original import mujoco
+    from surrogym_client.original.classic import TASKS
     from surrogym_client.original.gymnasium import GymnasiumEnvironment, task_for
     from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
 
     if spec is not None and spec.environment not in ("", name):
         raise UnknownEnvironment(f"expected a specification of {name}, got one of {spec.environment}")
-    if name in classic.TASKS:
+    if name in TASKS:
         spec = spec and spec.model_copy(update={"environment": name})
         base = spec or task_for(name, preset).spec()
         return GymnasiumEnvironment(choose(base))
     if mujoco.is_known(name):
         base = spec or mujoco.specification(name)
         return mujoco.MujocoEnvironment(name, choose(base))
-    known = ", ".join((*classic.TASKS, *SPECIFICATIONS))
+    known = ", ".join((*TASKS, *SPECIFICATIONS))
     raise UnknownEnvironment(
         f"no adapter knows the environment {name!r}: expected one of {known}, "
         "a MuJoCo id together with a specification, or package.module:factory"

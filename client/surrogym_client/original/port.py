@@ -7,10 +7,10 @@ from itertools import count
 
 import numpy as np
 
-from surrogym_client.evaluation.evaluator import LONGEST_EPISODE, decode_actions
+from surrogym_client.original.actions import decode_actions
 from surrogym_client.original.episodes import Episode, Moment, draw
 from surrogym_client.original.errors import NotParallel
-from surrogym_client.original.protocol import Array
+from surrogym_client.original.protocol import LONGEST_EPISODE, Array
 from surrogym_client.original.terms import observe
 from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction

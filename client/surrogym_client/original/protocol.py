@@ -17,6 +17,8 @@ from surrogym_shared.spec import EnvironmentSpec
 
 Array = NDArray[np.float64]
 
+LONGEST_EPISODE = 1_000  # steps, where nothing sets a time limit
+
 
 @dataclass(frozen=True)
 class RealStep:

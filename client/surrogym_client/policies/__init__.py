@@ -2,7 +2,8 @@
 
 from typing import Any
 
-from surrogym_client.policies.files import PolicyCard, UnusablePolicy, load_policy, read_card
+from surrogym_client.policies.card import PolicyCard, UnusablePolicy, read_card
+from surrogym_client.policies.files import load_policy
 
 __all__ = ["PolicyCard", "UnusablePolicy", "load_policy", "read_card"]
 

@@ -24,9 +24,9 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
 from surrogym_client.errors import SurrogymClientError
-from surrogym_client.evaluation.evaluator import Predict
 from surrogym_client.policies.files import load_learner
 from surrogym_client.policies.onnx_files import from_onnx
+from surrogym_client.policies.predict import Predict
 from surrogym_shared.network import Network
 
 CHECKS = 1_000  # random observations that both forms are asked for

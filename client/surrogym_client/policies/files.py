@@ -1,4 +1,4 @@
-"""A policy on disk: what Stable-Baselines3 wrote, and beside it a card that says what it is for."""
+"""A policy's file, read without running anything in it: of Stable-Baselines3, a network of arrays, or ONNX."""
 
 from __future__ import annotations
 
@@ -8,88 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, RootModel, ValidationError
 
-from surrogym_client.errors import SurrogymClientError
-from surrogym_client.evaluation.evaluator import Predict
+from surrogym_client.policies.card import DEFAULT_ALGORITHM, UnusablePolicy
 from surrogym_client.policies.onnx_files import load_onnx
+from surrogym_client.policies.predict import Predict
 from surrogym_shared.network import Network
-from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire import SurrogateName
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-DEFAULT_ALGORITHM = "PPO"
 BUFFERLESS = {"n_envs": 1, "n_steps": 1, "buffer_size": 1}  # what only acts needs no room for experience
 ONNX = ".onnx"
-MAX_CARD_BYTES = 1024 * 1024
-
-
-class UnusablePolicy(SurrogymClientError):
-    """The file is no policy of the algorithm, or its card is none."""
-
-
-class NotedAddress(RootModel[str]):
-    """A server's address that a file names. It is no ``str``, so that nothing connects to it: only a person gives the
-    address to which a token goes."""
-
-    model_config = ConfigDict(frozen=True)
-
-    def __str__(self) -> str:
-        return self.root
-
-
-class PolicyCard(BaseModel):
-    """What a policy is for and how it came about; a JSON file of the same name beside it."""
-
-    model_config = ConfigDict(extra="ignore", frozen=True)  # train() notes more than is read here
-
-    algorithm: str = DEFAULT_ALGORITHM
-    surrogate: SurrogateName | None = None
-    server: NotedAddress | None = None
-    spec: EnvironmentSpec | None = None
-    seed: int | None = None
-    virtual_steps: int | None = None
-    seconds: float | None = None
-    imagined_return: float | None = None
-    visited_confidence: tuple[float | None, ...] = ()
-    networks: int = 1  # that learned in the last training
-    settings: dict[str, Any] = Field(default_factory=dict)
-    versions: dict[str, str] = Field(default_factory=dict)
-
-
-def card_path(policy: Path) -> Path:
-    """Where the card of a policy lies."""
-    return policy.with_suffix(".json")
-
-
-def write_card(policy: Path, card: PolicyCard) -> None:
-    """Write the card beside the policy."""
-    card_path(policy).write_text(card.model_dump_json(indent=2) + "\n", encoding="utf-8")
-
-
-def read_card(policy: Path) -> PolicyCard:
-    """The card of a policy; an empty one where there is none.
-
-    Raises:
-        UnusablePolicy: the card is invalid, or has more than ``MAX_CARD_BYTES``.
-        FileNotFoundError: there is no such policy.
-    """
-    if not policy.is_file():
-        raise FileNotFoundError(2, "no such policy file", str(policy))
-    if not card_path(policy).exists():
-        return PolicyCard()
-    with card_path(policy).open("rb") as file:
-        content = file.read(MAX_CARD_BYTES + 1)
-    if len(content) > MAX_CARD_BYTES:
-        raise UnusablePolicy(f"{card_path(policy)} is no card of a policy: expected at most {MAX_CARD_BYTES} bytes")
-    try:
-        return PolicyCard.model_validate_json(content)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise UnusablePolicy(f"{card_path(policy)} is no card of a policy: {where}: {first['msg']}") from error
 
 
 def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM, *, trust: bool = False) -> Predict:

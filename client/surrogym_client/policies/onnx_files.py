@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.errors import SurrogymClientError
-from surrogym_client.evaluation.evaluator import Predict
+from surrogym_client.policies.predict import Predict
 
 MAX_BYTES = 256 * 1024 * 1024  # of a file
 LANES = 1_024  # observations in one call of the network; more are split

@@ -19,12 +19,12 @@ from surrogym_client.original.rollouts import answering
 from surrogym_client.sampler.leases import AWAY, LeaseEnded, Leases
 from surrogym_client.sampler.query_limits import check_environment, check_query
 from surrogym_client.sampler.sample_conversion import reset_seed, sample_of
+from surrogym_client.surrogates.phases import ENDED
 from surrogym_client.transport.api import Api
 from surrogym_client.transport.connection import Retries
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, StepQuery
 
-FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "failed")
 PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)  # with a server or a storage that is away
 LOOK_SECONDS = 0.1  # how often a worker that waits looks whether it was stopped
 LAST_SECONDS = 5.0  # a sampler that was stopped asks on for so long, with a real step that is not handed in yet
@@ -166,7 +166,7 @@ class Sampler:
     def _claim(self, limit: int) -> tuple[ClaimedQueries, float]:
         """Queries, and when they were asked for by the leases' clock."""
         s, since = self._settings, self._leases.clock()
-        waits = not (s.until_done and (self._phase is None or self._phase in FINISHED))
+        waits = not (s.until_done and (self._phase is None or self._phase in ENDED))
         left = s.wait_seconds if s.time_limit is None else min(s.wait_seconds, max(0.0, self._time_left()))
         claimed = self._api.claim(
             self._surrogate,
@@ -310,7 +310,7 @@ class Sampler:
     def _enough(self, claimed: ClaimedQueries) -> bool:
         if self._settings.once and claimed.queries:
             return True
-        return self._settings.until_done and self._none_allowed(claimed) and claimed.phase in FINISHED
+        return self._settings.until_done and self._none_allowed(claimed) and claimed.phase in ENDED
 
     def _none_allowed(self, claimed: ClaimedQueries) -> bool:
         """Whether a claim gave nothing but queries that the environment does not allow, or nothing."""

@@ -6,21 +6,16 @@ import time
 from collections.abc import Callable
 
 from surrogym_client.errors import ServerUnreachable, SurrogymClientError, UnknownSurrogate
+from surrogym_client.surrogates.phases import COMPLETED
 from surrogym_client.transport.api import Api
-from surrogym_shared.wire import Phase, SurrogateView
+from surrogym_shared.wire import SurrogateView
 
-FINISHED: tuple[Phase, ...] = ("ready", "over_budget")
 LOOK_SECONDS = 0.25
-IN_WORDS: dict[Phase, str] = {  # of the phases in which a sampler stops
-    "ready": "the design is ready",
-    "over_budget": "the budget is spent, and the design is not sure of its model",
-    "failed": "the design has failed",
-}
 
 
 def share_of_design(view: SurrogateView) -> float:
     """How much of a design is done, in [0, 1]: all of it when it ended, else by its budget."""
-    return 1.0 if view.phase in FINISHED else min(1.0, view.ledger.total / view.budget)
+    return 1.0 if view.phase in COMPLETED else min(1.0, view.ledger.total / view.budget)
 
 
 def words_of_design(view: SurrogateView) -> str:
@@ -77,7 +72,7 @@ def wait_for_design(
         if view is not None:
             if progress is not None:
                 progress(view)
-            if view.phase in FINISHED and view.round > after_round and not _under_way(view):
+            if view.phase in COMPLETED and view.round > after_round and not _under_way(view):
                 return view
             if view.phase == "failed":
                 raise DesignUnfinished(f"the design of {name!r} failed: {view.error}")

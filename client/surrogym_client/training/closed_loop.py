@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from surrogym_client.evaluation.evaluator import Predict
 from surrogym_client.policies.files import load_learner
+from surrogym_client.policies.predict import Predict
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.training.settings import SUGGESTED_STEPS, chosen_for, prolongs

@@ -19,12 +19,12 @@ from cmaes import CMA, SepCMA
 from numpy.typing import NDArray
 
 from surrogym_client.evaluation.imagined import (
-    LONGEST_EPISODE,
     Imagined,
     imagine,
     imagined_returns,
     observation_statistics,
 )
+from surrogym_client.original.protocol import LONGEST_EPISODE
 from surrogym_client.training.settings import (
     CHECK_EPISODES,
     CHECKS,

@@ -13,7 +13,8 @@ from surrogym_client.experiments.settings import DemoSettings
 from surrogym_client.experiments.tasks import Outcome
 from surrogym_client.original import make
 from surrogym_client.original.episodes import Episode, open_episode
-from surrogym_client.policies.files import load_policy, read_card
+from surrogym_client.policies.card import read_card
+from surrogym_client.policies.files import load_policy
 from surrogym_shared.terminal import progress
 
 

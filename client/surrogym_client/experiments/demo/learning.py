@@ -17,7 +17,7 @@ from surrogym_client.experiments.demo.judging import Judgement
 from surrogym_client.experiments.processes import Child, Children, await_file
 from surrogym_client.experiments.settings import DemoSettings
 from surrogym_client.experiments.tasks import ROUNDS, queries_a_round
-from surrogym_client.policies.files import read_card
+from surrogym_client.policies.card import read_card
 from surrogym_client.surrogates.waiting import share_of_design, wait_for_design, words_of_design
 from surrogym_client.training.words import words_of
 from surrogym_client.transport.api import Api

@@ -10,9 +10,9 @@ from surrogym_client.evaluation.evaluator import Evaluation
 from surrogym_client.experiments.demo.judging import Judgement
 from surrogym_client.experiments.demo.learning import Learned
 from surrogym_client.experiments.settings import DemoSettings, fingerprint
-from surrogym_client.policies.files import PolicyCard, read_card
+from surrogym_client.policies.card import PolicyCard, read_card
 from surrogym_client.runtime.versions import machine, versions
-from surrogym_client.surrogates.waiting import IN_WORDS
+from surrogym_client.surrogates.phases import IN_WORDS
 
 BY_RUN = (
     "seed",

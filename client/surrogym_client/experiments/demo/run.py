@@ -9,11 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from surrogym_client.cli.errors import CommandError
 from surrogym_client.experiments.demo.judging import Judgement, judge
 from surrogym_client.experiments.demo.learning import Learned, SurrogateRun
 from surrogym_client.experiments.demo.report import metrics_of
-from surrogym_client.experiments.processes import Children
+from surrogym_client.experiments.processes import Children, RunFailed
 from surrogym_client.experiments.settings import DemoSettings
 from surrogym_client.runtime.lifetime import terminations_as_interrupts
 from surrogym_client.runtime.versions import commit
@@ -46,7 +45,7 @@ def run_demo(
     """Run the whole loop, then ``tell`` the metrics, which also lie in the run folder, and where that is.
 
     Raises:
-        CommandError: the folder is not empty, or a process ended badly; says which, its last words and its log.
+        RunFailed: the folder is not empty, or a process ended badly; says which, its last words and its log.
         SurrogymClientError: the server refused, or the design failed.
     """
     started, code = time.monotonic(), commit()
@@ -87,7 +86,7 @@ def _new_folder(settings: DemoSettings) -> Path:
 def _empty_folder(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
-        raise CommandError(f"expected an empty run folder, got {folder}, where there is something already")
+        raise RunFailed(f"expected an empty run folder, got {folder}, where there is something already")
     return folder.resolve()
 
 

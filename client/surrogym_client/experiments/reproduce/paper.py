@@ -41,7 +41,7 @@ def run_cells(todo: Sequence[Cell], folder: Path, say: Say) -> list[Row]:
     are complete are written after each.
 
     Raises:
-        CommandError: the server did not start.
+        RunFailed: the server did not start.
         SurrogymClientError: it refused, or a design failed.
     """
     folder.mkdir(parents=True, exist_ok=True)

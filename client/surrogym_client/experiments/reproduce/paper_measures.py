@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_client.evaluation.evaluator import EvaluationSettings, Predict, Trace, evaluate
+from surrogym_client.evaluation.evaluator import EvaluationSettings, Trace, evaluate
 from surrogym_client.experiments.reproduce.paper_cases import ANYWHERE, Variation
 from surrogym_client.original import OriginalEnvironment, make
 from surrogym_client.original.episodes import GymnasiumEpisode, Moment, draw
 from surrogym_client.original.protocol import RealStep
 from surrogym_client.original.terms import observe
+from surrogym_client.policies.predict import Predict
 from surrogym_client.transport.api import Api
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
 from surrogym_shared.wire import ModelView

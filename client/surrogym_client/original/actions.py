@@ -1,0 +1,45 @@
+"""Actions of a policy as the original environment takes them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.original.protocol import Array
+from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
+
+
+def decode_actions(spec: EnvironmentSpec, raw: NDArray[Any], lanes: int) -> Array:
+    """A policy's actions as the environment takes them, (N, F); the bins of a continuous action are undone.
+
+    Raises:
+        ValueError: wrong shape.
+    """
+    rows = np.asarray(raw, dtype=np.float64)
+    if rows.size != lanes * spec.action.size:
+        raise ValueError(f"expected actions of shape ({lanes}, {spec.action.size}), got {np.shape(raw)}")
+    rows = rows.reshape(lanes, spec.action.size)
+    if isinstance(spec.action, BoxAction) and spec.action.bins is None:
+        if not np.isfinite(rows).all():
+            raise ValueError(f"expected finite actions, got {rows.tolist()}")
+        return np.clip(rows, spec.action.low, spec.action.high)
+    counts = np.array(_counts(spec.action))
+    if not ((rows >= 0) & (rows < counts) & (rows == np.round(rows))).all():
+        raise ValueError(f"expected whole numbers from 0 to below {counts.tolist()}, got {rows.tolist()}")
+    if not isinstance(spec.action, BoxAction):
+        return rows
+    low, high = np.array(spec.action.low), np.array(spec.action.high)
+    return np.asarray(low + rows * (high - low) / (counts - 1))
+
+
+def _counts(action: BoxAction | DiscreteAction | MultiDiscreteAction) -> tuple[int, ...]:
+    """How many values a policy chooses from in each dimension."""
+    match action:
+        case BoxAction(bins=bins):
+            return bins or ()
+        case DiscreteAction(n=n):
+            return (n,)
+        case MultiDiscreteAction(nvec=nvec):
+            return nvec

@@ -1,0 +1,12 @@
+"""What a policy is to whoever asks it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Predict = Callable[[NDArray[np.float32]], NDArray[Any]]
+"""Observations (N, D) to actions (N,) or (N, F)."""

@@ -1,0 +1,22 @@
+"""What a person can do about what is missing."""
+
+from __future__ import annotations
+
+EXTRAS = {  # their packages
+    "server": ("alembic", "fastapi", "psycopg", "safetensors", "scipy", "sqlalchemy", "starlette", "uvicorn"),
+    "train": ("matplotlib", "stable_baselines3", "tensorboard", "torch"),
+    "export": ("onnx", "onnxruntime", "onnxscript"),
+    "render": ("moviepy", "pygame"),
+    "trackers": ("mlflow", "wandb"),
+    "mujoco": ("mujoco", "imageio"),
+}
+START_SERVER = "start one with surrogym serve, or name another by --server or SURROGYM_URL"
+GIVE_TOKEN = "give a token of this server by SURROGYM_TOKEN or --token-file"
+
+
+def missing(module: str) -> str | None:
+    """Say which extra brings a module; None for a module of no extra."""
+    for extra, modules in EXTRAS.items():
+        if module in modules:
+            return f"this needs {module}, which is not installed: pip install 'surrogym[{extra}]'"
+    return None
