@@ -13,7 +13,7 @@ from pathlib import Path
 import report
 from common import machine, parser
 
-PARTS = ("step", "cold", "peers", "train", "fit", "growth", "predict", "evidence", "lists")
+PARTS = ("step", "cold", "peers", "train", "fit", "growth", "predict", "evidence", "lists", "attacks")
 
 
 def main() -> None:

@@ -133,6 +133,14 @@ def lists(found: dict[str, Any]) -> Iterator[Line]:
             )
 
 
+def attacks(found: dict[str, Any]) -> Iterator[Line]:
+    for name, measured in found["attacks"].items():
+        p99, grown = measured["p99 ms"], measured["MiB after"] - measured["MiB before"]
+        attack = name != "ordinary requests"
+        reached = f"p99 {p99:.0f} ms, worst {measured['worst ms']:.0f} ms, memory {grown:+.1f} MiB"
+        yield f"/healthz under: {name}", "50 ms" if attack else "", reached, p99 < 50 if attack else None
+
+
 def memory(found: dict[str, Any]) -> Iterator[Line]:
     mib = [m for _, m in found["readings"]]
     reached = f"{min(mib):.1f} to {max(mib):.1f} MiB, last quarter {found['growth']:+.1%} of the first"
@@ -148,6 +156,7 @@ PARTS = {
     "evidence": evidence,
     "growth": growth,
     "lists": lists,
+    "attacks": attacks,
     "memory": memory,
 }
 
