@@ -59,7 +59,12 @@ class LocalSurrogate:
             InvalidInput: not a model of it.
         """
         read = EnvironmentSpec.model_validate_json(Path(spec).read_bytes())
-        return cls(read, from_bytes(definition_from_spec(read), Path(model).read_bytes()))
+        return cls.from_bytes(read, Path(model).read_bytes())
+
+    @classmethod
+    def from_bytes(cls, spec: EnvironmentSpec, model: bytes) -> Self:
+        """A surrogate of a specification and a model's file. Raises ``InvalidInput``: no model of it."""
+        return cls(spec, from_bytes(definition_from_spec(spec), model))
 
     @classmethod
     def from_file(cls, path: str | Path) -> Self:
@@ -71,7 +76,7 @@ class LocalSurrogate:
             InvalidInput: its model is none of its specification.
         """
         file = SurrogateFile.load(path)
-        return cls(file.spec, from_bytes(definition_from_spec(file.spec), file.model))
+        return cls.from_bytes(file.spec, file.model)
 
     def spec(self) -> EnvironmentSpec:
         return self._spec

@@ -54,7 +54,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "pathwise": {"variant": "pathwise", "penalty": 1.0},
 }
 OF_A_SAMPLE = ("coordinates", "action", "next_coordinates", "reward", "terminated", "observation", "next_observation")
-PACKAGES = ("server", "client", "shared")
+PACKAGES = ("front", "server", "client", "shared")
 OF_ONE_RUN = {"created_at", "fit_seconds", "sampler", "seconds", "commit", "versions", "out", "machine"}  # not compared
 
 Facts = dict[str, Any]

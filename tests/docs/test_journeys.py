@@ -28,6 +28,7 @@ PAGES = ["docs/tutorial.md"]
 ALL_PAGES = [
     "README.md",
     "docs/how-to/files.md",
+    "docs/how-to/in-process.md",
     "docs/how-to/no-teleport.md",
     "docs/how-to/own-environment.md",
     "docs/how-to/page.md",

@@ -1,0 +1,105 @@
+"""The front door of Surrogym: the design of queries in this process, environments, the client, and specifications.
+
+Importing it loads neither torch nor Gymnasium. What a name needs is loaded when the name is first used.
+
+Example:
+    >>> import surrogym
+    >>> design = surrogym.Design(spec, budget=20)
+    >>> while (query := design.ask()) is not None:
+    ...     design.tell(query, machine.step_from(query.coordinates, query.action))
+    >>> env = surrogym.make(design)
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from surrogym_shared.spec import (
+    AcquisitionChoice,
+    AllOf,
+    Bounds,
+    BoxAction,
+    Coordinate,
+    DeclaredReward,
+    DiscreteAction,
+    EnvironmentSpec,
+    Fixed,
+    Inequality,
+    MultiDiscreteAction,
+    Normal,
+    ObservationEntry,
+    Part,
+    Quantity,
+    Reward,
+    RewardTerm,
+    Success,
+    Term,
+    Uniform,
+)
+from surrogym_shared.spec import Design as DesignSettings
+
+if TYPE_CHECKING:
+    from surrogym.design import Design, QueriesOpen, Query
+    from surrogym.environments import make, make_vec
+    from surrogym_client.original.protocol import RealStep
+    from surrogym_client.transport.api import Api as Client
+
+__all__ = [
+    "AcquisitionChoice",
+    "AllOf",
+    "Bounds",
+    "BoxAction",
+    "Client",
+    "Coordinate",
+    "DeclaredReward",
+    "Design",
+    "DesignSettings",
+    "DiscreteAction",
+    "EnvironmentSpec",
+    "Fixed",
+    "Inequality",
+    "MultiDiscreteAction",
+    "Normal",
+    "ObservationEntry",
+    "Part",
+    "Quantity",
+    "QueriesOpen",
+    "Query",
+    "RealStep",
+    "Reward",
+    "RewardTerm",
+    "Success",
+    "Term",
+    "Uniform",
+    "make",
+    "make_vec",
+]
+
+_LAZY = {  # name: module, its name there, the extra that brings what the module needs
+    "Design": ("surrogym.design", "Design", "server"),
+    "Query": ("surrogym.design", "Query", "server"),
+    "QueriesOpen": ("surrogym.design", "QueriesOpen", "server"),
+    "make": ("surrogym.environments", "make", ""),
+    "make_vec": ("surrogym.environments", "make_vec", ""),
+    "RealStep": ("surrogym_client.original.protocol", "RealStep", ""),
+    "Client": ("surrogym_client.transport.api", "Api", ""),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Loads a name on first use. Raises ``ImportError`` with the extra to install where a package is missing."""
+    if name not in _LAZY:
+        raise AttributeError(f"module 'surrogym' has no attribute {name!r}")
+    module, attribute, extra = _LAZY[name]
+    try:
+        value = getattr(import_module(module), attribute)
+    except ModuleNotFoundError as error:
+        what = f"surrogym[{extra}]" if extra else "surrogym"
+        raise ImportError(f"surrogym.{name} needs the package {error.name}: pip install '{what}'") from error
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,67 @@
+"""Virtual environments by one name, wherever the surrogate is: on a server, in a file, or a design of this process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+import surrogym_client  # noqa: F401  enters the environments into Gymnasium's registry
+from surrogym_client.environments.env import RemoteEnv
+from surrogym_client.environments.vector import RemoteVectorEnv
+from surrogym_client.registration import ENVIRONMENT_ID, FILE_ID
+from surrogym_shared.port import SurrogatePort
+
+SUFFIX = ".surrogate"
+
+
+def make(surrogate: Any, **options: Any) -> gymnasium.Env[Any, Any]:
+    """A virtual environment of Gymnasium, with one lane.
+
+    Args:
+        surrogate: the name of a surrogate on a server; the path of a file that ``surrogym export`` wrote, ending in
+            ``.surrogate``; a ``Design`` that has a model; or anything that is a ``SurrogatePort``.
+        options: for a name, ``url`` and ``token`` of the server; for all, those of ``RemoteEnv``: ``variant``,
+            ``penalty``, ``max_episode_steps``, ...
+
+    Raises:
+        TypeError: none of these, or an unknown option.
+        ImportError: a file or a design needs the extra ``server``.
+        SurrogymClientError: the server can't be reached or refuses.
+
+    Example:
+        >>> env = surrogym.make("pendulum", url="http://127.0.0.1:8000")
+        >>> observation, info = env.reset(seed=0)
+    """
+    if isinstance(surrogate, str | Path):
+        return gymnasium.make(**_registered(surrogate), **options)
+    return RemoteEnv(_port(surrogate), **options)
+
+
+def make_vec(surrogate: Any, num_envs: int = 1, **options: Any) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
+    """A virtual environment with ``num_envs`` lanes; arguments and errors as of ``make``.
+
+    Example:
+        >>> envs = surrogym.make_vec("pendulum.surrogate", num_envs=8)
+    """
+    if isinstance(surrogate, str | Path):
+        return gymnasium.make_vec(**_registered(surrogate), num_envs=num_envs, **options)
+    return RemoteVectorEnv(_port(surrogate), num_envs, **options)
+
+
+def _registered(surrogate: str | Path) -> dict[str, Any]:
+    if Path(surrogate).suffix == SUFFIX:
+        return {"id": FILE_ID, "file": surrogate}
+    return {"id": ENVIRONMENT_ID, "surrogate": str(surrogate)}
+
+
+def _port(surrogate: Any) -> SurrogatePort:
+    made = surrogate.surrogate() if hasattr(surrogate, "surrogate") else surrogate
+    if not hasattr(made, "open"):
+        raise TypeError(
+            f"expected the name of a surrogate, a path ending in {SUFFIX}, a Design or a SurrogatePort, "
+            f"got {type(surrogate).__name__}"
+        )
+    port: SurrogatePort = made
+    return port
