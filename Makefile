@@ -40,7 +40,8 @@ unit: .venv/dev postgresql chromium  ## The tests alone (ARGS="-k pendulum")
 	$(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
 
 test-all: test .venv-extras  ## make test, every command of the docs, and trainers and trackers with packages of their own
-	DOCS=full $(BIN)/pytest --durations 0 tests/docs tests/examples
+	$(BIN)/pytest -m long --numprocesses $(WORKERS) --dist loadfile
+	DOCS=full $(BIN)/pytest -m "" --durations 0 tests/docs tests/examples
 
 docs: .venv/dev  ## Build the site into build/docs; warnings are errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
@@ -52,7 +53,7 @@ audit: .venv/dev  ## Ask for known holes of the pinned packages, where that can 
 	@$(BIN)/python tests/audit.py
 
 chaos: .venv/dev postgresql  ## Faults and attacks in full length; make test has a short form (ARGS="-k killed")
-	CHAOS=full $(BIN)/pytest --durations 0 tests/chaos tests/security $(ARGS)
+	CHAOS=full $(BIN)/pytest -m "" --durations 0 tests/chaos tests/security $(ARGS)
 
 bench: .venv/dev  ## What steps, predictions and trainings cost here, beside echoes, libraries and other systems (ARGS="--quick")
 	$(BIN)/python tests/benchmarks/bench.py $(ARGS)

@@ -124,6 +124,7 @@ def test_a_task_that_is_not_the_papers_is_refused(surrogym):
 
 @pytest.mark.e2e
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_quick_run_gives_table_and_pictures_and_is_not_made_twice(surrogym, tmp_path):
     quick = ("reproduce", "paper", "--quick", "--tasks", "cartpole", "--seeds", "1", "--out", str(tmp_path), "--json")
     said = surrogym(*quick)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from support.examples import EXAMPLES, cells, run, surrogym
 from support.server import ServerProcess
 from surrogym_client.transport import Api
@@ -12,6 +14,7 @@ from surrogym_client.transport import Api
 ENVIRONMENT_LINES = 60  # of one's own environment, without blank ones
 
 
+@pytest.mark.long
 def test_the_drone_is_learned_trained_on_and_evaluated(server: ServerProcess, tmp_path: Path) -> None:
     surrogym(server, tmp_path, "register", "drone:Drone", "--name", "drone", "--budget", "10", "--initial", "10")
     report = surrogym(server, tmp_path, "sample", "drone", "--env", "drone:Drone", "--until-done", "--json")
@@ -26,6 +29,7 @@ def test_the_drone_is_as_short_as_the_docs_say() -> None:
     assert sum(bool(line) for line in lines) <= ENVIRONMENT_LINES
 
 
+@pytest.mark.long
 def test_four_samplers_share_the_queries_of_a_slow_simulator(server: ServerProcess, tmp_path: Path) -> None:
     surrogym(
         server, tmp_path, "register", "slow_simulator:SlowPendulum", "--name", "slow", "--budget", "8", "--initial", "8"

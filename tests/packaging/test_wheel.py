@@ -1,4 +1,4 @@
-"""The wheel holds all a user needs: three packages, migrations, the page, the marks of typed packages, the commands."""
+"""The wheel holds all a user needs: four packages, migrations, the page, the marks of typed packages, the commands."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from zipfile import ZipFile
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = {"client": "surrogym_client", "server": "surrogym_server", "shared": "surrogym_shared"}
+PACKAGES = {"front": "surrogym", "client": "surrogym_client", "server": "surrogym_server", "shared": "surrogym_shared"}
 
 
 @pytest.fixture(scope="module")
