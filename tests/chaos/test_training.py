@@ -17,7 +17,7 @@ from support.chaos import SEED, times
 from support.server import RestartingServer
 from support.teaching import teach
 from surrogym_client.original.classic import pendulum
-from surrogym_client.training.trainer import TrainProgress, TrainResult, TrainSettings, train
+from surrogym_client.training import TrainProgress, TrainResult, TrainSettings, train
 from surrogym_client.training.words import words_of_result
 from surrogym_client.transport import Api, HttpSurrogate, Retries
 

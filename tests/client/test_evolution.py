@@ -9,9 +9,8 @@ from support.real_steps import random_steps
 from surrogym_client.evaluation import imagined_returns
 from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
 from surrogym_client.policies import load_policy
-from surrogym_client.training.cma_es import evolve
-from surrogym_client.training.settings import TrainingInterrupted, prolongs
-from surrogym_client.training.trainer import TrainSettings, train
+from surrogym_client.training import TrainingInterrupted, TrainSettings, train
+from surrogym_client.training.search import is_prolonged
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.models.gaussian_process.learning.learn import learn
@@ -59,7 +58,7 @@ def test_a_penalty_is_reported(surrogate, tmp_path: Path):
 
 def test_the_same_seed_finds_the_same_policy(surrogate, tmp_path: Path):
     def found(seed: int) -> np.ndarray:
-        return Network.load(evolve(surrogate, tmp_path / "p.zip", small(seed=seed), 1_000).path).vector
+        return Network.load(train(surrogate, tmp_path / "p.zip", small(seed=seed, total_steps=1_000)).path).vector
 
     np.testing.assert_array_equal(found(0), found(0))
     assert not np.array_equal(found(0), found(1))
@@ -74,12 +73,12 @@ def test_it_learns_to_balance_and_evaluation_reads_the_file(tmp_path: Path):
 
 
 def test_it_goes_on_from_a_network(surrogate, tmp_path: Path):
-    first = evolve(surrogate, tmp_path / "first.zip", small(), 3_000)
-    second = evolve(surrogate, tmp_path / "second.zip", small(start_from=first.path, seed=1), 320)
+    first = train(surrogate, tmp_path / "first.zip", small(total_steps=3_000))
+    second = train(surrogate, tmp_path / "second.zip", small(start_from=first.path, seed=1, total_steps=320))
     assert second.path.exists()
-    wider = small(start_from=first.path, hyperparameters=SMALL | {"units": 6})
+    wider = small(total_steps=320, start_from=first.path, hyperparameters=SMALL | {"units": 6})
     with pytest.raises(ValueError, match="expected a network of 31 parameters, got 21"):
-        evolve(surrogate, tmp_path / "third.zip", wider, 320)
+        train(surrogate, tmp_path / "third.zip", wider)
 
 
 def test_unknown_hyperparameters_are_refused(surrogate, tmp_path: Path):
@@ -91,15 +90,17 @@ def test_it_is_not_prolonged(surrogate, tmp_path: Path):
     with pytest.raises(ValueError, match="expected no prolonging, or another algorithm"):
         train(surrogate, tmp_path / "policy.zip", small(prolong=True))
     assert not list(tmp_path.iterdir())
-    assert not prolongs(small(total_steps=None), pendulum())
+    assert not is_prolonged(small(total_steps=None), pendulum())
 
 
 @pytest.mark.long
 def test_a_goal_far_from_the_start_is_found(tmp_path: Path):
     """Whole policies explore: noise on each action leads nowhere here."""
     surrogate = local(mountain_car_continuous())
-    settings = TrainSettings(algorithm="cmaes", hyperparameters={"population": 16, "starts": 2, "units": 4})
-    assert evolve(surrogate, tmp_path / "policy.zip", settings, 8 * 16 * 2 * 999).imagined_return > 80
+    settings = TrainSettings(
+        algorithm="cmaes", total_steps=8 * 16 * 2 * 999, hyperparameters={"population": 16, "starts": 2, "units": 4}
+    )
+    assert train(surrogate, tmp_path / "policy.zip", settings).imagined_return > 80
 
 
 def test_an_interruption_keeps_what_was_found(surrogate, tmp_path: Path):
@@ -107,7 +108,7 @@ def test_an_interruption_keeps_what_was_found(surrogate, tmp_path: Path):
         raise KeyboardInterrupt
 
     with pytest.raises(TrainingInterrupted) as interrupted:
-        evolve(surrogate, tmp_path / "policy.zip", small(), 3_000, interrupt)
+        train(surrogate, tmp_path / "policy.zip", small(total_steps=3_000), interrupt)
     result = interrupted.value.result
     assert 0 < result.virtual_steps < 3_000
     assert Network.load(result.path).vector.size

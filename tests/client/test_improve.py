@@ -19,9 +19,10 @@ from support.teaching import answer
 from surrogym_client.original.classic import pendulum
 from surrogym_client.original.gymnasium import GymnasiumEnvironment
 from surrogym_client.surrogates.waiting import wait_for_design
-from surrogym_client.training.closed_loop import VISIT_LANES, ImproveSettings, explorer, shares, train_and_improve
+from surrogym_client.training import TrainProgress, TrainResult, TrainSettings, train
+from surrogym_client.training.closed_loop import VISIT_LANES, ImproveSettings, shares, train_and_improve
+from surrogym_client.training.search import search_for
 from surrogym_client.training.settings import DRAWS, chosen_for
-from surrogym_client.training.trainer import TrainProgress, TrainResult, TrainSettings, train
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
@@ -135,7 +136,7 @@ def test_a_policy_that_explores_by_state_visits_each_lanes_own_way_and_the_same_
     hyperparameters = {"n_steps": 16, "use_sde": True}
     train(port, out, TrainSettings(total_steps=128, num_envs=8, hyperparameters=hyperparameters))
     same = np.tile(np.float32([[1.0, 0.0, 0.5]]), (VISIT_LANES, 1))
-    first, again = (explorer(out, "PPO") for _ in range(2))
+    first, again = (search_for(TrainSettings()).explorer(out, "PPO", VISIT_LANES) for _ in range(2))
     actions = np.asarray(first(same))
     assert len(np.unique(actions)) > VISIT_LANES / 2  # the rest are clipped to the bounds
     assert np.array_equal(actions, first(same)), "until the next visit"

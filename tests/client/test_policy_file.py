@@ -36,7 +36,7 @@ from surrogym_client.policies.files import load_learner, load_policy, save_polic
 from surrogym_client.policies.networks import PaperPolicy, Standardise, decaying
 from surrogym_client.policies.saved_settings import MAX_EXPERIENCE_BYTES
 from surrogym_client.policies.structure import ENTRY, Structure, describe
-from surrogym_client.training.trainer import TrainSettings, train
+from surrogym_client.training import TrainSettings, train
 from surrogym_client.transport import Api
 from surrogym_shared.archives import read_entries, stored
 

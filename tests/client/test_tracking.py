@@ -15,7 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from support.real_steps import random_steps
 from surrogym_client.original.classic import pendulum
-from surrogym_client.training.trainer import TrainSettings, train
+from surrogym_client.training import TrainSettings, train
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.models.gaussian_process.learning.learn import learn

@@ -6,31 +6,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import PPO
 
 from support.real_steps import random_steps
 from surrogym_client.evaluation import imagined_returns
+from surrogym_client.evaluation.imagined import observation_statistics
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_client.original.loading import make
 from surrogym_client.policies import UnusablePolicy, load_policy
 from surrogym_client.policies.networks import WIDER, PaperPolicy
 from surrogym_client.sb3 import SurrogateVecEnv
-from surrogym_client.training import trainer as training
-from surrogym_client.training.early_stopping import Checks
+from surrogym_client.training import TrainingInterrupted, TrainProgress, TrainSettings, train
+from surrogym_client.training.search import MAX_STEPS, SEARCHES
 from surrogym_client.training.settings import prolongs
-from surrogym_client.training.trainer import (
-    MAX_STEPS,
-    TrainingInterrupted,
-    TrainProgress,
-    TrainSettings,
-    algorithm_by_name,
-    even_batch,
-    imagined_return,
-    observation_statistics,
-    suggested_gamma,
-    suggested_lanes,
-    train,
-)
+from surrogym_client.training.stable_baselines import search as training
+from surrogym_client.training.stable_baselines.algorithms import OffPolicySearch, OnPolicySearch, even_batch
+from surrogym_client.training.stable_baselines.early_stopping import Checks
+from surrogym_client.training.stable_baselines.search import imagined_return, suggested_gamma
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.models.gaussian_process.learning.learn import learn
@@ -204,7 +196,7 @@ def test_other_algorithms_by_name(surrogate, tmp_path: Path, algorithm):
     settings = small(algorithm=algorithm, num_envs=4, total_steps=64, hyperparameters=hyperparameters)
     result = train(surrogate, tmp_path / "policy.zip", settings)
     assert result.virtual_steps == 64
-    assert algorithm_by_name(algorithm).load(tmp_path / "policy.zip", device="cpu") is not None
+    assert SEARCHES.get(algorithm).algorithm.load(tmp_path / "policy.zip", device="cpu") is not None
 
 
 def test_dqn_takes_one_discrete_action_and_sac_none(tmp_path: Path):
@@ -239,7 +231,7 @@ def test_settings_follow_from_the_specification(surrogate):
     assert suggested_gamma(cartpole()) == pytest.approx(0.994)
     assert suggested_gamma(pendulum().model_copy(update={"time_limit": 20})) == 0.9
     assert suggested_gamma(pendulum().model_copy(update={"time_limit": None})) == pytest.approx(0.997)
-    assert suggested_lanes(PPO) > suggested_lanes(SAC)
+    assert OnPolicySearch.lanes > OffPolicySearch.lanes
 
 
 @pytest.mark.parametrize(("rollout", "batch"), [(8_192, 1_024), (128, 128), (1_536, 1_536), (3_072, 1_024), (1, 1)])
@@ -260,13 +252,13 @@ IDLE = SMALL | {"learning_rate": 0.0, "n_steps": 4}  # learns nothing
 @pytest.fixture
 def made(monkeypatch):
     """The settings of every network that training makes."""
-    made, plain = [], training._learner
+    made, plain = [], training.make_learner
 
     def seen(algorithm, env, settings, *rest):
         made.append(settings)
         return plain(algorithm, env, settings, *rest)
 
-    monkeypatch.setattr(training, "_learner", seen)
+    monkeypatch.setattr(training, "make_learner", seen)
     return made
 
 
@@ -284,14 +276,14 @@ def test_a_network_that_learns_nothing_is_given_up_for_another(surrogate, tmp_pa
 
 
 def test_ctrl_c_while_the_next_network_is_made_keeps_what_was_learned(surrogate, tmp_path: Path, made, monkeypatch):
-    plain = training._learner
+    plain = training.make_learner
 
     def interrupted(*args):
         if made:
             raise KeyboardInterrupt
         return plain(*args)
 
-    monkeypatch.setattr(training, "_learner", interrupted)
+    monkeypatch.setattr(training, "make_learner", interrupted)
     monkeypatch.setattr(training, "imagined_return", lambda *_: 0.0)
     with pytest.raises(TrainingInterrupted) as interruption:
         train(surrogate, tmp_path / "policy.zip", idle())

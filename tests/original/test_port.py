@@ -10,7 +10,7 @@ from surrogym_client import original
 from surrogym_client.original.episodes import GymnasiumEpisode, open_episode
 from surrogym_client.original.port import OriginalPort
 from surrogym_client.sb3 import SurrogateVecEnv
-from surrogym_client.training.trainer import TrainSettings, train
+from surrogym_client.training import TrainSettings, train
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import OpenSession
 

@@ -30,7 +30,7 @@ from surrogym_client.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from surrogym_client.training.trainer import TrainProgress, TrainResult, TrainSettings
+    from surrogym_client.training import TrainProgress, TrainResult, TrainSettings
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
     from surrogym_shared.wire import SurrogateView
@@ -154,6 +154,8 @@ def command(
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
     from surrogym_client.surrogates.budget import words_of_rounds
+    from surrogym_client.training import TrainSettings
+    from surrogym_client.training.search import SEARCHES
     from surrogym_client.training.words import words_of_result
     from surrogym_shared.terminal import give, on_interrupt, progress, say
     from surrogym_shared.wire import OF_PARTICLES
@@ -166,6 +168,7 @@ def command(
     if start_from is not None and not start_from.exists():
         raise CommandError(f"{start_from}: no such policy file")
     hyperparameters = _hyperparameters(chosen or [])
+    _require_known(algorithm)
     session = _given(
         variant=variant,
         particles=particles,
@@ -177,15 +180,13 @@ def command(
         penalty=penalty,
     )
     token = token_from(context, token, token_file)
-    spec, url = _trainable(surrogate, server, token, wait, quiet=quiet)
+    spec, url = _trainable(surrogate, server, token, wait, algorithm, quiet=quiet)
     if improve:
         with connect(server, token) as api:
             say(words_of_rounds(api, surrogate, improve, rounds), quiet=quiet)
     with on_interrupt(lambda: NOTHING_YET), progress("prepare", quiet=quiet) as update:
         update(None, "importing Stable-Baselines3")
-        from surrogym_client.training.trainer import (
-            TrainSettings,  # torch; imported once there is something to train on
-        )
+        SEARCHES.get(algorithm)  # torch; imported once there is something to train on
 
     settings = TrainSettings(
         algorithm=algorithm,
@@ -209,6 +210,17 @@ def command(
     summary = card(result)
     named = server if given_here(context, "server") else None
     give(summary, lambda: words_of_result(result, closed_loop=improve > 0, server=named), as_json=as_json, quiet=quiet)
+
+
+def _require_known(algorithm: str) -> None:
+    """Refuse an unknown search before a server is asked."""
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.training.search import SEARCHES
+
+    try:
+        SEARCHES.name_of(algorithm)
+    except ValueError as error:
+        raise CommandError(str(error)) from error
 
 
 def _hyperparameters(chosen: list[str]) -> dict[str, Any]:
@@ -252,9 +264,9 @@ def _keeping(write_card: Callable[[TrainResult], object], asked: str) -> Iterato
 
 
 def _trainable(
-    surrogate: str, server: str | None, token: str | None, wait: float, *, quiet: bool
+    surrogate: str, server: str | None, token: str | None, wait: float, algorithm: str, *, quiet: bool
 ) -> tuple[EnvironmentSpec, str]:
-    """Specification and server of a surrogate whose design is done; with ``wait``, torch is imported meanwhile."""
+    """Specification and server of a surrogate whose design is done; with ``wait``, the search is imported meanwhile."""
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.surrogates.phases import COMPLETED
     from surrogym_client.surrogates.waiting import (
@@ -262,12 +274,13 @@ def _trainable(
         wait_for_design,
         words_of_design,
     )
+    from surrogym_client.training.search import SEARCHES
     from surrogym_shared.terminal import on_interrupt, progress
 
     with connect(server, token, wait, quiet=quiet) as api:
         view = awaited_surrogate(api, surrogate, wait, quiet=quiet)
         if wait > 0:
-            import surrogym_client.training.trainer  # noqa: F401
+            SEARCHES.get(algorithm)
 
             stays = "interrupted while the design goes on at the server; the same command waits again"
             with on_interrupt(lambda: stays), progress("design", quiet=quiet) as update:

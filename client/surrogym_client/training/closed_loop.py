@@ -7,21 +7,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from surrogym_client.policies.files import load_learner
-from surrogym_client.policies.predict import Predict
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.surrogates.waiting import wait_for_design
-from surrogym_client.training.settings import SUGGESTED_STEPS, chosen_for, prolongs
-from surrogym_client.training.trainer import (
+from surrogym_client.training.search import is_prolonged, planned_steps, search_for
+from surrogym_client.training.settings import (
+    SUGGESTED_STEPS,
     TrainingInterrupted,
     TrainProgress,
     TrainResult,
     TrainSettings,
-    planned_steps,
-    train,
+    chosen_for,
 )
+from surrogym_client.training.trainer import train
 from surrogym_client.transport.api import Api
-from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import SurrogateView
 
@@ -76,7 +74,7 @@ def train_and_improve(
     rounds: list[TrainResult] = []
     visited, known, region_known = 0, list[float | None](), False
     whole, part = shares(settings, improve.rounds)
-    prolong = prolongs(settings, port.spec())
+    prolong = is_prolonged(settings, port.spec())
 
     def learn(steps: int, whole: int, settings: TrainSettings) -> None:
         now = replace(settings, total_steps=steps)
@@ -93,7 +91,7 @@ def train_and_improve(
                 break
             learn(part, whole, replace(settings, prolong=False))
             checkpoint = f"seed {settings.seed}, round {view.round}"
-            steps, index = visit(port, out, settings, checkpoint)
+            steps, index = visit(port, rounds[-1], settings, checkpoint)
             visited, known = visited + steps, [*known, index]
             region_known = index is not None and index >= view.target
             if region_known:
@@ -149,11 +147,13 @@ def shares(settings: TrainSettings, rounds: int) -> tuple[int, int]:
     return min(planned + rounds * part, SUGGESTED_STEPS), part
 
 
-def visit(port: SurrogatePort, policy: Path, settings: TrainSettings, checkpoint: str) -> tuple[int, float | None]:
-    """Let a policy run from the declared starts and submit where it went: the number of virtual steps that took, and
-    the confidence index there."""
+def visit(
+    port: SurrogatePort, learned: TrainResult, settings: TrainSettings, checkpoint: str
+) -> tuple[int, float | None]:
+    """Let the policy of a round run from the declared starts and submit where it went. Returns how many virtual steps
+    that took, and the confidence index there."""
     spec = port.spec()
-    act = explorer(policy, settings.algorithm)
+    act = search_for(settings).explorer(learned.path, learned.algorithm, VISIT_LANES)
     options = {**settings.session, "occupancy": True}
     env = SurrogateVecEnv.from_port(port, VISIT_LANES, seed=settings.seed, **options)
     steps = min(spec.time_limit or VISIT_STEPS, VISIT_STEPS)
@@ -165,17 +165,6 @@ def visit(port: SurrogatePort, policy: Path, settings: TrainSettings, checkpoint
     finally:
         env.close()
     return steps * VISIT_LANES, submitted.confidence_index
-
-
-def explorer(policy: Path, algorithm: str) -> Predict:
-    """The policy as it explores while it learns; a network of arrays has one action for each observation."""
-    if Network.is_at(policy):
-        return Network.load(policy)
-    learner = load_learner(policy, algorithm)
-    if learner.use_sde:
-        noisy: Any = learner.policy
-        noisy.reset_noise(VISIT_LANES)  # each lane explores its own way
-    return lambda observation: learner.predict(observation, deterministic=False)[0]
 
 
 def _shifted(

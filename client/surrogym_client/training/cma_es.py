@@ -6,12 +6,8 @@ candidates of a generation are stepped together, each from the same starts.
 
 from __future__ import annotations
 
-import json
-import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,91 +21,79 @@ from surrogym_client.evaluation.imagined import (
     observation_statistics,
 )
 from surrogym_client.original.protocol import LONGEST_EPISODE
-from surrogym_client.training.settings import (
-    CHECK_EPISODES,
-    CHECKS,
-    EVOLUTION,
-    TrainingInterrupted,
-    TrainProgress,
-    TrainResult,
-    TrainSettings,
-)
+from surrogym_client.training.search import Found, PolicySearch, SearchTask
+from surrogym_client.training.settings import CHECK_EPISODES, CHECKS, TrainProgress, TrainSettings
 from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
 
-EVOLUTION_STEPS = 10_000_000
 FULL_COVARIANCE = 200  # parameters; beyond, the covariance is diagonal (separable CMA-ES)
 
 
 @dataclass(frozen=True)
-class Evolution:
-    """The hyperparameters of CMA-ES here."""
+class CmaEs(PolicySearch):
+    """CMA-ES over the parameters of a network; gives the mean of the distribution whose imagined return was best."""
 
     population: int = 24  # candidates a generation
     starts: int = 16  # episodes a candidate
     units: int = 10  # hidden units of the network
     sigma: float = 1.0  # first deviation of a parameter
 
+    suggested_steps = 10_000_000
+    most_steps = None  # it learns from whole episodes and takes far more steps, each far cheaper
 
-def evolve(
-    port: SurrogatePort,
-    out: Path,
-    settings: TrainSettings,
-    total_steps: int,
-    progress: Callable[[TrainProgress], None] | None = None,
-) -> TrainResult:
-    """Search a policy by CMA-ES, and save the mean of the distribution whose imagined return was best.
-
-    Args:
-        port: the surrogate.
-        out: where the policy goes (``Network.save``); beside it, with suffix .json, what it was found with.
-        settings: ``hyperparameters`` are the fields of ``Evolution``.
-        total_steps: virtual steps, at least one generation's.
-        progress: called after every generation.
-
-    Raises:
-        ValueError: an unknown or impossible hyperparameter, or a file to go on from that is no network of this size.
-        SurrogymClientError: the surrogate can't be reached, or has no model yet.
-        TrainingInterrupted: Ctrl-C came; the best so far is saved.
-    """
-    search = _Search(port, settings, _evolution(settings))
-    started, spec = time.perf_counter(), port.spec()
-    cost = search.choices.population * search.choices.starts * (spec.time_limit or LONGEST_EPISODE)
-    generations = max(total_steps // cost, 1)
-    best, kept, latest, done, penalty = -np.inf, None, None, 0, None
-    with suppress(KeyboardInterrupt):
-        for number in range(1, generations + 1):
-            seen = search.generation(number)
-            done, penalty = number, seen.episode_penalty
-            if number * CHECKS // generations > (number - 1) * CHECKS // generations:
-                latest = search.imagined()
-                if latest >= best:
-                    best, kept = latest, search.policy
-            if progress is not None:
-                progress(TrainProgress(number * cost, generations * cost, latest, seen.penalty_share, penalty))
-    kept = kept or search.policy
-    out.parent.mkdir(parents=True, exist_ok=True)
-    kept.save(out)
-    result = TrainResult(
-        path=out,
-        algorithm=EVOLUTION,
-        virtual_steps=done * cost,
-        seconds=time.perf_counter() - started,
-        imagined_return=None if latest is None else best,
-        episode_penalty=penalty,
-        lost_episodes=0,
-        settings={**asdict(settings), **asdict(search.choices), "total_steps": generations * cost},
-    )
-    out.with_suffix(".json").write_text(json.dumps(asdict(result), indent=2, default=str) + "\n")
-    if done < generations:
-        raise TrainingInterrupted(result)
-    return result
+    def search(self, task: SearchTask) -> Found:
+        run = _Run(task, self)
+        with suppress(KeyboardInterrupt):
+            for number in range(1, run.generations + 1):
+                run.generation(number)
+        return run.found()
 
 
-class _Search:
+class _Run:
+    """The generations of one search, and the best mean so far."""
+
+    def __init__(self, task: SearchTask, choices: CmaEs) -> None:
+        self._task, self._choices = task, choices
+        self._distribution = _Distribution(task.port, task.settings, choices)
+        limit = task.port.spec().time_limit or LONGEST_EPISODE
+        self._cost = choices.population * choices.starts * limit  # virtual steps of a generation
+        self.generations = max(task.steps // self._cost, 1)
+        self._done = 0
+        self._kept: Network | None = None
+        self._best = -np.inf
+        self._latest: float | None = None
+        self._penalty: float | None = None
+
+    def generation(self, number: int) -> None:
+        """Learn from one generation; the mean is judged ``CHECKS`` times in a search."""
+        seen = self._distribution.generation(number)
+        self._done, self._penalty = number, seen.episode_penalty
+        if number * CHECKS // self.generations > (number - 1) * CHECKS // self.generations:
+            self._check()
+        steps, total = number * self._cost, self.generations * self._cost
+        self._task.progress(TrainProgress(steps, total, self._latest, seen.penalty_share, self._penalty))
+
+    def found(self) -> Found:
+        """The best mean, of as many generations as there were."""
+        return Found(
+            self._kept or self._distribution.policy,
+            self._done * self._cost,
+            None if self._latest is None else self._best,
+            {**asdict(self._choices), "total_steps": self.generations * self._cost},
+            whole=self._done == self.generations,
+            episode_penalty=self._penalty,
+        )
+
+    def _check(self) -> None:
+        self._latest = self._distribution.imagined()
+        if self._latest >= self._best:
+            self._best, self._kept = self._latest, self._distribution.policy
+
+
+class _Distribution:
     """The distribution of parameters, and the episodes that judge it."""
 
-    def __init__(self, port: SurrogatePort, settings: TrainSettings, choices: Evolution) -> None:
+    def __init__(self, port: SurrogatePort, settings: TrainSettings, choices: CmaEs) -> None:
         self.choices = choices
         self._port, self._settings, self._spec = port, settings, port.spec()
         mean, deviation = observation_statistics(port, settings.seed)
@@ -149,14 +133,6 @@ class _Search:
 
     def _network(self, vector: NDArray[np.float64]) -> Network:
         return Network.of(self._spec, self._mean, self._deviation, self.choices.units, vector)
-
-
-def _evolution(settings: TrainSettings) -> Evolution:
-    try:
-        return Evolution(**settings.hyperparameters)
-    except TypeError as error:
-        names = ", ".join(Evolution.__dataclass_fields__)
-        raise ValueError(f"{EVOLUTION} takes {names}, got {', '.join(settings.hyperparameters)}") from error
 
 
 def _first(settings: TrainSettings, size: int) -> NDArray[np.float64]:

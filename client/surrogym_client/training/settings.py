@@ -9,12 +9,13 @@ from typing import Any, Literal
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import OF_PARTICLES, SurrogateView
 
-EVOLUTION = "CMAES"  # CMA-ES, beside the algorithms of Stable-Baselines3
 CHECKS = 12  # of the imagined return in one training; the best policy is kept
 CHECK_EPISODES = 64
 SUGGESTED_STEPS = 1_000_000  # virtual ones, the most that is suggested for all rounds together; the paper's cap
 DRAWS: dict[str, Any] = {"variant": "probabilistic", "particles": 1, "spread": 0.0}  # each step of a lane is a draw
 FUNCTIONS: dict[str, Any] = {"variant": "pathwise"}  # each episode follows one function
+
+TENSORBOARD = "tensorboard"  # folder beside the policy
 
 Tracker = Literal["tensorboard", "wandb", "mlflow"]
 
@@ -27,7 +28,7 @@ class TrainSettings:
     go to the algorithm's constructor, over the defaults.
     """
 
-    algorithm: str = "PPO"
+    algorithm: str = "PPO"  # name of a ``PolicySearch``, in any case
     total_steps: int | None = None
     num_envs: int | None = None
     seed: int = 0
@@ -37,7 +38,7 @@ class TrainSettings:
     anew: bool = False  # begin with a new network, and go on from the saved policy only where that falls short
     prolong: bool | None = None  # as many steps again while it still gains; None: as ``prolongs``
     threads: int = 1
-    tracker: Tracker | None = None  # of Stable-Baselines3's algorithms; CMA-ES has none
+    tracker: Tracker | None = None  # of the searches that log curves
     tensorboard: Path | None = (
         None  # folder of TensorBoard's files; None: beside the policy, where the tracker has some
     )
@@ -66,18 +67,17 @@ def chosen_for(view: SurrogateView, settings: TrainSettings) -> TrainSettings:
 
 def prolongs(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
     """Whether a training that still gains at its end takes as many steps again: where nobody said so, if no number of
-    steps was asked for either. Preset ``paper`` has its cap, and CMA-ES takes the steps that it is given.
-
-    Raises:
-        ValueError: CMA-ES was asked to.
-    """
-    if settings.algorithm.upper() == EVOLUTION:
-        if settings.prolong:
-            raise ValueError(f"{EVOLUTION} takes the steps it is given: expected no prolonging, or another algorithm")
-        return False
+    steps was asked for either. Preset ``paper`` has its cap."""
     if settings.prolong is not None:
         return settings.prolong
     return settings.total_steps is None and spec.design.preset != "paper"
+
+
+def with_folder(settings: TrainSettings, out: Path) -> TrainSettings:
+    """The settings with the folder of TensorBoard's files, where the tracker has some: beside the policy by default."""
+    if settings.tensorboard is not None or settings.tracker not in ("tensorboard", "wandb"):
+        return settings
+    return replace(settings, tensorboard=out.parent / TENSORBOARD)
 
 
 @dataclass(frozen=True)

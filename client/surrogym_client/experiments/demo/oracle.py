@@ -10,7 +10,7 @@ from surrogym_client.experiments.demo.learning import Learned
 from surrogym_client.experiments.settings import DemoSettings
 from surrogym_client.original.port import OriginalPort
 from surrogym_client.policies.card import PolicyCard, write_card
-from surrogym_client.training.trainer import TrainProgress, TrainSettings, train
+from surrogym_client.training import TrainProgress, TrainSettings, train
 from surrogym_client.training.words import words_of
 from surrogym_shared.terminal import progress
 

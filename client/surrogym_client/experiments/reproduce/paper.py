@@ -24,7 +24,7 @@ from surrogym_client.policies.files import load_policy
 from surrogym_client.runtime.versions import commit
 from surrogym_client.sampler.worker import Outcome, Sampler, SamplerSettings
 from surrogym_client.surrogates.waiting import wait_for_design
-from surrogym_client.training.trainer import TrainProgress, TrainSettings, train
+from surrogym_client.training import TrainProgress, TrainSettings, train
 from surrogym_client.transport.api import Api
 from surrogym_client.transport.connection import Retries
 from surrogym_client.transport.http_surrogate import HttpSurrogate

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,6 @@ from stable_baselines3.common.logger import KVWriter
 from surrogym_client.training.settings import TrainSettings
 
 PROJECT = "surrogym"  # where Weights & Biases and MLflow put the runs
-FOLDER = "tensorboard"  # beside the policy
-
-
-def with_folder(settings: TrainSettings, out: Path) -> TrainSettings:
-    """The settings with the folder of TensorBoard's files, where the tracker has some: beside the policy by default."""
-    if settings.tensorboard is not None or settings.tracker not in ("tensorboard", "wandb"):
-        return settings
-    return replace(settings, tensorboard=out.parent / FOLDER)
 
 
 @contextmanager

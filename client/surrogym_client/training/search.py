@@ -1,0 +1,142 @@
+"""PolicySearch: the port of every way to find a policy in a surrogate, and the names of those that are installed.
+
+The laws of a search, which ``surrogym_client.testing`` checks:
+
+1. The same surrogate, settings and seed give the same policy, bit for bit.
+2. It takes at most ``task.steps`` virtual steps, but whole units of its own work (a rollout, a generation) and at least
+   one of them. Steps that only compare policies are not counted.
+3. It reports progress with steps that never fall, and never beyond their total.
+4. On Ctrl-C it gives back the best policy so far, with ``whole=False``. ``KeyboardInterrupt`` leaves it only where
+   there is no policy yet.
+5. Every session that it opens is closed on every way out. It writes no file: the policy does when it is asked to.
+6. What its policy saves, ``load_policy`` reads without trust, and gives actions of the surrogate's action space.
+7. Impossible settings raise ``ValueError`` with what was expected and what came, before the first virtual step.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+from surrogym_client.policies import load_policy
+from surrogym_client.policies.predict import Predict
+from surrogym_client.training.settings import TrainProgress, TrainSettings, prolongs
+from surrogym_shared.plugins import Registry
+from surrogym_shared.port import SurrogatePort
+from surrogym_shared.spec import EnvironmentSpec
+
+MAX_STEPS = 10_000_000  # virtual steps that can be asked for: hours of PPO
+ALGORITHMS = ("A2C", "DDPG", "DQN", "PPO", "SAC", "TD3")  # of Stable-Baselines3
+
+Progress = Callable[[TrainProgress], None]
+
+
+@dataclass(frozen=True)
+class SearchTask:
+    """What a search has to do."""
+
+    port: SurrogatePort
+    settings: TrainSettings
+    steps: int  # virtual ones, at most
+    out: Path  # where the policy will be saved; names the run to trackers
+    prolong: bool = False  # take as many steps again, once, while the imagined return still rises
+    progress: Progress = lambda _: None
+
+
+class Saved(Protocol):
+    """A policy that can be saved: a ``Network`` of arrays, or a ``LearnedPolicy`` of Stable-Baselines3."""
+
+    def save(self, path: Path) -> None:
+        """Write the file that ``load_policy`` reads."""
+        ...
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search found, and what that took."""
+
+    policy: Saved
+    virtual_steps: int
+    imagined_return: float | None  # of the policy; None where nothing was measured
+    settings: Mapping[str, Any] = field(default_factory=dict)  # what it ran with, defaults included
+    algorithm: str | None = None  # class of Stable-Baselines3 that reads the file; None where the file says enough
+    whole: bool = True  # False after Ctrl-C
+    episode_penalty: float | None = None
+    lost_episodes: int = 0
+    networks: int = 1
+    gaining: bool = False
+
+
+class PolicySearch(ABC):
+    """One way to find a policy. Its hyperparameters are the arguments of its class.
+
+    Example:
+        >>> @dataclass(frozen=True)
+        ... class Guess(PolicySearch):
+        ...     units: int = 8
+        ...
+        ...     def search(self, task):
+        ...         spec = task.port.spec()
+        ...         zeros, ones = np.zeros(len(spec.observation)), np.ones(len(spec.observation))
+        ...         vector = np.random.default_rng(task.settings.seed).normal(size=Network.size(spec, self.units))
+        ...         return Found(Network.of(spec, zeros, ones, self.units, vector), 0, None)
+    """
+
+    suggested_steps: ClassVar[int] = 600_000  # virtual ones, where a person asks for no number
+    most_steps: ClassVar[int | None] = MAX_STEPS  # None: no bound, as for a search whose steps are cheap
+    prolongable: ClassVar[bool] = False  # heeds ``task.prolong``
+    tracked: ClassVar[bool] = False  # logs its curves to ``settings.tracker``
+
+    @abstractmethod
+    def search(self, task: SearchTask) -> Found:
+        """Find a policy. See the laws at the top of this file."""
+
+    def explorer(self, policy: Path, algorithm: str, lanes: int) -> Predict:  # noqa: ARG002  for those that have noise
+        """A saved policy as it explores while it learns; its most probable actions where it has no noise."""
+        return load_policy(policy, algorithm)
+
+
+SEARCHES = Registry[PolicySearch](
+    "algorithm",
+    "surrogym.policy_searches",
+    PolicySearch,  # type: ignore[type-abstract]  # members are subclasses
+    {
+        **{name: f"surrogym_client.training.stable_baselines.algorithms:{name}" for name in ALGORITHMS},
+        "CMAES": "surrogym_client.training.cma_es:CmaEs",
+    },
+)
+
+
+def search_for(settings: TrainSettings) -> PolicySearch:
+    """The search that settings name, made with their hyperparameters.
+
+    Raises:
+        ValueError: there is none of this name, it has no such hyperparameter, or it can't be prolonged or tracked.
+    """
+    name, kind = SEARCHES.name_of(settings.algorithm), SEARCHES.get(settings.algorithm)
+    if settings.prolong and not kind.prolongable:
+        raise ValueError(f"{name} takes the steps it is given: expected no prolonging, or another algorithm")
+    if settings.tracker in ("wandb", "mlflow") and not kind.tracked:
+        raise ValueError(f"{name} logs to no tracker: expected none, got {settings.tracker}")
+    try:
+        return kind(**settings.hyperparameters)
+    except TypeError as error:
+        known = ", ".join(getattr(kind, "__dataclass_fields__", ())) or "other hyperparameters"
+        raise ValueError(f"{name} takes {known}, got {', '.join(settings.hyperparameters)}") from error
+
+
+def planned_steps(settings: TrainSettings) -> int:
+    """Virtual steps of a training. Raises ValueError where they exceed the cap, or for an unknown algorithm."""
+    kind = SEARCHES.get(settings.algorithm)
+    total = kind.suggested_steps if settings.total_steps is None else settings.total_steps
+    if total < 1 or (kind.most_steps is not None and total > kind.most_steps):
+        raise ValueError(f"virtual steps: expected 1 to {kind.most_steps or 'any number'}, got {total}")
+    return total
+
+
+def is_prolonged(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
+    """Whether a training that still gains at its end takes as many steps again. Raises as ``search_for``."""
+    return search_for(settings).prolongable and prolongs(settings, spec)

@@ -1,0 +1,1 @@
+"""Policy search by the algorithms of Stable-Baselines3; needs torch."""

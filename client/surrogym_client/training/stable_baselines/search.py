@@ -1,0 +1,243 @@
+"""A training by an algorithm of Stable-Baselines3: networks one after another until one learns, the best one kept."""
+
+from __future__ import annotations
+
+import inspect
+import itertools
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+from surrogym_client.evaluation.imagined import imagined_returns, observation_statistics
+from surrogym_client.policies.files import load_learner, save_policy
+from surrogym_client.policies.networks import Standardise
+from surrogym_client.policies.predict import Predict
+from surrogym_client.sb3 import SurrogateVecEnv
+from surrogym_client.training.search import Found, PolicySearch, SearchTask
+from surrogym_client.training.settings import CHECK_EPISODES, TrainSettings
+from surrogym_client.training.stable_baselines.early_stopping import Checks
+from surrogym_client.training.stable_baselines.tracking import tracking
+from surrogym_shared.port import SurrogatePort
+from surrogym_shared.spec import EnvironmentSpec
+
+ATTEMPT_SEED = 1_000_003  # between the seeds of one training's networks
+Statistics = tuple[Sequence[float], Sequence[float]]  # mean and deviation of observations, (D,) each
+
+
+@dataclass(frozen=True)
+class LearnedPolicy:
+    """The policy of a Stable-Baselines3 algorithm."""
+
+    learner: BaseAlgorithm
+
+    def save(self, path: Path) -> None:
+        """Write the zip of Stable-Baselines3, with a description by which it is read without unpickling."""
+        save_policy(self.learner, path)
+
+
+class StableBaselinesSearch(PolicySearch):
+    """A policy search by one algorithm. Its hyperparameters go to the algorithm's constructor, over the defaults."""
+
+    algorithm: ClassVar[type[BaseAlgorithm]]
+    policy: ClassVar[type[BasePolicy] | str]
+    lanes: ClassVar[int]  # of a session, where nobody says otherwise
+    prolongable = True
+    tracked = True
+
+    def __init__(self, **hyperparameters: Any) -> None:
+        self.hyperparameters = hyperparameters
+
+    def search(self, task: SearchTask) -> Found:
+        torch.set_num_threads(task.settings.threads)
+        gamma = self.hyperparameters.get("gamma", suggested_gamma(task.port.spec()))
+        with self._environment(task, gamma) as env:
+            return _Training(self, task, env, gamma).run()
+
+    def explorer(self, policy: Path, algorithm: str, lanes: int) -> Predict:
+        learner = load_learner(policy, algorithm)
+        if learner.use_sde:
+            noisy: Any = learner.policy
+            noisy.reset_noise(lanes)  # each lane explores its own way
+        return lambda observation: learner.predict(observation, deterministic=False)[0]
+
+    def defaults(self, env: VecNormalize) -> dict[str, Any]:  # noqa: ARG002  for algorithms that have some
+        """Hyperparameters in place of Stable-Baselines3's own."""
+        return {}
+
+    def network(self, spec: EnvironmentSpec) -> dict[str, Any]:  # noqa: ARG002
+        """Keywords of the policy beside its standardisation."""
+        return {}
+
+    def exploring_by_state(self, env: VecNormalize, spec: EnvironmentSpec) -> dict[str, Any]:  # noqa: ARG002
+        """Hyperparameters of a network that follows one which was given up."""
+        return {}
+
+    @contextmanager
+    def _environment(self, task: SearchTask, gamma: float) -> Iterator[VecNormalize]:
+        settings = task.settings
+        lanes = settings.num_envs or self.lanes
+        session = {"seed": settings.seed, "start_box": settings.start_box, **settings.session}
+        env = SurrogateVecEnv.from_port(task.port, lanes, **session)
+        wrapped = VecNormalize(VecMonitor(env), norm_obs=False, norm_reward=True, gamma=gamma)
+        try:
+            yield wrapped
+        finally:
+            wrapped.close()
+
+
+class _Training:
+    """The networks of one training, and the checks that compare them."""
+
+    def __init__(self, search: StableBaselinesSearch, task: SearchTask, env: VecNormalize, gamma: float) -> None:
+        self._search, self._task, self._env, self._gamma = search, task, env, gamma
+        settings, self._spec = task.settings, task.port.spec()
+        self._statistics = observation_statistics(task.port, settings.seed)
+        self._saved = None if settings.start_from is None else self._made(0, settings.start_from)
+        self._untrained = self._made(0)
+        self._total = _whole_rollouts(self._untrained, task.steps)
+        self._checks = Checks(
+            self._total,
+            task.progress,
+            lambda learner: imagined_return(task.port, learner, settings),
+            self._untrained,
+            self._saved if settings.anew else None,
+        )
+
+    def run(self) -> Found:
+        """Learn until a network comes to the end of its steps, or a person interrupts."""
+        settings, checks = self._task.settings, self._checks
+        with tracking(settings, self._task.out) as callbacks:
+            last, whole = self._learned(callbacks)
+        learner = checks.best_of(last)
+        ran_with = {"num_envs": self._env.num_envs, "total_steps": self._total, **effective(learner)}
+        return Found(
+            LearnedPolicy(learner),
+            checks.steps,
+            checks.best,
+            ran_with,
+            type(learner).__name__,
+            whole,
+            checks.episode_penalty,
+            checks.lost,
+            checks.networks,
+            checks.gaining,
+        )
+
+    def _learned(self, callbacks: Sequence[BaseCallback]) -> tuple[BaseAlgorithm, bool]:
+        """The network that learned last, and whether the training came to its end, and not to an interruption."""
+        checks = self._checks
+        learner: BaseAlgorithm | None = None
+        for attempt in itertools.count():
+            try:
+                learner = self._network(attempt)
+                if learner.tensorboard_log is None:  # otherwise a temporary folder is made
+                    learner.set_logger(Logger(folder=None, output_formats=[]))
+                self._learn(learner, callbacks)
+                if self._task.prolong and not checks.given_up and checks.prolong():
+                    self._learn(learner, callbacks)
+            except KeyboardInterrupt:
+                if learner is None:
+                    raise
+                return learner, False
+            if not checks.given_up:
+                return learner, True
+        raise AssertionError("unreachable")
+
+    def _learn(self, learner: BaseAlgorithm, callbacks: Sequence[BaseCallback]) -> None:
+        """Take what is left of the steps. A training that is prolonged continues with its learning rate from the
+        middle."""
+        steps = _whole_rollouts(learner, self._checks.left)
+        learner.learn(steps, callback=[self._checks, *callbacks], reset_num_timesteps=not self._checks.prolonged)
+
+    def _network(self, attempt: int) -> BaseAlgorithm:
+        """A new network; when it is its turn the saved policy, where that earns more than an untrained one."""
+        saved, anew = self._saved, self._task.settings.anew
+        if saved is not None and attempt == int(anew) and self._checks.worth_keeping(saved):
+            return saved
+        return self._made(attempt) if attempt else self._untrained
+
+    def _made(self, attempt: int, start_from: Path | None = None) -> BaseAlgorithm:
+        settings = self._task.settings
+        asked = replace(settings, seed=settings.seed + ATTEMPT_SEED * attempt, start_from=start_from)
+        if attempt and start_from is None:
+            by_state = self._search.exploring_by_state(self._env, self._spec)
+            asked = replace(asked, hyperparameters=by_state | asked.hyperparameters)
+        return make_learner(self._search, self._env, asked, self._spec, self._statistics, self._gamma)
+
+
+def make_learner(
+    search: StableBaselinesSearch,
+    env: VecNormalize,
+    settings: TrainSettings,
+    spec: EnvironmentSpec,
+    statistics: Statistics,
+    gamma: float,
+) -> BaseAlgorithm:
+    """A new network, or the saved one to start from.
+
+    Raises:
+        ValueError: the algorithm can't be trained here.
+        UnusablePolicy: the saved policy is none, or does not go with the surrogate.
+    """
+    algorithm, tensorboard = search.algorithm, None if settings.tensorboard is None else str(settings.tensorboard)
+    if settings.start_from is not None:
+        changes = {**settings.hyperparameters, "env": env, "seed": settings.seed}
+        learner = load_learner(settings.start_from, algorithm.__name__, trust=settings.trust_policy, **changes)
+        learner.tensorboard_log = tensorboard
+        return learner
+    extractor = {"mean": statistics[0], "deviation": statistics[1]}
+    try:
+        return algorithm(
+            search.policy,
+            env,
+            seed=settings.seed,
+            device="cpu",
+            policy_kwargs={
+                "features_extractor_class": Standardise,
+                "features_extractor_kwargs": extractor,
+                **search.network(spec),
+            },
+            tensorboard_log=tensorboard,
+            **({"gamma": gamma} | search.defaults(env) | settings.hyperparameters),
+        )
+    except (AssertionError, TypeError) as error:
+        raise ValueError(f"{settings.algorithm} can't be trained here: {error}") from error
+
+
+def imagined_return(port: SurrogatePort, learner: BaseAlgorithm, settings: TrainSettings) -> float:
+    """Mean imagined return of the policy as it is now, without exploration, on the same starts at every check."""
+
+    def predict(observation: Any) -> Any:
+        return learner.predict(observation, deterministic=True)[0]
+
+    return float(imagined_returns(port, predict, CHECK_EPISODES, settings.seed, **settings.judging).mean())
+
+
+def effective(learner: BaseAlgorithm) -> dict[str, Any]:
+    """What the algorithm was made with, defaults included, as far as it is numbers and words; and the network."""
+    names = inspect.signature(type(learner).__init__).parameters
+    given = {name: getattr(learner, name, None) for name in names if name not in ("self", "seed", "verbose")}
+    plain = {name: value for name, value in given.items() if isinstance(value, bool | int | float | str)}
+    return {**plain, "net_arch": learner.policy_kwargs.get("net_arch")}
+
+
+def suggested_gamma(spec: EnvironmentSpec) -> float:
+    """A discount whose horizon, 1 / (1 - gamma), is a third of the time limit: 0.985 for 200 steps, 0.994 for 500."""
+    return float(np.clip(1 - 3 / (spec.time_limit or 1_000), 0.9, 0.999))
+
+
+def _whole_rollouts(learner: BaseAlgorithm, total: int) -> int:
+    """The steps of as many whole rollouts as the total allows, at least one: Stable-Baselines3 would round up."""
+    rollout = learner.n_envs * (learner.n_steps if isinstance(learner, OnPolicyAlgorithm) else 1)
+    return max(total // rollout, 1) * rollout
