@@ -55,7 +55,10 @@ def command(
     surrogate: Surrogate,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write the policy to.")] = Path("policy.zip"),
     algorithm: Annotated[
-        str, typer.Option(help="Algorithm of Stable-Baselines3 (ppo, a2c, sac, td3, ddpg, dqn), or cmaes.")
+        str,
+        typer.Option(
+            help="Search by ppo, a2c, sac, td3, ddpg, dqn (Stable-Baselines3), cmaes, gradient, or a package's own."
+        ),
     ] = "PPO",
     steps: Annotated[
         int | None,

@@ -106,6 +106,7 @@ SEARCHES = Registry[PolicySearch](
     {
         **{name: f"surrogym_client.training.stable_baselines.algorithms:{name}" for name in ALGORITHMS},
         "CMAES": "surrogym_client.training.cma_es:CmaEs",
+        "GRADIENT": "surrogym_client.training.gradients:Gradients",
     },
 )
 

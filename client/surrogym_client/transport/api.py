@@ -54,6 +54,13 @@ class Api:
     ) -> None:
         self.connection = Connection(url, token, timeouts, retries)
 
+    @classmethod
+    def over(cls, connection: Connection) -> Self:
+        """The service over a connection that is there already."""
+        api = cls.__new__(cls)
+        api.connection = connection
+        return api
+
     @property
     def url(self) -> str:
         """Where the server is."""
