@@ -1,0 +1,141 @@
+"""Policy searches of other packages: installed, found by name, held to the same laws as the built-in ones."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from support.real_steps import random_steps
+from support.server import ServerProcess, running_server
+from surrogym_client.original.classic import pendulum
+from surrogym_client.testing import POLICY_SEARCH_LAWS
+from surrogym_client.training import TrainSettings
+from surrogym_client.training.search import SEARCHES
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.local import LocalSurrogate
+from surrogym_server.surrogate.learn import learn
+from surrogym_shared.port import SurrogatePort
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "plugins" / "policy_search"
+PAGE = ROOT / "docs" / "how-to" / "plugins.md"
+SEARCHED = {  # small enough to take a second each
+    "PPO": {"n_steps": 16, "batch_size": 32, "n_epochs": 2},
+    "SAC": {"learning_starts": 32, "batch_size": 16},
+    "CMAES": {"population": 4, "starts": 2, "units": 2},
+    "cross_entropy": {"population": 8, "starts": 2, "units": 2},
+}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the example package, installed as pip does it, and packages that are broken."""
+    folder = tmp_path_factory.mktemp("site")
+    options = ["--quiet", "--no-deps", "--no-build-isolation", "--disable-pip-version-check", "--target", str(folder)]
+    subprocess.run([sys.executable, "-m", "pip", "install", *options, str(EXAMPLE)], check=True, capture_output=True)
+    broken(folder, "missing_module", "nowhere_to_be_found:Missing")
+    broken(folder, "no_search", "json:JSONDecoder")
+    broken(folder, "ppo", "json:JSONDecoder")
+    return folder
+
+
+def broken(folder: Path, name: str, value: str) -> None:
+    written = folder / f"package_of_{name}-1.0.dist-info"
+    written.mkdir()
+    (written / "METADATA").write_text(f"Metadata-Version: 2.1\nName: package_of_{name}\nVersion: 1.0\n")
+    (written / "entry_points.txt").write_text(f"[surrogym.policy_searches]\n{name} = {value}\n")
+
+
+@pytest.fixture
+def installed(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The packages in this process, whose registry looks for them anew."""
+    monkeypatch.syspath_prepend(str(site))
+    monkeypatch.setattr(SEARCHES, "_installed", None)
+    monkeypatch.setattr(SEARCHES, "_broken", {})
+
+
+@pytest.fixture(scope="module")
+def surrogate() -> LocalSurrogate:
+    """Short episodes, so that a generation is short."""
+    spec = pendulum().model_copy(update={"time_limit": 20})
+    return LocalSurrogate(spec, learn(definition_from_spec(spec), random_steps(spec, 8, seed=0)).model)
+
+
+@pytest.mark.parametrize("law", POLICY_SEARCH_LAWS)
+@pytest.mark.parametrize("name", SEARCHED)
+@pytest.mark.usefixtures("installed")
+def test_every_search_keeps_the_laws(
+    surrogate: LocalSurrogate, tmp_path: Path, name: str, law: Callable[[SurrogatePort, TrainSettings, Path], None]
+):
+    settings = TrainSettings(algorithm=name, total_steps=1_280, num_envs=8, hyperparameters=SEARCHED[name])
+    law(surrogate, settings, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("nobody", "expected one of A2C, CMAES, DDPG, DQN, GRADIENT, PPO, SAC, TD3, cross_entropy"),
+        ("missing_module", "package 'package_of_missing_module', entry point missing_module = 'nowhere_to_be_found"),
+        ("missing_module", "No module named 'nowhere_to_be_found'"),
+        ("no_search", "expected a subclass of surrogym_client.training.search.PolicySearch, got <class 'json"),
+    ],
+)
+@pytest.mark.usefixtures("installed")
+def test_an_unknown_or_broken_search_is_one_sentence(name: str, said: str):
+    with pytest.raises(ValueError, match=f"unknown algorithm '{name}'") as refused:
+        SEARCHES.get(name)
+    assert said in str(refused.value)
+
+
+@pytest.mark.usefixtures("installed")
+def test_no_package_takes_the_name_of_a_built_in_search():
+    assert SEARCHES.get("ppo").__module__.startswith("surrogym_client.")
+    assert "expected another name than the built-in" in SEARCHES.broken["ppo"]
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
+    with running_server(tmp_path_factory.mktemp("server")) as server:
+        yield server
+
+
+def test_a_strangers_search_solves_pendulum_over_http(server: ServerProcess, site: Path, tmp_path: Path):
+    """Register, sample, train, evaluate, export: the commands of a person who installed the package."""
+
+    def surrogym(*arguments: str) -> str:
+        checkout = [str(ROOT / part) for part in ("server", "client", "shared")]
+        done = subprocess.run(
+            [sys.executable, "-m", "surrogym_client", *arguments],
+            env={"PYTHONPATH": ":".join([str(site), *checkout]), "SURROGYM_URL": server.url, "PATH": ""},
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=280,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    surrogym("register", "Pendulum-v1", "--name", "pendulum", "--seed", "0")
+    surrogym("sample", "pendulum", "--until-done", "--quiet")
+    said = surrogym("train", "pendulum", "--algorithm", "cross_entropy", "--quiet", "--json")
+    trained = json.loads(said)
+    assert trained["algorithm"] == "cross_entropy"
+    assert 1_000_000 < trained["virtual_steps"] <= 2_000_000
+    evaluated = json.loads(surrogym("evaluate", "policy.zip", "--episodes", "20", "--json", "--quiet"))
+    assert evaluated["mean"] > -900, "a random policy earns about -1,200"
+    surrogym("export-policy", "policy.zip", "--out", "policy.pt2", "--quiet")
+    assert (tmp_path / "policy.pt2").exists()
+
+
+def test_the_page_shows_the_example():
+    """Every line of the page's module stands in the package's."""
+    shown = PAGE.read_text().partition("## A policy search")[2].partition("```python\n")[2].partition("```")[0]
+    module = (EXAMPLE / "cross_entropy.py").read_text()
+    assert [line for line in shown.splitlines() if line not in module.splitlines()] == []
+    assert 'cross_entropy = "cross_entropy:CrossEntropy"' in (EXAMPLE / "pyproject.toml").read_text()
