@@ -8,17 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from surrogym_client.cli.groups import Output, Service, add
 from surrogym_client.cli.options import (
-    AsJson,
-    Quiet,
-    Server,
     SpecFile,
     StepLimit,
-    Token,
-    TokenFile,
-    connect,
     read_spec,
-    token_from,
 )
 
 if TYPE_CHECKING:
@@ -27,7 +21,7 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("doctor")(command)
+    add(app, "doctor", command)
 
 
 def command(
@@ -37,11 +31,9 @@ def command(
     ] = None,
     spec: SpecFile = None,
     step_limit: StepLimit = 30.0,
-    server: Server = None,
-    token: Token = None,
-    token_file: TokenFile = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    *,
+    service: Service,
+    output: Output,
 ) -> None:
     """Check versions, server, token, round trip, environment. One line each, with the way out
     of what is wrong. Exit status 1 where anything is; with --quiet, problems alone are shown.
@@ -50,14 +42,15 @@ def command(
     """
     from dataclasses import asdict
 
-    from surrogym_client.diagnosis.doctor import environment, installation, service
+    from surrogym_client.diagnosis.doctor import environment, installation
+    from surrogym_client.diagnosis.doctor import service as findings_of
     from surrogym_shared.terminal import give
 
     def findings() -> Iterator[Finding]:
         given = read_spec(spec)
         yield from installation()
-        with connect(server, token_from(context, token, token_file)) as api:
-            yield from service(api)
+        with service.connect(context) as api:
+            yield from findings_of(api)
         if env is not None:
             from surrogym_client.original.loading import make
 
@@ -66,10 +59,10 @@ def command(
     found: list[Finding] = []
     for finding in findings():
         found.append(finding)
-        if not as_json and not (quiet and finding.way_out is None):
+        if not output.as_json and not (output.quiet and finding.way_out is None):
             typer.echo(_line(finding))
     problems = sum(finding.way_out is not None for finding in found)
-    if as_json:
+    if output.as_json:
         give({"problems": problems, "findings": [asdict(finding) for finding in found]}, str, as_json=True)
     if problems:
         raise typer.Exit(1)

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from surrogym_client.cli.groups import Output, PolicyReading, Service, add
 from surrogym_client.cli.options import (
-    AsJson,
-    Quiet,
-    Server,
     SpecFile,
-    Token,
-    TokenFile,
-    TrustPolicy,
     read_spec,
-    token_from,
 )
 
 if TYPE_CHECKING:
@@ -26,13 +21,46 @@ if TYPE_CHECKING:
     from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, Progress
     from surrogym_client.original.episodes import Episode
     from surrogym_client.policies.card import PolicyCard
+    from surrogym_client.policies.predict import Predict
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
 
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("evaluate")(command)
+    add(app, "evaluate", command)
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """How many real episodes, from which starts, of how many instances."""
+
+    episodes: Annotated[int, typer.Option(min=1, help="How many real episodes.")] = 100
+    first_seed: Annotated[int, typer.Option(min=0, help="Reset seed of the first episode; the next follow.")] = 10_000
+    wide: Annotated[bool, typer.Option("--wide", help="Start anywhere in the sampling range.")] = False
+    start_scale: Annotated[
+        float, typer.Option(min=0, help="Spread the declared starts so many times as far about their middle.")
+    ] = 1.0
+    perturb: Annotated[
+        float, typer.Option(min=0, help="Deviation of random factors on masses, lengths and limits.")
+    ] = 0.0
+    parallel: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Instances of the environment that are open at once. [default: 1; one for each episode where the "
+            "environment declares that it runs in parallel, as Gymnasium's do]",
+        ),
+    ] = None
+
+    def settings(self) -> EvaluationSettings:
+        """The settings of the evaluation. Raises ``CommandError`` where they contradict each other."""
+        from surrogym_client.cli.errors import CommandError
+        from surrogym_client.evaluation.evaluator import EvaluationSettings
+
+        if self.wide and self.start_scale != 1:
+            raise CommandError("expected --wide or --start-scale, got both")
+        return EvaluationSettings(**vars(self))
 
 
 def command(
@@ -42,60 +70,51 @@ def command(
         str | None, typer.Option(help="Gymnasium id or package.module:factory. [default: what it was trained for]")
     ] = None,
     spec: SpecFile = None,
-    episodes: Annotated[int, typer.Option(min=1, help="How many real episodes.")] = 100,
-    first_seed: Annotated[int, typer.Option(min=0, help="Reset seed of the first episode; the next follow.")] = 10_000,
-    wide: Annotated[bool, typer.Option("--wide", help="Start anywhere in the sampling range.")] = False,
-    start_scale: Annotated[
-        float, typer.Option(min=0, help="Spread the declared starts so many times as far about their middle.")
-    ] = 1.0,
-    perturb: Annotated[
-        float, typer.Option(min=0, help="Deviation of random factors on masses, lengths and limits.")
-    ] = 0.0,
-    parallel: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Instances of the environment that are open at once. [default: 1; one for each episode where the "
-            "environment declares that it runs in parallel, as Gymnasium's do]",
-        ),
-    ] = None,
-    algorithm: Annotated[
-        str | None, typer.Option(help="Stable-Baselines3 algorithm of the file. [default: as noted beside it, or PPO]")
-    ] = None,
+    *,
+    episodes: Episodes,
+    reading: PolicyReading,
     surrogate: Annotated[
         str | None, typer.Option(help="Enter the real steps into this surrogate's ledger. [default: as noted]")
     ] = None,
-    trust_policy: TrustPolicy = False,
-    server: Server = None,
-    token: Token = None,
-    token_file: TokenFile = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    service: Service,
+    output: Output,
 ) -> None:
     """Run real episodes with a policy and count successes. The real steps go to the surrogate's ledger.
 
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 100
     """
-    from surrogym_client.cli.errors import CommandError
-    from surrogym_client.evaluation.evaluator import EvaluationInterrupted, EvaluationSettings, evaluate
-    from surrogym_client.original.errors import EvaluationFailed
     from surrogym_client.policies.card import card_path, read_card
-    from surrogym_client.policies.files import load_policy
-    from surrogym_client.runtime.lifetime import terminations_as_interrupts
-    from surrogym_shared.terminal import give, progress, say
+    from surrogym_shared.terminal import give
 
-    card = read_card(policy)
-    if wide and start_scale != 1:
-        raise CommandError("expected --wide or --start-scale, got both")
-    settings = EvaluationSettings(episodes, first_seed, wide, start_scale, perturb, parallel)
-    opener = _opener(env, read_spec(spec), card, quiet=quiet)
-    ledger = _ledger(surrogate, server, card, card_path(policy), quiet=quiet)
-    enter = partial(_enter, ledger, server, token_from(context, token, token_file), quiet=quiet)
+    card, settings = read_card(policy), episodes.settings()
+    opener = _opener(env, read_spec(spec), card, quiet=output.quiet)
+    ledger = _ledger(surrogate, service.server, card, card_path(policy), quiet=output.quiet)
+    enter = partial(_enter, ledger, service.server, service.token_for(context), quiet=output.quiet)
+    result = _run(lambda: reading.load(policy, card), policy, opener, settings, enter, quiet=output.quiet)
+    enter(result.steps, settings.episodes, f"{settings.episodes} episodes from seed {settings.first_seed}")
+    summary = {"policy": str(policy), **_settings(settings), **result.summary()}
+    give(summary, lambda: _words(result), as_json=output.as_json)  # with --quiet too: it is what was asked for
+
+
+def _run(
+    load: Callable[[], Predict],
+    policy: Path,
+    opener: Callable[[], Episode],
+    settings: EvaluationSettings,
+    enter: Callable[[int, int, str], None],
+    *,
+    quiet: bool,
+) -> Evaluation:
+    """Run the episodes; where they fail or are interrupted, their real steps are entered all the same."""
+    from surrogym_client.evaluation.evaluator import EvaluationInterrupted, evaluate
+    from surrogym_client.original.errors import EvaluationFailed
+    from surrogym_client.runtime.lifetime import terminations_as_interrupts
+    from surrogym_shared.terminal import progress, say
+
     try:
         with terminations_as_interrupts(), progress("evaluate", quiet=quiet) as update:
             update(0.0, f"reading {policy}")
-            predict = load_policy(policy, algorithm or card.algorithm, trust=trust_policy)
-            result = evaluate(predict, opener, settings, _telling(update, episodes))
+            return evaluate(load(), opener, settings, _telling(update, settings.episodes))
     except EvaluationFailed as failure:
         enter(failure.steps, 0, "failed")
         raise
@@ -103,9 +122,6 @@ def command(
         say(f"interrupted after {interruption.steps} real steps; no result was kept, the same command begins anew")
         enter(interruption.steps, 0, "interrupted")
         raise
-    enter(result.steps, episodes, f"{episodes} episodes from seed {first_seed}")
-    summary = {"policy": str(policy), **_settings(settings), **result.summary()}
-    give(summary, lambda: _words(result), as_json=as_json)
 
 
 def _opener(env: str | None, given: EnvironmentSpec | None, card: PolicyCard, *, quiet: bool) -> Callable[[], Episode]:

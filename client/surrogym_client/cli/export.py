@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, TokenFile, connect, token_from
+from surrogym_client.cli.groups import Output, Service, add
+from surrogym_client.cli.options import Surrogate, connect
 
 if TYPE_CHECKING:
     from surrogym_client.transport.api import Api
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("export")(command)
+    add(app, "export", command)
 
 
 def command(
@@ -27,11 +28,9 @@ def command(
             "--out", "-o", help="File to write; its ending says what: .surrogate, .csv, .npz, .safetensors, .json."
         ),
     ],
-    server: Server = None,
-    token: Token = None,
-    token_file: TokenFile = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    *,
+    service: Service,
+    output: Output,
 ) -> None:
     """Write a whole surrogate into one file (.surrogate). It is what surrogym import takes. Other endings write
     a part alone: every real sample (.csv, .npz), the latest model (.safetensors), the specification (.json).
@@ -40,21 +39,21 @@ def command(
 
     Example: surrogym export pendulum --out samples.csv
     """
-    from surrogym_shared.terminal import give, on_interrupt, progress
+    from surrogym_shared.terminal import on_interrupt, progress
 
-    token = token_from(context, token, token_file)
+    token = service.token_for(context)
     stays = "interrupted; nothing was written, and the same command begins anew"
     with (
         on_interrupt(lambda: stays),
-        progress("export", quiet=quiet) as update,
-        connect(server, token) as api,
+        progress("export", quiet=output.quiet) as update,
+        connect(service.server, token) as api,
     ):
         update(0.0, f"reading {surrogate}")
         content = _content(api, surrogate, out)
         out.write_bytes(content)
         update(1.0, "done")
     words = f"{len(content)} bytes written to {out}"
-    give({"file": str(out), "bytes": len(content)}, lambda: words, as_json=as_json, quiet=quiet)
+    output.give({"file": str(out), "bytes": len(content)}, lambda: words)
 
 
 def _content(api: Api, surrogate: str, out: Path) -> bytes:

@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, TrustPolicy
+from surrogym_client.cli.groups import Output, PolicyReading, add
 
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("export-policy")(command)
+    add(app, "export-policy", command)
 
 
 def command(
@@ -20,12 +20,9 @@ def command(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="File to write; its ending says what: .onnx, or .pt2 for torch.export.")
     ],
-    algorithm: Annotated[
-        str | None, typer.Option(help="Stable-Baselines3 algorithm of the file. [default: as noted beside it, or PPO]")
-    ] = None,
-    trust_policy: TrustPolicy = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    *,
+    reading: PolicyReading,
+    output: Output,
 ) -> None:
     """Write a policy as ONNX (.onnx) or for torch (.pt2). It gives the most probable action; .pt2 is a program of
     torch.export.
@@ -36,17 +33,17 @@ def command(
     Example: surrogym export-policy policy.zip --out policy.onnx
     """
     from surrogym_client.policies.card import read_card
-    from surrogym_shared.terminal import give, on_interrupt, progress
+    from surrogym_shared.terminal import on_interrupt, progress
 
     card = read_card(policy)
     stays = "interrupted; no checked file was written, and the same command begins anew"
-    with on_interrupt(lambda: stays), progress("export", quiet=quiet) as update:
+    with on_interrupt(lambda: stays), progress("export", quiet=output.quiet) as update:
         update(0.0, "converting and checking")
         from surrogym_client.policies.export import CHECKS, export_policy
 
-        largest = export_policy(policy, out, algorithm or card.algorithm, trust=trust_policy)
+        largest = export_policy(policy, out, reading.algorithm or card.algorithm, trust=reading.trust_policy)
         update(1.0, "done")
     size = out.stat().st_size
     result = {"file": str(out), "bytes": size, "observations_checked": CHECKS, "largest_difference": largest}
     words = f"{out}: {size} bytes; the same actions on {CHECKS} random observations, to {largest:.1g}"
-    give(result, lambda: words, as_json=as_json, quiet=quiet)
+    output.give(result, lambda: words)

@@ -7,23 +7,22 @@ from typing import Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, Token, TokenFile, connect, token_from
+from surrogym_client.cli.groups import Output, Service, add
+from surrogym_client.cli.options import connect
 
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("import")(command)
+    add(app, "import", command)
 
 
 def command(
     context: typer.Context,
     file: Annotated[Path, typer.Argument(help="What surrogym export wrote with the ending .surrogate.")],
     name: Annotated[str | None, typer.Option(help="Name of the surrogate. [default: as in the file]")] = None,
-    server: Server = None,
-    token: Token = None,
-    token_file: TokenFile = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    *,
+    service: Service,
+    output: Output,
 ) -> None:
     """Make a surrogate of a file. It serves the same model at once, judged by the same tolerances, its design paused.
 
@@ -34,14 +33,14 @@ def command(
     """
     from surrogym_client.surrogates.transfer import import_surrogate
     from surrogym_shared.surrogate_file import SurrogateFile
-    from surrogym_shared.terminal import give, on_interrupt, progress
+    from surrogym_shared.terminal import on_interrupt, progress
 
-    token = token_from(context, token, token_file)
+    token = service.token_for(context)
     stays = "interrupted; nothing stays of it at the server, and the same command begins anew"
     with (
         on_interrupt(lambda: stays),
-        progress("import", quiet=quiet) as update,
-        connect(server, token) as api,
+        progress("import", quiet=output.quiet) as update,
+        connect(service.server, token) as api,
     ):
         update(0.0, f"reading {file}")
         read = SurrogateFile.load(file)
@@ -50,7 +49,7 @@ def command(
         f"{view.name}: {view.environment or 'own environment'}, model {view.model_version} and {view.samples} real "
         f"samples{_origin(read.ledger)}, design paused; next: surrogym train {view.name}"
     )
-    give(view.model_dump(mode="json"), lambda: words, as_json=as_json, quiet=quiet)
+    output.give(view.model_dump(mode="json"), lambda: words)
 
 
 def _origin(ledger: dict[str, int]) -> str:

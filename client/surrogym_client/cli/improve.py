@@ -6,12 +6,13 @@ from typing import Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, TokenFile, connect, token_from
+from surrogym_client.cli.groups import Output, Service, add
+from surrogym_client.cli.options import Surrogate
 
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("improve")(command)
+    add(app, "improve", command)
 
 
 def command(
@@ -21,11 +22,9 @@ def command(
     checkpoint: Annotated[
         str | None, typer.Option(help="Weigh by the states that policies visited up to this checkpoint.")
     ] = None,
-    server: Server = None,
-    token: Token = None,
-    token_file: TokenFile = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    *,
+    service: Service,
+    output: Output,
 ) -> None:
     """Ask the design for more queries. A sampler has to answer them.
 
@@ -33,10 +32,9 @@ def command(
 
     Example: surrogym improve pendulum --queries 10
     """
-    from surrogym_shared.terminal import give
 
-    with connect(server, token_from(context, token, token_file)) as api:
+    with service.connect(context) as api:
         view = api.improve(surrogate, queries, checkpoint=checkpoint)
     raised = f"was raised by {view.budget_raised_by} to {view.budget}" if view.budget_raised_by else "holds them"
     words = f"{queries} more queries for {view.name}; its budget {raised}, with {view.budget_left} left"
-    give(view.model_dump(mode="json"), lambda: words, as_json=as_json, quiet=quiet)
+    output.give(view.model_dump(mode="json"), lambda: words)

@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from surrogym_client.cli.groups import Output, Service, add
 from surrogym_client.cli.options import (
-    AsJson,
     Preset,
-    Quiet,
-    Server,
     SpecFile,
-    Token,
-    TokenFile,
     Tolerances,
     Wait,
-    connect,
     read_spec,
     read_tolerances,
-    token_from,
 )
 
 if TYPE_CHECKING:
@@ -30,7 +25,32 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("register")(command)
+    add(app, "register", command)
+
+
+@dataclass(frozen=True)
+class DesignChoices:
+    """What of the environment's own specification is chosen anew; None keeps it."""
+
+    preset: Annotated[Preset | None, typer.Option(help="default, or paper: the method as printed.")] = None
+    budget: Annotated[int | None, typer.Option(min=2, help="Real steps the design may take.")] = None
+    initial: Annotated[int | None, typer.Option(min=2, help="Real steps before the first model.")] = None
+    target: Annotated[float | None, typer.Option(help="Confidence index to reach.")] = None
+    acquisition: Annotated[
+        str | None,
+        typer.Option(
+            help="Criterion of the queries after the first model: integrated_variance, variance, uncertainty_index, "
+            "latin_hypercube, or one that is installed beside the server. [default: the preset's]"
+        ),
+    ] = None
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the design.")] = None
+    bins: Annotated[int | None, typer.Option(min=2, help="Offer a continuous action as so many values.")] = None
+    teleport: Annotated[
+        bool, typer.Option("--teleport/--no-teleport", help="Whether it can be set to any state, or only be reset.")
+    ] = True
+    max_rollout: Annotated[
+        int | None, typer.Option(min=1, help="Longest action sequence of a query, without teleport.")
+    ] = None
 
 
 def command(
@@ -40,63 +60,29 @@ def command(
     ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the surrogate. [default: from the environment's]")] = None,
     spec: SpecFile = None,
-    preset: Annotated[Preset | None, typer.Option(help="default, or paper: the method as printed.")] = None,
-    budget: Annotated[int | None, typer.Option(min=2, help="Real steps the design may take.")] = None,
-    initial: Annotated[int | None, typer.Option(min=2, help="Real steps before the first model.")] = None,
-    target: Annotated[float | None, typer.Option(help="Confidence index to reach.")] = None,
+    *,
+    choices: DesignChoices,
     tolerance: Tolerances = None,
-    acquisition: Annotated[
-        str | None,
-        typer.Option(
-            help="Criterion of the queries after the first model: integrated_variance, variance, uncertainty_index, "
-            "latin_hypercube, or one that is installed beside the server. [default: the preset's]"
-        ),
-    ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the design.")] = None,
-    bins: Annotated[int | None, typer.Option(min=2, help="Offer a continuous action as so many values.")] = None,
-    teleport: Annotated[
-        bool, typer.Option("--teleport/--no-teleport", help="Whether it can be set to any state, or only be reset.")
-    ] = True,
-    max_rollout: Annotated[
-        int | None, typer.Option(min=1, help="Longest action sequence of a query, without teleport.")
-    ] = None,
     print_spec: Annotated[
         bool, typer.Option("--print-spec", help="Print the specification and register nothing.")
     ] = False,
     wait: Wait = 0.0,
-    server: Server = None,
-    token: Token = None,
-    token_file: TokenFile = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    service: Service,
+    output: Output,
 ) -> None:
     """Register an original environment. Samplers and trainers can then use it by name.
 
     Example: surrogym register Pendulum-v1 --name pendulum --budget 30
     """
-    from surrogym_shared.terminal import give
-
-    chosen = _specification(
-        environment,
-        read_spec(spec),
-        preset=preset,
-        budget=budget,
-        initial=initial,
-        target=target,
-        acquisition=acquisition,
-        seed=seed,
-        bins=bins,
-        teleport=teleport,
-        max_rollout=max_rollout,
-    )
+    chosen = _specification(environment, read_spec(spec), **vars(choices))
     if tolerance:
         chosen = _with_tolerances(chosen, read_tolerances(tolerance))
     if print_spec:
         typer.echo(chosen.model_dump_json(indent=2))
         return
-    with connect(server, token_from(context, token, token_file), wait, quiet=quiet) as api:
+    with service.connect(context, wait, quiet=output.quiet) as api:
         view = api.create_surrogate(name or default_name(chosen.environment or environment or ""), chosen)
-    give(view.model_dump(mode="json"), lambda: _words(view, environment or ""), as_json=as_json, quiet=quiet)
+    output.give(view.model_dump(mode="json"), lambda: _words(view, environment or ""))
 
 
 def default_name(environment: str) -> str:

@@ -8,37 +8,36 @@ from typing import Annotated
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet, Server, Surrogate, Token, TokenFile, connect, token_from
+from surrogym_client.cli.groups import Output, Service, add
+from surrogym_client.cli.options import Surrogate, connect
 
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("report")(command)
+    add(app, "report", command)
 
 
 def command(
     context: typer.Context,
     surrogate: Surrogate,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write.")] = Path("report.html"),
-    server: Server = None,
-    token: Token = None,
-    token_file: TokenFile = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    *,
+    service: Service,
+    output: Output,
 ) -> None:
     """Write one HTML page that needs nothing else. It has fidelity against samples, where they fell, maps of
     uncertainty, occupancy and index, the ledger, structure and hyperparameters, and every model.
 
     Example: surrogym report pendulum --out report.html
     """
-    from surrogym_shared.terminal import give, on_interrupt, progress
+    from surrogym_shared.terminal import on_interrupt, progress
 
-    token = token_from(context, token, token_file)
+    token = service.token_for(context)
     stays = "interrupted; nothing was written, and the same command begins anew"
     with (
         on_interrupt(lambda: stays),
-        progress("report", quiet=quiet) as update,
-        connect(server, token) as api,
+        progress("report", quiet=output.quiet) as update,
+        connect(service.server, token) as api,
     ):
         update(0.0, f"reading {surrogate}")
         view, models, samples = api.surrogate(surrogate), api.models(surrogate), list(api.samples(surrogate))
@@ -52,4 +51,4 @@ def command(
         size = out.write_text(text, encoding="utf-8")
         update(1.0, "done")
     words = f"{size} bytes written to {out}"
-    give({"file": str(out), "bytes": size}, lambda: words, as_json=as_json, quiet=quiet)
+    output.give({"file": str(out), "bytes": size}, lambda: words)

@@ -12,21 +12,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from surrogym_client.cli.groups import Output, Service, add
 from surrogym_client.cli.options import (
-    AsJson,
     ExitWithParent,
-    Quiet,
-    Server,
     SpecFile,
     StepLimit,
     Surrogate,
-    Token,
-    TokenFile,
     Wait,
     awaited_surrogate,
-    connect,
     read_spec,
-    token_from,
 )
 
 if TYPE_CHECKING:
@@ -41,7 +35,7 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("sample")(command)
+    add(app, "sample", command)
 
 
 def command(
@@ -62,11 +56,9 @@ def command(
     worker: Annotated[str | None, typer.Option(help="Name of this worker. [default: host and process]")] = None,
     wait: Wait = 0.0,
     exit_with_parent: ExitWithParent = False,
-    server: Server = None,
-    token: Token = None,
-    token_file: TokenFile = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    *,
+    service: Service,
+    output: Output,
 ) -> None:
     """Answer queries by real steps. The original environment is set to a state, takes one real step, and that is
     reported; where it can't be set to a state, it is reset and acts. Ctrl-C ends it.
@@ -77,7 +69,7 @@ def command(
     from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
     from surrogym_client.runtime.lifetime import terminations
     from surrogym_client.sampler.worker import Sampler, SamplerSettings, worker_name
-    from surrogym_shared.terminal import give, on_interrupt
+    from surrogym_shared.terminal import on_interrupt
 
     if exit_with_parent:
         watch_parent()
@@ -89,16 +81,19 @@ def command(
         max_queries=max_queries,
         time_limit=time_limit,
     )
-    with connect(server, token_from(context, token, token_file), wait, quiet=quiet) as api:
-        asked = awaited_surrogate(api, surrogate, wait, quiet=quiet).spec
+    with service.connect(context, wait, quiet=output.quiet) as api:
+        asked = awaited_surrogate(api, surrogate, wait, quiet=output.quiet).spec
         factory = _factory(env, read_spec(spec), asked)
-        with IsolatedEnvironment(factory, step_limit) as environment, _telling(api, surrogate, quiet=quiet) as tell:
+        with (
+            IsolatedEnvironment(factory, step_limit) as environment,
+            _telling(api, surrogate, quiet=output.quiet) as tell,
+        ):
             sampler = Sampler(api, surrogate, environment, settings, tell)
             for number in terminations():
                 signal.signal(number, lambda *_: sampler.stop())
             with on_interrupt(lambda: _words_of_interruption(sampler.summary())):
                 report = sampler.run()
-    give(asdict(report), lambda: _words(surrogate, report), as_json=as_json, quiet=quiet)
+    output.give(asdict(report), lambda: _words(surrogate, report))
     if report.phase == "failed":
         raise typer.Exit(1)
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Server, Token, TokenFile, connect, names_of_surrogates, token_from
+from surrogym_client.cli.groups import Service, add
+from surrogym_client.cli.options import AsJson, names_of_surrogates
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -26,7 +27,7 @@ FIDELITY = (
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("status")(command)
+    add(app, "status", command)
 
 
 def command(
@@ -35,11 +36,10 @@ def command(
         str | None, typer.Argument(help="One surrogate. [default: all]", autocompletion=names_of_surrogates)
     ] = None,
     watching: Annotated[bool, typer.Option("--watch", "-w", help="Stay, and show it anew until Ctrl-C.")] = False,
-    server: Server = None,
-    token: Token = None,
-    token_file: TokenFile = None,
     as_json: AsJson = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Names and phases alone, without a heading.")] = False,
+    *,
+    service: Service,
 ) -> None:
     """Show all surrogates, or one with fidelity and real steps.
 
@@ -50,7 +50,7 @@ def command(
     from surrogym_shared.terminal import visible, watch
 
     form: Form = "json" if as_json else "short" if quiet else "words"
-    with connect(server, token_from(context, token, token_file)) as api:
+    with service.connect(context) as api:
         look = partial(_all, api, form) if surrogate is None else partial(_one, api, surrogate, form)
         seen = look()  # an unknown name or a wrong address ends it here, also with --watch
         if watching:

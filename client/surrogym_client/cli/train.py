@@ -6,31 +6,27 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from surrogym_client.cli.groups import Output, Service, add
 from surrogym_client.cli.options import (
-    AsJson,
     ExitWithParent,
-    Quiet,
-    Server,
     Surrogate,
-    Token,
-    TokenFile,
     Wait,
     awaited_surrogate,
     connect,
     given_here,
-    token_from,
     typed,
 )
 
 if TYPE_CHECKING:
     from surrogym_client.training import TrainProgress, TrainResult, TrainSettings
+    from surrogym_client.training.closed_loop import LoopSettings
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
     from surrogym_shared.wire import SurrogateView
@@ -45,21 +41,16 @@ Log = Literal["tensorboard", "wandb", "mlflow", "none"]
 NOTHING_YET = "interrupted before there was a policy; nothing was saved, and the same command begins anew"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("train")(command)
+@dataclass(frozen=True)
+class SearchOptions:
+    """How to search, for how long."""
 
-
-def command(
-    context: typer.Context,
-    surrogate: Surrogate,
-    out: Annotated[Path, typer.Option("--out", "-o", help="File to write the policy to.")] = Path("policy.zip"),
     algorithm: Annotated[
         str,
         typer.Option(
             help="Search by ppo, a2c, sac, td3, ddpg, dqn (Stable-Baselines3), cmaes, gradient, or a package's own."
         ),
-    ] = "PPO",
+    ] = "PPO"
     steps: Annotated[
         int | None,
         typer.Option(
@@ -67,48 +58,87 @@ def command(
             help="Virtual steps, those of all rounds of --improve included; seeing where a round's policy goes comes "
             "on top. [default: from the algorithm]",
         ),
-    ] = None,
+    ] = None
     num_envs: Annotated[
         int | None, typer.Option(min=1, help="Lanes of the session. [default: from the specification]")
-    ] = None,
+    ] = None
     chosen: Annotated[
         list[str] | None,
         typer.Option("--set", help="A hyperparameter of the algorithm as NAME=VALUE; may be given several times."),
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of policy and virtual environment.")] = 0,
+    ] = None
+    seed: Annotated[int, typer.Option(min=0, help="Seed of policy and virtual environment.")] = 0
+
+    def hyperparameters(self) -> dict[str, Any]:
+        """What ``--set`` was given: values are JSON, or text where they are none."""
+        from surrogym_client.cli.errors import CommandError
+
+        found: dict[str, Any] = {}
+        for pair in self.chosen or []:
+            name, equals, value = pair.partition("=")
+            if not (name and equals):
+                raise CommandError(f"--set: expected NAME=VALUE, got {pair!r}")
+            try:
+                found[name] = json.loads(value)
+            except ValueError:
+                found[name] = value
+        return found
+
+
+@dataclass(frozen=True)
+class SessionOptions:
+    """How the state moves in the session that the policy learns in; each is a field of ``OpenSession``."""
+
     variant: Annotated[
         Variant | None,
         typer.Option(
-            help="The state moves by the mean, as particles, or along a drawn function. "
-            "[default: by the mean; at last by draws, where the design is not ready]"
+            help="The state moves by the mean, as particles, or along a drawn function. [default: the mean. If the "
+            "design is not ready, the final training draws from the posterior]"
         ),
-    ] = None,
-    particles: Annotated[int | None, typer.Option(min=1, help="Particles of variant probabilistic.")] = None,
+    ] = None
+    particles: Annotated[int | None, typer.Option(min=1, help="Particles of variant probabilistic.")] = None
     propagation: Annotated[
         Propagation | None, typer.Option(help="How a particle moves: by the mean or by a draw. [default: sample]")
-    ] = None,
+    ] = None
     weighting: Annotated[
         Weighting | None, typer.Option(help="Of the particles' rewards. [default: inverse_variance]")
-    ] = None,
+    ] = None
     spread: Annotated[
         float | None, typer.Option(help="First deviation of particles, as a share of the range. [default: 0.01]")
-    ] = None,
-    process_noise: Annotated[
-        bool, typer.Option("--process-noise", help="Let the learned noise move the state.")
-    ] = False,
+    ] = None
+    process_noise: Annotated[bool, typer.Option("--process-noise", help="Let the learned noise move the state.")] = (
+        False
+    )
     trust: Annotated[
         float | None,
         typer.Option(
-            help="End episodes where an output deviates by so many times its deviation in the samples. [default: none]"
+            help="End an episode where an output's predicted deviation is more than TRUST times its deviation in the "
+            "samples. [default: none]"
         ),
-    ] = None,
-    start_box: Annotated[
-        float, typer.Option(min=0, max=1, help="Share of episodes that start anywhere in the sampling range.")
-    ] = 0.5,
+    ] = None
     penalty: Annotated[
         float | None, typer.Option(min=0, help="Deviations taken off the reward. [default: the specification's]")
-    ] = None,
-    start_from: Annotated[Path | None, typer.Option(help="Policy file to go on from.")] = None,
+    ] = None
+
+    def fields(self) -> dict[str, Any]:
+        """The fields that were given a value. Raises ``CommandError`` where they contradict each other."""
+        from surrogym_client.cli.errors import CommandError
+        from surrogym_shared.wire import OF_PARTICLES
+
+        given = {name: value for name, value in vars(self).items() if value is not None and value is not False}
+        for name in OF_PARTICLES:
+            if name in given and self.variant != "probabilistic":
+                raise CommandError(f"--{name} is variant probabilistic's: give --variant probabilistic with it")
+        return given
+
+
+@dataclass(frozen=True)
+class StartOptions:
+    """Where episodes and the policy start, and how long a training may go on."""
+
+    start_box: Annotated[
+        float, typer.Option(min=0, max=1, help="Share of episodes that start anywhere in the sampling range.")
+    ] = 0.5
+    start_from: Annotated[Path | None, typer.Option(help="Policy file to go on from.")] = None
     trust_policy: Annotated[
         bool,
         typer.Option(
@@ -116,16 +146,22 @@ def command(
             help="Unpickle the objects of --start-from. This runs any code in the file. Policies of surrogym train "
             "don't need it.",
         ),
-    ] = False,
+    ] = False
     prolong: Annotated[
         bool | None,
         typer.Option(
             "--prolong/--no-prolong",
-            help="As many virtual steps again, once, where the imagined return still rises at the end. Not with cmaes. "
-            "[default: where --steps is not given]",
+            help="As many virtual steps again, once, where the imagined return still rises at the end. Not with cmaes "
+            "or gradient. [default: where --steps is not given]",
             show_default=False,
         ),
-    ] = None,
+    ] = None
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """The closed loop: real steps between trainings."""
+
     improve: Annotated[
         int,
         typer.Option(
@@ -133,20 +169,45 @@ def command(
             help="More real queries in each round, where the policy goes, until that is known or the design ready. A "
             "sampler has to be running, and the budget has to hold them; an admin's token raises it.",
         ),
-    ] = 0,
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds of --improve, at most.")] = 3,
-    log: Annotated[Log, typer.Option(help="Where the curves of the training go.")] = "tensorboard",
+    ] = 0
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds of --improve, at most.")] = 3
+
+    def settings(self) -> LoopSettings | None:
+        from surrogym_client.training.closed_loop import LoopSettings
+
+        return LoopSettings(self.improve, self.rounds) if self.improve else None
+
+
+@dataclass(frozen=True)
+class LogOptions:
+    """Where the curves of a training go."""
+
+    log: Annotated[Log, typer.Option(help="Where the curves of the training go.")] = "tensorboard"
     tensorboard: Annotated[
         Path | None, typer.Option(help="Folder for TensorBoard. [default: tensorboard beside the policy]")
-    ] = None,
+    ] = None
+    progress_file: Annotated[Path | None, typer.Option(hidden=True, help="Write progress as JSON lines.")] = None
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    add(app, "train", command)
+
+
+def command(
+    context: typer.Context,
+    surrogate: Surrogate,
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write the policy to.")] = Path("policy.zip"),
+    *,
+    search: SearchOptions,
+    session: SessionOptions,
+    start: StartOptions,
+    loop: LoopOptions,
+    log: LogOptions,
     wait: Wait = 0.0,
-    progress_file: Annotated[Path | None, typer.Option(hidden=True, help="Write progress as JSON lines.")] = None,
     exit_with_parent: ExitWithParent = False,
-    server: Server = None,
-    token: Token = None,
-    token_file: TokenFile = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    service: Service,
+    output: Output,
 ) -> None:
     """Train a policy in the virtual environment. No real step is taken, unless --improve asks a sampler for more.
 
@@ -154,65 +215,59 @@ def command(
 
     Example: surrogym train pendulum --out policy.zip --seed 0
     """
-    from surrogym_client.cli.errors import CommandError
     from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
     from surrogym_client.surrogates.budget import words_of_rounds
-    from surrogym_client.training import TrainSettings
-    from surrogym_client.training.search import SEARCHES
     from surrogym_client.training.words import words_of_result
-    from surrogym_shared.terminal import give, on_interrupt, progress, say
-    from surrogym_shared.wire import OF_PARTICLES
+    from surrogym_shared.terminal import say
 
     if exit_with_parent:
         watch_parent()
-    for given in OF_PARTICLES:
-        if context.params[given] is not None and variant != "probabilistic":
-            raise CommandError(f"--{given} is variant probabilistic's: give --variant probabilistic with it")
-    if start_from is not None and not start_from.exists():
-        raise CommandError(f"{start_from}: no such policy file")
-    hyperparameters = _hyperparameters(chosen or [])
-    _require_known(algorithm)
-    session = _given(
-        variant=variant,
-        particles=particles,
-        propagation=propagation,
-        weighting=weighting,
-        spread=spread,
-        process_noise=process_noise or None,
-        trust=trust,
-        penalty=penalty,
-    )
-    token = token_from(context, token, token_file)
-    spec, url = _trainable(surrogate, server, token, wait, algorithm, quiet=quiet)
-    if improve:
-        with connect(server, token) as api:
-            say(words_of_rounds(api, surrogate, improve, rounds), quiet=quiet)
-    with on_interrupt(lambda: NOTHING_YET), progress("prepare", quiet=quiet) as update:
-        update(None, "importing Stable-Baselines3")
-        SEARCHES.get(algorithm)  # torch; imported once there is something to train on
-
-    settings = TrainSettings(
-        algorithm=algorithm,
-        total_steps=steps,
-        num_envs=num_envs,
-        seed=seed,
-        start_box=start_box,
-        start_from=start_from,
-        trust_policy=trust_policy,
-        prolong=prolong,
-        tracker=None if log == "none" else log,
-        tensorboard=tensorboard,
-        hyperparameters=hyperparameters,
-        session=session,
-    )
-    card = partial(_write_card, surrogate=surrogate, spec=spec, url=url, seed=seed)
+    settings = _settings(search, session, start, log)
+    token = service.token_for(context)
+    spec, url = _trainable(surrogate, service.server, token, wait, search.algorithm, quiet=output.quiet)
+    if loop.improve:
+        with connect(service.server, token) as api:
+            say(words_of_rounds(api, surrogate, loop.improve, loop.rounds), quiet=output.quiet)
+    _import(search.algorithm, quiet=output.quiet)
+    card = partial(_write_card, surrogate=surrogate, spec=spec, url=url, seed=search.seed)
     with _keeping(card, typed(context, without=("out", "start_from", "trust_policy", "token"))):
-        result = _train(
-            url, token, surrogate, out, settings, (improve, rounds) if improve else None, progress_file, quiet=quiet
-        )
+        result = _train(url, token, surrogate, out, settings, loop.settings(), log.progress_file, quiet=output.quiet)
     summary = card(result)
-    named = server if given_here(context, "server") else None
-    give(summary, lambda: words_of_result(result, closed_loop=improve > 0, server=named), as_json=as_json, quiet=quiet)
+    named = service.server if given_here(context, "server") else None
+    output.give(summary, lambda: words_of_result(result, closed_loop=loop.improve > 0, server=named))
+
+
+def _settings(search: SearchOptions, session: SessionOptions, start: StartOptions, log: LogOptions) -> TrainSettings:
+    """The settings of the training; everything that needs no server is refused here."""
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.training import TrainSettings
+
+    given = session.fields()
+    if start.start_from is not None and not start.start_from.exists():
+        raise CommandError(f"{start.start_from}: no such policy file")
+    hyperparameters = search.hyperparameters()
+    _require_known(search.algorithm)
+    return TrainSettings(
+        algorithm=search.algorithm,
+        total_steps=search.steps,
+        num_envs=search.num_envs,
+        seed=search.seed,
+        tracker=None if log.log == "none" else log.log,
+        tensorboard=log.tensorboard,
+        hyperparameters=hyperparameters,
+        session=given,
+        **vars(start),
+    )
+
+
+def _import(algorithm: str, *, quiet: bool) -> None:
+    """Import what the search works with, once there is something to train on; a person sees what takes the time."""
+    from surrogym_client.training.search import SEARCHES
+    from surrogym_shared.terminal import on_interrupt, progress
+
+    with on_interrupt(lambda: NOTHING_YET), progress("prepare", quiet=quiet) as update:
+        update(None, f"importing what {algorithm} needs")
+        SEARCHES.get(algorithm)
 
 
 def _require_known(algorithm: str) -> None:
@@ -224,27 +279,6 @@ def _require_known(algorithm: str) -> None:
         SEARCHES.name_of(algorithm)
     except ValueError as error:
         raise CommandError(str(error)) from error
-
-
-def _hyperparameters(chosen: list[str]) -> dict[str, Any]:
-    """What ``--set`` was given: values are JSON, or text where they are none."""
-    from surrogym_client.cli.errors import CommandError
-
-    found: dict[str, Any] = {}
-    for pair in chosen:
-        name, equals, value = pair.partition("=")
-        if not (name and equals):
-            raise CommandError(f"--set: expected NAME=VALUE, got {pair!r}")
-        try:
-            found[name] = json.loads(value)
-        except ValueError:
-            found[name] = value
-    return found
-
-
-def _given(**options: Any) -> dict[str, Any]:
-    """The options that were given a value."""
-    return {name: value for name, value in options.items() if value is not None}
 
 
 @contextmanager
@@ -324,16 +358,16 @@ def _train(
     surrogate: str,
     out: Path,
     settings: TrainSettings,
-    rounds: tuple[int, int] | None,
+    improve: LoopSettings | None,
     progress_file: Path | None,
     *,
     quiet: bool,
 ) -> TrainResult:
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.training.closed_loop import ImproveSettings, train_and_improve
+    from surrogym_client.training import train
+    from surrogym_client.training.closed_loop import train_in_closed_loop
     from surrogym_client.training.settings import chosen_for
-    from surrogym_client.training.trainer import train
-    from surrogym_client.transport.http_surrogate import Api, HttpSurrogate
+    from surrogym_client.transport import Api, HttpSurrogate
     from surrogym_shared.terminal import progress
 
     with (
@@ -343,10 +377,9 @@ def _train(
         _recording(progress_file, update) as record,
     ):
         try:
-            if rounds is None:
+            if improve is None:
                 return train(port, out, chosen_for(api.surrogate(surrogate), settings), record)
-            improve = ImproveSettings(*rounds)
-            return train_and_improve(api, surrogate, port, out, settings, improve, record, _waiting(update))
+            return train_in_closed_loop(api, surrogate, port, out, settings, improve, record, _waiting(update))
         except ValueError as error:
             raise CommandError(str(error)) from error
 

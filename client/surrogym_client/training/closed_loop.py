@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ VISIT_STEPS = 1_000  # where the specification has no time limit
 
 
 @dataclass(frozen=True)
-class ImproveSettings:
+class LoopSettings:
     """How often to close the loop. No round follows once the design is ready, or once the confidence index where the
     policy goes has the design's target."""
 
@@ -38,13 +38,13 @@ class ImproveSettings:
     patience_seconds: float = 3_600.0  # for the sampler to answer one round
 
 
-def train_and_improve(
+def train_in_closed_loop(
     api: Api,
     name: str,
     port: SurrogatePort,
     out: Path,
     settings: TrainSettings,
-    improve: ImproveSettings,
+    improve: LoopSettings,
     progress: Callable[[TrainProgress], None] | None = None,
     waiting: Callable[[SurrogateView], None] | None = None,
 ) -> TrainResult:
@@ -71,44 +71,93 @@ def train_and_improve(
         TrainingInterrupted: Ctrl-C came when there was a policy already.
         ValueError, SurrogymClientError: as ``train``.
     """
-    rounds: list[TrainResult] = []
-    visited, known, region_known = 0, list[float | None](), False
-    whole, part = shares(settings, improve.rounds)
-    prolong = is_prolonged(settings, port.spec())
-
-    def learn(steps: int, whole: int, settings: TrainSettings) -> None:
-        now = replace(settings, total_steps=steps)
-        if rounds:
-            now = replace(now, start_from=out, trust_policy=False)
-        rounds.append(
-            train(port, out, now, _shifted(progress, _steps(rounds) + visited, whole, known[-1] if known else None))
-        )
-
+    loop = _Loop(api, name, port, out, settings, improve, progress, waiting)
     try:
         for _ in range(improve.rounds):
-            view = api.surrogate(name)
-            if view.phase == "ready":
+            if not loop.round():
                 break
-            learn(part, whole, replace(settings, prolong=False))
-            checkpoint = f"seed {settings.seed}, round {view.round}"
-            steps, index = visit(port, rounds[-1], settings, checkpoint)
-            visited, known = visited + steps, [*known, index]
-            region_known = index is not None and index >= view.target
-            if region_known:
-                break
-            api.improve(name, improve.queries, checkpoint=checkpoint)
-            wait_for_design(api, name, improve.patience_seconds, waiting, after_round=view.round)
-        left = whole - _steps(rounds)
-        left = max(left if settings.total_steps else min(planned_steps(settings), left), 1)
-        last = replace(_for_use(api.surrogate(name), settings, region_known=region_known), prolong=prolong)
-        learn(left, _steps(rounds) + visited + left, last)
+        loop.last()
     except TrainingInterrupted as interruption:
-        raise TrainingInterrupted(_together([*rounds, interruption.result], visited, known)) from None
+        loop.trained.append(interruption.result)
+        raise TrainingInterrupted(loop.result()) from None
     except KeyboardInterrupt:
-        if rounds:
-            raise TrainingInterrupted(_together(rounds, visited, known)) from None
+        if loop.trained:
+            raise TrainingInterrupted(loop.result()) from None
         raise
-    return _together(rounds, visited, known)
+    return loop.result()
+
+
+class _Loop:
+    """The trainings so far, and what is known of where their policies went."""
+
+    def __init__(
+        self,
+        api: Api,
+        name: str,
+        port: SurrogatePort,
+        out: Path,
+        settings: TrainSettings,
+        improve: LoopSettings,
+        progress: Callable[[TrainProgress], None] | None,
+        waiting: Callable[[SurrogateView], None] | None,
+    ) -> None:
+        self._api, self._name, self._port, self._out = api, name, port, out
+        self._settings, self._improve = settings, improve
+        self._progress, self._waiting = progress, waiting
+        self._whole, self._part = shares(settings, improve.rounds)
+        self._prolong = is_prolonged(settings, port.spec())
+        self._visited = 0  # virtual steps beside the trainings
+        self._known: list[float | None] = []  # confidence index where the policy went, of each round
+        self._region_known = False
+        self.trained: list[TrainResult] = []
+
+    def round(self) -> bool:
+        """Train a little, see where the policy goes, and query there; whether another round may follow."""
+        view = self._api.surrogate(self._name)
+        if view.phase == "ready":
+            return False
+        self._learn(self._part, self._whole, replace(self._settings, prolong=False))
+        checkpoint = f"seed {self._settings.seed}, round {view.round}"
+        steps, index = visit(self._port, self.trained[-1], self._settings, checkpoint)
+        self._visited += steps
+        self._known.append(index)
+        self._region_known = index is not None and index >= view.target
+        if self._region_known:
+            return False
+        self._api.improve(self._name, self._improve.queries, checkpoint=checkpoint)
+        patience = self._improve.patience_seconds
+        wait_for_design(self._api, self._name, patience, self._waiting, after_round=view.round)
+        return True
+
+    def last(self) -> None:
+        """Train the policy that is used, by what the design came to."""
+        settings, taken = self._settings, self._steps
+        left = self._whole - taken
+        left = max(left if settings.total_steps else min(planned_steps(settings), left), 1)
+        last = _for_use(self._api.surrogate(self._name), settings, region_known=self._region_known)
+        self._learn(left, taken + self._visited + left, replace(last, prolong=self._prolong))
+
+    def result(self) -> TrainResult:
+        """The last training's result, with what all of them took."""
+        return replace(
+            self.trained[-1],
+            virtual_steps=self._steps + self._visited,
+            seconds=sum(result.seconds for result in self.trained),
+            lost_episodes=sum(result.lost_episodes for result in self.trained),
+            visited_confidence=tuple(self._known),
+        )
+
+    @property
+    def _steps(self) -> int:
+        return sum(result.virtual_steps for result in self.trained)
+
+    def _learn(self, steps: int, whole: int, settings: TrainSettings) -> None:
+        now = replace(settings, total_steps=steps)
+        if self.trained:
+            now = replace(now, start_from=self._out, trust_policy=False)
+        known = self._known[-1] if self._known else None
+        progress = _shifted(self._progress, self._steps + self._visited, whole, known)
+        self.trained.append(train(self._port, self._out, now, progress))
 
 
 def _for_use(view: SurrogateView, settings: TrainSettings, *, region_known: bool) -> TrainSettings:
@@ -117,21 +166,6 @@ def _for_use(view: SurrogateView, settings: TrainSettings, *, region_known: bool
     last = chosen_for(view, settings)
     anew = last is not settings and settings.start_from is None and not region_known
     return replace(last, anew=anew)
-
-
-def _steps(rounds: Sequence[TrainResult]) -> int:
-    return sum(result.virtual_steps for result in rounds)
-
-
-def _together(rounds: Sequence[TrainResult], visited: int, known: Sequence[float | None]) -> TrainResult:
-    """The last round's result, with what all of them took; ``visited`` are virtual steps beside the trainings."""
-    return replace(
-        rounds[-1],
-        virtual_steps=_steps(rounds) + visited,
-        seconds=sum(r.seconds for r in rounds),
-        lost_episodes=sum(r.lost_episodes for r in rounds),
-        visited_confidence=tuple(known),
-    )
 
 
 def shares(settings: TrainSettings, rounds: int) -> tuple[int, int]:
