@@ -12,6 +12,7 @@ import pytest
 
 from support.real_steps import random_steps
 from support.server import ServerProcess, running_server
+from surrogym_client.diagnosis.doctor import installation
 from surrogym_client.original.classic import pendulum
 from surrogym_client.testing import POLICY_SEARCH_LAWS
 from surrogym_client.training import TrainSettings
@@ -96,6 +97,13 @@ def test_an_unknown_or_broken_search_is_one_sentence(name: str, said: str):
 def test_no_package_takes_the_name_of_a_built_in_search():
     assert SEARCHES.get("ppo").__module__.startswith("surrogym_client.")
     assert "expected another name than the built-in" in SEARCHES.broken["ppo"]
+
+
+@pytest.mark.usefixtures("installed")
+def test_the_doctor_names_packages_that_can_not_be_used():
+    problems = [finding for finding in installation() if finding.way_out]
+    assert [finding.name for finding in problems] == ["plug-in"] * 3
+    assert "package 'package_of_no_search', entry point no_search = " in " ".join(f.said for f in problems)
 
 
 @pytest.fixture(scope="module")

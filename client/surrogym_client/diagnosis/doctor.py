@@ -20,6 +20,7 @@ from surrogym_client.original.protocol import Array, Factory, RealStep
 from surrogym_client.runtime.versions import versions
 from surrogym_client.runtime.ways_out import EXTRAS, GIVE_TOKEN, START_SERVER
 from surrogym_client.sampler.sample_conversion import sample_of
+from surrogym_client.training.search import SEARCHES
 from surrogym_client.transport.api import Api
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.wire import PROTOCOL, StepQuery
@@ -43,6 +44,8 @@ def installation() -> Iterator[Finding]:
     lacking = [extra for extra, modules in EXTRAS.items() if not all(find_spec(module) for module in modules)]
     without = f"; not installed: {', '.join(f'surrogym[{extra}]' for extra in lacking)}" if lacking else ""
     yield Finding("packages", packages + without)
+    for why in SEARCHES.broken.values():
+        yield Finding("plug-in", f"left out: {why}", "bring the package up to date, or remove it")
 
 
 def service(api: Api) -> Iterator[Finding]:
