@@ -44,6 +44,7 @@ from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.sessions import MEBIBYTE, Limits, LiveSessions, Threads
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
+from surrogym_server.models.registry import MODELS
 from surrogym_server.private import keep_private
 from surrogym_server.sampling.acquisition import ACQUISITIONS
 from surrogym_server.services.activity import Samplers
@@ -156,7 +157,8 @@ async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: 
     engine = _build_engine(settings, design)
     app.state.notices = engine.notices
     services, sweeper = _build_services(settings, design, storage, engine, app.state.metrics)
-    logger.info("acquisitions: %s", ", ".join(ACQUISITIONS.names))
+    for registry in (ACQUISITIONS, MODELS):
+        logger.info("%ss: %s", registry.kind, ", ".join(registry.names))
     engine.fits.start()
     restored = services.sessions.restore()
     if restored:

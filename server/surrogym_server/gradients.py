@@ -19,7 +19,8 @@ from torch import Tensor
 
 from surrogym_server.errors import InvalidInput
 from surrogym_server.local import LocalSurrogate
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.abilities import Differentiable, offers
+from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual import LaneState, VirtualSettings, create, reset
 from surrogym_shared.network import Network
 from surrogym_shared.spec import BoxAction
@@ -74,8 +75,8 @@ def optimise(
         progress: called after every update.
 
     Raises:
-        InvalidInput: the policy's actions are discrete, so that nothing can be differentiated; or the return does not
-            depend on them anywhere, as where every step alive pays the same.
+        InvalidInput: the policy's actions are discrete, or the model's family can't be differentiated; or the return
+            does not depend on the actions anywhere, as where every step alive pays the same.
 
     Example:
         >>> optimise(LocalSurrogate.load("spec.json", "model.safetensors")).policy.save(Path("policy.zip"))
@@ -99,6 +100,9 @@ class _Search:
 
     def __init__(self, surrogate: LocalSurrogate, settings: GradientSettings) -> None:
         self._spec, self._model, self._settings = surrogate.spec(), surrogate.model, settings
+        if offers(self._model, Differentiable) is None:
+            family = self._model.definition.learning.model.name
+            raise InvalidInput(f"expected a model that can be differentiated, got one of the family {family!r}")
         action = self._spec.action
         if not isinstance(action, BoxAction) or action.bins is not None:
             raise InvalidInput("expected continuous actions to differentiate by, got discrete ones")
@@ -195,7 +199,7 @@ def _evened(gradient: Tensor) -> Tensor:
     return evened
 
 
-def _step(model: GaussianProcessModel, q: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _step(model: DynamicsModel, q: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Mean next state (N, C), mean reward (N,) and whether the episode ended (N,)."""
     moved = model.transition(q, u)
     over = model.terminated(moved.q_next)

@@ -21,8 +21,8 @@ from surrogym_server.engine.session import (
 )
 from surrogym_server.environment.actions import policy_actions
 from surrogym_server.errors import InvalidInput, NotReset, UnknownModel, UnknownSession
-from surrogym_server.models.gaussian_process.codec.model import from_bytes
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.files import from_bytes
+from surrogym_server.models.port import DynamicsModel
 from surrogym_server.services.sessions import resolved
 from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult
 from surrogym_shared.spec import EnvironmentSpec
@@ -44,7 +44,7 @@ class LocalSurrogate:
         >>> env = SurrogateVecEnv.from_port(surrogate, num_envs=16)
     """
 
-    def __init__(self, spec: EnvironmentSpec, model: GaussianProcessModel) -> None:
+    def __init__(self, spec: EnvironmentSpec, model: DynamicsModel) -> None:
         self._spec = spec
         self._model = model
         self._sessions: dict[str, Session] = {}
@@ -82,7 +82,7 @@ class LocalSurrogate:
         return self._spec
 
     @property
-    def model(self) -> GaussianProcessModel:
+    def model(self) -> DynamicsModel:
         """What the steps are computed with."""
         return self._model
 
@@ -151,6 +151,6 @@ class LocalSurrogate:
             raise UnknownSession(f"no session {session!r}: open a new one")
         return self._sessions[session]
 
-    def _version(self, version: int) -> GaussianProcessModel:
+    def _version(self, version: int) -> DynamicsModel:
         del version  # there is one
         return self._model

@@ -7,8 +7,10 @@ request holds beside a name.
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Generic, TypeVar
 
@@ -17,6 +19,14 @@ from surrogym_server.errors import InvalidSpec
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A member of a registry by its name, and its settings."""
+
+    name: str
+    settings: tuple[tuple[str, float | bool | str], ...] = ()
 
 
 class Registry(Generic[T]):
@@ -30,7 +40,7 @@ class Registry(Generic[T]):
             base: what each member is a subclass of.
             built_in: members of this package; no other package may take their names.
         """
-        self._kind = kind
+        self.kind = kind
         self._group = group
         self._base = base
         self._built_in = dict(built_in)
@@ -51,7 +61,23 @@ class Registry(Generic[T]):
         if (found := self._built_in.get(name) or self._others().get(name)) is not None:
             return found
         reason = f" ({self.broken[name]})" if name in self.broken else ""
-        raise InvalidSpec(f"{self._kind}: expected one of {', '.join(self.names)}, got {name!r}{reason}")
+        raise InvalidSpec(f"{self.kind}: expected one of {', '.join(self.names)}, got {name!r}{reason}")
+
+    def make(self, choice: Choice) -> T:
+        """The member of a name, with its settings: the fields of a frozen dataclass.
+
+        Raises:
+            InvalidSpec: an unknown name, or settings that it does not have or take.
+        """
+        kind, settings = self.get(choice.name), dict(choice.settings)
+        known: list[str] = [field.name for field in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else []
+        if unknown := sorted(set(settings) - set(known)):
+            expected = f"one of {', '.join(known)}" if known else "none"
+            raise InvalidSpec(f"{self.kind} {choice.name}: expected as settings {expected}, got {unknown[0]!r}")
+        try:
+            return kind(**settings)
+        except (TypeError, ValueError) as error:
+            raise InvalidSpec(f"{self.kind} {choice.name}: {error}") from None
 
     def _others(self) -> dict[str, type[T]]:
         if self._installed is None:
@@ -71,14 +97,14 @@ class Registry(Generic[T]):
             package = "a package" if entry.dist is None else f"package {entry.dist.name!r}"
             why = f"{package}, entry point {entry.name} = {entry.value!r} of {self._group}: {error}"
             self.broken[entry.name] = why
-            logger.warning("the %s %r is left out: %s", self._kind, entry.name, why)
+            logger.warning("the %s %r is left out: %s", self.kind, entry.name, why)
             return None
         loaded: type[T] = member
         return loaded
 
     def _check_name(self, name: str) -> None:
         if name in self._built_in:
-            raise ValueError(f"expected another name than the built-in {self._kind}s {', '.join(self._built_in)}")
+            raise ValueError(f"expected another name than the built-in {self.kind}s {', '.join(self._built_in)}")
 
     def _check_class(self, member: object) -> None:
         if not (isinstance(member, type) and issubclass(member, self._base)):

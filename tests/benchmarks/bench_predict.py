@@ -25,12 +25,12 @@ import torch
 from common import Call, Subject, parser, slopes, started, timed, write
 from owned import Child, installed
 
+from support.models import learn
 from support.real_steps import random_steps
 from surrogym_client.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.gp import Hyperparameters, Output, Posterior, Serving, condition
-from surrogym_server.models.gaussian_process.learning.learn import learn
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.tensors import in_blocks
 from surrogym_server.virtual import VirtualSettings, create, reset, step
 

@@ -31,7 +31,7 @@ from surrogym_client.transport.step_codecs import BinaryForm, Form, JsonForm
 from surrogym_client.transport.stream import Stream
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
-from surrogym_server.models.gaussian_process.codec.model import from_bytes
+from surrogym_server.models.files import from_bytes
 from surrogym_shared import frames
 from surrogym_shared.port import StepResult, SurrogatePort
 from surrogym_shared.wire import OpenSession

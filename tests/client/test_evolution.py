@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support.models import learn
 from support.real_steps import random_steps
 from surrogym_client.evaluation import imagined_returns
 from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
@@ -13,7 +14,6 @@ from surrogym_client.training import TrainingInterrupted, TrainSettings, train
 from surrogym_client.training.search import is_prolonged
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
-from surrogym_server.models.gaussian_process.learning.learn import learn
 from surrogym_shared.network import Network
 
 SMALL = {"population": 8, "starts": 2, "units": 4}

@@ -13,6 +13,7 @@ from uuid import uuid4
 import numpy as np
 import pytest
 
+from support.models import learn
 from support.real_steps import random_steps
 from support.server import ServerProcess, running_server
 from support.teaching import answer
@@ -26,7 +27,6 @@ from surrogym_client.training.settings import DRAWS, chosen_for
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
-from surrogym_server.models.gaussian_process.learning.learn import learn
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import Design, EnvironmentSpec
 

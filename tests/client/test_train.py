@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
+from support.models import learn
 from support.real_steps import random_steps
 from surrogym_client.evaluation import imagined_returns
 from surrogym_client.evaluation.imagined import observation_statistics
@@ -25,7 +26,6 @@ from surrogym_client.training.stable_baselines.early_stopping import Checks
 from surrogym_client.training.stable_baselines.search import imagined_return, suggested_gamma
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
-from surrogym_server.models.gaussian_process.learning.learn import learn
 
 SMALL = {"n_steps": 16, "batch_size": 32, "n_epochs": 2}
 

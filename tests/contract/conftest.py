@@ -13,7 +13,7 @@ import surrogym_server.errors
 from surrogym_client.transport import Api, HttpSurrogate, Transport
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
-from surrogym_server.models.gaussian_process.codec.model import from_bytes
+from surrogym_server.models.files import from_bytes
 from surrogym_shared.port import SurrogatePort
 
 

@@ -10,7 +10,7 @@ from surrogym_client.original.classic import cartpole
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
-from surrogym_server.models.gaussian_process.codec.model import from_bytes
+from surrogym_server.models.files import from_bytes
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import DeclaredReward, Quantity, RewardTerm, Term
 from surrogym_shared.wire import OpenSession

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from support.exact_models import exact_pendulum
+from support.models import learn
 from support.real_steps import random_steps
 from surrogym_client.evaluation import imagined_returns
 from surrogym_client.original.classic import cartpole, pendulum
@@ -14,7 +16,6 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
 from surrogym_server.gradients import GradientSettings, _evened, optimise
 from surrogym_server.local import LocalSurrogate
-from surrogym_server.models.gaussian_process.learning.learn import learn
 from surrogym_shared.wire import OpenSession
 
 SMALL = GradientSettings(updates=12, lanes=16, horizon=20, units=8)
@@ -50,6 +51,11 @@ def test_gradients_go_through_what_a_step_has_made_first(surrogate):
     moved = fresh.model.transition(torch.zeros(2, 2, dtype=torch.float64), u)
     (gradient,) = torch.autograd.grad(moved.reward.sum() + fresh.model.definition.observe(moved.q_next).sum(), u)
     assert bool((gradient != 0).all())
+
+
+def test_a_model_that_can_not_be_differentiated_is_refused():
+    with pytest.raises(InvalidInput, match="can be differentiated, got one of the family 'gaussian_process'"):
+        optimise(LocalSurrogate(pendulum(), exact_pendulum()), SMALL)
 
 
 def test_it_learns_to_hold_the_pendulum_up(tmp_path: Path):

@@ -1,10 +1,10 @@
-"""Models whose predictions are known exactly, in the shape of GaussianProcessModel, for the virtual environment."""
+"""Models whose predictions are known exactly, for the virtual environment."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from types import SimpleNamespace
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,11 +13,11 @@ from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.step_rules import settle
-from surrogym_server.models.gaussian_process.prediction.model import Transition
+from surrogym_server.models.port import DynamicsModel, Transition
 
 
 @dataclass(frozen=True)
-class ExactModel:
+class ExactModel(DynamicsModel):
     """``move`` gives q' of (q, u), ``pay`` the reward of (q, u); both deviate as told, in each output alike."""
 
     definition: EnvironmentDefinition
@@ -27,18 +27,26 @@ class ExactModel:
     reward_deviation: Callable[[Tensor], Tensor] = lambda q: torch.zeros(len(q), dtype=torch.float64)
     terminal_reward: float = 0.0
     process_deviation: float = 0.0
-    reward: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(scale=1.0))
+    samples: int = 1
+    digest: str = ""
 
     @property
     def scales(self) -> Tensor:
-        return torch.ones(len(self.definition.moving) + 1, dtype=torch.float64)
+        return torch.ones(len(self.definition.outputs), dtype=torch.float64)
 
     @property
-    def transitions(self) -> tuple[int, ...]:
-        return self.definition.moving
+    def structures(self) -> tuple[str, ...]:
+        return ("exact",) * len(self.definition.outputs)
 
-    def terminated(self, q: Tensor) -> Tensor:
-        return self.definition.terminated(q)
+    @property
+    def description(self) -> dict[str, Any]:
+        return {"outputs": [{"name": name} for name in self.definition.outputs]}
+
+    def learned_termination(self, q: Tensor) -> Tensor:
+        raise AssertionError("its termination is declared")
+
+    def means(self, q: Tensor, u: Tensor) -> Tensor:
+        return torch.cat([(self.move(q, u) - q)[:, list(self.definition.moving)], self.pay(q, u)[:, None]], -1)
 
     def transition(
         self,
@@ -47,11 +55,9 @@ class ExactModel:
         *,
         noise: Tensor | None = None,
         process: Tensor | None = None,
-        paths: Tensor | None = None,
         deviations: bool = False,
         reward_deviation: bool = False,
     ) -> Transition:
-        assert paths is None, "an exact model is no posterior to draw functions from"
         q_next, moving = self.move(q, u), list(self.definition.moving)
         if process is not None:
             q_next[..., moving] += self.process_deviation * process

@@ -16,7 +16,7 @@ from matplotlib.ticker import MaxNLocator
 
 from surrogym_client.report.maps import Cut, pairs
 from surrogym_shared.spec import Coordinate, limits
-from surrogym_shared.wire import ModelView, SampleView, SurrogateView
+from surrogym_shared.wire import ModelView, OutputFidelity, SampleView, SurrogateView
 
 COLOURS = {"initial": "#4c72b0", "adaptive": "#dd8452", "manual": "#55a868"}
 WIDTH = 6.0  # inches
@@ -34,7 +34,7 @@ def draw_fidelity(models: Sequence[ModelView], target: float) -> Figure:
         said = [(model.samples, o) for model in models for o in model.fidelity.outputs if o.name == name]
         samples = [count for count, _ in said]
         sure.plot(samples, [o.confidence_index for _, o in said], marker="o", label=name)
-        wrong.plot(samples, [max(o.leave_one_out_error / o.tolerance, SMALLEST) for _, o in said], marker="o")
+        wrong.plot(samples, [_in_tolerances(o) for _, o in said], marker="o")
     sure.axhline(target, color="black", linestyle="--", linewidth=0.8, label=f"target {target:g}")
     wrong.axhline(1.0, color="black", linestyle="--", linewidth=0.8)
     sure.set(ylabel="confidence index")
@@ -42,6 +42,12 @@ def draw_fidelity(models: Sequence[ModelView], target: float) -> Figure:
     wrong.xaxis.set_major_locator(MaxNLocator(integer=True))
     figure.legend(loc="outside upper right", ncols=4)
     return figure
+
+
+def _in_tolerances(output: OutputFidelity) -> float:
+    """Leave-one-out error; NaN, which is not drawn, where the family of models can't tell."""
+    error = output.leave_one_out_error
+    return math.nan if error is None else max(error / output.tolerance, SMALLEST)
 
 
 def draw_samples(view: SurrogateView, samples: Sequence[SampleView]) -> Figure:

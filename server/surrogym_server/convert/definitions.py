@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 from surrogym_server.environment import conditions, declared_reward, distributions, terms
 from surrogym_server.environment import definition as core
 from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.errors import InvalidSpec
+from surrogym_server.models.registry import GAUSSIAN_PROCESS, learner_of
+from surrogym_server.plugins import Choice
 from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_shared import spec as wire
 
@@ -21,7 +24,8 @@ def definition_from_spec(spec: wire.EnvironmentSpec) -> core.EnvironmentDefiniti
     """The core's view of a specification, every default of its preset resolved.
 
     Raises:
-        InvalidSpec: the preset can't represent this environment, or an acquisition that is not installed.
+        InvalidSpec: the preset can't represent this environment, or an acquisition or a family of models
+            that is not installed.
     """
     names = spec.coordinate_names
     definition = core.EnvironmentDefinition(
@@ -85,24 +89,36 @@ def _design(spec: wire.EnvironmentSpec) -> core.DesignDefinition:
     )
 
 
-def _acquisition(design: wire.Design, usual: str) -> core.AcquisitionChoice:
-    given = design.acquisition
-    if isinstance(given, wire.AcquisitionChoice):
-        choice = core.AcquisitionChoice(given.name, tuple(given.settings.items()))
-    else:
-        choice = core.AcquisitionChoice(given or usual)
+def _acquisition(design: wire.Design, usual: str) -> Choice:
+    choice = _choice(design.acquisition, usual)
     acquisition_of(choice)
     return choice
 
 
 def _learning(spec: wire.EnvironmentSpec) -> core.LearningDefinition:
-    paper = spec.design.preset == "paper"
-    return core.LearningDefinition(
-        moves="observation" if paper else "coordinates",
-        kernel="squared_exponential" if paper else "composite",
-        reward_jumps=not paper,
-        symmetry=spec.design.symmetry,
-    )
+    moves: Literal["observation", "coordinates"] = "observation" if spec.design.preset == "paper" else "coordinates"
+    return core.LearningDefinition(_model(spec.design), moves)
+
+
+def _model(design: wire.Design) -> Choice:
+    """The family of models. What the preset says of Gaussian processes holds unless the specification overrides it."""
+    choice, paper = _choice(design.model, GAUSSIAN_PROCESS), design.preset == "paper"
+    if choice.name == GAUSSIAN_PROCESS:
+        kernel = "squared_exponential" if paper else "composite"
+        preset: dict[str, float | bool | str] = {
+            "kernel": kernel,
+            "reward_jumps": not paper,
+            "symmetry": design.symmetry,
+        }
+        choice = Choice(choice.name, tuple({**preset, **dict(choice.settings)}.items()))
+    learner_of(choice)
+    return choice
+
+
+def _choice(given: str | wire.Choice | None, usual: str) -> Choice:
+    if isinstance(given, wire.Choice):
+        return Choice(given.name, tuple(given.settings.items()))
+    return Choice(given or usual)
 
 
 def _max_rollout(spec: wire.EnvironmentSpec) -> int:

@@ -55,7 +55,7 @@ export function learningCurves() {
       return output ? what(output) : null;
     }));
     const index = of((output) => output.confidence_index);
-    const errors = of((output) => Math.log10(Math.max(LEAST_ERROR, output.leave_one_out_error / output.tolerance)));
+    const errors = of((output) => (output.leave_one_out_error === null ? null : Math.log10(Math.max(LEAST_ERROR, output.leave_one_out_error / output.tolerance))));
     const { top, error } = heights(fidelity.target, errors.flat());
     const x = latest.map((model) => model.samples);
     both.draw(() => ({

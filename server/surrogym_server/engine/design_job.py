@@ -16,10 +16,10 @@ from threadpoolctl import threadpool_limits
 
 from surrogym_server.engine.fidelity import fidelity_fields
 from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.gaussian_process.codec.model import to_bytes
+from surrogym_server.models.files import to_bytes
 from surrogym_server.sampling.design import Decision, DesignState, Request, advance, initial_design, initial_rollouts
-from surrogym_server.sampling.outlook import Points
 
 Array = NDArray[np.float64]
 Verdict = Literal["continue", "ready", "over_budget"]

@@ -6,19 +6,20 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
-from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
-from surrogym_server.sampling.confidence import OutputConfidence, confidence, deviations
+from surrogym_server.models.port import DynamicsModel
+from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
 from surrogym_server.sampling.design import monte_carlo, usual_tolerances
 
 
 def fidelity_fields(
-    model: GaussianProcessModel, confidences: Sequence[OutputConfidence], tolerances: Sequence[float], target: float
+    model: DynamicsModel, confidences: Sequence[OutputConfidence], tolerances: Sequence[float], target: float
 ) -> dict[str, Any]:
     """The fields of ``wire.Fidelity``, from the confidence and tolerance of each output, (O,) each."""
     rows = [
-        {"name": output.name, "structure": _structure(output), "tolerance": tolerance, **asdict(judged)}
-        for output, judged, tolerance in zip(_outputs(model), confidences, tolerances, strict=True)
+        {"name": name, "structure": structure, "tolerance": tolerance, **asdict(judged)}
+        for name, structure, judged, tolerance in zip(
+            model.definition.outputs, model.structures, confidences, tolerances, strict=True
+        )
     ]
     return {
         "confidence_index": min(c.confidence_index for c in confidences),
@@ -29,7 +30,7 @@ def fidelity_fields(
     }
 
 
-def fidelity_of(model: GaussianProcessModel, usual: Sequence[float], target: float) -> dict[str, Any]:
+def fidelity_of(model: DynamicsModel, usual: Sequence[float], target: float) -> dict[str, Any]:
     """The fields of ``wire.Fidelity`` of any model of the surrogate.
 
     Args:
@@ -38,19 +39,7 @@ def fidelity_of(model: GaussianProcessModel, usual: Sequence[float], target: flo
             round, and then taken from the model's own scales.
         target: confidence index the design aims at.
     """
-    outputs = _outputs(model)
-    usual = usual or usual_tolerances(model.definition, [output.scale for output in outputs])
+    usual = usual or usual_tolerances(model.definition, model.scales.tolist())
     tolerances = model.definition.tolerances_over(usual)
     deviation = deviations(model, *monte_carlo(model.definition))
-    confidences = [confidence(o, deviation[:, i], t) for i, (o, t) in enumerate(zip(outputs, tolerances, strict=True))]
-    return fidelity_fields(model, confidences, tolerances, target)
-
-
-def _outputs(model: GaussianProcessModel) -> tuple[OutputModel, ...]:
-    return (*model.transitions, model.reward)
-
-
-def _structure(output: OutputModel) -> str:
-    if output.posterior is None:
-        return "constant"
-    return f"{output.posterior.hyper.kernel} on {output.feature_map}"
+    return fidelity_fields(model, confidences_of(model, deviation, tolerances), tolerances, target)

@@ -94,4 +94,4 @@ def _exit_when_closed(lifeline: Connection) -> None:
 
 
 def _warm() -> None:
-    import surrogym_server.models.gaussian_process.prediction.model  # noqa: F401
+    import surrogym_server.models.registry  # noqa: F401

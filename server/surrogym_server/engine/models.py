@@ -9,8 +9,11 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from threading import Lock
 
+import torch
+
 from surrogym_server.errors import Damaged, NoModel
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.port import DynamicsModel
+from surrogym_server.tensors import CPU
 
 CAPACITY = 64
 
@@ -20,7 +23,7 @@ class ModelCache:
 
     def __init__(
         self,
-        load: Callable[[int, int], GaussianProcessModel],
+        load: Callable[[int, int], DynamicsModel],
         newest: Callable[[], Mapping[int, int]],
         capacity: int = CAPACITY,
     ) -> None:
@@ -28,29 +31,33 @@ class ModelCache:
         Args:
             load: the model of a surrogate's version; raises ``UnknownModel``, ``UnknownSurrogate`` or ``Damaged``.
             newest: the newest stored version of each surrogate that has any; not one that ``load`` has set aside.
-            capacity: how many models are kept.
+            capacity: how many models are kept; one on another device than the CPU counts again.
         """
         self._load = load
         self._newest = newest
         self._capacity = capacity
-        self._models: OrderedDict[tuple[int, int], GaussianProcessModel] = OrderedDict()
+        self._models: OrderedDict[tuple[int, int, torch.device], DynamicsModel] = OrderedDict()
         self._latest: dict[int, int] = {}
         self._lock = Lock()
 
-    def get(self, surrogate: int, version: int) -> GaussianProcessModel:
-        """The model of a version. Raises ``UnknownModel``, ``UnknownSurrogate`` or ``Damaged``."""
+    def get(self, surrogate: int, version: int, device: torch.device = CPU) -> DynamicsModel:
+        """The model of a version, on a device. Raises ``UnknownModel``, ``UnknownSurrogate`` or ``Damaged``."""
+        key = (surrogate, version, device)
         with self._lock:
-            if model := self._models.get((surrogate, version)):
-                self._models.move_to_end((surrogate, version))
+            if model := self._models.get(key):
+                self._models.move_to_end(key)
                 return model
+        model = self._loaded(surrogate, version) if device == CPU else self.get(surrogate, version).on(device)
+        self._keep(key, model)
+        return model
+
+    def _loaded(self, surrogate: int, version: int) -> DynamicsModel:
         try:
-            model = self._load(surrogate, version)
+            return self._load(surrogate, version)
         except Damaged:
             with self._lock:
                 self._latest.pop(surrogate, None)  # it may have been this one
             raise
-        self._keep(surrogate, version, model)
-        return model
 
     def latest(self, surrogate: int) -> int:
         """The newest version that is known here. Raises ``NoModel`` or ``UnknownSurrogate``."""
@@ -104,8 +111,8 @@ class ModelCache:
             for key in [key for key in self._models if key[0] == surrogate]:
                 del self._models[key]
 
-    def _keep(self, surrogate: int, version: int, model: GaussianProcessModel) -> None:
+    def _keep(self, key: tuple[int, int, torch.device], model: DynamicsModel) -> None:
         with self._lock:
-            self._models[surrogate, version] = model
+            self._models[key] = model
             while len(self._models) > self._capacity:
                 self._models.popitem(last=False)

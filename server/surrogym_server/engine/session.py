@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from surrogym_server.engine.occupancy import Reservoir
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import IdempotencyConflict, InvalidInput, SeqConflict
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual import LaneState, Transition, VirtualSettings, create, reset, step
 from surrogym_shared.port import ResetResult, StepResult, quick
 
@@ -24,7 +24,7 @@ Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 Versions = NDArray[np.int64]
 ModelChoice = Literal["latest"] | int
-ModelOf = Callable[[int], GaussianProcessModel]
+ModelOf = Callable[[int], DynamicsModel]
 Seeds = int | Sequence[int] | None
 Outcome = ResetResult | tuple[StepResult, ...]
 

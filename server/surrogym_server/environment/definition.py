@@ -16,6 +16,7 @@ from surrogym_server.environment.conditions import Conditions, Inequality
 from surrogym_server.environment.declared_reward import DeclaredReward
 from surrogym_server.environment.distributions import Distribution
 from surrogym_server.environment.terms import Term, TermSet, compile_terms
+from surrogym_server.plugins import Choice
 from surrogym_server.tensors import CPU, cached, to_device
 
 REWARD = "reward"
@@ -76,25 +77,13 @@ class LearningDefinition:
     """What a model is made of, every default resolved.
 
     Attributes:
+        model: family of models, by its name in ``models.registry``, and its settings.
         moves: what the transition outputs are increments of; under ``observation`` the coordinates are read back from
             the observation, as the paper has it.
-        kernel: of every process; ``composite`` adds a linear part, and for the reward a quadratic one.
-        reward_jumps: whether the reward may jump where a learned region begins.
-        symmetry: ``auto`` compares feature maps that are their own mirror image with the others.
     """
 
+    model: Choice
     moves: Literal["coordinates", "observation"]
-    kernel: Literal["composite", "squared_exponential"]
-    reward_jumps: bool
-    symmetry: Literal["auto", "none"]
-
-
-@dataclass(frozen=True)
-class AcquisitionChoice:
-    """An acquisition by its name in the registry, and its settings."""
-
-    name: str
-    settings: tuple[tuple[str, float | bool | str], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -117,7 +106,7 @@ class DesignDefinition:
 
     initial: int
     hypercube_tries: int
-    acquisition: AcquisitionChoice
+    acquisition: Choice
     tolerance: Literal["relative", "raw"]
     monte_carlo: int
     visited_candidates: bool

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition, wrap
 from surrogym_server.environment.distributions import scaling
+from surrogym_server.environment.points import Points
 
 State = Literal["cos_sin", "wrapped", "both", "observation", "none"]
 Encoding = Literal["value", "one_hot"]  # of discrete actions
@@ -74,6 +75,12 @@ def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tupl
             for place, index in enumerate(leading(definition))
         ]
     return tuple(made)
+
+
+def distances(definition: EnvironmentDefinition, a: Points, b: Points) -> Tensor:
+    """Distances of points a (m) and b (n), in deviations of the sampling range, (m, n)."""
+    plain = FeatureMap()
+    return torch.cdist(encode(definition, plain, a.q, a.u), encode(definition, plain, b.q, b.u))
 
 
 def encode(

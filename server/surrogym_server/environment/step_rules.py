@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition, wrap
+from surrogym_server.environment.observation_inverse import ObservationInverse
 
 
 def paid(terminal_reward: float, reward: Tensor, terminated: Tensor) -> Tensor:
@@ -31,3 +32,10 @@ def settle(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
         if coordinate.kind == "angle":
             inside[..., index] = wrap(inside[..., index])
     return inside
+
+
+def moved(definition: EnvironmentDefinition, inverse: ObservationInverse | None, q: Tensor, change: Tensor) -> Tensor:
+    """Where coordinates q (m, C) arrive that change by (m, C), or whose observation does, by (m, D), given its inverse;
+    as the environment leaves them."""
+    arrived = q + change if inverse is None else inverse(definition.observe(q) + change, q)
+    return settle(definition, arrived)

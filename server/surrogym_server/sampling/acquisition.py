@@ -12,7 +12,6 @@ Its settings are the fields of a frozen dataclass: numbers, booleans and strings
 
 from __future__ import annotations
 
-import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,12 +20,10 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from surrogym_server.environment.definition import AcquisitionChoice
-from surrogym_server.errors import InvalidSpec
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
-from surrogym_server.plugins import Registry
+from surrogym_server.environment.points import Points
+from surrogym_server.models.port import DynamicsModel
+from surrogym_server.plugins import Choice, Registry
 from surrogym_server.sampling.confidence import log_model_uncertainty
-from surrogym_server.sampling.outlook import Points
 
 GROUP = "surrogym.acquisitions"
 
@@ -35,7 +32,7 @@ GROUP = "surrogym.acquisitions"
 class CandidateView:
     """What an acquisition may know of m candidates, for the sake of one output."""
 
-    model: GaussianProcessModel
+    model: DynamicsModel
     points: Points  # m states and actions
     output: int  # number of the output, in the order of the definition
     tolerance: float  # of the output, in its unit
@@ -139,7 +136,7 @@ class LatinHypercube(Acquisition):
 ACQUISITIONS: Registry[Acquisition] = Registry(
     "acquisition",
     GROUP,
-    Acquisition,  # type: ignore[type-abstract]
+    Acquisition,
     {
         "integrated_variance": IntegratedVariance,
         "variance": Variance,
@@ -149,18 +146,6 @@ ACQUISITIONS: Registry[Acquisition] = Registry(
 )
 
 
-def acquisition_of(choice: AcquisitionChoice) -> Acquisition:
-    """The acquisition of a name and settings.
-
-    Raises:
-        InvalidSpec: an unknown name, or settings that it does not have or take.
-    """
-    kind, settings = ACQUISITIONS.get(choice.name), dict(choice.settings)
-    known: list[str] = [field.name for field in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else []
-    if unknown := sorted(set(settings) - set(known)):
-        expected = f"one of {', '.join(known)}" if known else "none"
-        raise InvalidSpec(f"acquisition {choice.name}: expected as settings {expected}, got {unknown[0]!r}")
-    try:
-        return kind(**settings)
-    except (TypeError, ValueError) as error:
-        raise InvalidSpec(f"acquisition {choice.name}: {error}") from None
+def acquisition_of(choice: Choice) -> Acquisition:
+    """The acquisition of a name and settings. Raises InvalidSpec."""
+    return ACQUISITIONS.make(choice)

@@ -8,17 +8,19 @@ import torch
 from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.environment.features import FeatureMap, encode
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.environment.features import distances
+from surrogym_server.environment.points import Points
+from surrogym_server.models.abilities import OutputOutlook
+from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.acquisition import CandidateView, acquisition_of
 from surrogym_server.sampling.candidates import Candidates
-from surrogym_server.sampling.outlook import Outlook, OutputOutlook, Points
+from surrogym_server.sampling.outlook import outlook_of
 
 NEAR = 0.02  # queries closer than this, in deviations of the sampling range, are near-duplicates
 
 
 def choose(
-    model: GaussianProcessModel,
+    model: DynamicsModel,
     candidates: Candidates,
     taken: Points,
     assumed: Points,
@@ -44,11 +46,11 @@ def choose(
     acquisition = acquisition_of(definition.design.acquisition)
     # The covariances of the reference cost the most.
     reference = candidates.reference if acquisition.reads_reference else candidates.reference[:0]
-    outlook = Outlook.of(model, points, reference, assumed)
+    outlook = outlook_of(model, points, reference, assumed)
     distance = nearest(definition, points, taken)
     picks: list[int] = []
     for column in wanted:
-        output, allowed = outlook.outputs[column], distance >= NEAR
+        output, allowed = outlook[column], distance >= NEAR
         if not bool(allowed.any()):
             break
         value = distance
@@ -57,17 +59,17 @@ def choose(
         if reserved is not None and not picks and bool((allowed & reserved).any()):
             allowed &= reserved
         elif output is not None:
-            allowed &= output.counts
+            allowed &= output.learns
         pick = int(torch.where(allowed, value, -torch.inf).argmax())
         if allowed[pick]:
             picks.append(pick)
-            outlook = outlook.observe(pick)
+            outlook = tuple(None if o is None else o.observe(pick) for o in outlook)
             distance = torch.minimum(distance, nearest(definition, points, points[pick : pick + 1]))
     return picks
 
 
 def candidate_view(
-    model: GaussianProcessModel,
+    model: DynamicsModel,
     candidates: Candidates,
     column: int,
     output: OutputOutlook,
@@ -91,6 +93,4 @@ def nearest(definition: EnvironmentDefinition, points: Points, taken: Points) ->
     """Distance of m points to the nearest of those taken, in deviations of the sampling range, (m,)."""
     if not len(taken):
         return points.q.new_full((len(points),), torch.inf)
-    plain = FeatureMap()
-    a, b = (encode(definition, plain, p.q, p.u) for p in (points, taken))
-    return torch.cdist(a, b).amin(1)
+    return distances(definition, points, taken).amin(1)

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.environment.points import Points
+from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.latin_hypercube import random_points
 from surrogym_server.sampling.occupancy import log_occupancy
-from surrogym_server.sampling.outlook import Points
 
 MAX_CANDIDATES = 4_096  # of each kind; covariances with the reference are held for all of them
 REFERENCE = 256  # points of each kind
@@ -30,9 +30,7 @@ class Candidates:
     weights: Tensor  # (r,) add up to 1
 
 
-def candidates_of(
-    model: GaussianProcessModel, points: Points, states: Tensor | None, rng: np.random.Generator
-) -> Candidates:
+def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, rng: np.random.Generator) -> Candidates:
     """Candidates from the Monte Carlo set ``points`` (m) and, as many again, visited states (v, C) under random
     actions: few points of a set spread over the whole range lie where a policy goes.
 
@@ -54,7 +52,7 @@ def candidates_of(
     return Candidates(points, log_p, reference, weights / weights.sum())
 
 
-def input_probability(model: GaussianProcessModel, points: Points, states: Tensor | None) -> Tensor:
+def input_probability(model: DynamicsModel, points: Points, states: Tensor | None) -> Tensor:
     """log P_i (eq. 11) at m points from visited states (v, C): (m,).
 
     Without any, every state is equally likely, or as likely as the predicted next states are dense at it.

@@ -6,13 +6,14 @@ as a logarithm: written as a difference it cancels to 0 below sigma = tau / 8.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
-from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
+from surrogym_server.models.abilities import LeaveOneOut, LeaveOneOutErrors, offers
+from surrogym_server.models.port import DynamicsModel
 
 SUREST = 1e9  # tolerances over a deviation: what is known better counts as known so well
 
@@ -22,12 +23,12 @@ class OutputConfidence:
     confidence_index: float
     confidence_index_paper: float
     coverage: float  # share of the set whose deviation is below the tolerance
-    leave_one_out_error: float  # root mean square, in the output's unit
-    leave_one_out_within_one: float  # share of the samples within one predictive deviation: 0.68 if it tells the truth
-    leave_one_out_within_two: float  # 0.95
+    leave_one_out_error: float | None  # root mean square, in the output's unit; None where the family can't tell
+    leave_one_out_within_one: float | None  # share of the samples within one predictive deviation
+    leave_one_out_within_two: float | None
 
 
-def deviations(model: GaussianProcessModel, q: Tensor, u: Tensor) -> Tensor:
+def deviations(model: DynamicsModel, q: Tensor, u: Tensor) -> Tensor:
     """Latent deviation of every output, the reward last, at q (m, C) and u (m, F): (m, O)."""
     transition = model.transition(q, u, deviations=True, reward_deviation=True)
     assert transition.deviation is not None
@@ -47,22 +48,18 @@ def log_model_uncertainty(deviation: Tensor, tolerance: Tensor | float) -> Tenso
     return log_uncertainty
 
 
-def confidence(output: OutputModel, deviation: Tensor, tolerance: float) -> OutputConfidence:
-    """Confidence of one output from its deviations (m,) over the Monte Carlo set."""
+def confidences_of(model: DynamicsModel, deviation: Tensor, tolerances: Sequence[float]) -> list[OutputConfidence]:
+    """Confidence of every output (O,) from its deviations (m, O) over the Monte Carlo set."""
+    able = offers(model, LeaveOneOut)
+    errors = [None] * len(tolerances) if able is None else able.leave_one_out()
+    return [confidence(deviation[:, i], tolerances[i], errors[i]) for i in range(len(tolerances))]
+
+
+def confidence(deviation: Tensor, tolerance: float, errors: LeaveOneOutErrors | None) -> OutputConfidence:
+    """Confidence of one output from its deviations (m,) over the Monte Carlo set, and its leave-one-out errors."""
     return OutputConfidence(
         float(certainty(deviation, tolerance).mean()),
         float(certainty(deviation, 1.0).mean()),
         float((deviation <= tolerance).double().mean()),
-        *leave_one_out(output),
+        *((None, None, None) if errors is None else (errors.error, errors.within_one, errors.within_two)),
     )
-
-
-def leave_one_out(output: OutputModel) -> tuple[float, float, float]:
-    """Root mean square of the leave-one-out errors, in the output's unit, and which share of them lies within one and
-    within two of the deviations predicted for them. An output that never varied makes no error."""
-    if output.posterior is None:
-        return 0.0, 1.0, 1.0
-    mean, variance = output.posterior.leave_one_out()
-    error, deviation = (mean - output.posterior.y).abs(), variance.sqrt()
-    one, two = (float((error <= width * deviation).double().mean()) for width in (1, 2))
-    return float(output.scale * error.square().mean().sqrt()), one, two

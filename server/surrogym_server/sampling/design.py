@@ -13,21 +13,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples, increments
-from surrogym_server.models.gaussian_process.learning.learn import learn
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.port import DynamicsModel
+from surrogym_server.models.registry import learner_of
 from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.batch import choose
 from surrogym_server.sampling.candidates import Candidates, candidates_of
-from surrogym_server.sampling.confidence import OutputConfidence, confidence, deviations
+from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
 from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
-from surrogym_server.sampling.outlook import Points
 from surrogym_server.sampling.rollouts import Aim, first_rollouts, plan_round
 
 Verdict = Literal["continue", "ready", "over_budget"]
 SHORTEST_ROUND = 4  # real steps
 TOLERANCE = 0.05  # of the output's deviation over the initial design
+WARM = "thetas"  # in stored states, as it was called when it was always hyperparameters
 FEW_POINTS = 500  # more of them leave no gap worth a comparison of all pairs, whose memory grows with their square
 
 
@@ -37,16 +38,16 @@ class DesignState:
 
     round: int = 0
     usual: tuple[float, ...] = ()  # tolerances, per output, where nobody set one; frozen after the first round
-    thetas: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # what the fit leaves for the next one
 
     def to_json(self) -> dict[str, Any]:
-        thetas = {key: theta.tolist() for key, theta in self.thetas.items()}
-        return {"round": self.round, "usual": list(self.usual), "thetas": thetas}
+        warm = {key: array.tolist() for key, array in self.warm.items()}
+        return {"round": self.round, "usual": list(self.usual), WARM: warm}
 
     @classmethod
     def from_json(cls, state: dict[str, Any]) -> DesignState:
-        thetas = {key: np.array(theta) for key, theta in state.get("thetas", {}).items()}
-        return cls(state.get("round", 0), tuple(state.get("usual", ())), thetas)
+        warm = {key: np.array(array) for key, array in state.get(WARM, {}).items()}
+        return cls(state.get("round", 0), tuple(state.get("usual", ())), warm)
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Decision:
-    model: GaussianProcessModel
+    model: DynamicsModel
     confidences: tuple[OutputConfidence, ...]  # per output
     tolerances: tuple[float, ...]  # per output, those that it was judged by
     state: DesignState
@@ -95,14 +96,13 @@ def initial_rollouts(definition: EnvironmentDefinition, budget: int) -> list[Ten
 
 
 def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignState, request: Request) -> Decision:
-    """One round. Raises InvalidInput or NumericalFailure as ``learn`` does."""
-    learned = learn(definition, samples, state.thetas)
+    """One round. Raises InvalidInput or NumericalFailure as ``Learner.learn`` does."""
+    learned = learner_of(definition.learning.model).learn(definition, samples, state.warm)
     usual = state.usual or usual_tolerances(definition, sizes_of(definition, samples))
     tolerances = definition.tolerances_over(usual)
     points = Points(*monte_carlo(definition))
     deviation = deviations(learned.model, points.q, points.u)
-    outputs = (*learned.model.transitions, learned.model.reward)
-    confidences = tuple(confidence(o, deviation[:, i], tolerances[i]) for i, o in enumerate(outputs))
+    confidences = tuple(confidences_of(learned.model, deviation, tolerances))
     rng = _rng(definition, f"visited {state.round}")
     candidates = candidates_of(learned.model, points, request.states, rng)
     reserved = ending(learned.model, samples, candidates.points)
@@ -116,7 +116,7 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         rollouts = _plan(learned.model, samples, confidences, tolerances, verdict, request, rng, reserved is not None)
     if verdict == "continue" and not len(chosen) and not rollouts:
         verdict = "over_budget"  # the rest of the budget is pending, or nothing distinct is left to ask
-    new_state = DesignState(state.round + 1, usual, learned.thetas)
+    new_state = DesignState(state.round + 1, usual, learned.warm)
     return Decision(learned.model, confidences, tolerances, new_state, verdict, chosen.q, chosen.u, rollouts)
 
 
@@ -146,19 +146,24 @@ def judge(
     request: Request,
     settled: bool = True,
 ) -> Verdict:
-    """Whether to continue. A ``tested_confidence`` counts only when leave-one-out errors agree, it is settled where
-    episodes end, and adaptive queries, half as many as the initial design had, have tried to disprove it."""
+    """Whether to continue. A ``tested_confidence`` counts only when leave-one-out errors are known and agree, it is
+    settled where episodes end, and adaptive queries, half as many as the initial design had, have tried to disprove
+    it."""
     sure = all(c.confidence_index >= request.target for c in confidences)
     if definition.design.stopping == "tested_confidence":
-        sure = sure and all(c.leave_one_out_error <= t for c, t in zip(confidences, tolerances, strict=True))
+        sure = sure and all(_agrees(c, t) for c, t in zip(confidences, tolerances, strict=True))
         sure = sure and settled and samples >= math.ceil(1.5 * definition.design.initial)
     if sure:
         return "ready"
     return "continue" if samples < request.budget else "over_budget"
 
 
+def _agrees(confidence: OutputConfidence, tolerance: float) -> bool:
+    return confidence.leave_one_out_error is not None and confidence.leave_one_out_error <= tolerance
+
+
 def _choose(
-    model: GaussianProcessModel,
+    model: DynamicsModel,
     samples: Samples,
     candidates: Candidates,
     confidences: tuple[OutputConfidence, ...],
@@ -178,7 +183,7 @@ def _choose(
 
 
 def _plan(
-    model: GaussianProcessModel,
+    model: DynamicsModel,
     samples: Samples,
     confidences: tuple[OutputConfidence, ...],
     tolerances: tuple[float, ...],

@@ -8,15 +8,16 @@ from collections.abc import Iterator
 from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
-from surrogym_server.sampling.outlook import Points
+from surrogym_server.models.abilities import RewardEdges, offers
+from surrogym_server.models.port import DynamicsModel
 
 FRONTIER = 0.1  # of what was seen of the coordinates: a shorter way beyond it is not worth a query
 DOUBT = 0.005  # chance of a wrong ending, averaged over the candidates, that is good enough
 
 
-def ending(model: GaussianProcessModel, samples: Samples, points: Points) -> Tensor | None:
+def ending(model: DynamicsModel, samples: Samples, points: Points) -> Tensor | None:
     """Which of m points to take a query from for the sake of the episodes' end, (m,) bool; None if none is needed.
 
     Declared: those predicted to end one, as long as no sample has. Learned: those most in doubt, until little doubt is
@@ -36,13 +37,13 @@ def ending(model: GaussianProcessModel, samples: Samples, points: Points) -> Ten
     return beyond >= 0.9 * beyond.max() if float(beyond.max()) > FRONTIER else None
 
 
-def in_doubt(model: GaussianProcessModel, q_next: Tensor) -> Tensor:
+def in_doubt(model: DynamicsModel, q_next: Tensor) -> Tensor:
     """Chance that the model errs about an ending at q_next (m, C), (m,); 0 where termination is declared."""
     probability = model.termination_probability(q_next)
     return probability.minimum(1 - probability)
 
 
-def edge_in_doubt(model: GaussianProcessModel, q: Tensor, q_next: Tensor) -> Tensor:
+def edge_in_doubt(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Tensor:
     """Chance that the model errs about the side of a reward's edge, the largest of all edges, for steps from q (m, C)
     to q_next (m, C), (m,)."""
     doubt = q.new_zeros(len(q))
@@ -51,7 +52,7 @@ def edge_in_doubt(model: GaussianProcessModel, q: Tensor, q_next: Tensor) -> Ten
     return doubt
 
 
-def _edges(model: GaussianProcessModel, points: Points, q_next: Tensor) -> Tensor | None:
+def _edges(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor | None:
     """Where it is most in doubt on which side of a reward's edge points lie."""
     for doubt in _edge_doubts(model, points.q, q_next):
         if float(doubt.mean()) > DOUBT:
@@ -59,15 +60,13 @@ def _edges(model: GaussianProcessModel, points: Points, q_next: Tensor) -> Tenso
     return None
 
 
-def _edge_doubts(model: GaussianProcessModel, q: Tensor, q_next: Tensor) -> Iterator[Tensor]:
+def _edge_doubts(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Iterator[Tensor]:
     """For each edge of the reward the chance that the model errs about the side, (m,)."""
-    state = q_next if model.reward.feature_map.after else q
-    for jump in model.jumps:
-        inside = jump.region.probability(state)
-        yield inside.minimum(1 - inside)
+    edged = offers(model, RewardEdges)
+    return iter(()) if edged is None else edged.reward_edge_doubts(q, q_next)
 
 
-def _predicted(model: GaussianProcessModel, points: Points, q_next: Tensor) -> Tensor | None:
+def _predicted(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor | None:
     ends = model.terminated(q_next) & ~model.terminated(points.q)
     return ends if bool(ends.any()) else None
 

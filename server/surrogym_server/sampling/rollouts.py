@@ -1,15 +1,8 @@
 """Action sequences for an environment that can only be reset and act: random ones first, then planned in the model.
 
-A sequence is worth what its acquisition gives per real step: with most of them, information. Of output j the first t
-points of a predicted path give
-
-    I_j(t) = 1/2 log det(1 + W S_j W / tau_j^2),
-
-S_j (t, t) the posterior covariance of the process at these points, tau_j the output's tolerance, W a diagonal of
-weights. The determinant counts each point after those before it, so a repeat gives nothing. A weight is 0 outside the
-sampling range and after the end of an episode, and falls with the deviation gathered on the way: a plan ends where it
-can't be predicted.
-Reference: A. Krause, A. Singh, C. Guestrin (2008), JMLR 9, section 2 (information of a set of observations).
+A sequence is worth what its acquisition gives per real step: with most of them, the information that a path tells of
+each output (``PathOutlook.information``). A step's weight is 0 outside the sampling range and after the end of an
+episode, and falls with the deviation gathered on the way: a plan ends where it can't be predicted.
 """
 
 from __future__ import annotations
@@ -24,19 +17,18 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.distributions import scaling
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
-from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
+from surrogym_server.models.abilities import PathOutlook, PredictedSteps
+from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.acquisition import PathView, acquisition_of
 from surrogym_server.sampling.endings import edge_in_doubt, in_doubt
 from surrogym_server.sampling.occupancy import log_occupancy
-from surrogym_server.sampling.outlook import Points, counts_of, inputs_of
+from surrogym_server.sampling.outlook import as_if_answered, path_outlook
 
 STARTS = 6  # drawn from the start distribution for each plan
 POPULATION = 48  # action sequences compared at once
 ELITE = 12  # of them that the next generation varies
 GENERATIONS = 3
 DOUBTFUL = 0.25  # chance of an ending that is worth a rollout of its own
-BLOCK = 4_000_000  # numbers in a matrix of covariances at once
 
 Sequences = NDArray[np.float64]  # (k, T, F)
 
@@ -77,7 +69,7 @@ def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random
 
 
 def plan_round(
-    model: GaussianProcessModel, aim: Aim, steps: int, pending: Sequence[Tensor], rng: np.random.Generator
+    model: DynamicsModel, aim: Aim, steps: int, pending: Sequence[Tensor], rng: np.random.Generator
 ) -> list[Tensor]:
     """Sequences that take ``steps`` real steps in all, each as if those before it and the pending were answered."""
     rollouts: list[Tensor] = []
@@ -92,7 +84,7 @@ def plan_round(
     return rollouts
 
 
-def plan_rollout(model: GaussianProcessModel, aim: Aim, rng: np.random.Generator) -> Tensor:
+def plan_rollout(model: DynamicsModel, aim: Aim, rng: np.random.Generator) -> Tensor:
     """The sequence (T, F), 1 <= T <= ``aim.longest``, that gives most per expected real step: shooting, refined by
     varying the best."""
     starts = start_points(model.definition, STARTS, rng)
@@ -106,20 +98,11 @@ def plan_rollout(model: GaussianProcessModel, aim: Aim, rng: np.random.Generator
     return torch.from_numpy(population[best, : int(length[best])])
 
 
-def as_if_done(model: GaussianProcessModel, actions: Tensor, rng: np.random.Generator) -> GaussianProcessModel:
+def as_if_done(model: DynamicsModel, actions: Tensor, rng: np.random.Generator) -> DynamicsModel:
     """The model as if a sequence (T, F) had been answered along a predicted path: variances shrink, means stay."""
     path = predict_paths(model, start_points(model.definition, 1, rng), actions[None])
-    outputs = [_extended(model, column, path) for column in range(len(model.transitions) + 1)]
-    return replace(model, transitions=tuple(outputs[:-1]), reward=outputs[-1])
-
-
-def _extended(model: GaussianProcessModel, column: int, path: Paths) -> OutputModel:
-    output, posterior = output_of(model, column), output_of(model, column).posterior
-    if posterior is not None:
-        x, learns = _inputs(model, column, path)
-        for point in x[0][(learns * path.running)[0] > 0]:
-            posterior = posterior.extend(point, posterior.mean(point[None])[0])
-    return replace(output, posterior=posterior)
+    taken = path.running[0] > 0
+    return as_if_answered(model, PredictedSteps(path.q[0, taken], path.u[0, taken], path.q_next[0, taken]))
 
 
 def start_points(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> Tensor:
@@ -142,7 +125,7 @@ def random_sequences(definition: EnvironmentDefinition, count: int, length: int,
     return sequences
 
 
-def predict_paths(model: GaussianProcessModel, starts: Tensor, actions: Tensor) -> Paths:
+def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor) -> Paths:
     """Mean paths from starts (b, C) under actions (b, T, F)."""
     spread = [scaling(c.sampling)[1] for c in (model.definition.coordinates[i] for i in model.definition.moving)]
     q, running, drift = starts, starts.new_ones(len(starts)), starts.new_zeros(len(starts))
@@ -157,43 +140,24 @@ def predict_paths(model: GaussianProcessModel, starts: Tensor, actions: Tensor) 
     return Paths(*(torch.stack(column, 1) for column in zip(*steps, strict=True)))
 
 
-def path_values(model: GaussianProcessModel, aim: Aim, paths: Paths) -> Tensor:
+def path_values(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
     """What the acquisition gives for each beginning of paths (b, T), summed over the outputs of the aim: (b, T)."""
     acquisition = acquisition_of(model.definition.design.acquisition)
     weight = _weights(model.definition, aim, paths)
     total = torch.zeros_like(weight)
+    steps = PredictedSteps(paths.q, paths.u, paths.q_next)
     for column in aim.columns:
-        output = output_of(model, column)
-        if output.posterior is not None:
-            x, learns = _inputs(model, column, paths)
-            total += acquisition.path_value(_view(output, x, weight * learns, aim.tolerances[column]))
+        if (output := path_outlook(model, steps, column)) is not None:
+            total += acquisition.path_value(_view(output, weight * output.learns, aim.tolerances[column]))
     return total
 
 
-def _view(output: OutputModel, x: Tensor, weight: Tensor, tolerance: float) -> PathView:
-    """One output along paths with inputs x (b, T, d)."""
-    return PathView(
-        tolerance,
-        weight,
-        lambda: output.mean_and_deviation(x.flatten(0, 1))[1].reshape(weight.shape),
-        lambda: _information(output, x, weight, tolerance),
-    )
+def _view(output: PathOutlook, weight: Tensor, tolerance: float) -> PathView:
+    """What an acquisition may know of one output along paths, whose steps count by weight (b, T)."""
+    return PathView(tolerance, weight, lambda: output.deviation, lambda: output.information(weight, tolerance))
 
 
-def _information(output: OutputModel, x: Tensor, weight: Tensor, tolerance: float) -> Tensor:
-    """I(t) of one output after each step, (b, T)."""
-    assert output.posterior is not None
-    room = max(1, BLOCK // (x.shape[1] * (x.shape[1] + len(output.posterior.y))))
-    blocks = zip(torch.split(x, room), torch.split(weight, room), strict=True)
-    ratio = (output.scale / tolerance) ** 2
-    return torch.cat([_log_determinants(ratio * output.posterior.joint_covariance(b), w) for b, w in blocks])
-
-
-def output_of(model: GaussianProcessModel, column: int) -> OutputModel:
-    return (*model.transitions, model.reward)[column]
-
-
-def _worth(model: GaussianProcessModel, aim: Aim, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:
+def _worth(model: DynamicsModel, aim: Aim, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:
     """Information per expected real step of the best beginning of each sequence (k, T, F), and its length, (k,)."""
     count, lanes = len(sequences), len(starts)
     actions = torch.from_numpy(sequences).repeat_interleave(lanes, 0)
@@ -206,7 +170,7 @@ def _worth(model: GaussianProcessModel, aim: Aim, starts: Tensor, sequences: Seq
     return best.values, best.indices + 1
 
 
-def _endings(model: GaussianProcessModel, aim: Aim, paths: Paths) -> Tensor:
+def _endings(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
     """The chance that the model was wrong about an end or the side of a reward's edge on the way, (b, T); also whether
     paths have ended, where ends are declared and none was seen."""
     q, q_next = paths.q.flatten(0, 1), paths.q_next.flatten(0, 1)
@@ -225,22 +189,6 @@ def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tenso
         return weight
     density = log_occupancy(definition, aim.states, paths.q.flatten(0, 1)).exp().reshape(weight.shape)
     return weight * (density / density.max()).sqrt()
-
-
-def _inputs(model: GaussianProcessModel, column: int, paths: Paths) -> tuple[Tensor, Tensor]:
-    """What one output's process reads along paths, (b, T, d), and whether it would learn from it, (b, T) bool."""
-    points, q_next = Points(paths.q.flatten(0, 1), paths.u.flatten(0, 1)), paths.q_next.flatten(0, 1)
-    x = inputs_of(model, output_of(model, column), points, q_next)
-    learns = counts_of(model, column, q_next)
-    return x.reshape(*paths.running.shape, -1), learns.reshape(paths.running.shape)
-
-
-def _log_determinants(covariance: Tensor, weight: Tensor) -> Tensor:
-    """1/2 log det(1 + W S W) of all leading parts of S (b, T, T), W of diagonal weight (b, T): (b, T)."""
-    one = torch.eye(weight.shape[1], dtype=weight.dtype)
-    factor = torch.linalg.cholesky(one + weight[:, :, None] * covariance * weight[:, None, :])
-    halves: Tensor = factor.diagonal(dim1=-2, dim2=-1).log().cumsum(-1)
-    return halves
 
 
 def _varied(definition: EnvironmentDefinition, elite: Sequences, count: int, rng: np.random.Generator) -> Sequences:

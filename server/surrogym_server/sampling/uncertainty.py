@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.environment.points import Points
+from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.candidates import input_probability, under_random_actions
 from surrogym_server.sampling.confidence import certainty, deviations, log_model_uncertainty
-from surrogym_server.sampling.outlook import Points
 
 Array = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ class UncertaintyResult:
 
 
 def query_uncertainty(
-    model: GaussianProcessModel, q: Array, u: Array, tolerances: Array, occupancy: Array | None = None
+    model: DynamicsModel, q: Array, u: Array, tolerances: Array, occupancy: Array | None = None
 ) -> UncertaintyResult:
     """Mean, deviation, U_m, P_i and log U at q (n, C), u (n, F) under tolerances (O,)."""
     at, action = torch.from_numpy(q), torch.from_numpy(u)
@@ -41,7 +41,7 @@ def query_uncertainty(
     return UncertaintyResult(*(p.numpy() for p in parts))
 
 
-def visited_confidence(model: GaussianProcessModel, states: Array, tolerances: Sequence[float]) -> float:
+def visited_confidence(model: DynamicsModel, states: Array, tolerances: Sequence[float]) -> float:
     """Confidence index (eq. 8, 9) over visited states (v, C) instead of the Monte Carlo set, the smallest over outputs,
     under tolerances (O,): how well a policy's own region is known.
 

@@ -13,8 +13,8 @@ from surrogym_server.engine.fidelity import fidelity_of
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.environment.actions import model_actions
 from surrogym_server.errors import Damaged, InvalidInput
-from surrogym_server.models.gaussian_process.codec.model import from_bytes
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.files import from_bytes
+from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.uncertainty import UncertaintyResult, query_uncertainty
 from surrogym_server.services.definitions import Definitions, check_coordinates, check_points
 from surrogym_server.services.notices import Notices
@@ -38,7 +38,7 @@ class Said(Generic[T]):
     result: T
 
 
-def load_model(storage: Storage, definitions: Definitions, surrogate: int, version: int) -> GaussianProcessModel:
+def load_model(storage: Storage, definitions: Definitions, surrogate: int, version: int) -> DynamicsModel:
     """A stored model of a surrogate's id, ready to predict.
 
     Raises:
@@ -138,7 +138,7 @@ class ModelService:
         actions = model_actions(model.definition.action, u)
         return Said(version, model.definition.outputs, imagine(model, start, actions, draws=draws, seed=seed))
 
-    def _model(self, name: str, version: int | None) -> tuple[int, GaussianProcessModel]:
+    def _model(self, name: str, version: int | None) -> tuple[int, DynamicsModel]:
         surrogate = self._storage.surrogates.get(name).id
         version = self._models.refresh(surrogate) if version is None else version
         return version, self._models.get(surrogate, version)

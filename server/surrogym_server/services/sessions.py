@@ -40,6 +40,7 @@ from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import SavedSession
 from surrogym_server.tensors import CPU
 from surrogym_server.virtual import VirtualSettings, expected_bytes
+from surrogym_server.virtual.paths import function_draws
 
 logger = logging.getLogger(__name__)
 
@@ -252,7 +253,7 @@ class SessionService:
         id = self._storage.surrogates.get(surrogate).id
         version = self._models.refresh(id) if opening.model == "latest" else opening.model
         model = self._models.get(id, version)
-        return expected_bytes(self._definitions.get(surrogate), opening.settings, model.path_size)
+        return expected_bytes(self._definitions.get(surrogate), opening.settings, function_draws(model).path_size)
 
     def _open(self, surrogate: str, opening: Opening, digest: str) -> Session:
         definition = self._definitions.get(surrogate).on(self._device)
@@ -279,7 +280,7 @@ class SessionService:
             u,
             mask,
             deviations,
-            lambda version: self._models.get(session.surrogate_id, version).on(self._device),
+            lambda version: self._models.get(session.surrogate_id, version, self._device),
             self._latest(session),
         )
 

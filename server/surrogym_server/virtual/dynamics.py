@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
@@ -10,7 +11,8 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.step_rules import paid
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.port import DynamicsModel
+from surrogym_server.virtual.paths import function_draws
 
 Weighting = Literal["inverse_variance", "uniform"]
 WEIGHT_FLOOR = 1e-12  # of the reward's variance, so that a certain particle's weight stays finite
@@ -29,7 +31,7 @@ class Moved:
 
 
 def move_mean(
-    model: GaussianProcessModel,
+    model: DynamicsModel,
     q: Tensor,
     u: Tensor,
     penalty: float,
@@ -40,12 +42,11 @@ def move_mean(
 ) -> Moved:
     """AUR-D: q (N, C) under u (N, F) goes to the mean of the next state, or along each lane's own function, ``paths``
     (N, W); ``process`` (N, M), standard normal, adds the learned noise."""
-    transition = model.transition(
-        q, u, process=process, paths=paths, deviations=deviations, reward_deviation=deviations or penalty > 0
-    )
+    step = model.transition if paths is None else partial(function_draws(model).transition_along, paths)
+    transition = step(q, u, process=process, deviations=deviations, reward_deviation=deviations or penalty > 0)
     over, spread = model.terminated(transition.q_next), transition.reward_deviation
     mean = paid(model.terminal_reward, transition.reward, over)
-    reward = mean if spread is None else mean - penalty * spread
+    reward = mean if spread is None else penalised(mean, penalty, spread)
     all_deviations = None
     if transition.deviation is not None and spread is not None:
         all_deviations = torch.cat([transition.deviation, spread[:, None]], -1)
@@ -53,7 +54,7 @@ def move_mean(
 
 
 def move_particles(
-    model: GaussianProcessModel,
+    model: DynamicsModel,
     particles: Tensor,
     u: Tensor,
     penalty: float,
@@ -81,17 +82,23 @@ def move_particles(
     output = mean_state(model.definition, moved)
     over = model.terminated(output)
     mean = paid(model.terminal_reward, transition.reward, over.repeat_interleave(count))
-    weight = _weights(spread.reshape(lanes, count), model.reward.scale, weighting)
-    deviation = torch.cat([transition.deviation, spread[:, None]], -1).reshape(lanes, count, len(model.transitions) + 1)
-    penalised = (mean - penalty * spread).reshape(lanes, count)
+    weight = _weights(spread.reshape(lanes, count), model.scales[-1], weighting)
+    deviation = torch.cat([transition.deviation, spread[:, None]], -1).reshape(
+        lanes, count, len(model.definition.outputs)
+    )
     return Moved(
         output,
         moved,
         (weight * mean.reshape(lanes, count)).sum(1),
-        (weight * penalised).sum(1),
+        (weight * penalised(mean, penalty, spread).reshape(lanes, count)).sum(1),
         over,
         deviation.square().mean(1).sqrt(),
     )
+
+
+def penalised(reward: Tensor, penalty: float, deviation: Tensor) -> Tensor:
+    """Rewards (m,) less ``penalty`` of their deviations (m,)."""
+    return reward - penalty * deviation  # eq. 14
 
 
 def mean_state(definition: EnvironmentDefinition, particles: Tensor) -> Tensor:
@@ -103,7 +110,7 @@ def mean_state(definition: EnvironmentDefinition, particles: Tensor) -> Tensor:
     return mean
 
 
-def _weights(spread: Tensor, scale: float, weighting: Weighting) -> Tensor:
+def _weights(spread: Tensor, scale: Tensor, weighting: Weighting) -> Tensor:
     """Normalised weights (N, P) of particles whose rewards deviate by spread (N, P)."""
     if weighting == "uniform":
         return torch.full_like(spread, 1 / spread.shape[1])

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput, NotReset
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual.dynamics import Moved, Weighting, move_mean, move_particles
 from surrogym_server.virtual.lanes import ENDED, EVERY, NEW, RUNNING, Chosen, LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
@@ -108,7 +108,7 @@ def reset(
 
 @torch.inference_mode()  # its tensors keep no account of themselves for a gradient: a sixth less time
 def step(
-    model: GaussianProcessModel,
+    model: DynamicsModel,
     settings: VirtualSettings,
     lanes: LaneState,
     u: Floats,
@@ -175,10 +175,8 @@ def _divided(settings: VirtualSettings, lanes: LaneState, chosen: Chosen) -> tup
     return chosen & ~waiting, waiting
 
 
-def _move(
-    model: GaussianProcessModel, settings: VirtualSettings, lanes: LaneState, u: Tensor, deviations: bool
-) -> Moved:
-    outputs, particles = len(model.transitions), lanes.particles.shape[1]
+def _move(model: DynamicsModel, settings: VirtualSettings, lanes: LaneState, u: Tensor, deviations: bool) -> Moved:
+    outputs, particles = len(model.definition.outputs) - 1, lanes.particles.shape[1]
     process = normal_noise(lanes, Purpose.PROCESS, max(particles, 1), outputs) if settings.process_noise else None
     if settings.variant == "probabilistic":
         noise = None
@@ -196,7 +194,7 @@ def _move(
     )
 
 
-def _untrusted(model: GaussianProcessModel, settings: VirtualSettings, moved: Moved) -> Tensor | None:
+def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> Tensor | None:
     """Which lanes (N,) left the trusted range: some output deviates by more than ``trust`` of its own deviations."""
     if settings.trust is None:
         return None

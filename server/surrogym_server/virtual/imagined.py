@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual.environment import VirtualSettings, create, step
 from surrogym_server.virtual.lanes import RUNNING
 
@@ -32,7 +32,7 @@ class Imagined:
     draws: tuple[ImaginedEpisode, ...]
 
 
-def imagine(model: GaussianProcessModel, q: Array, u: Array, *, draws: int, seed: int) -> Imagined:
+def imagine(model: DynamicsModel, q: Array, u: Array, *, draws: int, seed: int) -> Imagined:
     """Episodes from q (C,) under u (T, F), the model's actions. The same seed draws the same functions."""
     mean = _episodes(model, VirtualSettings(1, autoreset_mode="disabled"), q, u, seed)[0]
     if not draws:
@@ -42,7 +42,7 @@ def imagine(model: GaussianProcessModel, q: Array, u: Array, *, draws: int, seed
 
 
 def _episodes(
-    model: GaussianProcessModel, settings: VirtualSettings, q: Array, u: Array, seed: int
+    model: DynamicsModel, settings: VirtualSettings, q: Array, u: Array, seed: int
 ) -> tuple[ImaginedEpisode, ...]:
     count = settings.num_envs
     lanes = create(model.definition, settings, seed)

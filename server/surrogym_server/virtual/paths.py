@@ -1,15 +1,60 @@
-"""Variant ``pathwise``: each episode of a lane follows one function drawn from the posterior (TS-infinity of PETS)."""
+"""Variant ``pathwise``: each episode of a lane follows one function drawn from what the model believes (TS-infinity of
+PETS)."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from torch import Tensor
+
+from surrogym_server.models.abilities import FunctionDraws, offers
+from surrogym_server.models.port import DynamicsModel, Transition
 from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
 
 
-def with_paths(model: GaussianProcessModel, lanes: LaneState) -> LaneState:
+def function_draws(model: DynamicsModel) -> FunctionDraws:
+    """What draws functions of a model: itself, or the fallback for a family that draws none."""
+    return offers(model, FunctionDraws) or ConstantErrors(model)
+
+
+@dataclass(frozen=True)
+class ConstantErrors(FunctionDraws):
+    """Functions that lie the same number of deviations from the mean everywhere; the reward's is its mean.
+
+    A draw is one standard normal number for each transition output.
+    """
+
+    model: DynamicsModel
+
+    @property
+    def path_size(self) -> int:
+        return len(self.model.definition.outputs) - 1
+
+    def draw(self, noise: Tensor) -> Tensor:
+        return noise
+
+    def transition_along(
+        self,
+        paths: Tensor,
+        q: Tensor,
+        u: Tensor,
+        *,
+        process: Tensor | None = None,
+        deviations: bool = False,
+        reward_deviation: bool = False,
+    ) -> Transition:
+        return self.model.transition(
+            q,
+            u,
+            noise=paths[:, : self.path_size],
+            process=process,
+            deviations=deviations,
+            reward_deviation=reward_deviation,
+        )
+
+
+def with_paths(model: DynamicsModel, lanes: LaneState) -> LaneState:
     """Lanes whose functions are drawn: those in the first step of their episode draw it now, under its model.
 
     A draw is a pure function of model, seed, lane and episode. It is kept in the state all the same: solving for other
@@ -18,7 +63,7 @@ def with_paths(model: GaussianProcessModel, lanes: LaneState) -> LaneState:
     fresh = lanes.elapsed == 0
     if not bool(fresh.any()):
         return lanes
-    drawing = lanes.take(fresh)
-    noise = normal_noise(drawing, Purpose.PATH, 1, model.path_size)[:, 0]
-    drawn = replace(drawing, path=model.draw(noise))
+    drawing, draws = lanes.take(fresh), function_draws(model)
+    noise = normal_noise(drawing, Purpose.PATH, 1, draws.path_size)[:, 0]
+    drawn = replace(drawing, path=draws.draw(noise))
     return drawn if len(drawn) == len(lanes) else lanes.put(fresh, drawn)

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from surrogym_server.environment.step_rules import paid
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.port import DynamicsModel
 
 Array = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ class PointPrediction:
     terminated: NDArray[Any]  # (n,) bool
 
 
-def predict_points(model: GaussianProcessModel, q: Array, u: Array) -> PointPrediction:
+def predict_points(model: DynamicsModel, q: Array, u: Array) -> PointPrediction:
     """One mean step from each of q (n, C) under u (n, F)."""
     at, action = torch.from_numpy(q), torch.from_numpy(u)
     predicted = model.transition(at, action, reward_deviation=True)

@@ -16,11 +16,19 @@ from surrogym_shared.spec.rewards import AnyReward, DeclaredReward, Reward, Succ
 from surrogym_shared.spec.terms import AllOf, ObservationEntry, Term, Termination
 
 
-class AcquisitionChoice(Frozen):
-    """An acquisition with settings of its own."""
+class Choice(Frozen):
+    """One of several, by its name, with settings of its own."""
 
     name: Name
     settings: dict[Name, StrictBool | StrictInt | StrictFloat | StrictStr] = Field(default_factory=dict, max_length=64)
+
+
+class AcquisitionChoice(Choice):
+    """An acquisition with settings of its own."""
+
+
+class ModelChoice(Choice):
+    """A family of models with settings of its own."""
 
 
 class Design(Frozen):
@@ -36,7 +44,8 @@ class Design(Frozen):
     variance most over the range and where policies went; ``variance``, where the deviation is largest;
     ``uncertainty_index``, the paper's (eq. 12); ``latin_hypercube``: the whole budget is one, whatever ``initial``
     says, and only what is asked for beyond it is chosen, in the largest gaps; or one of a package that is installed
-    beside the server. ``monte_carlo`` points estimate the confidence index (eq. 8).
+    beside the server. ``model`` is the family of models that is learned: ``gaussian_process``, the default, or one of a
+    package that is installed beside the server. ``monte_carlo`` points estimate the confidence index (eq. 8).
     """
 
     preset: Literal["default", "paper"] = "default"
@@ -44,6 +53,7 @@ class Design(Frozen):
     initial: Annotated[int, Field(ge=2, le=100_000, strict=True)] | None = None
     target: Annotated[float, Field(gt=0.5, lt=1, strict=True)] = 0.999
     acquisition: Name | AcquisitionChoice | None = None
+    model: Name | ModelChoice | None = None
     tolerance: Literal["relative", "raw"] | None = None
     monte_carlo: Annotated[int, Field(ge=16, le=100_000, strict=True)] | None = None
     symmetry: Literal["auto", "none"] = "auto"

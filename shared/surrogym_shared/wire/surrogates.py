@@ -39,11 +39,13 @@ class OutputFidelity(Reply):
     confidence_index_paper: float = Field(description="mean Phi(1 / deviation): the paper's, in raw units")
     tolerance: float
     coverage: float = Field(description="share of the Monte Carlo set whose deviation is below the tolerance")
-    leave_one_out_error: float = Field(description="root mean square, in the output's unit")
+    leave_one_out_error: float | None = Field(
+        description="root mean square, in the output's unit; None where the family of models can't tell"
+    )
     leave_one_out_within_one: float | None = Field(
         default=None,
         description="share of the samples that the model without them predicts within one of its deviations: near 0.68 "
-        "where the deviations tell the truth; None for a model fitted before this was counted",
+        "where the deviations tell the truth; None where the error is, and for a model fitted before this was counted",
     )
     leave_one_out_within_two: float | None = Field(default=None, description="the same within two deviations: 0.95")
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from support.models import learn
 from support.real_steps import random_steps
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_client.policies import read_card
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.models.gaussian_process.codec.model import to_bytes
-from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_server.models.files import to_bytes
 from surrogym_shared.network import Network
 
 

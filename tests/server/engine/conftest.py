@@ -13,8 +13,8 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
 from surrogym_server.engine.session import Session, open_session
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.models.gaussian_process.codec.model import from_bytes
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.files import from_bytes
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.virtual import VirtualSettings
 from surrogym_shared.spec import EnvironmentSpec
 

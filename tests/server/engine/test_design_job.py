@@ -12,7 +12,7 @@ from support.real_steps import answer
 from surrogym_client.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, initial_queries, run_design_job
-from surrogym_server.models.gaussian_process.codec.model import from_bytes
+from surrogym_server.models.files import from_bytes
 from surrogym_shared.spec import Design
 from surrogym_shared.wire import Fidelity
 

@@ -5,11 +5,19 @@ from __future__ import annotations
 from typing import Any, cast
 
 import pytest
+import torch
 
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.errors import Damaged, NoModel
 
 A, NOBODY = 7, 8
+
+
+class Named(str):
+    """A model that is its own name, and says where it lives."""
+
+    def on(self, device: torch.device) -> Named:
+        return Named(f"{self} on {device}")
 
 
 class Store:
@@ -24,7 +32,7 @@ class Store:
         self.loaded.append((surrogate, version))
         if version in self.damaged:
             raise Damaged(f"model {version}")
-        return f"{surrogate} {version}"
+        return Named(f"{surrogate} {version}")
 
 
 @pytest.fixture
@@ -40,6 +48,14 @@ def cache(store: Store) -> ModelCache:
 def test_a_model_is_loaded_once(cache: ModelCache, store: Store):
     assert [cast(str, cache.get(A, 1)) for _ in range(3)] == [f"{A} 1"] * 3
     assert store.loaded == [(A, 1)]
+
+
+def test_a_model_is_moved_to_a_device_once_and_forgotten_there_too(cache: ModelCache, store: Store):
+    meta = torch.device("meta")
+    moved = cache.get(A, 1, meta)
+    assert (cast(str, moved), cache.get(A, 1, meta) is moved, store.loaded) == (f"{A} 1 on meta", True, [(A, 1)])
+    cache.forget(A)
+    assert cache.get(A, 1, meta) is not moved
 
 
 def test_the_least_recently_used_is_dropped(cache: ModelCache, store: Store):

@@ -22,7 +22,7 @@ from surrogym_server.engine.session import (
 )
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import Damaged, InvalidInput, SeqConflict
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_shared.port import StepResult
 
 Open = Callable[..., Session]

@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
+from support.models import learn
 from support.real_steps import answer, random_steps
 from surrogym_client.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.gaussian_process.learning.learn import learn
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.sampling.design import initial_design
 
 

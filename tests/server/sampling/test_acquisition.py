@@ -9,20 +9,21 @@ from scipy.stats import norm
 
 from surrogym_client.original.classic import cartpole
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.environment.definition import AcquisitionChoice
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.environment.points import Points
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
+from surrogym_server.plugins import Choice
 from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.batch import NEAR, candidate_view, choose, nearest
 from surrogym_server.sampling.candidates import Candidates
 from surrogym_server.sampling.confidence import deviations
-from surrogym_server.sampling.outlook import Outlook, Points
+from surrogym_server.sampling.outlook import outlook_of
 
 TOLERANCES = (0.01, 0.02, 0.1)
 CRITERIA = ("uncertainty_index", "variance", "integrated_variance")
 
 
 def by(model: GaussianProcessModel, criterion: str) -> GaussianProcessModel:
-    design = replace(model.definition.design, acquisition=AcquisitionChoice(criterion))
+    design = replace(model.definition.design, acquisition=Choice(criterion))
     return replace(model, definition=replace(model.definition, design=design))
 
 
@@ -35,11 +36,11 @@ def candidates(points) -> Candidates:
 
 def value(model: GaussianProcessModel, candidates: Candidates, criterion: str, column: int) -> torch.Tensor:
     points = candidates.points
-    outlook = Outlook.of(model, points, candidates.reference, points[:0])
-    output, distance = outlook.outputs[column], torch.ones(len(points), dtype=torch.float64)
+    outlook = outlook_of(model, points, candidates.reference, points[:0])
+    output, distance = outlook[column], torch.ones(len(points), dtype=torch.float64)
     assert output is not None
     view = candidate_view(model, candidates, column, output, TOLERANCES[column], distance)
-    return acquisition_of(AcquisitionChoice(criterion)).value(view)
+    return acquisition_of(Choice(criterion)).value(view)
 
 
 def test_the_index_is_uncertainty_times_probability(model, candidates):

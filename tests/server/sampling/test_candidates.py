@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 import torch
 
+from support.models import learn
 from support.real_steps import random_steps
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.environment.definition import AcquisitionChoice
+from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_server.plugins import Choice
 from surrogym_server.sampling import candidates as candidates_room
 from surrogym_server.sampling.candidates import OCCUPIED, candidates_of, input_probability
 from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.occupancy import log_occupancy
-from surrogym_server.sampling.outlook import Points
 from surrogym_shared.spec import Design
 
 
@@ -46,7 +46,7 @@ def test_the_paper_takes_the_density_of_predicted_next_states(points):
 
 @pytest.mark.parametrize("acquisition", ["uncertainty_index", "integrated_variance", "variance"])
 def test_probabilities_are_computed_for_the_criterion_that_reads_them(model, points, unseen, rng, acquisition):
-    design = dataclasses.replace(model.definition.design, acquisition=AcquisitionChoice(acquisition))
+    design = dataclasses.replace(model.definition.design, acquisition=Choice(acquisition))
     asked = dataclasses.replace(model, definition=dataclasses.replace(model.definition, design=design))
     made = candidates_of(asked, Points(*points), unseen.q, rng)
     reads = acquisition == "uncertainty_index"

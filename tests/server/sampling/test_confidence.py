@@ -11,17 +11,12 @@ import pytest
 import torch
 from scipy.stats import norm
 
+from support.models import learn
 from support.real_steps import join
-from surrogym_server.environment.features import FeatureMap
-from surrogym_server.gp import Hyperparameters, condition
-from surrogym_server.gp.kernel import covariance
-from surrogym_server.models.gaussian_process.learning.learn import learn
-from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.sampling.confidence import (
     certainty,
     confidence,
     deviations,
-    leave_one_out,
     log_model_uncertainty,
 )
 from surrogym_server.sampling.occupancy import log_occupancy
@@ -34,15 +29,15 @@ def tensor(*values: float) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def test_confidence_index_with_a_tolerance_and_as_the_paper_has_it(model):
-    made = confidence(model.reward, tensor(0.1, 0.05, 0.2), tolerance=0.1)
+def test_confidence_index_with_a_tolerance_and_as_the_paper_has_it():
+    made = confidence(tensor(0.1, 0.05, 0.2), 0.1, None)
     assert made.confidence_index == pytest.approx((0.8413447461 + 0.9772498681 + 0.6914624613) / 3, abs=1e-9)
     assert made.confidence_index_paper == pytest.approx((1 + 1 + 0.9999997133) / 3, abs=1e-9)
     assert made.coverage == pytest.approx(2 / 3)
 
 
-def test_confidence_of_the_papers_tolerance_is_the_papers(model):
-    made = confidence(model.reward, tensor(1.0, 2.0), tolerance=1.0)
+def test_confidence_of_the_papers_tolerance_is_the_papers():
+    made = confidence(tensor(1.0, 2.0), 1.0, None)
     assert made.confidence_index == made.confidence_index_paper == pytest.approx((0.8413447461 + 0.6914624613) / 2)
 
 
@@ -63,39 +58,6 @@ def test_small_uncertainties_stay_ordered_where_one_minus_phi_is_zero():
     log_u = log_model_uncertainty(deviation, 1.0)
     assert torch.all(log_u.diff() < 0)
     np.testing.assert_allclose(log_u.numpy(), norm.logsf([9, 10, 20, 100]), rtol=1e-9)
-
-
-def test_leave_one_out_error_is_of_models_that_never_saw_the_point(definition, few, unseen):
-    samples = join(few, replace(unseen, **{n: getattr(unseen, n)[:5] for n in unseen.__dataclass_fields__}))
-    reward = learn(definition, samples).model.reward
-    posterior, errors, deviations = reward.posterior, [], []
-    for i in range(len(posterior.y)):
-        others = torch.arange(len(posterior.y)) != i
-        k = posterior.factor @ posterior.factor.T
-        weights = torch.linalg.solve(k[others][:, others], posterior.y[others])
-        errors.append(float(k[i, others] @ weights - posterior.y[i]))
-        known = k[i, others] @ torch.linalg.solve(k[others][:, others], k[others, i])
-        deviations.append(float((k[i, i] - known).sqrt()))
-    expected = reward.scale * float(np.sqrt(np.mean(np.square(errors))))
-    error, within_one, within_two = leave_one_out(reward)
-    assert error == pytest.approx(expected, rel=1e-4)
-    assert within_one == np.mean(np.abs(errors) <= deviations)
-    assert within_two == np.mean(np.abs(errors) <= 2 * np.array(deviations))
-    assert leave_one_out(replace(reward, posterior=None)) == (0.0, 1.0, 1.0)
-
-
-def test_deviations_that_tell_the_truth_hold_two_thirds_and_nineteen_in_twenty():
-    """A process whose data are its own draws is right about its errors."""
-    generator = torch.Generator().manual_seed(0)
-    x = 4 * torch.rand(300, 1, generator=generator, dtype=torch.float64)
-    hyper = Hyperparameters(torch.tensor([0.5]).double(), 1.0, 0.0, 0.0, 0.01)
-    k = covariance(hyper, x, x) + 0.01 * torch.eye(300, dtype=torch.float64)
-    y = torch.linalg.cholesky(k) @ torch.randn(300, generator=generator, dtype=torch.float64)
-    drawn = OutputModel("y", FeatureMap(), condition(hyper, x, y), 0.0, 1.0)
-    error, within_one, within_two = leave_one_out(drawn)
-    assert error == pytest.approx(0.1, rel=0.1)
-    assert within_one == pytest.approx(0.68, abs=0.05)
-    assert within_two == pytest.approx(0.95, abs=0.025)
 
 
 def test_query_uncertainty_says_all_of_it(model, points, unseen):

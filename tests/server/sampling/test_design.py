@@ -12,6 +12,7 @@ from support.real_steps import answer, join, random_steps
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition, wrap
+from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.sampling import batch
 from surrogym_server.sampling.batch import NEAR, nearest
@@ -27,7 +28,6 @@ from surrogym_server.sampling.design import (
     sizes_of,
     usual_tolerances,
 )
-from surrogym_server.sampling.outlook import Points
 from surrogym_shared.spec import Design, EnvironmentSpec
 
 NEVER = DesignState(1, (1e-12,) * 3)  # tolerances that no model reaches
@@ -99,14 +99,14 @@ def test_tolerances_are_frozen_after_the_first_round_and_rounds_are_counted(defi
     two = advance(definition, random_steps(pendulum(), 8, seed=2), one, request()).state
     assert two.usual == one.usual
     assert (one.round, two.round) == (1, 2)
-    assert set(one.thetas) <= set(two.thetas)
+    assert set(one.warm) <= set(two.warm)
 
 
 def test_a_state_survives_json(definition, few):
     state = advance(definition, few, DesignState(), request()).state
     again = DesignState.from_json(json.loads(json.dumps(state.to_json())))
     assert (again.round, again.usual) == (state.round, state.usual)
-    assert all(np.array_equal(again.thetas[key], state.thetas[key]) for key in state.thetas)
+    assert all(np.array_equal(again.warm[key], state.warm[key]) for key in state.warm)
     assert DesignState.from_json({}) == DesignState()
 
 
@@ -291,6 +291,7 @@ def still(steps: Samples, outputs: str) -> Samples:
 SURE = OutputConfidence(0.9995, 0.9995, 1.0, 0.5, 0.68, 0.95)
 UNSURE = replace(SURE, confidence_index=0.9985)
 SURPRISED = replace(SURE, leave_one_out_error=1.5)
+UNTESTED = replace(SURE, leave_one_out_error=None)
 
 
 @pytest.mark.parametrize(
@@ -299,10 +300,13 @@ SURPRISED = replace(SURE, leave_one_out_error=1.5)
         ("default", (SURE, SURE, SURE), 15, "ready"),
         ("default", (SURE, UNSURE, SURE), 15, "continue"),
         ("default", (SURE, SURPRISED, SURE), 15, "continue"),
+        ("default", (SURE, UNTESTED, SURE), 15, "continue"),
+        ("default", (UNTESTED, UNTESTED, UNTESTED), 20, "over_budget"),
         ("default", (SURE, SURE, SURE), 14, "continue"),
         ("default", (SURE, UNSURE, SURE), 20, "over_budget"),
         ("default", (SURE, SURE, SURE), 20, "ready"),
         ("paper", (SURE, SURPRISED, SURE), 10, "ready"),
+        ("paper", (UNTESTED, UNTESTED, UNTESTED), 10, "ready"),
         ("paper", (SURE, UNSURE, SURE), 10, "continue"),
         ("paper", (SURE, UNSURE, SURE), 21, "over_budget"),
     ],

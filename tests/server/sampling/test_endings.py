@@ -3,15 +3,15 @@
 import pytest
 import torch
 
+from support.models import learn
 from support.plane import drifting, plane
 from support.real_steps import answer, join, random_steps
 from surrogym_client.original.classic import cartpole
 from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.gaussian_process.learning.learn import learn
 from surrogym_server.sampling.design import DesignState, Request, advance, initial_design
 from surrogym_server.sampling.endings import ending, in_doubt
-from surrogym_server.sampling.outlook import Points
 from surrogym_server.virtual.environment import VirtualSettings, create, reset, step
 
 LEARNED = cartpole().model_copy(update={"termination": "learned"})

@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 import torch
 
+from support.models import learn
 from support.real_steps import random_steps
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.features import encode
-from surrogym_server.models.gaussian_process.learning.learn import learn
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.environment.points import Points
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.sampling.confidence import deviations
 from surrogym_server.sampling.latin_hypercube import random_points
-from surrogym_server.sampling.outlook import Outlook, Points
+from surrogym_server.sampling.outlook import outlook_of
 from surrogym_shared.spec import Reward
 
 NOTHING = slice(0)
@@ -43,27 +44,27 @@ def answered(model: GaussianProcessModel, query: Points) -> GaussianProcessModel
 
 
 def test_it_begins_with_the_deviations_of_the_model(model, candidates):
-    outlook = Outlook.of(model, candidates, candidates[NOTHING], candidates[NOTHING])
-    said = torch.stack([output.deviation for output in outlook.outputs], -1)
+    outlook = outlook_of(model, candidates, candidates[NOTHING], candidates[NOTHING])
+    said = torch.stack([output.deviation for output in outlook], -1)
     torch.testing.assert_close(said, deviations(model, candidates.q, candidates.u), rtol=1e-6, atol=1e-9)
 
 
 def test_the_reduction_is_what_the_answer_brings(model, candidates, reference):
     weights = torch.arange(1.0, 26.0, dtype=torch.float64) / 325
-    outlook = Outlook.of(model, candidates, reference, candidates[NOTHING])
+    outlook = outlook_of(model, candidates, reference, candidates[NOTHING])
     before = deviations(model, reference.q, reference.u).square()
     for index in range(3):
         after = deviations(answered(model, candidates[index : index + 1]), reference.q, reference.u).square()
         brought = weights @ (before - after)
-        said = torch.stack([output.reduction(weights)[index] for output in outlook.outputs])
+        said = torch.stack([output.reduction(weights)[index] for output in outlook])
         torch.testing.assert_close(said, brought, rtol=1e-4, atol=1e-10)
 
 
 def test_queries_assumed_and_candidates_observed_do_the_same(model, candidates, reference):
     weights = torch.full((25,), 1 / 25, dtype=torch.float64)
-    observed = Outlook.of(model, candidates, reference, candidates[NOTHING]).observe(4).observe(9)
-    assumed = Outlook.of(model, candidates, reference, candidates[[4, 9]])
-    for one, other in zip(observed.outputs, assumed.outputs, strict=True):
+    observed = [o.observe(4).observe(9) for o in outlook_of(model, candidates, reference, candidates[NOTHING])]
+    assumed = outlook_of(model, candidates, reference, candidates[[4, 9]])
+    for one, other in zip(observed, assumed, strict=True):
         torch.testing.assert_close(one.deviation, other.deviation, rtol=1e-6, atol=1e-9)
         torch.testing.assert_close(one.reduction(weights), other.reduction(weights), rtol=1e-5, atol=1e-12)
 
@@ -72,24 +73,24 @@ def test_an_answer_at_a_bound_teaches_the_dynamics_nothing(model):
     """It is left out of the processes, so asking for it would not lower their deviations."""
     q = torch.tensor([[1.5, 7.9], [1.5, 0.0]], dtype=torch.float64)
     points = Points(q, torch.full((2, 1), 2.0, dtype=torch.float64))
-    theta, speed, reward = Outlook.of(model, points, points[NOTHING], points[NOTHING]).outputs
-    assert speed.counts.tolist() == [False, True]
-    assert reward.counts.tolist() == [True, True]
+    theta, speed, reward = outlook_of(model, points, points[NOTHING], points[NOTHING])
+    assert speed.learns.tolist() == [False, True]
+    assert reward.learns.tolist() == [True, True]
     torch.testing.assert_close(speed.observe(0).deviation, speed.deviation)
     assert speed.observe(1).deviation[1] < speed.deviation[1]
-    assert theta.counts.tolist() == [model.transitions[0].feature_map.lead, True]
+    assert theta.learns.tolist() == [model.transitions[0].feature_map.lead, True]
 
 
 def test_an_output_that_never_varied_has_no_outlook():
     steps = random_steps(cartpole(), 12, seed=0)
     model = learn(definition_from_spec(cartpole()), steps).model
     points = Points(steps.q, steps.u)
-    assert Outlook.of(model, points, points, points).observe(0).outputs[-1] is None
+    assert outlook_of(model, points, points, points)[-1] is None
 
 
 def test_a_reward_after_the_step_is_known_where_the_step_leads(candidates):
     spec = pendulum().model_copy(update={"reward": Reward(timing="after")})
     model = learn(definition_from_spec(spec), random_steps(spec, 12, seed=0)).model
-    outlook = Outlook.of(model, candidates, candidates[NOTHING], candidates[NOTHING])
+    outlook = outlook_of(model, candidates, candidates[NOTHING], candidates[NOTHING])
     expected = deviations(model, candidates.q, candidates.u)[:, -1]
-    torch.testing.assert_close(outlook.outputs[-1].deviation, expected, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(outlook[-1].deviation, expected, rtol=1e-6, atol=1e-9)

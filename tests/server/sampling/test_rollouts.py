@@ -8,17 +8,19 @@ import numpy as np
 import pytest
 import torch
 
+from support.models import learn
 from support.plane import drifting, plane
 from support.real_steps import join, roll
 from surrogym_client.original.classic import acrobot, cartpole, pendulum
 from surrogym_server.convert import default_budget, definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.gaussian_process.learning.learn import learn
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.abilities import PredictedSteps
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.prediction.lookahead import process_inputs
 from surrogym_server.sampling.confidence import deviations
 from surrogym_server.sampling.design import DesignState, Request, advance, initial_rollouts
-from surrogym_server.sampling.outlook import Points
 from surrogym_server.sampling.rollouts import (
     Aim,
     as_if_done,
@@ -109,7 +111,7 @@ def test_information_is_that_of_points_each_after_those_before_it(model: Gaussia
     posterior = model.reward.posterior
     assert posterior is not None
     tolerance = aim.tolerances[2] / model.reward.scale
-    x = _reward_inputs(model, paths.q[0], paths.u[0], paths.q_next[0])
+    x = process_inputs(model.definition, model.reward, PredictedSteps(paths.q[0], paths.u[0], paths.q_next[0]))
     joint = posterior.joint_covariance(x[None])[0]
     expected, known = [], 0.0
     for t in range(6):
@@ -119,12 +121,6 @@ def test_information_is_that_of_points_each_after_those_before_it(model: Gaussia
         expected.append(known)
     got = path_values(model, replace(aim, columns=(2,)), paths)
     torch.testing.assert_close(got[0], torch.tensor(expected, dtype=torch.float64), rtol=1e-6, atol=1e-9)
-
-
-def _reward_inputs(model, q, u, q_next):
-    from surrogym_server.sampling.outlook import inputs_of
-
-    return inputs_of(model, model.reward, Points(q, u), q_next)
 
 
 def test_a_point_seen_twice_on_a_path_gives_almost_nothing_the_second_time(model: GaussianProcessModel, aim: Aim):

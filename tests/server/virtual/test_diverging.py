@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
+from support.models import learn
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.gaussian_process.learning.learn import learn
 from surrogym_server.virtual import VirtualSettings, create, reset, step
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from support.exact_models import ExactModel, exact_pendulum
+from support.models import learn
 from support.real_steps import random_steps
 from surrogym_client.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.gaussian_process.learning.learn import learn
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.virtual import LaneState, step
 
 ARRAYS = ("observation", "reward", "terminated", "truncated")
@@ -119,3 +120,18 @@ def test_the_reward_follows_a_function_as_well(model, started):
     _, transition = step(model, settings, at(lanes, 2.0, -6.0), np.full((50, 1), 0.5))
     assert transition.reward.std() > 0
     np.testing.assert_array_equal(transition.reward, transition.reward_mean)
+
+
+def test_a_family_that_draws_no_functions_keeps_its_errors_for_the_episode(started):
+    """Each lane lies the same number of deviations from the mean at every step, another in each episode."""
+    exact = exact_pendulum()
+    model = ExactModel(exact.definition, lambda q, _: q.clone(), exact.pay, deviation=0.01)
+    settings, lanes = started(model, 3, variant="pathwise", autoreset_mode="same_step", time_limit=4)
+    moved = [lanes.q[:, 1]]
+    for _ in range(8):
+        lanes, _ = step(model, settings, lanes, np.zeros((3, 1)))
+        moved.append(lanes.q[:, 1])
+    change = torch.stack(moved).diff(dim=0)
+    torch.testing.assert_close(change[1:3], change[:1].expand(2, -1))
+    assert bool((change[0].abs() > 0).all())
+    assert not torch.allclose(change[4], change[0])

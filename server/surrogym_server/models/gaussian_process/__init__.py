@@ -1,1 +1,5 @@
-"""The family of exact Gaussian processes: feature maps and structure chosen by evidence."""
+"""The family of exact Gaussian processes: structure chosen by evidence, every posterior in closed form."""
+
+from surrogym_server.models.gaussian_process.family import GaussianProcesses
+
+__all__ = ["GaussianProcesses"]

@@ -17,7 +17,7 @@ CENTRED = 1e-9  # of its scale: how far from 0 the middle of a range may be
 def reward_candidates(definition: EnvironmentDefinition) -> tuple[FeatureMap, ...]:
     """Maps worth comparing for the reward: of the state before the step, after it, or both, as its timing says.
 
-    Rewards are often told by what the observation combines, such as the way from a tip to its target.
+    Rewards often depend on features that the observation combines, such as the distance to a target.
     """
     timings = {"before": (False,), "after": (True,), "auto": (False, True)}[definition.reward_timing]
     maps = candidates(definition, follows=False, parity="even")
@@ -43,8 +43,6 @@ def candidates(
     maps = tuple(FeatureMap(s, a, lead) for s, a, lead in product(states, actions, leads))
     maps += tuple(replace(m, drift=drift) for m in maps if drift and m.state == "cos_sin")
     maps += (FeatureMap("none", lead=True),) if any(leads) else ()
-    if definition.learning.symmetry == "none":
-        return maps
     mirrored = (replace(m, parity=parity) for m in maps)
     return maps + tuple(m for m in mirrored if reflection(definition, m) is not None)
 

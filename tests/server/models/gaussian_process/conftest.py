@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+from support.models import learn
 from support.real_steps import random_steps
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.gaussian_process.learning.learn import learn
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from support.models import learn
 from support.real_steps import random_steps
 from surrogym_client.original.classic import acrobot, cartpole
 from surrogym_client.original.swingup import swing_up
@@ -13,10 +14,9 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.features import FeatureMap, encode
 from surrogym_server.environment.samples import Samples, increments
 from surrogym_server.errors import InvalidInput
-from surrogym_server.models.gaussian_process.codec.model import from_bytes, to_bytes
+from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.gaussian_process.feature_maps import candidates
 from surrogym_server.models.gaussian_process.learning.angle_prediction import learn_drift
-from surrogym_server.models.gaussian_process.learning.learn import learn
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ from safetensors.torch import load, save
 
 from surrogym_server.environment.features import FeatureMap
 from surrogym_server.errors import InvalidInput
-from surrogym_server.models.gaussian_process.codec.model import from_bytes, to_bytes
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.files import from_bytes, to_bytes
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 
 
 def header_of(data: bytes) -> dict:

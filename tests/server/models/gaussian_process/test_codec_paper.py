@@ -2,8 +2,8 @@
 
 import torch
 
-from surrogym_server.models.gaussian_process.codec.model import from_bytes, to_bytes
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.files import from_bytes, to_bytes
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 
 
 def test_a_model_of_the_paper_survives_storage(paper_model: GaussianProcessModel):

@@ -8,14 +8,14 @@ import pytest
 import torch
 from pydantic import ValidationError
 
+from support.models import learn
 from support.real_steps import random_steps
 from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_client.original.swingup import LENGTH, WIDTH, swing_up_narrow
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
-from surrogym_server.models.gaussian_process.codec.model import from_bytes, to_bytes
-from surrogym_server.models.gaussian_process.learning.learn import learn
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.files import from_bytes, to_bytes
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.sampling.confidence import deviations
 from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Inequality, Quantity, RewardTerm, Term
 

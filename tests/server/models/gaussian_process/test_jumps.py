@@ -7,12 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from support.models import learn
 from support.plane import drifting, plane
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
-from surrogym_server.models.gaussian_process.codec.model import from_bytes, to_bytes
-from surrogym_server.models.gaussian_process.learning.learn import learn
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.files import from_bytes, to_bytes
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 
 
 def in_box(q: torch.Tensor) -> torch.Tensor:

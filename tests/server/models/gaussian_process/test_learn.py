@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from support.models import learn
 from support.real_steps import join, random_steps
 from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
 from surrogym_server.convert import definition_from_spec
@@ -12,8 +13,7 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.environment.step_rules import paid
 from surrogym_server.errors import InvalidInput
 from surrogym_server.gp import sparse
-from surrogym_server.models.gaussian_process.codec.model import from_bytes, to_bytes
-from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_shared.spec import Design
 
 PAPER = pendulum().model_copy(update={"design": Design(preset="paper")})

@@ -7,16 +7,17 @@ import pytest
 import torch
 from safetensors.torch import load, save
 
+from support.models import learn
 from support.real_steps import random_steps
 from surrogym_client.original.classic import acrobot, cartpole
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
-from surrogym_server.models.gaussian_process.codec.model import from_bytes, to_bytes
-from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.learning.region import learn_termination
-from surrogym_server.models.gaussian_process.prediction.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.regions import Classifier, Thresholds
+from surrogym_server.models.gaussian_process.settings import Settings
 from surrogym_server.sampling.endings import unexplored
 from surrogym_server.virtual.single_step import predict_points
 from surrogym_shared.spec import EnvironmentSpec
@@ -46,7 +47,7 @@ def test_cartpole_ends_where_its_pole_has_fallen(model):
 
 def test_where_no_threshold_tells_a_classifier_does():
     spec, steps = ACROBOT, random_steps(ACROBOT, 150, seed=1)
-    region = learn_termination(OutputLearner(definition_from_spec(spec), {}, {}), steps)
+    region = learn_termination(OutputLearner(definition_from_spec(spec), Settings(), {}, {}), steps)
     assert isinstance(region.forms[0][1], Classifier)
     unseen = random_steps(ACROBOT, 500, seed=20_000)
     wrong = ((region.probability(unseen.q_next) > 0.5) != unseen.terminated).double().mean()

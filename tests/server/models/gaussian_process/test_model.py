@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from support.models import learn
 from support.real_steps import random_steps
 from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
 from surrogym_server.convert import definition_from_spec
@@ -12,7 +13,6 @@ from surrogym_server.environment.definition import wrap
 from surrogym_server.environment.features import encode
 from surrogym_server.environment.step_rules import settle
 from surrogym_server.gp import serving
-from surrogym_server.models.gaussian_process.learning.learn import learn
 from surrogym_server.virtual.single_step import predict_points
 
 

@@ -14,8 +14,9 @@ from surrogym_server.environment.features import FeatureMap
 from surrogym_server.gp import FitOptions, Fitted, condition_sparse, fit, spread
 from surrogym_server.models.gaussian_process.feature_maps import reflection
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
+from surrogym_server.models.gaussian_process.settings import Settings
+from surrogym_server.models.port import Warm
 
-Thetas = Mapping[str, NDArray[np.float64]]  # "output|feature map" -> hyperparameters, for warm starts
 # Log odds of maps before any data. A map that reads the lead fits no better where nothing was cut, and alone is right
 # where something is; few samples look like noise over the lead alone; and what is seen of one side alone says nothing
 # of the other, mirrored or not.
@@ -28,8 +29,13 @@ class OutputLearner:
     """Fits processes, each from its warm start, and keeps their hyperparameters."""
 
     definition: EnvironmentDefinition
-    warm: Thetas
-    thetas: dict[str, NDArray[np.float64]]
+    settings: Settings
+    warm: Warm  # hyperparameters of earlier fits by "output|feature map"
+    thetas: dict[str, NDArray[np.float64]]  # those of this one
+
+    def allowed(self, maps: tuple[FeatureMap, ...]) -> tuple[FeatureMap, ...]:
+        """Of these maps those that the settings let compare."""
+        return tuple(m for m in maps if self.settings.symmetry == "auto" or not m.parity)
 
     def output(
         self, name: str, target: Tensor, inputs: Mapping[FeatureMap, Tensor], keep: Tensor, keep_lead: Tensor
@@ -66,7 +72,7 @@ class OutputLearner:
 
     def _options(self, name: str) -> FitOptions:
         """Dynamics tend to be near linear, costs to be quadratic."""
-        if self.definition.learning.kernel == "squared_exponential":
+        if self.settings.kernel == "squared_exponential":
             return FitOptions(linear=False)
         return FitOptions(quadratic=name == REWARD)
 

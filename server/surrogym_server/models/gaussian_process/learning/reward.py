@@ -24,12 +24,12 @@ def learn_reward(learner: OutputLearner, samples: Samples) -> tuple[OutputModel,
         return _declared(known, samples), known.terminal, ()
     inputs = {
         m: encode(definition, m, samples.q_next if m.after else samples.q, samples.u)
-        for m in reward_candidates(definition)
+        for m in learner.allowed(reward_candidates(definition))
     }
     going = ~samples.terminated if int((~samples.terminated).sum()) >= FEW else torch.ones_like(samples.terminated)
     output = learner.output(REWARD, samples.reward, inputs, going, going)
     jumps: tuple[Jump, ...] = ()
-    if definition.learning.reward_jumps:
+    if learner.settings.reward_jumps:
         output, jumps = with_jumps(learner, samples, inputs, going, output)
     ended = ~going
     if not bool(ended.any()):

@@ -39,3 +39,10 @@ def describe(output: OutputModel) -> dict[str, Any]:
                 "unexplained_deviation": output.scale * math.sqrt(prior) * sparse.unexplained,
             }
     return described
+
+
+def structure(output: OutputModel) -> str:
+    """Kernel and inputs of an output, in a few words."""
+    if output.posterior is None:
+        return "constant"
+    return f"{output.posterior.hyper.kernel} on {output.feature_map}"

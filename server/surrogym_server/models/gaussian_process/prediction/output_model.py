@@ -8,6 +8,7 @@ from torch import Tensor
 
 from surrogym_server.environment.features import FeatureMap
 from surrogym_server.gp import Posterior
+from surrogym_server.models.abilities import LeaveOneOutErrors
 
 
 @dataclass(frozen=True)
@@ -37,3 +38,12 @@ class OutputModel:
             return x.new_full(x.shape[:-1], self.centre), x.new_zeros(x.shape[:-1])
         mean, variance = self.posterior.mean_and_variance(x)
         return self.centre + self.scale * mean, self.scale * variance.sqrt()
+
+    def leave_one_out(self) -> LeaveOneOutErrors:
+        """How the process without each sample in turn foretells it. One that never varied makes no error."""
+        if self.posterior is None:
+            return LeaveOneOutErrors(0.0, 1.0, 1.0)
+        mean, variance = self.posterior.leave_one_out()
+        error, deviation = (mean - self.posterior.y).abs(), variance.sqrt()
+        one, two = (float((error <= width * deviation).double().mean()) for width in (1, 2))
+        return LeaveOneOutErrors(float(self.scale * error.square().mean().sqrt()), one, two)

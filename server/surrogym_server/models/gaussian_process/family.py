@@ -1,0 +1,24 @@
+"""GaussianProcesses: the family of exact Gaussian processes, as the registry of models has it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.samples import Samples
+from surrogym_server.models.gaussian_process.codec.model import GaussianProcessCodec
+from surrogym_server.models.gaussian_process.learning.learn import learn
+from surrogym_server.models.gaussian_process.settings import Settings
+from surrogym_server.models.port import Learned, Learner, ModelCodec, Warm
+
+
+@dataclass(frozen=True)
+class GaussianProcesses(Settings, Learner):
+    """One exact process for each output, their structure chosen by evidence. The warm start is hyperparameters."""
+
+    @property
+    def codec(self) -> ModelCodec:
+        return GaussianProcessCodec()
+
+    def learn(self, definition: EnvironmentDefinition, samples: Samples, warm: Warm | None = None) -> Learned:
+        return learn(self, definition, samples, warm or {})

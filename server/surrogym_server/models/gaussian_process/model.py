@@ -1,0 +1,163 @@
+"""GaussianProcessModel: one fit of one environment by exact Gaussian processes. Complete in itself when stored."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.points import Points
+from surrogym_server.environment.step_rules import paid
+from surrogym_server.models.abilities import (
+    Differentiable,
+    FunctionDraws,
+    LeaveOneOut,
+    LeaveOneOutErrors,
+    Lookahead,
+    OutputOutlook,
+    PathOutlook,
+    PredictedSteps,
+    RewardEdges,
+)
+from surrogym_server.models.gaussian_process.censoring import usable
+from surrogym_server.models.gaussian_process.prediction.description import describe, structure
+from surrogym_server.models.gaussian_process.prediction.lookahead import (
+    ProcessAlongPaths,
+    ProcessOutlook,
+    as_if_answered,
+    process_inputs,
+)
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
+from surrogym_server.models.gaussian_process.prediction.predictor import Predictor
+from surrogym_server.models.gaussian_process.prediction.regions import Jump, Region
+from surrogym_server.models.port import DynamicsModel, Transition
+from surrogym_server.tensors import cached
+
+
+@dataclass(frozen=True)
+class GaussianProcessModel(DynamicsModel, FunctionDraws, LeaveOneOut, Lookahead, RewardEdges, Differentiable):
+    """One process for each output; regions for what ends an episode, and for where the reward jumps."""
+
+    definition: EnvironmentDefinition
+    transitions: tuple[OutputModel, ...]  # M, in the order of definition.outputs
+    reward: OutputModel
+    terminal_reward: float  # what a step that ends the episode pays beyond the reward process
+    samples: int
+    digest: str
+    ending: Region | None = None  # where episodes end, if that is learned
+    jumps: tuple[Jump, ...] = ()  # of the reward, beyond its process
+
+    @property
+    def outputs(self) -> tuple[OutputModel, ...]:
+        """All of them, the reward last."""
+        return (*self.transitions, self.reward)
+
+    def transition(
+        self,
+        q: Tensor,
+        u: Tensor,
+        *,
+        noise: Tensor | None = None,
+        process: Tensor | None = None,
+        deviations: bool = False,
+        reward_deviation: bool = False,
+    ) -> Transition:
+        return self._predictor.transition(q, u, noise, process, None, deviations, reward_deviation)
+
+    def means(self, q: Tensor, u: Tensor) -> Tensor:
+        change, q_next, reward = self._predictor.means(q, u)
+        reward = paid(self.terminal_reward, reward, self.terminated(q_next))
+        return torch.cat([change, reward[:, None]], -1)
+
+    def learned_termination(self, q: Tensor) -> Tensor:
+        assert self.ending is not None
+        return self.ending.probability(q)
+
+    @cached
+    def scales(self) -> Tensor:
+        return torch.tensor([o.scale for o in self.outputs], dtype=torch.float64, device=self.definition.device)
+
+    @property
+    def structures(self) -> tuple[str, ...]:
+        return tuple(structure(output) for output in self.outputs)
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """Structure and hyperparameters of every output, for people."""
+        outputs = [describe(o) for o in self.outputs]
+        if self.definition.declared_reward is not None:
+            outputs[-1]["kernel"] = "declared"
+        ending = {} if self.ending is None else {"termination": self.ending.description}
+        jumps = [{"size": jump.size, **jump.region.description} for jump in self.jumps]
+        beyond = {"terminal_reward": self.terminal_reward, "jumps": jumps}
+        return {"outputs": outputs, **beyond, "samples": self.samples, **ending}
+
+    @property
+    def path_size(self) -> int:
+        return self._predictor.path_size
+
+    def draw(self, noise: Tensor) -> Tensor:
+        return self._predictor.draw(noise)
+
+    def transition_along(
+        self,
+        paths: Tensor,
+        q: Tensor,
+        u: Tensor,
+        *,
+        process: Tensor | None = None,
+        deviations: bool = False,
+        reward_deviation: bool = False,
+    ) -> Transition:
+        return self._predictor.transition(q, u, None, process, paths, deviations, reward_deviation)
+
+    def leave_one_out(self) -> tuple[LeaveOneOutErrors, ...]:
+        return tuple(output.leave_one_out() for output in self.outputs)
+
+    def outlook(self, candidates: Points, reference: Points, assumed: Points) -> tuple[OutputOutlook | None, ...]:
+        everywhere = Points.joined([candidates, reference, assumed])
+        steps = PredictedSteps(everywhere.q, everywhere.u, self.transition(everywhere.q, everywhere.u).q_next)
+        spans = (len(candidates), len(candidates) + len(reference))
+        return tuple(
+            None
+            if output.posterior is None
+            else ProcessOutlook.of(
+                output, process_inputs(self.definition, output, steps), self._learns(column, steps.q_next), spans
+            )
+            for column, output in enumerate(self.outputs)
+        )
+
+    def along(self, steps: PredictedSteps, column: int) -> PathOutlook | None:
+        output = self.outputs[column]
+        if output.posterior is None:
+            return None
+        flat, shape = steps.flat, steps.q.shape[:-1]
+        x = process_inputs(self.definition, output, flat)
+        return ProcessAlongPaths(output, x.reshape(*shape, -1), self._learns(column, flat.q_next).reshape(shape))
+
+    def as_if_answered(self, steps: PredictedSteps) -> GaussianProcessModel:
+        outputs = [
+            as_if_answered(output, process_inputs(self.definition, output, steps)[self._learns(column, steps.q_next)])
+            for column, output in enumerate(self.outputs)
+        ]
+        return replace(self, transitions=tuple(outputs[:-1]), reward=outputs[-1])
+
+    def reward_edge_doubts(self, q: Tensor, q_next: Tensor) -> Iterator[Tensor]:
+        state = q_next if self.reward.feature_map.after else q
+        for jump in self.jumps:
+            inside = jump.region.probability(state)
+            yield inside.minimum(1 - inside)
+
+    def _learns(self, column: int, q_next: Tensor) -> Tensor:
+        """Which samples that end at q_next (m, C) an output would learn from, (m,) bool."""
+        if column == len(self.transitions):
+            return ~self.terminated(q_next)
+        return usable(self.definition, column, q_next, self.transitions[column].feature_map)
+
+    @cached
+    def _predictor(self) -> Predictor:
+        return Predictor(self.definition, self.transitions, self.reward, self.jumps)

@@ -1,0 +1,108 @@
+"""What further real steps would do to the deviations of processes, before any of them is answered.
+
+The deviations of a process depend on where it is observed, not on what was seen there. So the outlook after a query
+needs no guess of its answer; only processes that read a predicted value (the lead, the next state of a reward) take the
+prediction of the model at hand.
+
+Of an output the first t points of a predicted path tell
+
+    I(t) = 1/2 log det(1 + W S W / tau^2),
+
+S (t, t) the posterior covariance of the process at these points, tau the output's tolerance, W a diagonal of weights.
+The determinant counts each point after those before it, so a repeat gives nothing.
+Reference: A. Krause, A. Singh, C. Guestrin (2008), JMLR 9, section 2 (information of a set of observations).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.features import encode, leading
+from surrogym_server.gp import Joint
+from surrogym_server.models.abilities import OutputOutlook, PathOutlook, PredictedSteps
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
+
+BLOCK = 4_000_000  # numbers in a matrix of covariances at once
+
+
+@dataclass(frozen=True)
+class ProcessOutlook(OutputOutlook):
+    """One output, in its own unit."""
+
+    joint: Joint  # at candidates, reference and what was assumed, in this order
+    learns: Tensor  # (m,) bool
+    shared: Tensor  # (r, m) covariance of reference and candidates, standardised: kept, so that it is taken once
+    scale: float
+
+    @classmethod
+    def of(cls, output: OutputModel, x: Tensor, learns: Tensor, spans: tuple[int, int]) -> ProcessOutlook:
+        """At inputs x (m + r + p, d): m candidates, r reference points, p points assumed observed."""
+        assert output.posterior is not None
+        joint = Joint.of(output.posterior, x)
+        for index in range(spans[1], len(x)):
+            joint = joint.observe(index) if learns[index] else joint
+        shared = joint.between(slice(*spans), slice(spans[0]))
+        return cls(joint, learns[: spans[0]], shared, output.scale)
+
+    @property
+    def deviation(self) -> Tensor:
+        return self.scale * self.joint.variance[: len(self.learns)].sqrt()
+
+    def reduction(self, weights: Tensor) -> Tensor:
+        """sum_r w_r k(x_r, x)^2 / (k(x, x) + sigma_n^2), Cohn (NIPS 1993), in closed form for a Gaussian process."""
+        spread = self.joint.variance[: len(self.learns)] + self.joint.noise
+        return self.scale**2 * (weights @ self.shared.square()) / spread
+
+    def observe(self, index: int) -> ProcessOutlook:
+        if not self.learns[index]:
+            return self
+        joint = self.joint.observe(index)
+        row, (r, m) = joint.observed[-1], self.shared.shape
+        return replace(self, joint=joint, shared=torch.addr(self.shared, row[m : m + r], row[:m], alpha=-1))
+
+
+@dataclass(frozen=True)
+class ProcessAlongPaths(PathOutlook):
+    """One output along paths."""
+
+    output: OutputModel
+    x: Tensor  # (b, T, d) what its process reads
+    learns: Tensor  # (b, T) bool
+
+    @property
+    def deviation(self) -> Tensor:
+        return self.output.mean_and_deviation(self.x.flatten(0, 1))[1].reshape(self.learns.shape)
+
+    def information(self, weight: Tensor, tolerance: float) -> Tensor:
+        output = self.output
+        assert output.posterior is not None
+        room = max(1, BLOCK // (self.x.shape[1] * (self.x.shape[1] + len(output.posterior.y))))
+        blocks = zip(torch.split(self.x, room), torch.split(weight, room), strict=True)
+        ratio = (output.scale / tolerance) ** 2
+        return torch.cat([_log_determinants(ratio * output.posterior.joint_covariance(b), w) for b, w in blocks])
+
+
+def process_inputs(definition: EnvironmentDefinition, output: OutputModel, steps: PredictedSteps) -> Tensor:
+    """What one output's process reads along steps (..., C): (..., d)."""
+    state = steps.q_next if output.feature_map.after else steps.q
+    return encode(definition, output.feature_map, state, steps.u, steps.q_next[..., leading(definition)])
+
+
+def as_if_answered(output: OutputModel, x: Tensor) -> OutputModel:
+    """The output as if its mean had been observed at inputs x (k, d)."""
+    if (posterior := output.posterior) is not None:
+        for point in x:
+            posterior = posterior.extend(point, posterior.mean(point[None])[0])
+    return replace(output, posterior=posterior)
+
+
+def _log_determinants(covariance: Tensor, weight: Tensor) -> Tensor:
+    """1/2 log det(1 + W S W) of all leading parts of S (b, T, T), W of diagonal weight (b, T): (b, T)."""
+    one = torch.eye(weight.shape[1], dtype=weight.dtype)
+    factor = torch.linalg.cholesky(one + weight[:, :, None] * covariance * weight[:, None, :])
+    halves: Tensor = factor.diagonal(dim1=-2, dim2=-1).log().cumsum(-1)
+    return halves

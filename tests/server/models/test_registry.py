@@ -1,0 +1,46 @@
+"""Families of models are chosen by name; what is unknown or set wrong is refused in words."""
+
+import pytest
+
+from surrogym_client.original.classic import pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.errors import InvalidSpec
+from surrogym_server.models.gaussian_process import GaussianProcesses
+from surrogym_server.models.registry import MODELS, learner_of
+from surrogym_server.plugins import Choice
+from surrogym_shared.spec import Design, ModelChoice
+
+
+def learner(**design: object) -> object:
+    spec = pendulum().model_copy(update={"design": Design.model_validate(design)})
+    return learner_of(definition_from_spec(spec).learning.model)
+
+
+def test_gaussian_processes_are_the_default_and_the_preset_says_how():
+    assert learner() == GaussianProcesses("composite", True, "auto")
+    assert learner(symmetry="none") == GaussianProcesses("composite", True, "none")
+    assert learner(preset="paper", symmetry="none") == GaussianProcesses("squared_exponential", False, "none")
+
+
+def test_settings_of_the_specification_override_those_of_the_preset():
+    chosen = ModelChoice(name="gaussian_process", settings={"reward_jumps": False})
+    assert learner(model=chosen) == GaussianProcesses("composite", False, "auto")
+    assert learner(model="gaussian_process") == learner()
+
+
+@pytest.mark.parametrize(
+    ("choice", "said"),
+    [
+        (Choice("nobody"), "model: expected one of gaussian_process.*, got 'nobody'"),
+        (Choice("gaussian_process", (("depth", 3.0),)), "expected as settings one of kernel, reward_jumps, symmetry"),
+        (Choice("gaussian_process", (("kernel", "cubic"),)), "kernel to be one of composite, squared_exponential"),
+        (Choice("gaussian_process", (("reward_jumps", 1.0),)), "reward_jumps to be true or false, got 1.0"),
+    ],
+)
+def test_what_is_unknown_or_set_wrong_is_refused(choice, said):
+    with pytest.raises(InvalidSpec, match=said):
+        learner_of(choice)
+
+
+def test_names_are_listed():
+    assert MODELS.names[0] == "gaussian_process"

@@ -1,0 +1,87 @@
+"""A family with none of the abilities is asked as its fallbacks say: by distance, step by step, without tests."""
+
+import numpy as np
+import pytest
+import torch
+
+from support.exact_models import exact_pendulum
+from surrogym_server.environment.features import distances
+from surrogym_server.environment.points import Points
+from surrogym_server.models.abilities import LeaveOneOut, PredictedSteps, offers
+from surrogym_server.models.port import DynamicsModel
+from surrogym_server.sampling.batch import choose
+from surrogym_server.sampling.candidates import Candidates
+from surrogym_server.sampling.confidence import confidences_of, deviations
+from surrogym_server.sampling.endings import edge_in_doubt
+from surrogym_server.sampling.outlook import as_if_answered, outlook_of, path_outlook
+from surrogym_server.sampling.rollouts import Aim, plan_round
+
+TOLERANCES = [0.1, 0.1, 0.1]
+
+
+@pytest.fixture
+def plain() -> DynamicsModel:
+    """It deviates by 0.5 in both coordinates, and more in the reward the farther from 0 the speed is."""
+    exact = exact_pendulum()
+    return type(exact)(exact.definition, exact.move, exact.pay, 0.5, lambda q: 0.1 * q[:, 1].abs())
+
+
+@pytest.fixture
+def candidates(points) -> Points:
+    return Points(*points)
+
+
+def test_leave_one_out_errors_are_unknown(plain, candidates):
+    assert offers(plain, LeaveOneOut) is None
+    judged = confidences_of(plain, deviations(plain, candidates.q, candidates.u), TOLERANCES)
+    assert {(j.leave_one_out_error, j.leave_one_out_within_one) for j in judged} == {(None, None)}
+
+
+def test_an_answer_is_worth_what_lies_near_it(plain, candidates):
+    reference = candidates[30:]
+    outlook = outlook_of(plain, candidates, reference, candidates[:0])[2]
+    torch.testing.assert_close(outlook.deviation, 0.1 * candidates.q[:, 1].abs())
+    here = torch.zeros(30, dtype=torch.float64)
+    here[4] = 1.0
+    reduction = outlook.reduction(here)
+    assert int(reduction.argmax()) == 34
+    assert float(reduction[34]) == pytest.approx(float(outlook.deviation[34]) ** 2)
+    after = outlook.observe(34)
+    assert float(after.deviation[34]) == 0
+    assert bool((after.deviation <= outlook.deviation).all())
+    assert float(after.reduction(here).max()) == 0
+
+
+def test_queries_assumed_and_observed_do_the_same(plain, candidates):
+    observed = [o.observe(4).observe(9) for o in outlook_of(plain, candidates, candidates, candidates[:0])]
+    assumed = outlook_of(plain, candidates, candidates, candidates[[4, 9]])
+    for one, other in zip(observed, assumed, strict=True):
+        torch.testing.assert_close(one.deviation, other.deviation)
+
+
+def test_a_batch_spreads(plain, candidates):
+    made = Candidates(candidates, torch.zeros(60), candidates, torch.full((60,), 1 / 60, dtype=torch.float64))
+    nothing = candidates[:0]
+    picks = choose(plain, made, nothing, nothing, [0, 0, 0, 0], TOLERANCES)
+    assert len(set(picks)) == 4
+    apart = distances(plain.definition, candidates[picks], candidates[picks])
+    assert float(apart[~torch.eye(4, dtype=torch.bool)].min()) > 1
+
+
+def test_steps_of_a_path_count_one_by_one(plain, candidates):
+    steps = PredictedSteps(*(t.reshape(2, 30, -1) for t in (candidates.q, candidates.u, candidates.q)))
+    along = path_outlook(plain, steps, 0)
+    weight = torch.ones(2, 30, dtype=torch.float64)
+    information = along.information(weight, 0.1)
+    torch.testing.assert_close(information[:, -1], torch.full((2,), 30 * 0.5 * np.log1p(25.0), dtype=torch.float64))
+    assert as_if_answered(plain, steps) is plain
+
+
+def test_rollouts_are_planned_all_the_same(plain):
+    aim = Aim([0, 1], TOLERANCES, longest=5)
+    rollouts = plan_round(plain, aim, 8, [torch.zeros(3, 1, dtype=torch.float64)], np.random.default_rng(0))
+    assert sum(map(len, rollouts)) == 8
+
+
+def test_no_edge_is_in_doubt(plain, candidates):
+    assert float(edge_in_doubt(plain, candidates.q, candidates.q).max()) == 0
