@@ -23,7 +23,7 @@ from torch import Tensor
 from surrogym_server.environment.points import Points
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.plugins import Choice, Registry
-from surrogym_server.sampling.confidence import log_model_uncertainty
+from surrogym_server.sampling.confidence import log_model_uncertainty, log_uncertainty_index
 
 GROUP = "surrogym.acquisitions"
 
@@ -117,7 +117,8 @@ class UncertaintyIndex(Acquisition):
     reads_probability: ClassVar[bool] = True
 
     def value(self, candidates: CandidateView) -> Tensor:
-        return log_model_uncertainty(candidates.deviation, candidates.tolerance) + candidates.log_probability  # eq. 12
+        log_u_m = log_model_uncertainty(candidates.deviation, candidates.tolerance)
+        return log_uncertainty_index(log_u_m, candidates.log_probability)
 
     def path_value(self, paths: PathView) -> Tensor:
         return (paths.weight * log_model_uncertainty(paths.deviation, paths.tolerance).exp()).cumsum(-1)

@@ -48,6 +48,11 @@ def log_model_uncertainty(deviation: Tensor, tolerance: Tensor | float) -> Tenso
     return log_uncertainty
 
 
+def log_uncertainty_index(log_model_uncertainty: Tensor, log_probability: Tensor) -> Tensor:
+    """log U, the uncertainty index of the paper."""
+    return log_model_uncertainty + log_probability  # eq. 12
+
+
 def confidences_of(model: DynamicsModel, deviation: Tensor, tolerances: Sequence[float]) -> list[OutputConfidence]:
     """Confidence of every output (O,) from its deviations (m, O) over the Monte Carlo set."""
     able = offers(model, LeaveOneOut)

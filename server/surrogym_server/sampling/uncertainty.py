@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from surrogym_server.environment.points import Points
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.candidates import input_probability, under_random_actions
-from surrogym_server.sampling.confidence import certainty, deviations, log_model_uncertainty
+from surrogym_server.sampling.confidence import certainty, deviations, log_model_uncertainty, log_uncertainty_index
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ def query_uncertainty(
     mean, deviation = model.means(at, action), deviations(model, at, action)
     log_p = input_probability(model, Points(at, action), states)[:, None].expand_as(deviation)
     log_u_m = log_model_uncertainty(deviation, torch.from_numpy(tolerances))
-    parts = (mean, deviation, log_u_m.exp(), log_p.exp(), log_u_m + log_p)
+    parts = (mean, deviation, log_u_m.exp(), log_p.exp(), log_uncertainty_index(log_u_m, log_p))
     return UncertaintyResult(*(p.numpy() for p in parts))
 
 
