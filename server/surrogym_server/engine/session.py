@@ -23,7 +23,7 @@ from surrogym_shared.port import ResetResult, StepResult, quick
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 Versions = NDArray[np.int64]
-ModelChoice = Literal["latest"] | int
+WantedVersion = Literal["latest"] | int
 ModelOf = Callable[[int], DynamicsModel]
 Seeds = int | Sequence[int] | None
 Outcome = ResetResult | tuple[StepResult, ...]
@@ -77,7 +77,7 @@ class Session:
     definition: EnvironmentDefinition
     settings: VirtualSettings
     seed: int
-    model: ModelChoice
+    model: WantedVersion
     lanes: LaneState
     versions: Versions  # (N,) the model each lane's episode runs under
     answer: Answer | None = None
@@ -109,7 +109,7 @@ def open_session(
     settings: VirtualSettings,
     *,
     seed: int,
-    model: ModelChoice,
+    model: WantedVersion,
     version: int,
     occupancy: bool,
     opened_by: tuple[str, str] | None = None,

@@ -73,7 +73,8 @@ class DynamicsModel(ABC):
         Args:
             q: where it begins.
             u: the action, in the model's units.
-            noise: (m, M), standard normal: each transition output is mean + deviation * noise, instead of its mean.
+            noise: (m, M), standard normal: each transition output is mean + deviation * noise, instead of its mean;
+                one that reads the prediction of another reads its draw.
             process: (m, M), standard normal: each is moved by its learned noise as well (w of eq. 2). A family that
                 learns no noise ignores it.
             deviations: whether to give the deviations of the transition outputs.

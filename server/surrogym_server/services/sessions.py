@@ -20,9 +20,9 @@ from surrogym_server.engine.saved import session_from_bytes, session_to_bytes
 from surrogym_server.engine.session import (
     Answer,
     Fingerprint,
-    ModelChoice,
     Outcome,
     Session,
+    WantedVersion,
     digest_of,
     open_session,
     reset_session,
@@ -60,7 +60,7 @@ class Opening:
     settings: VirtualSettings
     penalty: float | None
     seed: int | None
-    model: ModelChoice
+    model: WantedVersion
     occupancy: bool
     key: str | None
 

@@ -1,0 +1,163 @@
+"""Laws of what only some families can do; a family without an ability keeps its laws by not having it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+
+from surrogym_server.environment.points import Points
+from surrogym_server.models.abilities import (
+    Differentiable,
+    FunctionDraws,
+    LeaveOneOut,
+    Lookahead,
+    PredictedSteps,
+    RewardEdges,
+    offers,
+)
+from surrogym_server.sampling.confidence import deviations
+from surrogym_server.testing.cases import ModelCase, close
+
+DRAWS = 400
+
+
+def a_drawn_function_is_one_function(case: ModelCase) -> None:
+    """The same weights at the same point give the same step, whatever rows they stand in."""
+    if (able := offers(case.model, FunctionDraws)) is None:
+        return
+    noise = case.noise(3, able.path_size)
+    paths = able.draw(noise)
+    assert paths.shape == (3, able.path_size)
+    assert close(able.draw(noise[1:2])[0], paths[1])
+    q, u = case.points.q[:1].expand(4, -1), case.points.u[:1].expand(4, -1)
+    made = able.transition_along(paths[[0, 1, 0, 2]], q, u).q_next
+    assert close(made[0], made[2])
+
+
+def drawn_functions_scatter_as_the_deviations_say(case: ModelCase) -> None:
+    if (able := offers(case.model, FunctionDraws)) is None:
+        return
+    q, u = case.points.q[:1], case.points.u[:1]
+    paths = able.draw(case.noise(DRAWS, able.path_size))
+    made = able.transition_along(paths, q.expand(DRAWS, -1), u.expand(DRAWS, -1)).q_next[:, 1]
+    said = float(deviations(case.model, q, u)[0, 1])
+    assert float(made.std()) < 2 * said + 1e-9
+    assert float(made.std()) > said / 2 - 1e-9
+
+
+def a_drawn_function_may_have_columns_beyond_its_own(case: ModelCase) -> None:
+    """Those of a session whose lanes follow models of several sizes."""
+    if (able := offers(case.model, FunctionDraws)) is not None:
+        paths = able.draw(case.noise(2, able.path_size))
+        wider = torch.cat([paths, torch.zeros(2, 3, dtype=torch.float64)], 1)
+        q, u = case.points.q[:2], case.points.u[:2]
+        assert torch.equal(able.transition_along(paths, q, u).q_next, able.transition_along(wider, q, u).q_next)
+
+
+def leave_one_out_errors_are_there_for_every_output(case: ModelCase) -> None:
+    if (able := offers(case.model, LeaveOneOut)) is not None:
+        errors = able.leave_one_out()
+        assert len(errors) == len(case.definition.outputs)
+        for one in errors:
+            assert math.isfinite(one.error)
+            assert one.error >= 0
+            assert 0 <= one.within_one <= one.within_two <= 1
+
+
+def an_outlook_begins_with_the_deviations_and_an_answer_lowers_them(case: ModelCase) -> None:
+    if (able := offers(case.model, Lookahead)) is None:
+        return
+    points, nothing = case.points, case.points[:0]
+    said = deviations(case.model, points.q, points.u)
+    for column, output in enumerate(able.outlook(points, points[:8], nothing)):
+        if output is None:
+            continue
+        assert torch.allclose(output.deviation, said[:, column], rtol=1e-4, atol=1e-8)
+        after = output.observe(3).deviation
+        assert bool((after <= output.deviation + 1e-12).all())
+        if output.learns[3]:
+            assert after[3] < output.deviation[3] or float(output.deviation[3]) == 0
+        reduction = output.reduction(torch.full((8,), 1 / 8, dtype=torch.float64))
+        assert reduction.shape == (len(points),)
+        assert float(reduction.min()) >= 0
+
+
+def what_is_assumed_is_as_what_is_observed(case: ModelCase) -> None:
+    if (able := offers(case.model, Lookahead)) is None:
+        return
+    points, nothing = case.points, case.points[:0]
+    pairs = zip(able.outlook(points, nothing, points[[4]]), able.outlook(points, nothing, nothing), strict=True)
+    for assumed, begun in pairs:
+        if assumed is not None and begun is not None:
+            assert torch.allclose(assumed.deviation, begun.observe(4).deviation, rtol=1e-4, atol=1e-8)
+
+
+def paths_tell_more_the_longer_they_are(case: ModelCase) -> None:
+    if (able := offers(case.model, Lookahead)) is None:
+        return
+    steps = _paths(case, case.points[:12])
+    weight = torch.ones(3, 4, dtype=torch.float64)
+    for column in range(len(case.definition.outputs)):
+        if (along := able.along(steps, column)) is not None:
+            information = along.information(weight, 0.1)
+            assert information.shape == along.deviation.shape == along.learns.shape == (3, 4)
+            assert float(information.min()) >= 0
+            assert float(information.diff(dim=1).min()) >= -1e-9
+
+
+def steps_that_are_taken_lower_the_deviations(case: ModelCase) -> None:
+    if (able := offers(case.model, Lookahead)) is None:
+        return
+    taken = case.points[:4]
+    q_next = case.model.transition(taken.q, taken.u).q_next
+    model = able.as_if_answered(PredictedSteps(taken.q, taken.u, q_next))
+    before, after = (deviations(m, taken.q, taken.u) for m in (case.model, model))
+    assert float(after.sum()) <= float(before.sum()) + 1e-9
+
+
+def doubts_about_edges_are_probabilities_of_error(case: ModelCase) -> None:
+    if (able := offers(case.model, RewardEdges)) is not None:
+        for doubt in able.reward_edge_doubts(case.points.q, case.unseen.q_next):
+            assert doubt.shape == (len(case.points),)
+            assert 0 <= float(doubt.min()) <= float(doubt.max()) <= 0.5
+
+
+def gradients_are_those_of_differences(case: ModelCase) -> None:
+    if offers(case.model, Differentiable) is None or case.definition.action.nvec:
+        return
+    q, u = 0.5 * case.points.q[:3], case.points.u[:3].clone().requires_grad_()
+
+    def total(action: torch.Tensor) -> torch.Tensor:
+        made = case.model.transition(q, action)
+        return made.q_next[:, 1].sum() + made.reward.sum()
+
+    (gradient,) = torch.autograd.grad(total(u), u)
+    small = 1e-5
+    for row in range(3):
+        there = torch.zeros_like(u)
+        there[row] = small
+        with torch.no_grad():
+            difference = (total(u + there) - total(u - there)) / (2 * small)
+        assert math.isclose(float(gradient[row]), float(difference), rel_tol=1e-3, abs_tol=1e-5)
+
+
+def _paths(case: ModelCase, points: Points) -> PredictedSteps:
+    """Three paths of four steps."""
+    q_next = case.model.transition(points.q, points.u).q_next
+    return PredictedSteps(*(tensor.reshape(3, 4, -1) for tensor in (points.q, points.u, q_next)))
+
+
+LAWS_OF_ABILITIES: tuple[Callable[[ModelCase], None], ...] = (
+    a_drawn_function_is_one_function,
+    drawn_functions_scatter_as_the_deviations_say,
+    a_drawn_function_may_have_columns_beyond_its_own,
+    leave_one_out_errors_are_there_for_every_output,
+    an_outlook_begins_with_the_deviations_and_an_answer_lowers_them,
+    what_is_assumed_is_as_what_is_observed,
+    paths_tell_more_the_longer_they_are,
+    steps_that_are_taken_lower_the_deviations,
+    doubts_about_edges_are_probabilities_of_error,
+    gradients_are_those_of_differences,
+)

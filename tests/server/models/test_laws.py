@@ -1,0 +1,14 @@
+"""Every family of this package keeps the laws of the port, in every kind of environment."""
+
+import pytest
+
+from surrogym_server.testing import LAWS_OF_MODELS, model_cases
+
+FAMILIES: dict[str, dict[str, float]] = {"gaussian_process": {}}
+CASES = {f"{family}, {case}": case for family, own in FAMILIES.items() for case in model_cases(family, own)}
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("law", LAWS_OF_MODELS, ids=lambda law: law.__name__)
+def test_a_family_keeps_the_laws(law, name):
+    law(CASES[name])
