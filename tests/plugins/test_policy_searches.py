@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from support.models import learn
 from support.real_steps import random_steps
 from support.server import ServerProcess, running_server
 from surrogym_client.diagnosis.doctor import installation
@@ -19,7 +20,6 @@ from surrogym_client.training import TrainSettings
 from surrogym_client.training.search import SEARCHES
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
-from surrogym_server.surrogate.learn import learn
 from surrogym_shared.port import SurrogatePort
 
 ROOT = Path(__file__).parents[2]

@@ -102,7 +102,7 @@ class PolicySearch(ABC):
 SEARCHES = Registry[PolicySearch](
     "algorithm",
     "surrogym.policy_searches",
-    PolicySearch,  # type: ignore[type-abstract]  # members are subclasses
+    PolicySearch,
     {
         **{name: f"surrogym_client.training.stable_baselines.algorithms:{name}" for name in ALGORITHMS},
         "CMAES": "surrogym_client.training.cma_es:CmaEs",
