@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 EXTRAS = {  # their packages
-    "server": ("alembic", "fastapi", "psycopg", "safetensors", "scipy", "sqlalchemy", "starlette", "uvicorn"),
-    "train": ("matplotlib", "stable_baselines3", "tensorboard", "torch"),
+    "server": (
+        *("alembic", "fastapi", "jiter", "prometheus_client", "psycopg", "safetensors", "scipy", "sqlalchemy"),
+        *("starlette", "threadpoolctl", "uvicorn"),
+    ),
+    "train": ("cmaes", "matplotlib", "stable_baselines3", "tensorboard", "torch"),
     "export": ("onnx", "onnxruntime", "onnxscript"),
     "render": ("moviepy", "pygame"),
     "trackers": ("mlflow", "wandb"),
