@@ -15,10 +15,10 @@ from support.server import ServerProcess
 from surrogym_client.experiments.reproduce.rows import Row, write_rows
 
 ELSEWHERE = {
-    "conformance": "tests/client/test_conformance.py",
-    "demo": "tests/demo/test_demo.py",
+    "conformance": "tests/diagnosis/test_conformance.py",
+    "demo": "tests/experiments/test_demo.py",
     "evaluate": "test_commands.py",
-    "export-policy": "tests/client/test_policy_export.py",
+    "export-policy": "tests/policies/test_export.py",
     "optimise": "tests/server/cli/test_optimise.py",
     "reproduce efficiency": "test_reproduce.py",
     "reproduce paper": "test_reproduce_paper.py",

@@ -50,20 +50,20 @@ SHORTER = {
 }
 IN_PROGRAMS = {"0_000": "00", "num_envs=16": "num_envs=2"}
 ELSEWHERE = {
-    "make": "tests/demo and the Makefile itself",
+    "make": "tests/experiments and the Makefile itself",
     "docker": "tests/docker",
     "export": "a setting of the shell",
     ".": "a setting of the shell",
     "pip": "tests/packaging",
     "tensorboard": "a page that stays open",
     "surrogym serve": "a server of this test runs already",
-    "surrogym demo": "tests/demo",
+    "surrogym demo": "tests/experiments",
     "surrogym reproduce": "tests/cli/test_reproduce.py",
 }
 ELSEWHERE_WITH = {  # a word anywhere in the line
     "--watch": "tests/cli/test_status.py",
     "--install-completion": "tests/cli/test_completion.py",
-    "--improve": "tests/client/test_improve.py",
+    "--improve": "tests/training/test_closed_loop.py",
     "wandb": "tests/examples/test_trackers.py",
     "mlflow": "tests/examples/test_trackers.py",
 }
