@@ -1,7 +1,8 @@
-"""Tensors, whatever they hold: on a device, cached outside inference mode, and rows in blocks."""
+"""Tensors, whatever they hold: where they live, what is cached, rows in blocks, and the order of memory."""
 
 from surrogym_server.tensors.blocks import in_blocks
 from surrogym_server.tensors.cached import cached
+from surrogym_server.tensors.in_rows import in_rows
 from surrogym_server.tensors.to_device import CPU, to_device
 
-__all__ = ["CPU", "cached", "in_blocks", "to_device"]
+__all__ = ["CPU", "cached", "in_blocks", "in_rows", "to_device"]
