@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from surrogym_client.original.actions import decode_actions
 from surrogym_client.policies import load_policy
 from surrogym_client.training import TrainingInterrupted, TrainProgress, TrainResult, TrainSettings, train
+from surrogym_client.training.search import SEARCHES
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import OpenSession, SessionView
 
@@ -87,6 +88,20 @@ def unknown_hyperparameters_are_refused(port: SurrogatePort, settings: TrainSett
     _require(not list(folder.iterdir()), "no file", sorted(path.name for path in folder.iterdir()))
 
 
+def start_is_taken_or_refused(port: SurrogatePort, settings: TrainSettings, folder: Path) -> None:
+    """A search starts from a policy of its own, or, where it says that it can't, refuses to."""
+    start = train(port, folder / "start.zip", replace(settings, seed=settings.seed + 1)).path
+    resumed = replace(settings, start_from=start)
+    if SEARCHES.get(settings.algorithm).resumable:
+        _actions(port, train(port, folder / "policy.zip", resumed))
+        return
+    try:
+        train(port, folder / "policy.zip", resumed)
+    except ValueError:
+        return
+    raise LawBroken("expected ValueError for a policy to start from, got a policy")
+
+
 def policy_is_read_without_trust(port: SurrogatePort, settings: TrainSettings, folder: Path) -> None:
     """The file gives actions of the action space, and says nothing that only the search's package could read."""
     result = train(port, folder / "policy.zip", settings)
@@ -101,6 +116,7 @@ POLICY_SEARCH_LAWS = (
     interruption_keeps_the_policy,
     sessions_are_closed,
     unknown_hyperparameters_are_refused,
+    start_is_taken_or_refused,
     policy_is_read_without_trust,
 )
 

@@ -14,6 +14,7 @@ from surrogym_client.original.classic import cartpole
 from surrogym_client.policies import load_policy
 from surrogym_client.surrogates.transfer import export_surrogate
 from surrogym_client.training import TrainSettings, train
+from surrogym_client.training.closed_loop import LoopSettings, train_in_closed_loop
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_server.gradients import GradientSettings, optimise
 from surrogym_shared.network import Network
@@ -59,7 +60,7 @@ def test_it_finds_the_policy_of_optimise_with_the_servers_model(pendulum_server:
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"start_from": Path("policy.zip")}, "expected no policy to start from"),
+        ({"start_from": Path("policy.zip")}, "GRADIENT begins with a new network: expected no policy to start from"),
         ({"session": {"penalty": 1.0}}, r"expected no session options, got \['penalty'\]"),
         (
             {"hyperparameters": {"speed": 1}},
@@ -86,3 +87,12 @@ def test_a_surrogate_without_a_model_at_hand_is_refused(tmp_path: Path):
 
     with pytest.raises(ValueError, match="gradients need the model: expected a surrogate of a server or a file"):
         train(Port(), tmp_path / "policy.zip", few())
+
+
+def test_rounds_are_refused_before_a_real_step(pendulum_server: ServerProcess, tmp_path: Path):
+    with (
+        HttpSurrogate(pendulum_server.url, "pendulum") as port,
+        Api(pendulum_server.url) as api,
+        pytest.raises(ValueError, match="gradient can't start from a policy: expected no rounds"),
+    ):
+        train_in_closed_loop(api, "pendulum", port, tmp_path / "policy.zip", few(), LoopSettings(queries=1))

@@ -106,6 +106,10 @@ class _Loop:
         self._progress, self._waiting = progress, waiting
         self._whole, self._part = shares(settings, improve.rounds)
         self._prolong = is_prolonged(settings, port.spec())
+        if not search_for(settings).resumable:
+            raise ValueError(
+                f"{settings.algorithm} can't start from a policy: expected no rounds, or another algorithm"
+            )
         self._visited = 0  # virtual steps beside the trainings
         self._known: list[float | None] = []  # confidence index where the policy went, of each round
         self._region_known = False

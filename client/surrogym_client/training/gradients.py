@@ -38,10 +38,12 @@ class Gradients(PolicySearch):
     largest_norm: float = 1.0
 
     suggested_steps = 1_843_200  # 200 updates on Pendulum
+    resumable = False
 
     def search(self, task: SearchTask) -> Found:
         _require_plain(task)
         library = _library()
+        library.torch.set_num_threads(task.settings.threads)  # many small products: threads cost more than they give
         surrogate = _with_model(task.port)
         settings = self._settings(library, task)
 
@@ -69,8 +71,6 @@ class Gradients(PolicySearch):
 
 def _require_plain(task: SearchTask) -> None:
     """Refuse what has no meaning for the mean of the latest model."""
-    if task.settings.start_from is not None:
-        raise ValueError("gradients begin with a new network: expected no policy to start from")
     if others := sorted({*task.settings.session} - {*DRAWS, *FUNCTIONS}):
         raise ValueError(f"gradients follow the mean of the latest model: expected no session options, got {others}")
 

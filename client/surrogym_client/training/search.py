@@ -11,6 +11,7 @@ The laws of a search, which ``surrogym_client.testing`` checks:
 5. Every session that it opens is closed on every way out. It writes no file: the policy does when it is asked to.
 6. What its policy saves, ``load_policy`` reads without trust, and gives actions of the surrogate's action space.
 7. Impossible settings raise ``ValueError`` with what was expected and what came, before the first virtual step.
+8. It starts from the policy of ``settings.start_from`` where there is one; if it can't, it says ``resumable = False``.
 """
 
 from __future__ import annotations
@@ -89,6 +90,7 @@ class PolicySearch(ABC):
     most_steps: ClassVar[int | None] = MAX_STEPS  # None: no bound, as for a search whose steps are cheap
     prolongable: ClassVar[bool] = False  # heeds ``task.prolong``
     tracked: ClassVar[bool] = False  # logs its curves to ``settings.tracker``
+    resumable: ClassVar[bool] = True  # can start from a policy, and so learn in rounds
 
     @abstractmethod
     def search(self, task: SearchTask) -> Found:
@@ -115,13 +117,16 @@ def search_for(settings: TrainSettings) -> PolicySearch:
     """The search that settings name, made with their hyperparameters.
 
     Raises:
-        ValueError: there is none of this name, it has no such hyperparameter, or it can't be prolonged or tracked.
+        ValueError: there is none of this name, it has no such hyperparameter, or it can't be prolonged, tracked or
+            started from a policy.
     """
     name, kind = SEARCHES.name_of(settings.algorithm), SEARCHES.get(settings.algorithm)
     if settings.prolong and not kind.prolongable:
         raise ValueError(f"{name} takes the steps it is given: expected no prolonging, or another algorithm")
     if settings.tracker in ("wandb", "mlflow") and not kind.tracked:
         raise ValueError(f"{name} logs to no tracker: expected none, got {settings.tracker}")
+    if settings.start_from is not None and not kind.resumable:
+        raise ValueError(f"{name} begins with a new network: expected no policy to start from")
     try:
         return kind(**settings.hyperparameters)
     except TypeError as error:

@@ -38,7 +38,7 @@ class CrossEntropy(PolicySearch):
     def search(self, task: SearchTask) -> Found:
         rng, spec = np.random.default_rng(task.settings.seed), task.port.spec()
         mean, deviation = map(np.array, observation_statistics(task.port, task.settings.seed))
-        centre = np.zeros(Network.size(spec, self.units))
+        centre = self.start(task, Network.size(spec, self.units))
         spread = np.full_like(centre, self.spread)
         cost = self.population * self.starts * (spec.time_limit or 1_000)
         generations = max(task.steps // cost, 1)
@@ -56,6 +56,15 @@ class CrossEntropy(PolicySearch):
             pass  # what has been found so far is given back
         policy = Network.of(spec, mean, deviation, self.units, centre)
         return Found(policy, done * cost, best, asdict(self), whole=done == generations)
+
+    def start(self, task: SearchTask, size: int) -> Any:
+        """The first centre (size,): that of the policy to start from, if there is one."""
+        if task.settings.start_from is None:
+            return np.zeros(size)
+        vector = Network.load(task.settings.start_from).vector
+        if len(vector) != size:
+            raise ValueError(f"{task.settings.start_from}: expected a network of {size} parameters, got {len(vector)}")
+        return vector
 
     def returns(self, task: SearchTask, candidates: Network, seed: int) -> Any:
         """Mean imagined return (population,) of each candidate, all from the same starts."""
