@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from surrogym_server.models.ensemble import NetworkEnsembles
 from surrogym_server.models.gaussian_process import GaussianProcesses
 from surrogym_server.models.port import Learner
 from surrogym_server.plugins import Choice, Registry
@@ -9,7 +10,15 @@ from surrogym_server.plugins import Choice, Registry
 GROUP = "surrogym.models"
 GAUSSIAN_PROCESS = "gaussian_process"
 
-MODELS: Registry[Learner] = Registry("model", GROUP, Learner, {GAUSSIAN_PROCESS: GaussianProcesses})
+MODELS: Registry[Learner] = Registry(
+    "model",
+    GROUP,
+    Learner,
+    {
+        GAUSSIAN_PROCESS: GaussianProcesses,
+        "ensemble": NetworkEnsembles,
+    },
+)
 
 
 def learner_of(choice: Choice) -> Learner:

@@ -44,8 +44,9 @@ class Design(Frozen):
     variance most over the range and where policies went; ``variance``, where the deviation is largest;
     ``uncertainty_index``, the paper's (eq. 12); ``latin_hypercube``: the whole budget is one, whatever ``initial``
     says, and only what is asked for beyond it is chosen, in the largest gaps; or one of a package that is installed
-    beside the server. ``model`` is the family of models that is learned: ``gaussian_process``, the default, or one of a
-    package that is installed beside the server. ``monte_carlo`` points estimate the confidence index (eq. 8).
+    beside the server. ``model`` is the family of models that is learned: ``gaussian_process``, the default,
+    ``ensemble`` (of networks), or one of a package that is installed beside the server. ``monte_carlo`` points estimate
+    the confidence index (eq. 8).
     """
 
     preset: Literal["default", "paper"] = "default"

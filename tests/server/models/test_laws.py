@@ -4,7 +4,7 @@ import pytest
 
 from surrogym_server.testing import LAWS_OF_MODELS, model_cases
 
-FAMILIES: dict[str, dict[str, float]] = {"gaussian_process": {}}
+FAMILIES: dict[str, dict[str, float]] = {"gaussian_process": {}, "ensemble": {"steps": 300}}
 CASES = {f"{family}, {case}": case for family, own in FAMILIES.items() for case in model_cases(family, own)}
 
 

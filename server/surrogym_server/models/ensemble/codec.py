@@ -1,0 +1,124 @@
+"""NetworkEnsembleCodec: weights as named arrays, and back, every shape and number checked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import fields
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.errors import InvalidInput
+from surrogym_server.models.ensemble.inputs import Inputs
+from surrogym_server.models.ensemble.model import NetworkEnsembleModel, Regression
+from surrogym_server.models.ensemble.networks import Networks
+from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel
+
+FORMAT = 1
+TRANSITIONS, REWARD, ENDING = "transitions", "reward", "ending"
+MAX_MEMBERS, MAX_UNITS = 16, 128
+Arrays = Mapping[str, Tensor]
+
+
+class NetworkEnsembleCodec(ModelCodec):
+    def encode(self, model: DynamicsModel) -> StoredModel:
+        if not isinstance(model, NetworkEnsembleModel):
+            raise TypeError(f"expected a model of an ensemble of networks, got {type(model).__name__}")
+        tensors = _regression_arrays(TRANSITIONS, model.transitions)
+        if model.reward is not None:
+            tensors |= _regression_arrays(REWARD, model.reward)
+        networks = isinstance(model.ending, Networks)
+        if isinstance(model.ending, Networks):
+            tensors |= _arrays(ENDING, model.ending)
+        header = {
+            "format": FORMAT,
+            "outputs": list(model.definition.outputs),
+            "terminal_reward": model.terminal_reward,
+            "samples": model.samples,
+            "digest": model.digest,
+            "ending": None if networks else model.ending,
+        }
+        return StoredModel(header, tensors)
+
+    def decode(self, definition: EnvironmentDefinition, stored: StoredModel) -> NetworkEnsembleModel:
+        header, arrays = stored.header, stored.tensors
+        outputs = tuple(header["outputs"])
+        if header["format"] != FORMAT or outputs != definition.outputs:
+            raise InvalidInput(
+                f"expected a model of format {FORMAT} with outputs {definition.outputs}, "
+                f"got format {header['format']!r} with {outputs}"
+            )
+        terminal_reward, samples = float(header["terminal_reward"]), int(header["samples"])
+        if not math.isfinite(terminal_reward) or samples < 1:
+            raise InvalidInput(f"expected a finite terminal reward and samples, got {terminal_reward} and {samples}")
+        for name, array in arrays.items():
+            if array.dtype != torch.float64 or not bool(torch.isfinite(array).all()):
+                raise InvalidInput(f"expected finite numbers of torch.float64 as {name}, got {array.dtype}")
+        return _checked(definition, arrays, terminal_reward, samples, str(header["digest"]), header["ending"])
+
+
+def _checked(
+    definition: EnvironmentDefinition, arrays: Arrays, terminal_reward: float, samples: int, digest: str, label: object
+) -> NetworkEnsembleModel:
+    """The model of these arrays, every shape that of the environment."""
+    inputs = Inputs(definition)
+    q = torch.zeros(1, len(definition.coordinates), dtype=torch.float64)
+    u = torch.zeros(1, definition.action.size, dtype=torch.float64)
+    x, count = inputs.of_transition(q, u), len(definition.outputs) - 1
+    transitions = _regression(TRANSITIONS, arrays, x.shape[1], count, quadratic=False)
+    reward = None
+    if definition.declared_reward is None:
+        reward = _regression(REWARD, arrays, inputs.of_reward(q, u, q).shape[1], 1, quadratic=True)
+    ending: Networks | float | None = None
+    if definition.learns_termination:
+        networks = f"{ENDING}.skip" in arrays
+        ending = _networks(ENDING, arrays, inputs.of_end(q).shape[1], 1, quadratic=False) if networks else _label(label)
+    return NetworkEnsembleModel(definition, transitions, reward, ending, terminal_reward, samples, digest)
+
+
+def _regression_arrays(name: str, regression: Regression) -> dict[str, Tensor]:
+    own = {f"{name}.centre": regression.centre, f"{name}.scale": regression.scale}
+    return own | _arrays(name, regression.networks)
+
+
+def _arrays(name: str, networks: Networks) -> dict[str, Tensor]:
+    return {f"{name}.{field.name}": getattr(networks, field.name).contiguous() for field in fields(networks)}
+
+
+def _regression(name: str, arrays: Arrays, inputs: int, outputs: int, *, quadratic: bool) -> Regression:
+    centre, scale = arrays[f"{name}.centre"], arrays[f"{name}.scale"]
+    _require(name, {"centre": centre, "scale": scale}, {"centre": (outputs,), "scale": (outputs,)})
+    if bool((scale < 0).any()):
+        raise InvalidInput(f"{name}: expected scales of at least 0, got {float(scale.min()):g}")
+    return Regression(_networks(name, arrays, inputs, outputs, quadratic=quadratic), centre, scale)
+
+
+def _networks(name: str, arrays: Arrays, d: int, p: int, *, quadratic: bool) -> Networks:
+    networks = Networks(*(arrays[f"{name}.{field.name}"] for field in fields(Networks)))
+    k, h = len(networks.skip), networks.last.shape[1]
+    if not (2 <= k <= MAX_MEMBERS and 1 <= h <= MAX_UNITS):
+        raise InvalidInput(f"{name}: expected 2 to {MAX_MEMBERS} members of 1 to {MAX_UNITS} units, got {k} of {h}")
+    shapes = {
+        "skip": (k, 1 + (2 if quadratic else 1) * d, p),
+        "first": (k, d, h),
+        "first_bias": (k, 1, h),
+        "second": (k, h, h),
+        "second_bias": (k, 1, h),
+        "last": (k, h, p),
+    }
+    _require(name, vars(networks), shapes)
+    return networks
+
+
+def _require(name: str, arrays: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    for part, shape in shapes.items():
+        if (got := tuple(arrays[part].shape)) != shape:
+            raise InvalidInput(f"{name}: expected {part} of shape {shape}, got {got}")
+
+
+def _label(label: object) -> float:
+    if label not in (0.0, 1.0):
+        raise InvalidInput(f"expected the only label of an ending to be 0 or 1, got {str(label)[:80]}")
+    return float(bool(label))

@@ -1,0 +1,48 @@
+"""NetworkEnsembles: a few anchored networks, as the registry of models has them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.samples import Samples
+from surrogym_server.models.ensemble.codec import MAX_MEMBERS, MAX_UNITS, NetworkEnsembleCodec
+from surrogym_server.models.ensemble.learning import learn
+from surrogym_server.models.ensemble.training import Training
+from surrogym_server.models.port import Learned, Learner, ModelCodec, Warm
+
+LARGEST = {"members": MAX_MEMBERS, "units": MAX_UNITS, "steps": 5_000, "seed": 2**31}
+LEAST = {"members": 2, "units": 1, "steps": 1, "seed": 0}
+
+
+@dataclass(frozen=True)
+class NetworkEnsembles(Learner):
+    """Networks of two hidden layers, each pulled to weights of its own. There is no warm start: networks that go on
+    from fewer samples would remember them better than those that came since.
+
+    Attributes:
+        members: how many networks.
+        units: of each hidden layer.
+        steps: of gradient descent.
+        seed: of first weights and of batches.
+    """
+
+    members: int = 5
+    units: int = 32
+    steps: int = 600
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, largest in LARGEST.items():
+            given, least = getattr(self, name), LEAST[name]
+            if isinstance(given, bool) or not isinstance(given, int) or not least <= given <= largest:
+                raise ValueError(f"expected {name} to be a whole number from {least} to {largest}, got {given!r}")
+
+    @property
+    def codec(self) -> ModelCodec:
+        return NetworkEnsembleCodec()
+
+    def learn(self, definition: EnvironmentDefinition, samples: Samples, warm: Warm | None = None) -> Learned:
+        del warm
+        training = Training(self.members, self.units, self.steps, self.seed)
+        return Learned(learn(training, definition, samples), {})

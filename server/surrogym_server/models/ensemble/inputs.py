@@ -1,0 +1,52 @@
+"""What the networks of one environment read: features near mean 0 and deviation 1, without a choice by evidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.features import Encoder, Encoding, FeatureMap, State
+from surrogym_server.tensors import cached
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Features of states and actions of one environment."""
+
+    definition: EnvironmentDefinition
+
+    def of_transition(self, q: Tensor, u: Tensor) -> Tensor:
+        """What moves the state, at q (m, C) and u (m, F): (m, d)."""
+        return self._of_transition(q, u)
+
+    def of_reward(self, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
+        """What a step pays by, before and after it as the reward's timing says, (m, d)."""
+        match self.definition.reward_timing:
+            case "before":
+                return self._of_state(q, u)
+            case "after":
+                return self._of_state(q_next, u)
+            case "auto":
+                return torch.cat([self._of_state(q, u), self._of_state(q_next, u)], -1)
+
+    def of_end(self, q: Tensor) -> Tensor:
+        """What an end is told by, at the state q (m, C) that a step led to: (m, d)."""
+        return self._of_state(q, q.new_zeros(len(q), self.definition.action.size))
+
+    @cached
+    def _of_transition(self) -> Encoder:
+        return self._encoder("observation" if self.definition.moves_observation else "cos_sin")
+
+    @cached
+    def _of_state(self) -> Encoder:
+        """Coordinates, and the observation where it says more."""
+        combined = self.definition.observation_combines or self.definition.moves_observation
+        more: tuple[State, ...] = ("observation",) if combined else ()
+        return self._encoder("both", *more)
+
+    def _encoder(self, *states: State) -> Encoder:
+        action: Encoding = "one_hot" if self.definition.action.nvec else "value"
+        return Encoder.of(self.definition, [FeatureMap(state, action) for state in states])

@@ -1,0 +1,72 @@
+"""From samples to networks: targets, what is left out, and what an end pays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.samples import Samples, increments, saturated
+from surrogym_server.errors import InvalidInput
+from surrogym_server.models.ensemble.inputs import Inputs
+from surrogym_server.models.ensemble.model import NetworkEnsembleModel, Regression
+from surrogym_server.models.ensemble.networks import Networks
+from surrogym_server.models.ensemble.training import Training, cross_entropy, squared_error, train
+
+MIN_POINTS = 2
+CONSTANT = 1e-9  # an output whose deviation is below this share of its own size never varied
+REWARD_SEED, END_SEED = 1, 2  # beyond the seed, so that the networks of each are others
+
+
+def learn(training: Training, definition: EnvironmentDefinition, samples: Samples) -> NetworkEnsembleModel:
+    """As ``Learner.learn``. Raises InvalidInput for fewer than two samples."""
+    if len(samples) < MIN_POINTS:
+        raise InvalidInput(f"a model needs at least {MIN_POINTS} samples, got {len(samples)}")
+    inputs = Inputs(definition)
+    usable = _enough(~saturated(definition, samples.q_next))
+    x, change = inputs.of_transition(samples.q, samples.u), increments(definition, samples)
+    transitions = _regression(training, x[usable], change[usable])
+    reward, terminal_reward = _reward(_seeded(training, REWARD_SEED), inputs, samples)
+    ending = None
+    if definition.learns_termination:
+        ending = _ending(_seeded(training, END_SEED), inputs.of_end(samples.q_next), samples.terminated)
+    return NetworkEnsembleModel(definition, transitions, reward, ending, terminal_reward, len(samples), samples.digest)
+
+
+def _reward(training: Training, inputs: Inputs, samples: Samples) -> tuple[Regression | None, float]:
+    """The reward of steps that end no episode, and what one that does pays beyond it on average."""
+    if (known := inputs.definition.declared_reward) is not None:
+        return None, known.terminal
+    goes_on = _enough(~samples.terminated)
+    x = inputs.of_reward(samples.q, samples.u, samples.q_next)
+    reward = _regression(training, x[goes_on], samples.reward[goes_on, None], quadratic=True)
+    if bool(goes_on.all()):
+        return reward, 0.0
+    beyond = samples.reward - reward(x).mean(0)[:, 0]
+    return reward, float(beyond[~goes_on].mean())
+
+
+def _ending(training: Training, x: Tensor, ended: Tensor) -> Networks | float:
+    """Networks that tell which states end an episode; the only label, where there is one alone."""
+    if bool(ended.all()) or not bool(ended.any()):
+        return float(ended[0])
+    return train(training, x, ended.double()[:, None], cross_entropy)
+
+
+def _regression(training: Training, x: Tensor, y: Tensor, *, quadratic: bool = False) -> Regression:
+    """Networks of inputs x (n, d) and targets y (n, p), standardised."""
+    centre, scale = y.mean(0), y.std(0, correction=0)
+    scale = torch.where(scale > CONSTANT * centre.abs(), scale, 0.0)
+    target = (y - centre) / torch.where(scale > 0, scale, 1.0)
+    return Regression(train(training, x, target, squared_error, quadratic=quadratic), centre, scale)
+
+
+def _enough(chosen: Tensor) -> Tensor:
+    """The chosen samples (n,), or all where those are too few to learn from."""
+    return chosen if int(chosen.sum()) >= MIN_POINTS else torch.ones_like(chosen)
+
+
+def _seeded(training: Training, beyond: int) -> Training:
+    return replace(training, seed=training.seed + beyond)

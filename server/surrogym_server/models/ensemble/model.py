@@ -1,0 +1,176 @@
+"""NetworkEnsembleModel: one fit of one environment by a few networks, whose disagreement is what is not known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.observation_inverse import ObservationInverse
+from surrogym_server.environment.step_rules import moved, paid
+from surrogym_server.models.abilities import Differentiable, FunctionDraws
+from surrogym_server.models.ensemble.inputs import Inputs
+from surrogym_server.models.ensemble.networks import Networks
+from surrogym_server.models.port import DynamicsModel, Transition
+from surrogym_server.tensors import cached, in_blocks
+
+ROWS = 8_192  # predicted at once
+
+
+@dataclass(frozen=True)
+class Regression:
+    """Networks of some outputs in their own units: centre + scale * f(x); an output that never varied has scale 0."""
+
+    networks: Networks
+    centre: Tensor  # (p,)
+    scale: Tensor  # (p,)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """Every member at x (m, d), (K, m, p)."""
+        return self.centre + self.scale * self.networks(x)
+
+
+@dataclass(frozen=True)
+class NetworkEnsembleModel(DynamicsModel, FunctionDraws, Differentiable):
+    """K members. The mean is theirs, the deviation that of one from another; no noise is learned."""
+
+    definition: EnvironmentDefinition
+    transitions: Regression  # M outputs
+    reward: Regression | None  # None where it is declared
+    ending: Networks | float | None  # logits of an end; the only label there was; None where ends are declared
+    terminal_reward: float
+    samples: int
+    digest: str
+
+    def transition(
+        self,
+        q: Tensor,
+        u: Tensor,
+        *,
+        noise: Tensor | None = None,
+        process: Tensor | None = None,
+        deviations: bool = False,
+        reward_deviation: bool = False,
+    ) -> Transition:
+        del process  # no noise is learned
+        step = partial(self._step, deviations, reward_deviation)
+        q_next, reward, spread, doubt = in_blocks(ROWS, step, q, u, noise, None)
+        return Transition(q_next, reward, spread if deviations else None, doubt if reward_deviation else None)
+
+    @property
+    def path_size(self) -> int:
+        return 1
+
+    def draw(self, noise: Tensor) -> Tensor:
+        """A function is a member, each as likely as any other: its number."""
+        members = self.transitions.networks.members
+        number: Tensor = (members * torch.special.ndtr(noise)).floor().clamp_max(members - 1)
+        return number
+
+    def transition_along(
+        self,
+        paths: Tensor,
+        q: Tensor,
+        u: Tensor,
+        *,
+        process: Tensor | None = None,
+        deviations: bool = False,
+        reward_deviation: bool = False,
+    ) -> Transition:
+        del process
+        step = partial(self._step, deviations, reward_deviation)
+        q_next, reward, spread, doubt = in_blocks(ROWS, step, q, u, None, paths[:, 0].long())
+        return Transition(q_next, reward, spread if deviations else None, doubt if reward_deviation else None)
+
+    def means(self, q: Tensor, u: Tensor) -> Tensor:
+        change = self.transitions(self._inputs.of_transition(q, u)).mean(0)
+        q_next = self._arrived(q, change)
+        reward = paid(self.terminal_reward, self._rewards(q, u, q_next).mean(0), self.terminated(q_next))
+        return torch.cat([change, reward[:, None]], -1)
+
+    def learned_termination(self, q: Tensor) -> Tensor:
+        """The members' mean probability; as long as all samples had one label, that one."""
+        if isinstance(self.ending, Networks):
+            return self.ending(self._inputs.of_end(q))[..., 0].sigmoid().mean(0)
+        return q.new_full((len(q),), self.ending or 0.0)
+
+    @cached
+    def scales(self) -> Tensor:
+        reward = self.transitions.scale.new_zeros(1) if self.reward is None else self.reward.scale
+        scales = torch.cat([self.transitions.scale, reward])
+        return torch.where(scales > 0, scales, 1.0)
+
+    @property
+    def structures(self) -> tuple[str, ...]:
+        members, units = self.transitions.networks.members, self.transitions.networks.second.shape[-1]
+        network = f"{members} networks, 2 x {units} units and a linear part"
+        learned = [network if float(scale) else "constant" for scale in self.transitions.scale]
+        if self.reward is None:
+            return (*learned, "declared")
+        return (*learned, f"{network}, squares included" if float(self.reward.scale) else "constant")
+
+    @property
+    def description(self) -> dict[str, Any]:
+        names, scales = self.definition.outputs, self.scales.tolist()
+        outputs = [
+            {"name": name, "kernel": structure, "scale": scale}
+            for name, structure, scale in zip(names, self.structures, scales, strict=True)
+        ]
+        return {"outputs": outputs, "terminal_reward": self.terminal_reward, "samples": self.samples}
+
+    def _step(
+        self,
+        deviations: bool,
+        reward_deviation: bool,
+        q: Tensor,
+        u: Tensor,
+        noise: Tensor | None,
+        member: Tensor | None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Next states (m, C), rewards (m,), and the deviations asked for, (m, M) and (m,), else (m, 0).
+
+        All follow the mean, moved by ``noise`` (m, M) deviations, or each the member (m,) of its own.
+        """
+        changes = self.transitions(self._inputs.of_transition(q, u))
+        spread = changes.std(0) if deviations or noise is not None else q.new_zeros(len(q), 0)
+        change = _chosen(changes, member)
+        change = change if noise is None else change + spread * noise
+        q_next = self._arrived(q, change)
+        rewards = self._rewards(q, u, q_next)
+        doubt = rewards.std(0) if reward_deviation else q.new_zeros(len(q), 0)
+        return q_next, _chosen(rewards, member), spread, doubt
+
+    def _rewards(self, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
+        """Rewards of every member, (K, m)."""
+        if (known := self.definition.declared_reward) is not None:
+            return known(q_next if known.after else q, u).expand(self.transitions.networks.members, -1)
+        assert self.reward is not None
+        return self.reward(self._inputs.of_reward(q, u, q_next))[..., 0]
+
+    def _arrived(self, q: Tensor, change: Tensor) -> Tensor:
+        if not self.definition.moves_observation:
+            change = torch.zeros_like(q).index_copy(1, self._moving, change)
+        return moved(self.definition, self._inverse, q, change)
+
+    @cached_property
+    def _inverse(self) -> ObservationInverse | None:
+        return ObservationInverse.of(self.definition) if self.definition.moves_observation else None
+
+    @cached
+    def _moving(self) -> Tensor:
+        return torch.tensor(self.definition.moving, device=self.definition.device)
+
+    @cached_property
+    def _inputs(self) -> Inputs:
+        return Inputs(self.definition)
+
+
+def _chosen(values: Tensor, member: Tensor | None) -> Tensor:
+    """The mean of members' values (K, m, ...), or the value of one member (m,) in each row."""
+    if member is None:
+        return values.mean(0)
+    return values[member, torch.arange(len(member), device=member.device)]

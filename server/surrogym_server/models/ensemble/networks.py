@@ -1,0 +1,51 @@
+"""Networks of one shape, all evaluated at once. K members, d inputs, h hidden units, p outputs.
+
+A member is f(x) = b(x) S + tanh(tanh(x W_1 + c_1) W_2 + c_2) W_3 with b(x) = [1, x], or [1, x, x^2] of a quadratic one:
+a linear part takes no hidden units, and extrapolates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Networks:
+    """Weights of K members."""
+
+    skip: Tensor  # S (K, s, p)
+    first: Tensor  # W_1 (K, d, h)
+    first_bias: Tensor  # c_1 (K, 1, h)
+    second: Tensor  # W_2 (K, h, h)
+    second_bias: Tensor  # c_2 (K, 1, h)
+    last: Tensor  # W_3 (K, h, p)
+
+    @property
+    def members(self) -> int:
+        return len(self.skip)
+
+    @property
+    def hidden(self) -> tuple[Tensor, ...]:
+        """What is trained by gradients: all but the skip."""
+        return (self.first, self.first_bias, self.second, self.second_bias, self.last)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """Every member at x (m, d), (K, m, p)."""
+        quadratic = self.skip.shape[1] > x.shape[-1] + 1
+        return basis(x, quadratic) @ self.skip + nonlinear(x, self.hidden)
+
+
+def basis(x: Tensor, quadratic: bool) -> Tensor:
+    """b(x) of x (m, d), (m, s)."""
+    return torch.cat([torch.ones_like(x[:, :1]), x, *([x.square()] if quadratic else [])], -1)
+
+
+def nonlinear(x: Tensor, hidden: tuple[Tensor, ...]) -> Tensor:
+    """What the hidden layers add at x (m, d), (K, m, p)."""
+    first, first_bias, second, second_bias, last = hidden
+    z = torch.tanh(torch.baddbmm(first_bias, x.expand(len(first), -1, -1), first))
+    z = torch.tanh(torch.baddbmm(second_bias, z, second))
+    return z @ last

@@ -1,0 +1,102 @@
+"""Training of anchored networks: each member is pulled to the random weights that it began with.
+
+Of member k the weights minimise, over n samples (x_i, y_i) of standardised inputs and outputs,
+
+    1/n sum_i |y_i - f_k(x_i)|^2 + sigma^2 / n sum_j (w_j - w_kj)^2 / v_j,
+
+w_k drawn from a normal prior of variances v, sigma the deviation of the noise. For a linear model that draws from the
+posterior; for networks nearly so, and where there is no sample the members differ as their priors do.
+Reference: T. Pearce, F. Leibfried, A. Brintrup, "Uncertainty in neural networks: approximately Bayesian ensembling",
+AISTATS 2020, eq. 9.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
+
+from surrogym_server.models.ensemble.networks import Networks, basis, nonlinear
+from surrogym_server.tensors import in_rows
+
+NOISE = 0.01  # sigma, in deviations of an output
+RIDGE = 1e-3  # of the skip, in samples
+RATE = 0.01  # first learning rate; it falls to 0 as a cosine does
+LARGEST_BATCH = 512
+Loss = Callable[[Tensor, Tensor], Tensor]  # of predictions (K, m, p) and targets (m, p)
+
+
+@dataclass(frozen=True)
+class Training:
+    members: int
+    units: int
+    steps: int
+    seed: int
+
+
+def squared_error(predicted: Tensor, target: Tensor) -> Tensor:
+    """Summed over members and outputs, averaged over samples."""
+    return (predicted - target).square().mean(1).sum()
+
+
+def cross_entropy(predicted: Tensor, target: Tensor) -> Tensor:
+    """Of logits and labels 0 or 1; summed over members, averaged over samples."""
+    each = binary_cross_entropy_with_logits(predicted, target.expand_as(predicted), reduction="none")
+    total: Tensor = each.mean(1).sum()
+    return total
+
+
+def train(training: Training, x: Tensor, y: Tensor, loss: Loss, *, quadratic: bool = False) -> Networks:
+    """Networks fitted to inputs x (n, d) and targets y (n, p)."""
+    generator = torch.Generator().manual_seed(training.seed)
+    anchors, variances = _priors(training, x.shape[1], y.shape[1], generator)
+    linear = basis(x, quadratic)
+    skip = _ridge(linear, y - nonlinear(x, anchors)).requires_grad_()
+    hidden = tuple(anchor.clone().requires_grad_() for anchor in anchors)
+
+    def objective() -> Tensor:
+        rows = _batch(len(x), generator)
+        pull = [((w - a).square() / v).sum() for w, a, v in zip(hidden, anchors, variances, strict=True)]
+        error = loss(linear[rows] @ skip + nonlinear(x[rows], hidden), y[rows])
+        return error + NOISE**2 / len(x) * torch.stack(pull).sum()
+
+    _descend((skip, *hidden), objective, training.steps)
+    return Networks(*map(in_rows, (skip, *hidden)))
+
+
+def _descend(weights: Sequence[Tensor], objective: Callable[[], Tensor], steps: int) -> None:
+    """Change weights in place by Adam."""
+    adam = torch.optim.Adam(weights, lr=RATE)
+    rate = torch.optim.lr_scheduler.CosineAnnealingLR(adam, steps)
+    for _ in range(steps):
+        adam.zero_grad()
+        objective().backward()  # type: ignore[no-untyped-call]
+        adam.step()
+        rate.step()
+
+
+def _batch(count: int, generator: torch.Generator) -> Tensor | slice:
+    """Rows of one step: all, or of very many a random choice."""
+    return slice(None) if count <= LARGEST_BATCH else torch.randint(count, (LARGEST_BATCH,), generator=generator)
+
+
+def _priors(
+    training: Training, d: int, p: int, generator: torch.Generator
+) -> tuple[tuple[Tensor, ...], tuple[float, ...]]:
+    """Random first weights of the hidden layers, and the variances they are drawn with."""
+    h, k = training.units, training.members
+    shapes = ((k, d, h), (k, 1, h), (k, h, h), (k, 1, h), (k, h, p))
+    variances = (1 / d, 1.0, 1 / h, 1.0, 1 / h)
+    drawn = (torch.randn(shape, generator=generator, dtype=torch.float64) for shape in shapes)
+    return tuple(math.sqrt(v) * weights for weights, v in zip(drawn, variances, strict=True)), variances
+
+
+def _ridge(b: Tensor, target: Tensor) -> Tensor:
+    """Weights (K, s, p) of inputs b (n, s) for targets (K, n, p): where the skip begins."""
+    gram = b.T @ b + RIDGE * torch.eye(b.shape[1], dtype=b.dtype)
+    weights: Tensor = torch.linalg.solve(gram, b.T @ target)
+    return weights

@@ -1,0 +1,159 @@
+"""The ensemble of networks: members disagree where nothing was seen, a draw is a member, odd files are refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from safetensors.torch import load, save
+
+from support.models import learn
+from support.real_steps import random_steps
+from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.errors import InvalidInput, InvalidSpec
+from surrogym_server.models.ensemble.model import NetworkEnsembleModel
+from surrogym_server.models.files import from_bytes, to_bytes
+from surrogym_server.models.registry import learner_of
+from surrogym_server.plugins import Choice
+from surrogym_shared.spec import EnvironmentSpec, ModelChoice, Reward
+
+SETTINGS = {"steps": 200, "units": 16, "members": 4}
+
+
+def designed(spec: EnvironmentSpec, **settings: int) -> EnvironmentSpec:
+    chosen = ModelChoice(name="ensemble", settings=SETTINGS | settings)
+    return spec.model_copy(update={"design": spec.design.model_copy(update={"model": chosen})})
+
+
+def ensemble(spec: EnvironmentSpec, samples: int = 24, **settings: int) -> NetworkEnsembleModel:
+    spec = designed(spec, **settings)
+    model = learn(definition_from_spec(spec), random_steps(spec, samples, seed=0)).model
+    assert isinstance(model, NetworkEnsembleModel)
+    return model
+
+
+@pytest.fixture(scope="module")
+def model() -> NetworkEnsembleModel:
+    return ensemble(pendulum())
+
+
+@pytest.fixture(scope="module")
+def definition(model) -> EnvironmentDefinition:
+    return model.definition
+
+
+def test_members_disagree_more_where_nothing_was_seen(model):
+    steps = random_steps(pendulum(), 24, seed=0)
+    near = model.transition(steps.q, steps.u, deviations=True).deviation
+    far = model.transition(torch.tensor([[0.0, 60.0]]).double(), torch.zeros(1, 1).double(), deviations=True).deviation
+    assert float(far[0, 1]) > 10 * float(near[:, 1].median())
+
+
+def test_a_draw_is_one_of_the_members_each_as_likely(model):
+    noise = torch.randn(2_000, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    drawn = model.draw(noise)[:, 0]
+    assert drawn.unique().tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert int(drawn.long().bincount().min()) > 400
+
+
+def test_the_mean_is_that_of_the_members(model):
+    steps = random_steps(pendulum(), 10, seed=3)
+    members = torch.arange(4.0, dtype=torch.float64)[:, None]
+    one = [model.transition_along(member.expand(10, 1), steps.q, steps.u) for member in members]
+    speeds = torch.stack([made.q_next[:, 1] for made in one])
+    made = model.transition(steps.q, steps.u, deviations=True)
+    torch.testing.assert_close(speeds.mean(0), made.q_next[:, 1])
+    torch.testing.assert_close(speeds.std(0), made.deviation[:, 1])
+
+
+def test_another_seed_gives_other_members(model):
+    other = ensemble(pendulum(), seed=7)
+    assert not torch.equal(other.transitions.networks.first, model.transitions.networks.first)
+
+
+@pytest.mark.parametrize("timing", ["before", "after", "auto"])
+def test_a_reward_is_learned_by_every_timing(timing):
+    made = ensemble(pendulum().model_copy(update={"reward": Reward(timing=timing)}), samples=40)
+    steps = random_steps(pendulum(), 50, seed=9)
+    off = made.transition(steps.q, steps.u).reward - steps.reward
+    assert float(off.square().mean().sqrt()) < 0.25 * float(steps.reward.std())
+
+
+def test_the_papers_representation_moves_the_observation():
+    spec = pendulum()
+    made = ensemble(spec.model_copy(update={"design": spec.design.model_copy(update={"preset": "paper"})}))
+    assert made.definition.outputs == ("cos", "sin", "speed", "reward")
+    steps = random_steps(spec, 20, seed=9)
+    off = made.transition(steps.q, steps.u).q_next - steps.q_next
+    assert float(off[:, 1].square().mean().sqrt()) < 0.5 * float(steps.q_next[:, 1].std())
+
+
+def test_what_never_varied_is_constant_and_certain():
+    made = ensemble(cartpole())
+    steps = random_steps(cartpole(), 5, seed=9)
+    moved = made.transition(steps.q, steps.u, reward_deviation=True)
+    assert made.structures[-1] == "constant"
+    assert (moved.reward.tolist(), moved.reward_deviation.tolist()) == ([1.0] * 5, [0.0] * 5)
+
+
+def test_very_many_samples_are_learned_from_in_batches():
+    made = ensemble(pendulum(), samples=600, steps=20)
+    assert made.samples == 600
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"members": 1}, "members to be a whole number from 2 to 16, got 1"),
+        ({"units": 1.5}, "units to be a whole number from 1 to 128, got 1.5"),
+        ({"steps": True}, "steps to be a whole number from 1 to 5000, got True"),
+        ({"seed": -1}, "seed to be a whole number"),
+        ({"depth": 3}, "expected as settings one of members, units, steps, seed, got 'depth'"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(settings, said):
+    with pytest.raises(InvalidSpec, match=said):
+        learner_of(Choice("ensemble", tuple(settings.items())))
+
+
+def changed(model: NetworkEnsembleModel, **header: object) -> bytes:
+    data = to_bytes(model)
+    stored = json.loads(json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]["surrogym"])
+    del stored["checksum"]
+    return save(load(data), {"surrogym": json.dumps(stored | header)})
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ({"format": 2}, "expected a model of format 1"),
+        ({"outputs": ["theta", "reward"]}, "with outputs"),
+        ({"samples": 0}, "finite terminal reward and samples"),
+        ({"terminal_reward": float("inf")}, "finite terminal reward"),
+        ({"family": "gaussian_process"}, "family 'ensemble', as specified, got one of 'gaussian_process'"),
+    ],
+)
+def test_a_header_that_contradicts_the_environment_is_refused(model, definition, header, said):
+    with pytest.raises(InvalidInput, match=said):
+        from_bytes(definition, changed(model, **header))
+
+
+def test_the_only_label_of_an_ending_is_0_or_1():
+    spec = pendulum().model_copy(update={"termination": "learned"})
+    model = ensemble(spec, steps=20)
+    assert model.ending == 0.0
+    assert from_bytes(model.definition, to_bytes(model)).ending == 0.0
+    with pytest.raises(InvalidInput, match=r"to be 0 or 1, got 0\.5"):
+        from_bytes(model.definition, changed(model, ending=0.5))
+
+
+def test_more_members_than_any_learner_makes_are_refused(model, definition):
+    few = model.transitions.networks
+    networks = type(few)(*(weights.repeat(5, 1, 1) for weights in vars(few).values()))
+    data = to_bytes(replace(model, transitions=replace(model.transitions, networks=networks)))
+    with pytest.raises(InvalidInput, match="expected 2 to 16 members"):
+        from_bytes(definition, data)
