@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
 
-from support.server import ServerProcess, running_server
+from support.server import ServerProcess
 from support.teaching import teach
 from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
@@ -23,39 +20,15 @@ EXAMPLE = ROOT / "examples" / "plugins" / "acquisition"
 BROKEN = "broken_acquisition"
 
 
-@pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the example package, installed as pip does it, and one package that is broken."""
-    folder = tmp_path_factory.mktemp("site")
-    options = ["--quiet", "--no-deps", "--no-build-isolation", "--disable-pip-version-check", "--target", str(folder)]
-    subprocess.run([sys.executable, "-m", "pip", "install", *options, str(EXAMPLE)], check=True, capture_output=True)
-    broken = folder / f"{BROKEN}-1.0.dist-info"
-    broken.mkdir()
-    (broken / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {BROKEN}\nVersion: 1.0\n")
-    (broken / "entry_points.txt").write_text("[surrogym.acquisitions]\nbroken = nowhere_to_be_found:Missing\n")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def server(installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
-    with running_server(tmp_path_factory.mktemp("server"), PYTHONPATH=with_path(installed)) as server:
-        yield server
-
-
-def with_path(folder: Path) -> str:
-    """This process's own search path too: the tests may run from a checkout."""
-    return ":".join([str(folder), *(path for path in sys.path if path.endswith(("server", "client", "shared")))])
-
-
 def designed(settings: dict[str, float | str]) -> Design:
     return Design(acquisition=Choice(name="focused_variance", settings=settings), target=0.99999)
 
 
-def test_the_design_asks_by_an_installed_acquisition(server: ServerProcess):
+def test_the_design_asks_by_an_installed_acquisition(plugin_server: ServerProcess):
     """Near a speed of 6, as its settings say; the ranges are -8 to 8."""
     settings = {"coordinate": "speed", "near": 6.0, "width": 0.5}
     spec = pendulum().model_copy(update={"design": designed(settings)})
-    with Api(server.url) as api:
+    with Api(plugin_server.url) as api:
         teach(api, "focused", spec, queries=12, initial=4)
         speeds = np.array([sample.coordinates[1] for sample in api.samples("focused") if sample.purpose == "adaptive"])
     assert len(speeds) >= 1
@@ -74,20 +47,20 @@ def test_the_design_asks_by_an_installed_acquisition(server: ServerProcess):
     ],
 )
 def test_what_is_not_installed_or_set_wrong_is_refused(
-    server: ServerProcess, name: str, settings: dict[str, object], said: str
+    plugin_server: ServerProcess, name: str, settings: dict[str, object], said: str
 ):
     spec = pendulum().model_dump(mode="json")
     spec["design"]["acquisition"] = {"name": name, "settings": settings}
-    reply = httpx.post(f"{server.url}/v1/surrogates", json={"name": "refused", "spec": spec}, timeout=60)
+    reply = httpx.post(f"{plugin_server.url}/v1/surrogates", json={"name": "refused", "spec": spec}, timeout=60)
     assert (reply.status_code, reply.json()["code"]) == (422, "invalid_spec")
     assert said in reply.json()["detail"]
-    assert httpx.get(f"{server.url}/v1/surrogates/refused", timeout=60).status_code == 404
+    assert httpx.get(f"{plugin_server.url}/v1/surrogates/refused", timeout=60).status_code == 404
 
 
-def test_a_server_starts_without_a_broken_package_and_names_it(server: ServerProcess):
-    assert "the acquisition 'broken' is left out" in server.log
-    assert "No module named 'nowhere_to_be_found'" in server.log
-    assert "focused_variance" in server.log
+def test_a_server_starts_without_a_broken_package_and_names_it(plugin_server: ServerProcess):
+    assert "the acquisition 'broken' is left out" in plugin_server.log
+    assert "No module named 'nowhere_to_be_found'" in plugin_server.log
+    assert "focused_variance" in plugin_server.log
 
 
 def test_the_page_shows_the_example():

@@ -1,0 +1,41 @@
+"""A server beside which the example packages are installed, and one package for each group that is broken."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from support.server import ServerProcess, running_server
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = sorted((ROOT / "examples" / "plugins").iterdir())
+
+
+@pytest.fixture(scope="session")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the example packages, installed as pip does it, and packages that are broken."""
+    folder = tmp_path_factory.mktemp("site")
+    options = ["--quiet", "--no-deps", "--no-build-isolation", "--disable-pip-version-check", "--target", str(folder)]
+    packages = [str(example) for example in EXAMPLES]
+    subprocess.run([sys.executable, "-m", "pip", "install", *options, *packages], check=True, capture_output=True)
+    for kind in ("acquisition", "model"):
+        broken = folder / f"broken_{kind}-1.0.dist-info"
+        broken.mkdir()
+        (broken / "METADATA").write_text(f"Metadata-Version: 2.1\nName: broken_{kind}\nVersion: 1.0\n")
+        (broken / "entry_points.txt").write_text(f"[surrogym.{kind}s]\nbroken = nowhere_to_be_found:Missing\n")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def plugin_server(installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
+    with running_server(tmp_path_factory.mktemp("server"), PYTHONPATH=with_path(installed)) as server:
+        yield server
+
+
+def with_path(folder: Path) -> str:
+    """This process's own search path too: the tests may run from a checkout."""
+    return ":".join([str(folder), *(path for path in sys.path if path.endswith(("server", "client", "shared")))])
