@@ -159,6 +159,8 @@ async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: 
     services, sweeper = _build_services(settings, design, storage, engine, app.state.metrics)
     for registry in (ACQUISITIONS, MODELS):
         logger.info("%ss: %s", registry.kind, ", ".join(registry.names))
+        for name, why in registry.broken.items():
+            logger.warning("the %s %r is left out: %s", registry.kind, name, why)
     engine.fits.start()
     restored = services.sessions.restore()
     if restored:

@@ -25,11 +25,12 @@ class Registry(Generic[T]):
         kind: what its members are, for messages: "algorithm".
         group: of the entry points of other packages.
         base: what each member is a subclass of.
-        built_in: ``module:class`` by name, imported when it is first asked for; no other package may take these names.
+        built_in: classes by name, or ``module:class``, imported when it is first asked for; no other package may take
+            these names.
     """
 
-    def __init__(self, kind: str, group: str, base: type[T], built_in: Mapping[str, str]) -> None:
-        self._kind = kind
+    def __init__(self, kind: str, group: str, base: type[T], built_in: Mapping[str, type[T] | str]) -> None:
+        self.kind = kind
         self._group = group
         self._base = base
         self._built_in = dict(built_in)
@@ -38,8 +39,8 @@ class Registry(Generic[T]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All names in alphabetical order."""
-        return tuple(sorted((*self._built_in, *self._others())))
+        """All names, the built-in ones first."""
+        return (*self._built_in, *sorted(self._others()))
 
     @property
     def broken(self) -> Mapping[str, str]:
@@ -58,14 +59,17 @@ class Registry(Generic[T]):
                 if member.casefold() == name.casefold():
                     return member
         why = f" ({self.broken[name]})" if name in self.broken else ""
-        raise UnknownMember(f"unknown {self._kind} {name!r}: expected one of {', '.join(self.names)}{why}")
+        raise UnknownMember(f"{self.kind}: expected one of {', '.join(self.names)}, got {name!r}{why}")
 
     def get(self, name: str) -> type[T]:
         """The class of a name. Raises as ``name_of``."""
         known = self.name_of(name)
         if known not in self._built_in:
             return self._others()[known]
-        module, _, attribute = self._built_in[known].partition(":")
+        built_in = self._built_in[known]
+        if not isinstance(built_in, str):
+            return built_in
+        module, _, attribute = built_in.partition(":")
         member: type[T] = getattr(import_module(module), attribute)
         return member
 
