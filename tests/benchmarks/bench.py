@@ -10,8 +10,9 @@ import sys
 import time
 from pathlib import Path
 
-import report
 from common import machine, parser
+
+import report
 
 PARTS = ("step", "cold", "peers", "train", "fit", "growth", "predict", "evidence", "lists", "attacks")
 

@@ -44,120 +44,124 @@ class TooMuch(Exception):
         self.status = status
 
 
-def patient(seconds: float, most: int) -> type[HttpToolsProtocol]:
-    """uvicorn's protocol, with a limit of seconds for a request to arrive whole, of connections, and of its head."""
+class Patient(HttpToolsProtocol):
+    """uvicorn's protocol, with limits of connections, of a request's head, and of the time it takes to arrive whole."""
 
-    class Patient(HttpToolsProtocol):
-        _timer: asyncio.TimerHandle | None = None
-        _head_bytes = 0  # of target, headers and trailers of this request
-        _head_lines = 0
-        _head_complete = False
-        _too_much: TooMuch | None = None
-        _working: RequestResponseCycle | None = None  # the request that the app works at, or did last
-        _unparsed = 0  # bytes since the parser last came to the end of something
+    seconds: float
+    most: int  # connections
+    _timer: asyncio.TimerHandle | None = None
+    _head_bytes = 0  # of target, headers and trailers of this request
+    _head_lines = 0
+    _head_complete = False
+    _too_much: TooMuch | None = None
+    _working: RequestResponseCycle | None = None  # the request that the app works at, or did last
+    _unparsed = 0  # bytes since the parser last came to the end of something
 
-        def data_received(self, data: bytes) -> None:
-            self._unparsed += len(data)
-            super().data_received(data)
-            if self._unparsed > MAX_HEAD_BYTES and not self.transport.is_closing():
-                self._refuse(Code.TOO_LARGE, HEAD, status=HEAD_TOO_LARGE)
+    def data_received(self, data: bytes) -> None:
+        self._unparsed += len(data)
+        super().data_received(data)
+        if self._unparsed > MAX_HEAD_BYTES and not self.transport.is_closing():
+            self._refuse(Code.TOO_LARGE, HEAD, status=HEAD_TOO_LARGE)
 
-        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-            super().connection_made(transport)
-            if len(self.connections) > most:
-                self._refuse(Code.UNAVAILABLE, f"expected at most {most} connections, got one more")
-            else:
-                self._wait()
-
-        def connection_lost(self, exc: Exception | None) -> None:
-            self._arrived()
-            super().connection_lost(exc)
-
-        def on_message_begin(self) -> None:
-            super().on_message_begin()
-            self._head_bytes = self._head_lines = self._unparsed = 0
-            self._head_complete = False
-            self._arrived()
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        if len(self.connections) > self.most:
+            self._refuse(Code.UNAVAILABLE, f"expected at most {self.most} connections, got one more")
+        else:
             self._wait()
 
-        def on_url(self, url: bytes) -> None:
-            self._count(len(url))
-            super().on_url(url)
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._arrived()
+        super().connection_lost(exc)
 
-        def on_header(self, name: bytes, value: bytes) -> None:
-            self._head_lines += 1
-            self._count(len(name) + len(value))
-            if not self._head_complete:  # a trailer is counted, and nobody reads it
-                super().on_header(name, value)
+    def on_message_begin(self) -> None:
+        super().on_message_begin()
+        self._head_bytes = self._head_lines = self._unparsed = 0
+        self._head_complete = False
+        self._arrived()
+        self._wait()
 
-        def on_headers_complete(self) -> None:
-            self._head_complete, self._unparsed = True, 0
-            if len(self.pipeline) >= MAX_PIPELINED:
-                self._stop(f"expected at most {MAX_PIPELINED} requests that wait for an answer, got one more", 429)
-            super().on_headers_complete()
+    def on_url(self, url: bytes) -> None:
+        self._count(len(url))
+        super().on_url(url)
 
-        def on_body(self, body: bytes) -> None:
-            self._unparsed = 0
-            super().on_body(body)
+    def on_header(self, name: bytes, value: bytes) -> None:
+        self._head_lines += 1
+        self._count(len(name) + len(value))
+        if not self._head_complete:  # a trailer is counted, and nobody reads it
+            super().on_header(name, value)
 
-        def on_chunk_header(self) -> None:
-            self._unparsed = 0
+    def on_headers_complete(self) -> None:
+        self._head_complete, self._unparsed = True, 0
+        if len(self.pipeline) >= MAX_PIPELINED:
+            self._stop(f"expected at most {MAX_PIPELINED} requests that wait for an answer, got one more", 429)
+        super().on_headers_complete()
 
-        def on_message_complete(self) -> None:
-            self._unparsed = 0
-            self._arrived()
-            super().on_message_complete()
+    def on_body(self, body: bytes) -> None:
+        self._unparsed = 0
+        super().on_body(body)
 
-        def send_400_response(self, msg: str) -> None:
-            if self._too_much is not None:
-                self._refuse(Code.TOO_LARGE, str(self._too_much), status=self._too_much.status)
-            else:
-                self._refuse(Code.INVALID_REQUEST, f"expected a request of HTTP/1.1, got none: {msg}", status=400)
+    def on_chunk_header(self) -> None:
+        self._unparsed = 0
 
-        def handle_websocket_upgrade(self) -> None:
-            if self.scope["method"] == "GET":
-                super().handle_websocket_upgrade()
-            else:
-                self._refuse(Code.INVALID_REQUEST, "expected GET to open a stream, got another method", status=400)
+    def on_message_complete(self) -> None:
+        self._unparsed = 0
+        self._arrived()
+        super().on_message_complete()
 
-        def _count(self, size: int) -> None:
-            self._head_bytes += size
-            if self._head_bytes > MAX_HEAD_BYTES or self._head_lines > MAX_HEADERS:
-                self._stop(HEAD, HEAD_TOO_LARGE)
+    def send_400_response(self, msg: str) -> None:
+        if self._too_much is not None:
+            self._refuse(Code.TOO_LARGE, str(self._too_much), status=self._too_much.status)
+        else:
+            self._refuse(Code.INVALID_REQUEST, f"expected a request of HTTP/1.1, got none: {msg}", status=400)
 
-        def _stop(self, detail: str, status: int) -> None:
-            self._too_much = TooMuch(detail, status)
-            raise self._too_much
+    def handle_websocket_upgrade(self) -> None:
+        if self.scope["method"] == "GET":
+            super().handle_websocket_upgrade()
+        else:
+            self._refuse(Code.INVALID_REQUEST, "expected GET to open a stream, got another method", status=400)
 
-        def _wait(self) -> None:
-            self._timer = asyncio.get_running_loop().call_later(seconds, self._late)
+    def _count(self, size: int) -> None:
+        self._head_bytes += size
+        if self._head_bytes > MAX_HEAD_BYTES or self._head_lines > MAX_HEADERS:
+            self._stop(HEAD, HEAD_TOO_LARGE)
 
-        def _arrived(self) -> None:
-            if self._timer is not None:
-                self._timer.cancel()
-                self._timer = None
+    def _stop(self, detail: str, status: int) -> None:
+        self._too_much = TooMuch(detail, status)
+        raise self._too_much
 
-        def _late(self) -> None:
-            answering = self.cycle is not None and not self.cycle.response_complete
-            if answering and (self.cycle.response_started or self.pipeline):
-                self.transport.close()
-            else:
-                self._refuse(Code.REQUEST_TIMEOUT, f"expected a whole request within {seconds:g} s")
+    def _wait(self) -> None:
+        self._timer = asyncio.get_running_loop().call_later(self.seconds, self._late)
 
-        def _start_asgi_task(self, cycle: RequestResponseCycle, app: Any) -> None:
-            self._working = cycle
-            super()._start_asgi_task(cycle, app)
+    def _arrived(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
 
-        def _refuse(self, code: Code, detail: str, status: int | None = None) -> None:
-            if self._working is not None:  # its answer would go to a closed connection
-                self._working.disconnected = True
-                self._working.message_event.set()
-            reply = problem_response(code, detail, status=status, headers={"connection": "close"})
-            lines = b"".join(name + b": " + value + b"\r\n" for name, value in reply.raw_headers)
-            self.transport.write(b"HTTP/1.1 %d \r\n%s\r\n%s" % (reply.status_code, lines, bytes(reply.body)))
+    def _late(self) -> None:
+        answering = self.cycle is not None and not self.cycle.response_complete
+        if answering and (self.cycle.response_started or self.pipeline):
             self.transport.close()
+        else:
+            self._refuse(Code.REQUEST_TIMEOUT, f"expected a whole request within {self.seconds:g} s")
 
-    return Patient
+    def _start_asgi_task(self, cycle: RequestResponseCycle, app: Any) -> None:
+        self._working = cycle
+        super()._start_asgi_task(cycle, app)
+
+    def _refuse(self, code: Code, detail: str, status: int | None = None) -> None:
+        if self._working is not None:  # its answer would go to a closed connection
+            self._working.disconnected = True
+            self._working.message_event.set()
+        reply = problem_response(code, detail, status=status, headers={"connection": "close"})
+        lines = b"".join(name + b": " + value + b"\r\n" for name, value in reply.raw_headers)
+        self.transport.write(b"HTTP/1.1 %d \r\n%s\r\n%s" % (reply.status_code, lines, bytes(reply.body)))
+        self.transport.close()
+
+
+def patient(seconds: float, most: int) -> type[HttpToolsProtocol]:
+    """``Patient`` with its limits, as uvicorn takes it: a class."""
+    return type("Patient", (Patient,), {"seconds": seconds, "most": most})
 
 
 class Unfinished:

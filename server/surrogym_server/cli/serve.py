@@ -14,6 +14,40 @@ from surrogym_server.errors import InvalidInput, SurrogymError
 from surrogym_shared.terminal import give, progress
 
 WORKERS_VARIABLE = "WEB_CONCURRENCY"
+OF_THE_COMMAND = ("ready_file", "exit_with_parent", "as_json", "quiet")  # its other options are settings
+
+Host = Annotated[str | None, typer.Option(help="Address to listen on. [default: 127.0.0.1]")]
+Port = Annotated[int | None, typer.Option(help="Port; 0 takes any free one. [default: 8000]")]
+Database = Annotated[str | None, typer.Option(help="SQLite file, or a SQLAlchemy URL. [default: surrogym.db]")]
+Synchronous = Annotated[
+    str | None, typer.Option(help="Of a SQLite file: full waits for the disk, normal not always. [default: full]")
+]
+TokenFile = Annotated[Path | None, typer.Option(help="File with one token a line: an admin token, or role:token.")]
+Insecure = Annotated[
+    bool | None, typer.Option("--insecure", help="Allow another address than loopback without a token.")
+]
+PublicUrl = Annotated[
+    str | None, typer.Option(help="Address that browsers know the server by, where a proxy stands before it.")
+]
+TlsCertificate = Annotated[Path | None, typer.Option(help="PEM file; the server then speaks HTTPS alone.")]
+TlsKey = Annotated[Path | None, typer.Option(help="PEM file with the certificate's private key.")]
+Device = Annotated[
+    str | None, typer.Option(help="What steps sessions: cpu, or cuda where torch has it. [default: cpu]")
+]
+Threads = Annotated[int | None, typer.Option(help="Threads of one torch operation. [default: 1]")]
+SessionIdleSeconds = Annotated[
+    float | None, typer.Option(help="Idle time after which a session expires. [default: 3600]")
+]
+LogLevel = Annotated[str | None, typer.Option(help="critical, error, warning, info or debug. [default: info]")]
+LogFormat = Annotated[str | None, typer.Option(help="text, or json: one object a line. [default: text]")]
+ReadyFile = Annotated[Path | None, typer.Option(help="File to write the URL to, once the server accepts requests.")]
+ExitWithParent = Annotated[
+    bool, typer.Option("--exit-with-parent", help="End when the process that started this one ends.")
+]
+AsJson = Annotated[
+    bool, typer.Option("--json", help="Print address and version as JSON, once the server accepts requests.")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No remarks; the log is what --log-level says.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -22,46 +56,25 @@ def register(app: typer.Typer) -> None:
 
 
 def serve(
-    host: Annotated[str | None, typer.Option(help="Address to listen on. [default: 127.0.0.1]")] = None,
-    port: Annotated[int | None, typer.Option(help="Port; 0 takes any free one. [default: 8000]")] = None,
-    database: Annotated[
-        str | None, typer.Option(help="SQLite file, or a SQLAlchemy URL. [default: surrogym.db]")
-    ] = None,
-    synchronous: Annotated[
-        str | None, typer.Option(help="Of a SQLite file: full waits for the disk, normal not always. [default: full]")
-    ] = None,
-    token_file: Annotated[
-        Path | None, typer.Option(help="File with one token a line: an admin token, or role:token.")
-    ] = None,
-    insecure: Annotated[
-        bool | None, typer.Option("--insecure", help="Allow another address than loopback without a token.")
-    ] = None,
-    public_url: Annotated[
-        str | None, typer.Option(help="Address that browsers know the server by, where a proxy stands before it.")
-    ] = None,
-    tls_certificate: Annotated[Path | None, typer.Option(help="PEM file; the server then speaks HTTPS alone.")] = None,
-    tls_key: Annotated[Path | None, typer.Option(help="PEM file with the certificate's private key.")] = None,
-    device: Annotated[
-        str | None, typer.Option(help="What steps sessions: cpu, or cuda where torch has it. [default: cpu]")
-    ] = None,
-    threads: Annotated[int | None, typer.Option(help="Threads of one torch operation. [default: 1]")] = None,
-    session_idle_seconds: Annotated[
-        float | None, typer.Option(help="Idle time after which a session expires. [default: 3600]")
-    ] = None,
-    log_level: Annotated[
-        str | None, typer.Option(help="critical, error, warning, info or debug. [default: info]")
-    ] = None,
-    log_format: Annotated[str | None, typer.Option(help="text, or json: one object a line. [default: text]")] = None,
-    ready_file: Annotated[
-        Path | None, typer.Option(help="File to write the URL to, once the server accepts requests.")
-    ] = None,
-    exit_with_parent: Annotated[
-        bool, typer.Option("--exit-with-parent", help="End when the process that started this one ends.")
-    ] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print address and version as JSON, once the server accepts requests.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No remarks; the log is what --log-level says.")] = False,
+    context: typer.Context,
+    host: Host = None,
+    port: Port = None,
+    database: Database = None,
+    synchronous: Synchronous = None,
+    token_file: TokenFile = None,
+    insecure: Insecure = None,
+    public_url: PublicUrl = None,
+    tls_certificate: TlsCertificate = None,
+    tls_key: TlsKey = None,
+    device: Device = None,
+    threads: Threads = None,
+    session_idle_seconds: SessionIdleSeconds = None,
+    log_level: LogLevel = None,
+    log_format: LogFormat = None,
+    ready_file: ReadyFile = None,
+    exit_with_parent: ExitWithParent = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Run the server until Ctrl-C.
 
@@ -75,23 +88,8 @@ def serve(
 
     try:
         _refuse_workers()
-        settings = read_settings(
-            os.environ,
-            host=host,
-            port=port,
-            database=database,
-            synchronous=synchronous,
-            token_file=token_file,
-            insecure=insecure,
-            public_url=public_url,
-            tls_certificate=tls_certificate,
-            tls_key=tls_key,
-            device=device,
-            threads=threads,
-            session_idle_seconds=session_idle_seconds,
-            log_level=log_level,
-            log_format=log_format,
-        )
+        given = {name: value for name, value in context.params.items() if name not in OF_THE_COMMAND}
+        settings = read_settings(os.environ, **given)
         with progress("serve", quiet=quiet or not sys.stderr.isatty()) as update:
             update(None, "importing torch")
             from surrogym_server.cli import runner  # neither --help nor a refusal should wait for it
