@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -138,9 +138,31 @@ def validation_detail(found: Sequence[Any]) -> str:
 
 
 def shown(value: Any) -> str:
-    """What came, short enough for a message."""
-    text = "nothing" if value is None else repr(value)
-    return text if len(text) <= SHOWN_CHARACTERS else f"{text[:SHOWN_CHARACTERS]}..."
+    """What came, short enough for a message. Of a long value no more is put into words than is shown."""
+    text = ""
+    for piece in ["nothing"] if value is None else _pieces(value):
+        text += piece
+        if len(text) > SHOWN_CHARACTERS:
+            return f"{text[:SHOWN_CHARACTERS]}..."
+    return text
+
+
+def _pieces(value: Any) -> Iterator[str]:
+    """The ``repr`` of a value from JSON, piece by piece."""
+    if isinstance(value, dict):
+        yield "{"
+        for index, (key, entry) in enumerate(value.items()):
+            yield f"{', ' if index else ''}{key!r}: "
+            yield from _pieces(entry)
+        yield "}"
+    elif isinstance(value, list):
+        yield "["
+        for index, entry in enumerate(value):
+            yield ", " if index else ""
+            yield from _pieces(entry)
+        yield "]"
+    else:
+        yield repr(value[: SHOWN_CHARACTERS + 1] if isinstance(value, str) else value)
 
 
 def _located(found: Sequence[Any]) -> list[dict[str, str]]:
