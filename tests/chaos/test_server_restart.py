@@ -78,7 +78,7 @@ def test_a_stop_lets_long_polls_end_and_running_steps_finish(restarting: Restart
     design = pendulum().design.model_copy(update={"initial": 2, "budget": 2})
     with (
         Api(restarting.url) as api,
-        HttpSurrogate(restarting.url, "pendulum", transport="json", retries=Retries(seconds=0)) as port,
+        HttpSurrogate(restarting.url, "pendulum", transport="binary", retries=Retries(seconds=0)) as port,
         ThreadPoolExecutor(2) as pool,
     ):
         api.create_surrogate("leased", pendulum().model_copy(update={"design": design}))
