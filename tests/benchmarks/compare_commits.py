@@ -55,7 +55,18 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 OF_A_SAMPLE = ("coordinates", "action", "next_coordinates", "reward", "terminated", "observation", "next_observation")
 PACKAGES = ("front", "server", "client", "shared")
-OF_ONE_RUN = {"created_at", "fit_seconds", "sampler", "seconds", "commit", "versions", "out", "machine"}  # not compared
+OF_ONE_RUN = {
+    "created_at",
+    "fit_seconds",
+    "sampler",
+    "seconds",
+    "commit",
+    "versions",
+    "out",
+    "machine",
+    "tensorboard",
+    "tensorboard_log",
+}  # not compared
 
 Facts = dict[str, Any]
 
