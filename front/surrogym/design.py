@@ -1,4 +1,4 @@
-"""The adaptive design of queries in this process: ask for a query, tell what the real step gave.
+"""The adaptive design of queries in this process.
 
 It does what the server's designer does, by the same functions on the same arrays, so that the same answers lead to the
 same queries. It keeps everything in memory; ``save`` writes it down.
@@ -34,7 +34,7 @@ Phase = Literal["collecting", "sampling", "ready", "over_budget"]
 
 
 class QueriesOpen(RuntimeError):
-    """The next round can't be chosen before these queries were told or given up; ``ids`` are theirs."""
+    """The next round needs the answers to these queries first. ``ids`` are their numbers."""
 
     def __init__(self, ids: Sequence[int]) -> None:
         self.ids = tuple(ids)
@@ -144,8 +144,8 @@ class Design:
                 nothing is kept.
         """
         taken = [steps] if isinstance(steps, RealStep) else list(steps)
-        if query is not None and query.id not in self._open:
-            raise InvalidInput(f"expected an open query, one of {sorted(self._open)}, got {query.id}")
+        if query is not None:
+            self._require_open(query)
         if not taken or (query is not None and len(taken) > len(query.actions)):
             most = "any number" if query is None else len(query.actions)
             raise InvalidInput(f"expected 1 to {most} steps, got {len(taken)}")
@@ -159,9 +159,8 @@ class Design:
         Raises:
             InvalidInput: the query is not open.
         """
-        if self._open.pop(query.id, None) is None:
-            raise InvalidInput(f"expected an open query, one of {sorted(self._open)}, got {query.id}")
-        self._given_up.append(query)
+        self._require_open(query)
+        self._given_up.append(self._open.pop(query.id))
 
     def improve(self, steps: int, visited: Floats | None = None) -> None:
         """Have the next round choose more real steps within the budget, whatever the verdict.
@@ -220,9 +219,10 @@ class Design:
         finally:
             torch.set_num_threads(threads)
         self._state, self._result, self._fitted, self._extra = result.state, result, len(self._samples), 0
-        chosen = self._queries("adaptive", result.query_coordinates, result.query_action, result.query_rollouts)
-        self._queue.extend(chosen)
-        self._phase = "sampling" if chosen else "ready" if result.verdict == "ready" else "over_budget"
+        self._queue.extend(
+            self._queries("adaptive", result.query_coordinates, result.query_action, result.query_rollouts)
+        )
+        self._phase = result.phase
 
     def _job(self) -> DesignJob:
         q, u, q_next, reward, terminated = self._arrays()
@@ -270,6 +270,10 @@ class Design:
             if not np.isfinite(values).all():
                 raise InvalidInput(f"{what}: expected finite numbers, got {values.tolist()}")
         return RealStep(q[0], u[0], q_next[0], float(step.reward), bool(step.terminated), bool(step.truncated))
+
+    def _require_open(self, query: Query) -> None:
+        if query.id not in self._open:
+            raise InvalidInput(f"expected an open query, one of {sorted(self._open)}, got {query.id}")
 
     def _spoken_for(self) -> int:
         waiting = [*self._queue, *self._open.values(), *self._given_up]

@@ -207,11 +207,7 @@ def differences(before: Any, after: Any, where: str = "") -> Iterator[str]:
         for index, pair in enumerate(zip(before, after, strict=True)):
             yield from differences(*pair, f"{where}[{index}]")
     elif before != after:
-        yield f"{where}: {_short(before)} became {_short(after)}"
-
-
-def _short(value: Any) -> str:
-    return reprlib.repr(value)
+        yield f"{where}: {reprlib.repr(before)} became {reprlib.repr(after)}"
 
 
 def timings(servers: Mapping[str, Server], rounds: int) -> Facts:

@@ -61,6 +61,13 @@ class DesignResult:
     query_action: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (m, F)
     query_rollouts: tuple[Array, ...] = ()  # each (T, F)
 
+    @property
+    def phase(self) -> Literal["sampling", "ready", "over_budget"]:
+        """What the design does next: it takes the chosen queries, or it has ended."""
+        if len(self.query_coordinates) or self.query_rollouts:
+            return "sampling"
+        return "ready" if self.verdict == "ready" else "over_budget"
+
 
 def initial_queries(
     definition: EnvironmentDefinition, budget: int

@@ -22,7 +22,6 @@ from surrogym_server.storage.records import (
     Granted,
     NewDesign,
     NewModel,
-    Phase,
 )
 
 logger = logging.getLogger(__name__)
@@ -191,7 +190,7 @@ class Designer:
         design = NewDesign(
             model=model,
             state=result.state,
-            phase=phase_after(result),
+            phase=result.phase,
             query_coordinates=result.query_coordinates,
             query_action=result.query_action,
             query_rollouts=result.query_rollouts,
@@ -213,10 +212,3 @@ class Designer:
                 error = f"all {len(set_aside)} initial queries were set aside; the last said: {set_aside[-1].error}"
                 self._storage.surrogates.set_phase(name, "failed", error)
                 self._notices.post(name)
-
-
-def phase_after(result: DesignResult) -> Phase:
-    """The phase that a fit leads to."""
-    if len(result.query_coordinates) or result.query_rollouts:
-        return "sampling"
-    return "ready" if result.verdict == "ready" else "over_budget"

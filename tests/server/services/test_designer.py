@@ -17,7 +17,7 @@ from surrogym_server.engine.design_job import DesignJob, DesignResult, run_desig
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.errors import InvalidInput, NoModel, NumericalFailure, Unavailable
 from surrogym_server.services.definitions import Definitions
-from surrogym_server.services.designer import ATTEMPTS, Designer, phase_after
+from surrogym_server.services.designer import ATTEMPTS, Designer
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.models import load_model
 from surrogym_server.services.notices import Notices
@@ -286,7 +286,7 @@ def test_the_phase_after_a_fit(answered: Storage, designer, runner: Runner, verd
     fit_all(designer)
     result = run_design_job(runner.jobs[0])
     changed = replace(result, verdict=verdict, query_coordinates=np.zeros((queries, 2)))
-    assert phase_after(changed) == phase
+    assert changed.phase == phase
 
 
 def test_a_surrogate_deleted_under_its_eyes_does_not_end_the_designer(answered: Storage, designer, runner, monkeypatch):

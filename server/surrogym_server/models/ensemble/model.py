@@ -57,9 +57,7 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, Differentiable):
         reward_deviation: bool = False,
     ) -> Transition:
         del process  # no noise is learned
-        step = partial(self._step, deviations, reward_deviation)
-        q_next, reward, spread, doubt = in_blocks(ROWS, step, q, u, noise, None)
-        return Transition(q_next, reward, spread if deviations else None, doubt if reward_deviation else None)
+        return self._in_blocks(q, u, noise, None, deviations, reward_deviation)
 
     @property
     def path_size(self) -> int:
@@ -82,9 +80,7 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, Differentiable):
         reward_deviation: bool = False,
     ) -> Transition:
         del process
-        step = partial(self._step, deviations, reward_deviation)
-        q_next, reward, spread, doubt = in_blocks(ROWS, step, q, u, None, paths[:, 0].long())
-        return Transition(q_next, reward, spread if deviations else None, doubt if reward_deviation else None)
+        return self._in_blocks(q, u, None, paths[:, 0].long(), deviations, reward_deviation)
 
     def means(self, q: Tensor, u: Tensor) -> Tensor:
         change = self.transitions(self._inputs.of_transition(q, u)).mean(0)
@@ -121,6 +117,19 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, Differentiable):
             for name, structure, scale in zip(names, self.structures, scales, strict=True)
         ]
         return {"outputs": outputs, "terminal_reward": self.terminal_reward, "samples": self.samples}
+
+    def _in_blocks(
+        self,
+        q: Tensor,
+        u: Tensor,
+        noise: Tensor | None,
+        member: Tensor | None,
+        deviations: bool,
+        reward_deviation: bool,
+    ) -> Transition:
+        step = partial(self._step, deviations, reward_deviation)
+        q_next, reward, spread, doubt = in_blocks(ROWS, step, q, u, noise, member)
+        return Transition(q_next, reward, spread if deviations else None, doubt if reward_deviation else None)
 
     def _step(
         self,
