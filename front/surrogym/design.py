@@ -95,7 +95,7 @@ class Design:
         self._visited: Floats | None = None
         self._phase: Phase = "collecting"
         self._result: DesignResult | None = None
-        self._fitted = 0  # samples in the last fit
+        self._settled = 0  # samples and queries given up before the last fit
         self._state, q, u, rollouts = initial_queries(self._definition, self.budget)
         self._queue = deque(self._queries("initial", q, u, rollouts))
 
@@ -124,7 +124,7 @@ class Design:
         """
         if not self._queue and self._open:
             raise QueriesOpen(sorted(self._open))
-        if not self._queue and (len(self._samples) > self._fitted or self._extra):
+        if not self._queue and (len(self._samples) + len(self._given_up) > self._settled or self._extra):
             self._fit()
         if not self._queue:
             return None
@@ -218,7 +218,8 @@ class Design:
             result = run_design_job(self._job())
         finally:
             torch.set_num_threads(threads)
-        self._state, self._result, self._fitted, self._extra = result.state, result, len(self._samples), 0
+        self._state, self._result, self._extra = result.state, result, 0
+        self._settled = len(self._samples) + len(self._given_up)
         self._queue.extend(
             self._queries("adaptive", result.query_coordinates, result.query_action, result.query_rollouts)
         )

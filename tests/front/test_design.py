@@ -83,6 +83,26 @@ def test_a_query_without_an_answer_counts_against_the_budget():
         design.give_up(lost)
 
 
+def test_a_round_that_is_given_up_is_followed_by_another_until_the_budget_is_spent():
+    design = surrogym.Design(small())
+    real = GymnasiumEnvironment(design.spec)
+    while (query := design.ask()) is not None:
+        if query.purpose == "initial":
+            design.tell(query, real.step_from(np.array(query.coordinates), np.array(query.action)))
+        else:
+            design.give_up(query)
+    assert (design.phase, design.steps) == ("over_budget", INITIAL)
+
+
+def test_without_any_answer_nothing_can_be_fitted():
+    design = surrogym.Design(small(budget=2))
+    for query in (design.ask(), design.ask()):
+        assert query is not None
+        design.give_up(query)
+    with pytest.raises(InvalidInput, match="a model needs at least 2 samples, got 0"):
+        design.ask()
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
