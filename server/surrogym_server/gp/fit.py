@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+import scipy  # its parts are loaded on first use: a server that fits nothing starts without them
 import torch
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
-from scipy.optimize import minimize
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
@@ -70,7 +69,7 @@ def fit(
 
 
 def _minimum(objective: _Objective, start: Array) -> tuple[float, Array]:
-    found = minimize(
+    found = scipy.optimize.minimize(
         objective,
         np.clip(start, objective.lower, objective.upper),
         jac=True,
@@ -168,12 +167,13 @@ class _Objective:
     def _solve(self, matrix: Array) -> tuple[Array, Array, float] | None:
         """Of a matrix K, given by its lower half: the inverse (its lower half counts), K^-1 y, and half of K's log
         determinant; None if it has no Cholesky factor."""
-        upper, info = dpotrf(matrix.T, lower=0, overwrite_a=1)  # transposed: the order of memory that LAPACK wants
+        lapack = scipy.linalg.lapack
+        upper, info = lapack.dpotrf(matrix.T, lower=0, overwrite_a=1)  # transposed: the order that LAPACK wants
         if info:
             return None
-        weights, _ = dpotrs(upper, self.y, lower=0)
+        weights, _ = lapack.dpotrs(upper, self.y, lower=0)
         root = float(np.log(upper.diagonal()).sum())
-        inverse, _ = dpotri(upper, lower=0, overwrite_c=1)
+        inverse, _ = lapack.dpotri(upper, lower=0, overwrite_c=1)
         return inverse.T, weights, root
 
     def _pairs(self, symmetric: Tensor) -> Array:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy  # its parts are loaded on first use
 import torch
 from numpy.typing import NDArray
-from scipy.spatial.distance import pdist
 from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
@@ -72,4 +72,4 @@ def _unit_hypercube(count: int, dimensions: int, rng: np.random.Generator, nvec:
 
 
 def _closest_pair(points: Array) -> float:
-    return float(pdist(points).min())
+    return float(scipy.spatial.distance.pdist(points).min())

@@ -15,6 +15,7 @@ import pytest
 import sqlalchemy as sa
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
 
 from support.postgresql import Postgresql
 from surrogym_server.errors import InvalidInput, Unavailable
@@ -23,6 +24,7 @@ from surrogym_server.storage.records import NewSurrogate
 from surrogym_server.storage.sql import database, filelock, open_storage
 from surrogym_server.storage.sql.database import connect
 from surrogym_server.storage.sql.filelock import FileLock
+from surrogym_server.storage.sql.migrate import SCRIPTS
 from surrogym_server.storage.sql.tables import metadata
 
 WRITER = """
@@ -74,6 +76,26 @@ def test_a_database_of_a_newer_program_is_refused_and_left_alone(url: str) -> No
         open_storage(url)
     with engine(url).connect() as connection:
         assert connection.execute(sa.text("SELECT version_num FROM alembic_version")).scalar() == "9999"
+
+
+def test_the_names_of_the_migrations_are_their_revisions_in_order() -> None:
+    """Opening compares the names with the database, so that Alembic is loaded only where something is missing."""
+    scripts = ScriptDirectory(str(SCRIPTS)).walk_revisions()
+    assert [f"r{script.revision}" for script in reversed(list(scripts))] == [
+        path.name[:5] for path in sorted(SCRIPTS.glob("versions/r*.py"))
+    ]
+
+
+def test_a_database_with_today_s_schema_is_opened_without_alembic(url: str) -> None:
+    open_storage(url).close()
+    opening = f"from surrogym_server.storage.sql import open_storage; open_storage({url!r}).close(); import sys"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{opening}; print('alembic' in sys.modules)"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.strip() == "False"
 
 
 @pytest.mark.postgresql
