@@ -1,4 +1,4 @@
-"""The paper's policy as plain arrays: one hidden layer of tanh. Made by searches that need no trainer's library.
+"""A policy as plain arrays: layers of tanh or ReLU. Made by searches that need no trainer's library.
 
 Leading dimensions (...) stand for several policies at once. D observation entries, H hidden units, A outputs.
 """
@@ -7,36 +7,56 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, PositiveInt, ValidationError
+from pydantic import BaseModel, Field, PositiveInt, ValidationError
 
 from surrogym_shared.archives import Header, read_arrays, read_entries
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
 
 Array = NDArray[np.float64]
+Activation = Literal["tanh", "relu"]
 HEAD = "surrogym-network.json"
 ARRAYS = "network.npz"
 MAX_BYTES = 16 * 1024 * 1024  # of a file's contents
 MAX_HEAD_BYTES = 64 * 1024
+MAX_LAYERS = 8
+OUTSIDE = ("mean", "deviation", "low", "high")  # arrays of a policy beside its layers
+
+
+class Layer(NamedTuple):
+    """Inputs to outputs: x @ weights + bias."""
+
+    weights: Array  # (..., I, O)
+    bias: Array  # (..., O)
 
 
 class _Head(BaseModel):
-    """The JSON head of a file."""
+    """The JSON head of a file. Version 1 had one hidden layer of tanh."""
 
-    version: Literal[1]
+    version: Literal[1, 2]
     counts: tuple[PositiveInt, ...]
+    activation: Activation = "tanh"
+    layers: Annotated[int, Field(ge=1, le=MAX_LAYERS)] = 2
+
+    @property
+    def names(self) -> list[tuple[str, str]]:
+        """The names of the weights and the bias of each layer."""
+        if self.version == 1:
+            return [("hidden", "hidden_bias"), ("output", "output_bias")]
+        return [(f"weights{i}", f"bias{i}") for i in range(self.layers)]
 
 
 @dataclass(frozen=True)
 class Network:
-    """Standardised observations, one tanh layer, then tanh scaled to the action's bounds, or the most probable choice.
+    """Standardised observations, hidden layers, then tanh scaled to the action's bounds, or the most probable choice.
 
     ``counts`` are the choices of each entry of a discrete action, empty for a continuous one, whose bounds are
     ``low`` and ``high`` (F,).
@@ -44,45 +64,39 @@ class Network:
 
     mean: Array  # (D,)
     deviation: Array  # (D,)
-    hidden: Array  # (..., D, H)
-    hidden_bias: Array  # (..., H)
-    output: Array  # (..., H, A)
-    output_bias: Array  # (..., A)
+    layers: tuple[Layer, ...]
     low: Array
     high: Array
     counts: tuple[int, ...] = ()
+    activation: Activation = "tanh"  # of the hidden layers
 
     @classmethod
-    def of(cls, spec: EnvironmentSpec, mean: Array, deviation: Array, units: int, vector: Array) -> Self:
+    def of(
+        cls, spec: EnvironmentSpec, mean: Array, deviation: Array, units: int | Sequence[int], vector: Array
+    ) -> Self:
         """The policies whose parameters are vectors (..., ``size``), layer weights in units of 1 / sqrt(inputs)."""
-        d, a = len(mean), sum(counts_of(spec)) or spec.action.size
-        shapes = [(d, units), (units,), (units, a), (a,)]
-        ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
-        parts = np.split(vector, ends[:-1], axis=-1)
-        hidden, hidden_bias, output, output_bias = (
-            part.reshape(*vector.shape[:-1], *shape) for part, shape in zip(parts, shapes, strict=True)
-        )
-        low, high = bounds_of(spec)
-        weights = (hidden / np.sqrt(d), hidden_bias, output / np.sqrt(units), output_bias)
-        return cls(mean, deviation, *weights, low, high, counts_of(spec))
+        layers, begin = [], 0
+        for inputs, outputs in pairwise(_sizes(spec, units)):
+            middle, end = begin + inputs * outputs, begin + (inputs + 1) * outputs
+            weights = vector[..., begin:middle].reshape(*vector.shape[:-1], inputs, outputs)
+            layers.append(Layer(weights / np.sqrt(inputs), vector[..., middle:end]))
+            begin = end
+        return cls(mean, deviation, tuple(layers), *bounds_of(spec), counts_of(spec))
 
     @staticmethod
-    def size(spec: EnvironmentSpec, units: int) -> int:
-        """How many parameters a policy has."""
-        d, a = len(spec.observation), sum(counts_of(spec)) or spec.action.size
-        return (d + 1) * units + (units + 1) * a
+    def size(spec: EnvironmentSpec, units: int | Sequence[int]) -> int:
+        """How many parameters a policy has; ``units`` of its hidden layer, or of each."""
+        return sum((inputs + 1) * outputs for inputs, outputs in pairwise(_sizes(spec, units)))
 
     @property
     def vector(self) -> Array:
         """The parameters of one policy, as ``of`` takes them."""
-        d, units = self.hidden.shape
-        parts = (self.hidden * np.sqrt(d), self.hidden_bias, self.output * np.sqrt(units), self.output_bias)
-        return np.concatenate([part.ravel() for part in parts])
+        parts = [(layer.weights * np.sqrt(len(layer.weights)), layer.bias) for layer in self.layers]
+        return np.concatenate([part.ravel() for layer in parts for part in layer])
 
     def __call__(self, observation: NDArray[Any]) -> NDArray[Any]:
         """Actions (..., N, F) of observations (..., N, D); int64 (..., N) where there is one discrete choice."""
-        x = (np.asarray(observation, dtype=np.float64) - self.mean) / self.deviation
-        y = np.tanh(x @ self.hidden + self.hidden_bias[..., None, :]) @ self.output + self.output_bias[..., None, :]
+        y = self.outputs(observation)
         if not self.counts:
             centre, reach = (self.low + self.high) / 2, (self.high - self.low) / 2
             return np.asarray(centre + reach * np.tanh(y), dtype=np.float32)
@@ -90,24 +104,39 @@ class Network:
         chosen = [group.argmax(-1) for group in groups]
         return chosen[0] if len(chosen) == 1 else np.stack(chosen, -1)
 
+    def outputs(self, observation: NDArray[Any]) -> Array:
+        """The last layer's (..., N, A), before the tanh of a continuous action: scores of discrete choices."""
+        x = (np.asarray(observation, dtype=np.float64) - self.mean) / self.deviation
+        *hidden, last = self.layers
+        for weights, bias in hidden:
+            x = x @ weights + bias[..., None, :]
+            x = np.tanh(x) if self.activation == "tanh" else np.maximum(x, 0.0)
+        scores: Array = x @ last.weights + last.bias[..., None, :]
+        return scores
+
     def save(self, path: Path) -> None:
         """Write one policy: a zip of arrays and a JSON head, nothing in it is code."""
-        names = [name for name in self.__dataclass_fields__ if name != "counts"]
+        head = _Head(version=2, counts=self.counts, activation=self.activation, layers=len(self.layers))
+        arrays = {name: getattr(self, name) for name in OUTSIDE}
+        for names, layer in zip(head.names, self.layers, strict=True):
+            arrays |= dict(zip(names, layer, strict=True))
         with zipfile.ZipFile(path, "w") as file:
-            file.writestr(HEAD, json.dumps({"version": 1, "counts": self.counts}))
-            with file.open(ARRAYS, "w") as arrays:
-                np.savez(arrays, **{name: getattr(self, name) for name in names})
+            file.writestr(HEAD, json.dumps(head.model_dump()))
+            with file.open(ARRAYS, "w") as opened:
+                np.savez(opened, **arrays)
 
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read what ``save`` wrote. Raises ValueError where it is something else, or has more than ``MAX_BYTES``."""
         try:
             entries = read_entries(path, MAX_BYTES)
-            counts = _read_counts(entries[HEAD])
-            arrays = read_arrays(entries[ARRAYS], MAX_BYTES, partial(_require_chain, counts))
+            head = _read_head(entries[HEAD])
+            arrays = read_arrays(entries[ARRAYS], MAX_BYTES, partial(_require_chain, head))
         except (LookupError, TypeError, OSError, ValueError, RecursionError, MemoryError) as error:
             raise ValueError(f"{path} is no network of arrays: {error}") from error
-        return cls(**arrays, counts=counts)
+        layers = tuple(Layer(*(arrays[name] for name in names)) for names in head.names)
+        outside = {name: arrays[name] for name in OUTSIDE}
+        return cls(**outside, layers=layers, counts=head.counts, activation=head.activation)
 
     @staticmethod
     def is_at(path: Path) -> bool:
@@ -137,37 +166,49 @@ def bounds_of(spec: EnvironmentSpec) -> tuple[Array, Array]:
     return np.zeros(0), np.zeros(0)
 
 
-def _read_counts(head: bytes) -> tuple[int, ...]:
-    if len(head) > MAX_HEAD_BYTES:
-        raise ValueError(f"expected {HEAD} of at most {MAX_HEAD_BYTES} bytes, got {len(head)}")
+def _sizes(spec: EnvironmentSpec, units: int | Sequence[int]) -> list[int]:
+    """Numbers that enter, pass between the layers, and leave."""
+    hidden = [units] if isinstance(units, int) else units
+    return [len(spec.observation), *hidden, sum(counts_of(spec)) or spec.action.size]
+
+
+def _read_head(content: bytes) -> _Head:
+    if len(content) > MAX_HEAD_BYTES:
+        raise ValueError(f"expected {HEAD} of at most {MAX_HEAD_BYTES} bytes, got {len(content)}")
     try:
-        return _Head.model_validate_json(head).counts
+        return _Head.model_validate_json(content)
     except ValidationError as error:
         first = error.errors()[0]
         raise ValueError(f"{HEAD}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
 
 
-def _require_chain(counts: tuple[int, ...], headers: Mapping[str, Header]) -> None:
+def _require_chain(head: _Head, headers: Mapping[str, Header]) -> None:
     """Raise ValueError unless the arrays are those of one policy, whose layers and bounds fit together.
 
     Shapes that merely broadcast are refused: a call would compute far larger arrays than the file holds.
     """
-    names = {name for name in Network.__dataclass_fields__ if name != "counts"}
+    names = {*OUTSIDE, *(name for names in head.names for name in names)}
     if names != set(headers):
         raise ValueError(f"expected the arrays {', '.join(sorted(names))}, got {', '.join(sorted(headers)) or 'none'}")
-    for name, shape in _chained(counts, headers).items():
+    for name, shape in _chained(head, headers).items():
         header = headers[name]
         if header.shape != shape or header.dtype.kind != "f":
             raise ValueError(f"expected {name} as floats of shape {shape}, got {header.dtype} of {header.shape}")
-    if counts and sum(counts) != headers["output_bias"].shape[0]:
-        raise ValueError(f"expected {sum(counts)} outputs for the counts, got {headers['output_bias'].shape[0]}")
+    outputs = headers[head.names[-1][1]].shape[0]
+    if head.counts and sum(head.counts) != outputs:
+        raise ValueError(f"expected {sum(head.counts)} outputs for the counts, got {outputs}")
 
 
-def _chained(counts: tuple[int, ...], headers: Mapping[str, Header]) -> dict[str, tuple[int, ...]]:
-    """The shapes of one policy with as many observation entries, hidden units and outputs as the headers name."""
-    d, units, outputs, bounds = (
-        (headers[name].shape or (0,))[0] for name in ("mean", "hidden_bias", "output_bias", "low")
-    )
-    layers = {"hidden": (d, units), "hidden_bias": (units,), "output": (units, outputs), "output_bias": (outputs,)}
-    limits = (bounds if counts else outputs,)  # a discrete action may have none
-    return {"mean": (d,), "deviation": (d,), **layers, "low": limits, "high": limits}
+def _chained(head: _Head, headers: Mapping[str, Header]) -> dict[str, tuple[int, ...]]:
+    """The shapes of one policy with as many observation entries, units of each layer and bounds as the headers name."""
+
+    def length(name: str) -> int:
+        return (headers[name].shape or (0,))[0]
+
+    size = length("mean")
+    shapes: dict[str, tuple[int, ...]] = {"mean": (size,), "deviation": (size,)}
+    for weights, bias in head.names:
+        shapes |= {weights: (size, length(bias)), bias: (length(bias),)}
+        size = length(bias)
+    limits = (length("low") if head.counts else size,)  # a discrete action may have none
+    return shapes | {"low": limits, "high": limits}

@@ -188,10 +188,12 @@ def test_arrays_that_would_broadcast_are_refused_before_they_are_made(tmp_path: 
         ({"counts": [3]}, "expected 3 outputs for the counts, got 1"),
         ({"counts": [-1, 2]}, r"counts\.0: Input should be greater than 0"),
         ({"counts": ["a"]}, r"counts\.0: Input should be a valid integer"),
-        ({"counts": [], "version": 2}, "version: Input should be 1"),
+        ({"counts": [], "version": 3}, "version: Input should be 1 or 2"),
+        ({"counts": [], "version": 2}, "expected the arrays bias0, bias1, .*, got deviation, hidden"),
+        ({"counts": [], "version": 2, "layers": 9}, "layers: Input should be less than or equal to 8"),
         ({"counts": [1] * 50_000}, "expected surrogym-network.json of at most 65536 bytes, got "),
     ],
-    ids=["too many", "negative", "text", "version", "long"],
+    ids=["too many", "negative", "text", "version", "names", "layers", "long"],
 )
 def test_a_network_whose_head_does_not_fit_is_refused(tmp_path: Path, head, message):
     file = io.BytesIO()

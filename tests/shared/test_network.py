@@ -1,5 +1,8 @@
 """A network of arrays: its layers, several at once, both kinds of action, and a file that holds no code."""
 
+import json
+import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +28,9 @@ def observations(spec: EnvironmentSpec, *shape: int) -> np.ndarray:
 def test_a_continuous_action_is_a_scaled_tanh():
     made, seen = network(pendulum()), observations(pendulum(), 7)
     x = (seen - [0, 1, 2]) / 2
-    hidden = np.tanh(x @ made.hidden + made.hidden_bias)
-    np.testing.assert_allclose(made(seen), 2 * np.tanh(hidden @ made.output + made.output_bias), rtol=1e-5)
+    hidden, output = made.layers
+    first = np.tanh(x @ hidden.weights + hidden.bias)
+    np.testing.assert_allclose(made(seen), 2 * np.tanh(first @ output.weights + output.bias), rtol=1e-5)
     assert made(seen).shape == (7, 1)
     assert made(1e6 * seen).dtype == np.float32
     assert np.abs(made(1e6 * seen)).max() <= 2
@@ -39,7 +43,8 @@ def test_a_discrete_action_is_the_most_probable_of_each_entry(counts, shape):
     made, seen = network(spec), 10 * observations(spec, 50)
     chosen = made(seen)
     assert chosen.shape == shape
-    scores = np.tanh((seen - made.mean) / 2 @ made.hidden + made.hidden_bias) @ made.output + made.output_bias
+    hidden, output = made.layers
+    scores = np.tanh((seen - made.mean) / 2 @ hidden.weights + hidden.bias) @ output.weights + output.bias
     expected = [part.argmax(1) for part in np.split(scores, np.cumsum(counts)[:-1], axis=1)]
     np.testing.assert_array_equal(chosen.reshape(50, -1), np.stack(expected, 1))
     assert len(np.unique(chosen)) > 1
@@ -52,6 +57,36 @@ def test_many_networks_at_once_act_as_each_alone():
         one = Network.of(pendulum(), many.mean, many.deviation, UNITS, vector[i])
         np.testing.assert_allclose(one(seen[i]), many(seen)[i], rtol=1e-6)
         np.testing.assert_allclose(one.vector, vector[i])
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+def test_layers_follow_one_another(tmp_path: Path, activation):
+    spec, units = pendulum(), (4, 6)
+    vector = np.random.default_rng(0).normal(size=Network.size(spec, units))
+    made = replace(Network.of(spec, np.zeros(3), np.ones(3), units, vector), activation=activation)
+    assert [layer.weights.shape for layer in made.layers] == [(3, 4), (4, 6), (6, 1)]
+    np.testing.assert_allclose(made.vector, vector)
+    x = seen = observations(spec, 7).astype(float)
+    for weights, bias in made.layers[:-1]:
+        x = x @ weights + bias
+        x = np.tanh(x) if activation == "tanh" else np.where(x > 0, x, 0)
+    expected = 2 * np.tanh(x @ made.layers[-1].weights + made.layers[-1].bias)
+    np.testing.assert_allclose(made(seen), expected, rtol=1e-6)
+    made.save(tmp_path / "policy.zip")
+    np.testing.assert_array_equal(Network.load(tmp_path / "policy.zip")(seen), made(seen))
+
+
+def test_a_file_of_version_1_is_still_read(tmp_path: Path):
+    made, seen = network(pendulum()), observations(pendulum(), 9)
+    names = dict(zip(("hidden", "output"), made.layers, strict=True))
+    arrays = {name: layer.weights for name, layer in names.items()}
+    arrays |= {f"{name}_bias": layer.bias for name, layer in names.items()}
+    arrays |= {name: getattr(made, name) for name in ("mean", "deviation", "low", "high")}
+    with zipfile.ZipFile(tmp_path / "old.zip", "w") as file:
+        file.writestr("surrogym-network.json", json.dumps({"version": 1, "counts": []}))
+        with file.open("network.npz", "w") as opened:
+            np.savez(opened, **arrays)
+    np.testing.assert_array_equal(Network.load(tmp_path / "old.zip")(seen), made(seen))
 
 
 def test_what_is_saved_is_read_again(tmp_path: Path):

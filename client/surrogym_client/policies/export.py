@@ -67,23 +67,24 @@ class ArrayNetwork(nn.Module):
 
     mean: Tensor
     deviation: Tensor
-    hidden: Tensor
-    hidden_bias: Tensor
-    output: Tensor
-    output_bias: Tensor
     low: Tensor
     high: Tensor
 
     def __init__(self, network: Network) -> None:
         super().__init__()
-        self.size, self._counts = len(network.mean), network.counts
+        self.size, self._counts, self._layers = len(network.mean), network.counts, len(network.layers)
+        self._activation = torch.tanh if network.activation == "tanh" else torch.relu
         bounds = () if network.counts else ("low", "high")
-        for name in ("mean", "deviation", "hidden", "hidden_bias", "output", "output_bias", *bounds):
-            self.register_buffer(name, torch.as_tensor(getattr(network, name), dtype=torch.float64))
+        arrays = {name: getattr(network, name) for name in ("mean", "deviation", *bounds)}
+        for i, layer in enumerate(network.layers):
+            arrays |= {f"weights{i}": layer.weights, f"bias{i}": layer.bias}
+        for name, array in arrays.items():
+            self.register_buffer(name, torch.as_tensor(array, dtype=torch.float64))
 
     def forward(self, observation: Tensor) -> Tensor:
-        x = (observation.double() - self.mean) / self.deviation
-        y = torch.tanh(x @ self.hidden + self.hidden_bias) @ self.output + self.output_bias
+        y = (observation.double() - self.mean) / self.deviation
+        for i in range(self._layers):
+            y = (self._activation(y) if i else y) @ getattr(self, f"weights{i}") + getattr(self, f"bias{i}")
         if not self._counts:
             action: Tensor = (self.low + self.high) / 2 + (self.high - self.low) / 2 * torch.tanh(y)
             return action.float()
