@@ -14,7 +14,7 @@ from common import machine, parser
 
 import report
 
-PARTS = ("step", "cold", "peers", "train", "fit", "growth", "predict", "evidence", "lists", "attacks")
+PARTS = ("step", "cold", "peers", "train", "search", "fit", "growth", "predict", "evidence", "lists", "attacks")
 
 
 def main() -> None:

@@ -65,6 +65,19 @@ def train(found: dict[str, Any]) -> Iterator[Line]:
     yield "PPO, 16 lanes, remote beside in process", "1.10 x", reached, found["ratio"] <= 1.1
 
 
+def search(found: dict[str, Any]) -> Iterator[Line]:
+    whole, one = found["trainings"], found["updates"]
+    runs = {name: [run["imagined"] for run in each] for name, each in whole["runs"].items()}
+    imagined = ", ".join(f"{name} {' '.join(f'{value:.1f}' for value in each)}" for name, each in runs.items())
+    reached = f"{whole['ppo / fastppo']:.1f} x ({one['ppo / fastppo']:.1f} x an update); imagined returns {imagined}"
+    yield (
+        f"{whole['steps']:,} virtual steps of Pendulum, PPO beside FASTPPO",
+        "3 x",
+        reached,
+        whole["ppo / fastppo"] >= 3,
+    )
+
+
 def fit(found: dict[str, Any]) -> Iterator[Line]:
     for lanes, measured in found["lanes"].items():
         rest, busy = measured["rest"], measured["samples and fits"]
@@ -151,6 +164,7 @@ PARTS = {
     "step": step,
     "peers": peers,
     "train": train,
+    "search": search,
     "fit": fit,
     "predict": predict,
     "evidence": evidence,

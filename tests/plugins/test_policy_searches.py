@@ -27,6 +27,7 @@ EXAMPLE = ROOT / "examples" / "plugins" / "policy_search"
 PAGE = ROOT / "docs" / "how-to" / "plugins.md"
 SEARCHED = {  # small enough to take a second each
     "PPO": {"n_steps": 16, "batch_size": 32, "n_epochs": 2},
+    "FASTPPO": {"n_steps": 16, "batch_size": 32, "n_epochs": 2},
     "SAC": {"learning_starts": 32, "batch_size": 16},
     "CMAES": {"population": 4, "starts": 2, "units": 2},
     "cross_entropy": {"population": 8, "starts": 2, "units": 2},
@@ -80,7 +81,7 @@ def test_every_search_keeps_the_laws(
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("nobody", "expected one of A2C, DDPG, DQN, PPO, SAC, TD3, CMAES, GRADIENT, cross_entropy"),
+        ("nobody", "expected one of A2C, DDPG, DQN, PPO, SAC, TD3, FASTPPO, CMAES, GRADIENT, cross_entropy"),
         ("missing_module", "package 'package_of_missing_module', entry point missing_module = 'nowhere_to_be_found"),
         ("missing_module", "No module named 'nowhere_to_be_found'"),
         ("no_search", "expected a subclass of surrogym_client.training.search.PolicySearch, got <class 'json"),

@@ -18,12 +18,13 @@ from surrogym_client.policies import UnusablePolicy, load_policy
 from surrogym_client.policies.networks import WIDER, PaperPolicy
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.training import TrainingInterrupted, TrainProgress, TrainSettings, train
+from surrogym_client.training.proportions import even_batch, suggested_gamma
 from surrogym_client.training.search import MAX_STEPS, SEARCHES
 from surrogym_client.training.settings import prolongs
 from surrogym_client.training.stable_baselines import search as training
-from surrogym_client.training.stable_baselines.algorithms import OffPolicySearch, OnPolicySearch, even_batch
+from surrogym_client.training.stable_baselines.algorithms import OffPolicySearch, OnPolicySearch
 from surrogym_client.training.stable_baselines.early_stopping import Checks
-from surrogym_client.training.stable_baselines.search import imagined_return, suggested_gamma
+from surrogym_client.training.stable_baselines.search import imagined_return
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 
@@ -374,7 +375,9 @@ def test_anew_a_saved_policy_waits_until_a_new_network_falls_short(
     train(surrogate, saved, small(session=session))
     returns = itertools.chain([0.0, 100.0], itertools.repeat(earned))
     monkeypatch.setattr(training, "imagined_return", lambda *_: next(returns))
-    monkeypatch.setattr(Checks, "worth_keeping", lambda self, known: turns.append(self.steps) or plain(self, known))
+    monkeypatch.setattr(
+        Checks, "worth_keeping", lambda self, known: turns.append(self.verdicts.steps) or plain(self, known)
+    )
     settings = small(start_from=saved, anew=True, session=session, total_steps=steps, hyperparameters=IDLE)
     train(surrogate, tmp_path / "policy.zip", settings)
     assert len(turns) == given_up

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from surrogym_client.cli.options import ExitWithParent, Quiet
+from surrogym_client.cli.options import ExitWithParent, Quiet, require_known
 from surrogym_client.experiments.arms import ARMS
 from surrogym_client.experiments.tasks import TASKS
 
@@ -35,6 +35,9 @@ def command(
     arm: Annotated[ArmName, typer.Option(help="How to spend the real steps; see docs/results.md.")] = "default",
     budget: Annotated[int | None, typer.Option(min=2, help="Real steps, at most. [default: the task's]")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Virtual steps of the training.")] = None,
+    algorithm: Annotated[
+        str | None, typer.Option(help="Policy search, as of surrogym train. [default: that command's]")
+    ] = None,
     episodes: Annotated[int, typer.Option(min=1, help="Real episodes of the evaluation.")] = 100,
     pictures: Annotated[bool, typer.Option(help="Draw the run.")] = True,
     keep: Annotated[bool, typer.Option("--keep", help="Leave the server running until Ctrl-C.")] = False,
@@ -56,6 +59,8 @@ def command(
     if exit_with_parent:
         watch_parent()
 
+    if algorithm is not None:
+        require_known(algorithm)
     if json_file is not None and not json_file.resolve().parent.is_dir():
         raise CommandError(f"expected an existing folder for --json, got {json_file.parent}")
     settings = DemoSettings(
@@ -64,6 +69,7 @@ def command(
         arm=arm,
         budget=budget,
         steps=steps,
+        algorithm=algorithm,
         episodes=episodes,
         pictures=pictures,
         keep=keep,

@@ -212,3 +212,14 @@ def read_tolerances(given: list[str]) -> dict[str, float]:
         except ValueError as error:
             raise CommandError(f"--tolerance: expected output=number, such as theta=0.01, got {text!r}") from error
     return tolerances
+
+
+def require_known(algorithm: str) -> None:
+    """Refuse an unknown policy search before anything begins."""
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.training.search import SEARCHES
+
+    try:
+        SEARCHES.name_of(algorithm)
+    except ValueError as error:
+        raise CommandError(str(error)) from error

@@ -21,6 +21,7 @@ from surrogym_client.cli.options import (
     awaited_surrogate,
     connect,
     given_here,
+    require_known,
     typed,
 )
 
@@ -48,7 +49,8 @@ class SearchOptions:
     algorithm: Annotated[
         str,
         typer.Option(
-            help="Search by ppo, a2c, sac, td3, ddpg, dqn (Stable-Baselines3), cmaes, gradient, or a package's own."
+            help="Search by ppo, a2c, sac, td3, ddpg, dqn (Stable-Baselines3), fastppo (the same PPO in NumPy), cmaes, "
+            "gradient, or a package's own."
         ),
     ] = "PPO"
     steps: Annotated[
@@ -246,7 +248,7 @@ def _settings(search: SearchOptions, session: SessionOptions, start: StartOption
     if start.start_from is not None and not start.start_from.exists():
         raise CommandError(f"{start.start_from}: no such policy file")
     hyperparameters = search.hyperparameters()
-    _require_known(search.algorithm)
+    require_known(search.algorithm)
     return TrainSettings(
         algorithm=search.algorithm,
         total_steps=search.steps,
@@ -268,17 +270,6 @@ def _import(algorithm: str, *, quiet: bool) -> None:
     with on_interrupt(lambda: NOTHING_YET), progress("prepare", quiet=quiet) as update:
         update(None, f"importing what {algorithm} needs")
         SEARCHES.get(algorithm)
-
-
-def _require_known(algorithm: str) -> None:
-    """Refuse an unknown search before a server is asked."""
-    from surrogym_client.cli.errors import CommandError
-    from surrogym_client.training.search import SEARCHES
-
-    try:
-        SEARCHES.name_of(algorithm)
-    except ValueError as error:
-        raise CommandError(str(error)) from error
 
 
 @contextmanager

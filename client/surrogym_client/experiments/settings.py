@@ -27,6 +27,7 @@ class DemoSettings:
     episodes: int = 100
     pictures: bool = True
     keep: bool = False
+    algorithm: str | None = None  # name of a policy search
 
     @property
     def demo_task(self) -> DemoTask:
@@ -68,7 +69,8 @@ class DemoSettings:
         """All that a result depends on and that is known before the run, but the seed; JSON-able."""
         spec = self.spec().model_dump(mode="json")
         spec["design"].pop("seed")
-        names = ("task", "real_steps", "virtual_steps", "prolong", "episodes")
+        names = ["task", "real_steps", "virtual_steps", "prolong", "episodes"]
+        names += ["algorithm"] * (self.algorithm is not None)
         return {"spec": spec, "arm": self.way.fields(), **{name: getattr(self, name) for name in names}}
 
 

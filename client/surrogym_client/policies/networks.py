@@ -17,17 +17,14 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 
+from surrogym_client.policies.schedule import decaying
+
 HIDDEN = 32
 CRITIC = (64, 64)
 WIDER = {"pi": [64, 64], "vf": list(CRITIC)}  # in place of the paper's, which lies 20 below it on Pendulum
 EXPLORATION = 0.5  # first deviation of a continuous action, as a share of half its range
-LEARNING_RATE = 3e-3
-LAST_RATE = 0.02  # share of the learning rate that is left at the end
 
-
-def decaying(remaining: float) -> float:
-    """Learning rate of PPO, by the share of the training that remains."""
-    return LEARNING_RATE * max(remaining, LAST_RATE)
+__all__ = ["WIDER", "Bounded", "PaperPolicy", "Standardise", "decaying"]  # files name ``decaying`` as of this module
 
 
 class Standardise(BaseFeaturesExtractor):

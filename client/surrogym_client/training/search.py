@@ -107,6 +107,7 @@ SEARCHES = Registry[PolicySearch](
     PolicySearch,
     {
         **{name: f"surrogym_client.training.stable_baselines.algorithms:{name}" for name in ALGORITHMS},
+        "FASTPPO": "surrogym_client.training.fast_ppo.search:FastPpo",
         "CMAES": "surrogym_client.training.cma_es:CmaEs",
         "GRADIENT": "surrogym_client.training.gradients:Gradients",
     },

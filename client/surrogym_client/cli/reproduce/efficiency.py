@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from surrogym_client.cli.options import AsJson, Quiet
+from surrogym_client.cli.options import AsJson, Quiet, require_known
 
 if TYPE_CHECKING:
     from surrogym_client.experiments.reproduce.cells import Progress
@@ -36,6 +36,9 @@ def command(
     again: Annotated[bool, typer.Option("--again", help="Run also what has a row already.")] = False,
     steps: Annotated[int | None, typer.Option(min=1, help="Virtual steps of each training.")] = None,
     episodes: Annotated[int, typer.Option(min=1, help="Real episodes of each evaluation.")] = 100,
+    algorithm: Annotated[
+        str | None, typer.Option(help="Policy search, as of surrogym train. [default: that command's]")
+    ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -62,7 +65,9 @@ def command(
     from surrogym_shared.terminal import on_interrupt, progress, say
 
     named, numbers = _chosen("task", tasks, TASKS), range(first_seed, first_seed + seeds)
-    each: dict[str, Any] = {"shares": _shares(shares), "steps": steps, "episodes": episodes}
+    if algorithm is not None:
+        require_known(algorithm)
+    each: dict[str, Any] = {"shares": _shares(shares), "steps": steps, "episodes": episodes, "algorithm": algorithm}
     if arms == STUDY:
         wanted = list(study(named, numbers, **each))
     else:

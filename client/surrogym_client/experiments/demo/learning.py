@@ -107,6 +107,8 @@ class SurrogateRun:
     def _employ_trainer(self) -> Child:
         steps, queries = self._settings.virtual_steps, queries_a_round(self._settings.real_steps)
         options = [] if steps is None else ["--steps", str(steps)]
+        if self._settings.algorithm is not None:
+            options += ["--algorithm", self._settings.algorithm]
         if self._settings.way.start_box is not None:
             options += ["--start-box", str(self._settings.way.start_box)]
         options.append("--prolong" if self._settings.prolong else "--no-prolong")

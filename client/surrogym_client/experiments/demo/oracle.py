@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from surrogym_client.experiments.demo.judging import Judgement, episodes_of
@@ -27,6 +27,8 @@ class OriginalRun:
         """Train, and count the steps of the original environment."""
         asked = self._settings
         chosen = TrainSettings(total_steps=asked.virtual_steps, seed=asked.seed, prolong=asked.prolong)
+        if asked.algorithm is not None:
+            chosen = replace(chosen, algorithm=asked.algorithm)
         port = OriginalPort(self._settings.judged_by(), episodes_of(self._settings))
         with progress("train", quiet=self._quiet) as update:
 

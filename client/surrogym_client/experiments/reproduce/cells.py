@@ -48,6 +48,7 @@ class Cell:
         """Of ``surrogym demo``."""
         s = self.settings
         given = {"--seed": s.seed, "--arm": s.arm, "--budget": s.budget, "--steps": s.steps, "--episodes": s.episodes}
+        given |= {"--algorithm": s.algorithm}
         options = [word for name, value in given.items() if value is not None for word in (name, str(value))]
         return (s.task, *options, *(() if s.pictures else ("--no-pictures",)))
 
@@ -85,6 +86,7 @@ def cells(
     shares: Sequence[float] = (1.0,),
     steps: int | None = None,
     episodes: int = 100,
+    algorithm: str | None = None,
 ) -> Iterator[Cell]:
     """Every combination; a seed of everything comes before the next seed of anything.
 
@@ -93,10 +95,11 @@ def cells(
         shares: of each task's budget of real steps.
         steps: virtual steps; None takes the task's.
         episodes: of each evaluation.
+        algorithm: name of a policy search; None takes the command's.
     """
     for seed, task, arm, share in product(seeds, tasks, arms, shares):
         budget = None if share == 1 else max(2, round(share * TASKS[task].budget))
-        yield Cell(DemoSettings(task, seed, arm, budget, steps, episodes, pictures=False))
+        yield Cell(DemoSettings(task, seed, arm, budget, steps, episodes, pictures=False, algorithm=algorithm))
 
 
 def study(tasks: Sequence[str], seeds: Sequence[int], **chosen: Any) -> Iterator[Cell]:

@@ -12,10 +12,9 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
 from surrogym_client.policies.networks import WIDER, PaperPolicy, decaying
+from surrogym_client.training.proportions import even_batch
 from surrogym_client.training.stable_baselines.search import StableBaselinesSearch
 from surrogym_shared.spec import EnvironmentSpec
-
-BATCH = 1_024  # most of a training is the update, and its cost goes by the batch
 
 
 class OnPolicySearch(StableBaselinesSearch):
@@ -79,8 +78,3 @@ class DDPG(OffPolicySearch):
 
 class DQN(OffPolicySearch):
     algorithm = stable_baselines3.DQN
-
-
-def even_batch(rollout: int) -> int:
-    """Rows of a batch, about 1,024, of which a rollout is a whole number; the whole rollout where it is smaller."""
-    return next(rollout // k for k in range(max(rollout // BATCH, 1), rollout + 1) if rollout % k == 0)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -24,6 +23,7 @@ from surrogym_client.policies.files import load_learner, save_policy
 from surrogym_client.policies.networks import Standardise
 from surrogym_client.policies.predict import Predict
 from surrogym_client.sb3 import SurrogateVecEnv
+from surrogym_client.training.proportions import suggested_gamma
 from surrogym_client.training.search import Found, PolicySearch, SearchTask
 from surrogym_client.training.settings import CHECK_EPISODES, TrainSettings
 from surrogym_client.training.stable_baselines.early_stopping import Checks
@@ -116,27 +116,27 @@ class _Training:
 
     def run(self) -> Found:
         """Learn until a network comes to the end of its steps, or a person interrupts."""
-        settings, checks = self._task.settings, self._checks
+        settings, checks, verdicts = self._task.settings, self._checks, self._checks.verdicts
         with tracking(settings, self._task.out) as callbacks:
             last, whole = self._learned(callbacks)
         learner = checks.best_of(last)
         ran_with = {"num_envs": self._env.num_envs, "total_steps": self._total, **effective(learner)}
         return Found(
             LearnedPolicy(learner),
-            checks.steps,
-            checks.best,
+            verdicts.steps,
+            verdicts.best,
             ran_with,
             type(learner).__name__,
             whole,
             checks.episode_penalty,
             checks.lost,
-            checks.networks,
-            checks.gaining,
+            verdicts.networks,
+            verdicts.gaining,
         )
 
     def _learned(self, callbacks: Sequence[BaseCallback]) -> tuple[BaseAlgorithm, bool]:
         """The network that learned last, and whether the training came to its end, and not to an interruption."""
-        checks = self._checks
+        verdicts = self._checks.verdicts
         learner: BaseAlgorithm | None = None
         for attempt in itertools.count():
             try:
@@ -144,21 +144,22 @@ class _Training:
                 if learner.tensorboard_log is None:  # otherwise a temporary folder is made
                     learner.set_logger(Logger(folder=None, output_formats=[]))
                 self._learn(learner, callbacks)
-                if self._task.prolong and not checks.given_up and checks.prolong():
+                if self._task.prolong and not verdicts.given_up and verdicts.prolong():
                     self._learn(learner, callbacks)
             except KeyboardInterrupt:
                 if learner is None:
                     raise
                 return learner, False
-            if not checks.given_up:
+            if not verdicts.given_up:
                 return learner, True
         raise AssertionError("unreachable")
 
     def _learn(self, learner: BaseAlgorithm, callbacks: Sequence[BaseCallback]) -> None:
         """Take what is left of the steps. A training that is prolonged continues with its learning rate from the
         middle."""
-        steps = _whole_rollouts(learner, self._checks.left)
-        learner.learn(steps, callback=[self._checks, *callbacks], reset_num_timesteps=not self._checks.prolonged)
+        verdicts = self._checks.verdicts
+        steps = _whole_rollouts(learner, verdicts.left)
+        learner.learn(steps, callback=[self._checks, *callbacks], reset_num_timesteps=not verdicts.prolonged)
 
     def _network(self, attempt: int) -> BaseAlgorithm:
         """A new network; when it is its turn the saved policy, where that earns more than an untrained one."""
@@ -230,11 +231,6 @@ def effective(learner: BaseAlgorithm) -> dict[str, Any]:
     given = {name: getattr(learner, name, None) for name in names if name not in ("self", "seed", "verbose")}
     plain = {name: value for name, value in given.items() if isinstance(value, bool | int | float | str)}
     return {**plain, "net_arch": learner.policy_kwargs.get("net_arch")}
-
-
-def suggested_gamma(spec: EnvironmentSpec) -> float:
-    """A discount whose horizon, 1 / (1 - gamma), is a third of the time limit: 0.985 for 200 steps, 0.994 for 500."""
-    return float(np.clip(1 - 3 / (spec.time_limit or 1_000), 0.9, 0.999))
 
 
 def _whole_rollouts(learner: BaseAlgorithm, total: int) -> int:

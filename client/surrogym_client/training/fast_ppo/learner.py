@@ -1,0 +1,225 @@
+"""Actor, critic and Adam: one update of proximal policy optimisation.
+
+Loss of a batch, with ratio r = p(a) / p_old(a) and advantages A of mean 0 and deviation 1 in the batch:
+
+    -mean(min(r A, clip(r, 1 - c, 1 + c) A)) + v mean((V - R)^2)
+
+References: Schulman et al. (2017), arXiv 1707.06347, eq. 7; Kingma and Ba (2015). Constants are those of
+Stable-Baselines3, whose update this is but for rounding.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.policies.card import UnusablePolicy
+from surrogym_client.policies.predict import Predict
+from surrogym_client.training.fast_ppo.actions import distribution_of
+from surrogym_client.training.fast_ppo.mlp import Array, Mlp, layers_of, orthogonal
+from surrogym_shared.archives import Header, read_arrays, read_entries
+from surrogym_shared.network import MAX_BYTES, Layer, Network, bounds_of, counts_of
+from surrogym_shared.spec import EnvironmentSpec
+
+CRITIC = (64, 64)
+HIDDEN_GAIN, ACTION_GAIN, VALUE_GAIN = 2**0.5, 0.01, 1.0
+FIRST_DECAY, SECOND_DECAY, EPSILON = 0.9, 0.999, 1e-5  # of Adam
+LEARNER = "learner.npz"  # entry of a policy's file, for those who go on from it
+VECTORS = ("parameters", "first", "second")
+
+
+@dataclass(frozen=True)
+class Objective:
+    """Constants of the loss, and of a step."""
+
+    clip_range: float = 0.2
+    vf_coef: float = 0.5
+    max_grad_norm: float = 0.5
+
+
+@dataclass(frozen=True)
+class Batch:
+    observations: Array  # (B, D) standardised
+    actions: Array  # (B, F)
+    log_probabilities: Array  # (B,) when they were taken
+    advantages: Array  # (B,)
+    returns: Array  # (B,)
+
+
+class Learner:
+    """All parameters in one vector, so that Adam and the norm of the gradient are a few operations."""
+
+    def __init__(
+        self,
+        spec: EnvironmentSpec,
+        mean: NDArray[np.float64],
+        deviation: NDArray[np.float64],
+        units: tuple[int, ...],
+        rng: np.random.Generator,
+    ) -> None:
+        self._spec, self._units = spec, units
+        self.mean, self.deviation = mean.astype(np.float32), deviation.astype(np.float32)
+        self.distribution = distribution_of(counts_of(spec), *bounds_of(spec))
+        inputs, further = len(spec.observation), self.distribution.further()
+        actor, critic = (inputs, *units, self.distribution.outputs), (inputs, *CRITIC, 1)
+        ends = np.cumsum([Mlp.count(actor), Mlp.count(critic), len(further)])
+        self.parameters = np.zeros(ends[-1], dtype=np.float32)
+        self._gradient = np.zeros_like(self.parameters)
+        self._first, self._second = np.zeros_like(self.parameters), np.zeros_like(self.parameters)
+        self._updates = 0
+        spans = [slice(0, ends[0]), slice(ends[0], ends[1])]
+        self.actor, self.critic = (
+            Mlp(sizes, activation, self.parameters[span], self._gradient[span])
+            for sizes, activation, span in zip((actor, critic), (self.distribution.activation,) * 2, spans, strict=True)
+        )
+        self.further, self._further_gradient = self.parameters[ends[1] :], self._gradient[ends[1] :]
+        self.further[:] = further
+        _initialise(self.actor, ACTION_GAIN, rng)
+        _initialise(self.critic, VALUE_GAIN, rng)
+        self._actor_sizes = actor
+
+    def standardised(self, observation: NDArray[Any]) -> Array:
+        x: Array = ((observation - self.mean) / self.deviation).astype(np.float32, copy=False)
+        return x
+
+    def act(self, x: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Actions of standardised observations x (B, D) with noise, and their log probabilities."""
+        return self.distribution.sample(self.actor.forward(x), self.further, rng)
+
+    def values(self, x: Array) -> Array:
+        """Of standardised observations (B, D), (B,)."""
+        return self.critic.forward(x)[:, 0].copy()
+
+    def update(self, batch: Batch, objective: Objective, rate: float) -> None:
+        """One step of Adam on the loss of a batch."""
+        size = len(batch.returns)
+        outputs = self.actor.forward(batch.observations)
+        advantages = batch.advantages
+        if size > 1:
+            advantages = (advantages - advantages.mean()) / (advantages.std(ddof=1) + np.float32(1e-8))
+        log = self.distribution.log_probability(outputs, self.further, batch.actions)
+        ratio = np.exp(log - batch.log_probabilities)
+        clip = np.float32(objective.clip_range)
+        free = np.where(advantages > 0, ratio <= 1 + clip, ratio >= 1 - clip)  # elsewhere the loss is flat
+        by = -(advantages * ratio * free) / np.float32(size)
+        by_outputs, self._further_gradient[:] = self.distribution.slopes(outputs, self.further, batch.actions, by)
+        self.actor.backward(by_outputs)
+        error = self.critic.forward(batch.observations)[:, 0] - batch.returns
+        self.critic.backward((error * np.float32(2 * objective.vf_coef / size))[:, None])
+        self._adam(objective.max_grad_norm, rate)
+
+    def _adam(self, largest: float, rate: float) -> None:
+        gradient = self._gradient
+        norm = float(np.sqrt(gradient @ gradient))
+        gradient *= np.float32(min(1.0, largest / (norm + 1e-6)))
+        self._updates += 1
+        self._first *= np.float32(FIRST_DECAY)
+        self._first += np.float32(1 - FIRST_DECAY) * gradient
+        gradient *= gradient
+        self._second *= np.float32(SECOND_DECAY)
+        self._second += np.float32(1 - SECOND_DECAY) * gradient
+        root = np.sqrt(self._second)
+        root *= np.float32((1 - SECOND_DECAY**self._updates) ** -0.5)
+        root += np.float32(EPSILON)
+        step = np.float32(rate / (1 - FIRST_DECAY**self._updates))
+        self.parameters -= step * self._first / root
+
+    def policy(self) -> Network:
+        """The actor's most probable actions as they are now."""
+        layers = layers_of(self._actor_sizes, self.parameters[: Mlp.count(self._actor_sizes)].copy())
+        return Network(
+            self.mean.astype(np.float64),
+            self.deviation.astype(np.float64),
+            tuple(Layer(weights.astype(np.float64), bias.astype(np.float64)) for weights, bias in layers),
+            *bounds_of(self._spec),
+            counts_of(self._spec),
+            self.distribution.activation,
+        )
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Everything that learning goes on from."""
+        vectors = zip(VECTORS, (self.parameters, self._first, self._second), strict=True)
+        further = {"further": self.further.copy(), "updates": np.array(self._updates)}
+        return further | {name: vector.copy() for name, vector in vectors}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Go back to what ``state`` gave."""
+        for name, vector in zip(VECTORS, (self.parameters, self._first, self._second), strict=True):
+            vector[:] = state[name]
+        self._updates = int(state["updates"])
+
+    def require(self, headers: Mapping[str, Header]) -> None:
+        """Raise ValueError unless these are the arrays of a state of this network."""
+        shapes = {**dict.fromkeys(VECTORS, self.parameters.shape), "further": self.further.shape, "updates": ()}
+        found = {name: header.shape for name, header in headers.items()}
+        if found != shapes:
+            raise ValueError(f"expected a network of {self.parameters.size} parameters, got arrays of shapes {found}")
+
+
+@dataclass(frozen=True)
+class LearnedNetwork:
+    """A policy with all that learning goes on from."""
+
+    policy: Network
+    state: Mapping[str, NDArray[Any]]
+
+    def save(self, path: Path) -> None:
+        """Write the network of arrays, and beside it in the same file the learner's."""
+        self.policy.save(path)
+        file = io.BytesIO()
+        arrays: dict[str, Any] = dict(self.state)
+        np.savez(file, **arrays)
+        with zipfile.ZipFile(path, "a") as archive:
+            archive.writestr(LEARNER, file.getvalue())
+
+
+def restored(path: Path, spec: EnvironmentSpec, units: tuple[int, ...]) -> Learner:
+    """The learner in a policy's file.
+
+    Raises:
+        UnusablePolicy: the file holds none, or one of another network.
+    """
+    policy = _policy(path)
+    learner = Learner(spec, policy.mean, policy.deviation, units, np.random.default_rng(0))
+    learner.restore(_state(path, learner.require))
+    return learner
+
+
+def noisy(path: Path) -> Predict:
+    """A saved policy that acts with its noise, the same each time it is read. Raises as ``restored``."""
+    policy = _policy(path)
+    distribution = distribution_of(policy.counts, policy.low, policy.high)
+    further, rng = _state(path, lambda _: None)["further"], np.random.default_rng(0)
+    return lambda observation: distribution.sent(
+        distribution.sample(policy.outputs(observation).astype(np.float32), further, rng)[0]
+    )
+
+
+def _policy(path: Path) -> Network:
+    try:
+        return Network.load(path)
+    except ValueError as error:
+        raise UnusablePolicy(str(error)) from error
+
+
+def _state(path: Path, require: Callable[[Mapping[str, Header]], None]) -> dict[str, NDArray[Any]]:
+    try:
+        entries = read_entries(path, MAX_BYTES)
+        if LEARNER not in entries:
+            raise ValueError("expected what this algorithm saves, got a policy alone")
+        return read_arrays(entries[LEARNER], MAX_BYTES, require)
+    except (OSError, ValueError) as error:
+        raise UnusablePolicy(f"{path} is nothing to go on from: {error}") from error
+
+
+def _initialise(network: Mlp, last_gain: float, rng: np.random.Generator) -> None:
+    for number, (weights, _) in enumerate(network.layers):
+        last = number == len(network.layers) - 1
+        weights[:] = orthogonal(rng, len(weights), weights.shape[1], last_gain if last else HIDDEN_GAIN)

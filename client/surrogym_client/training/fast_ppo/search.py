@@ -1,0 +1,245 @@
+"""Proximal policy optimisation in NumPy as a policy search."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from surrogym_client.environments.lanes import Lanes, session_request
+from surrogym_client.evaluation.imagined import imagined_returns, observation_statistics
+from surrogym_client.policies.predict import Predict
+from surrogym_client.policies.schedule import decaying
+from surrogym_client.training.fast_ppo.learner import Batch, LearnedNetwork, Learner, Objective, noisy, restored
+from surrogym_client.training.fast_ppo.rollouts import Collector, Rollout
+from surrogym_client.training.proportions import even_batch, suggested_gamma
+from surrogym_client.training.search import SEARCHES, Found, PolicySearch, SearchTask
+from surrogym_client.training.settings import CHECK_EPISODES, TrainProgress
+from surrogym_client.training.verdicts import Verdicts
+from surrogym_shared.network import Network
+from surrogym_shared.spec import BoxAction, EnvironmentSpec
+
+REFERENCE = "PPO"  # of Stable-Baselines3
+RANGES = {
+    "n_steps": (1, 100_000),
+    "n_epochs": (1, 1_000),
+    "batch_size": (1, 10_000_000),
+    "learning_rate": (0.0, 1.0),
+    "gamma": (0.0, 1.0),
+    "gae_lambda": (0.0, 1.0),
+    "clip_range": (0.0, 10.0),
+    "vf_coef": (0.0, 100.0),
+    "max_grad_norm": (0.0, 1e6),
+}
+ANOTHER = 1_000_003  # between the seeds of one training's networks
+
+
+@dataclass(frozen=True)
+class FastPpo(PolicySearch):
+    """PPO as ``PPO`` of Stable-Baselines3 is set here, at a quarter of the cost of an update.
+
+    The same networks, loss, Adam, scaled rewards and advantages. A network that has learned nothing after a quarter of
+    the steps is given up; then ``PPO`` of Stable-Baselines3 takes the steps that are left, for continuous actions with
+    noise by the state.
+    """
+
+    n_steps: int = 128  # of a lane in a rollout
+    n_epochs: int = 10
+    batch_size: int | None = None  # None: about 1,024
+    learning_rate: float | None = None  # None: falls from 3e-3 to a fiftieth of it
+    gamma: float | None = None  # None: by the time limit
+    gae_lambda: float = 0.97
+    clip_range: float = 0.2
+    vf_coef: float = 0.5
+    max_grad_norm: float = 0.5
+
+    suggested_steps = 600_000
+    prolongable = True
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in RANGES.items():
+            value = getattr(self, name)
+            if value is not None and not (isinstance(value, int | float) and low <= value <= high):
+                raise ValueError(f"{name}: expected {low} to {high}, got {value!r}")
+
+    def search(self, task: SearchTask) -> Found:
+        start = task.settings.start_from
+        if start is not None and not Network.is_at(start):
+            return _reference().search(task)  # a policy of Stable-Baselines3 goes on there
+        with threadpool_limits(limits=task.settings.threads), _lanes(task) as lanes:
+            return _Training(self, task, lanes).run()
+
+    def explorer(self, policy: Path, algorithm: str, lanes: int) -> Predict:
+        if not Network.is_at(policy):
+            return _reference().explorer(policy, algorithm, lanes)
+        return noisy(policy)
+
+
+class _Training:
+    """The networks of one training, and the checks that compare them."""
+
+    def __init__(self, search: FastPpo, task: SearchTask, lanes: Lanes) -> None:
+        self._search, self._task, self._spec = search, task, task.port.spec()
+        settings = task.settings
+        self._gamma = suggested_gamma(self._spec) if search.gamma is None else search.gamma
+        self._rng = np.random.default_rng(settings.seed)
+        mean, deviation = observation_statistics(task.port, settings.seed)
+        units = units_of(self._spec)
+        self._new = Learner(self._spec, np.array(mean), np.array(deviation), units, self._rng)
+        self._saved = None if settings.start_from is None else restored(settings.start_from, self._spec, units)
+        self._rollout = lanes.num_envs * search.n_steps
+        self._batch = search.batch_size or even_batch(self._rollout)
+        self._objective = Objective(search.clip_range, search.vf_coef, search.max_grad_norm)
+        self._lanes, self._lost = lanes, 0
+        planned = max(task.steps // self._rollout, 1) * self._rollout
+        proof = self._imagined(self._saved) if self._saved is not None and settings.anew else None
+        self._verdicts = Verdicts(planned, self._imagined(self._new), proof)
+        self._kept: LearnedNetwork | None = None
+        self._collector = Collector(lanes, self._gamma, search.gae_lambda, self._rng)
+
+    def run(self) -> Found:
+        """Learn until a network comes to the end of its steps, or a person interrupts."""
+        verdicts, learner, whole = self._verdicts, self._new, True
+        try:
+            for learner in self._networks():
+                self._learn(learner, verdicts.left)
+                if self._task.prolong and not verdicts.given_up and verdicts.prolong():
+                    self._learn(learner, verdicts.left)
+                if not verdicts.given_up:
+                    break
+            else:
+                return self._by_reference()
+        except KeyboardInterrupt:
+            whole = False
+        return self._found(self._kept or _saved(learner), whole=whole)
+
+    def _networks(self) -> Iterator[Learner]:
+        """A new network; when it is its turn the saved one, where that learned anything."""
+        anew = self._task.settings.anew
+        if anew or self._saved is None:
+            yield self._new
+        if self._saved is not None:
+            best, learned = self._verdicts.knows(self._imagined(self._saved))
+            if best:
+                self._kept = _saved(self._saved)
+            if learned:
+                yield self._saved
+            elif not anew:
+                yield self._new
+
+    def _learn(self, learner: Learner, steps: int) -> None:
+        """Take so many steps with one network, or fewer if it is given up."""
+        verdicts, search = self._verdicts, self._search
+        verdicts.begin()
+        before = verdicts.own_steps
+        for number in range(1, max(steps // self._rollout, 1) + 1):
+            rollout = self._collector.collect(learner, search.n_steps)
+            verdicts.saw(rollout.earned)
+            verdicts.at(before + number * self._rollout)
+            self._lost += rollout.lost
+            self._after(learner, rollout)
+            if verdicts.given_up:
+                return
+            remaining = 1 - verdicts.own_steps / (before + steps)
+            rate = decaying(remaining) if search.learning_rate is None else search.learning_rate
+            self._update(learner, rollout, rate)
+        self._check(learner)
+
+    def _after(self, learner: Learner, rollout: Rollout) -> None:
+        verdicts = self._verdicts
+        if verdicts.after_rollout():
+            self._check(learner)
+            verdicts.judge()
+        steps = min(verdicts.steps, verdicts.total)
+        penalty = self._collector.episode_penalty
+        self._task.progress(TrainProgress(steps, verdicts.total, verdicts.latest, rollout.penalty_share, penalty))
+
+    def _update(self, learner: Learner, rollout: Rollout, rate: float) -> None:
+        rows = len(rollout.returns)
+        for _ in range(self._search.n_epochs):
+            order = self._rng.permutation(rows)
+            for begin in range(0, rows, self._batch):
+                at = order[begin : begin + self._batch]
+                batch = Batch(
+                    rollout.observations[at],
+                    rollout.actions[at],
+                    rollout.log_probabilities[at],
+                    rollout.advantages[at],
+                    rollout.returns[at],
+                )
+                learner.update(batch, self._objective, rate)
+
+    def _check(self, learner: Learner) -> None:
+        if self._verdicts.check(self._imagined(learner)):
+            self._kept = _saved(learner)
+
+    def _imagined(self, learner: Learner) -> float:
+        settings = self._task.settings
+        policy = learner.policy()
+        returns = imagined_returns(self._task.port, policy, CHECK_EPISODES, settings.seed, **settings.judging)
+        return float(returns.mean())
+
+    def _found(self, policy: LearnedNetwork, *, whole: bool) -> Found:
+        verdicts = self._verdicts
+        chosen = {"gamma": self._gamma, "batch_size": self._batch, "net_arch": units_of(self._spec)}
+        ran_with = {**asdict(self._search), **chosen, "num_envs": self._lanes.num_envs, "total_steps": verdicts.total}
+        return Found(
+            policy,
+            verdicts.steps,
+            verdicts.best,
+            ran_with,
+            whole=whole,
+            episode_penalty=self._collector.episode_penalty,
+            lost_episodes=self._lost,
+            networks=verdicts.networks,
+            gaining=verdicts.gaining,
+        )
+
+    def _by_reference(self) -> Found:
+        """What ``PPO`` of Stable-Baselines3 finds in the steps that are left, or what is kept where that earns more."""
+        verdicts, task = self._verdicts, self._task
+        spent, left = verdicts.steps, max(verdicts.left, 1)
+        by_state = isinstance(self._spec.action, BoxAction) and not self._spec.action.bins
+        chosen = {"use_sde": True} if by_state and self._spec.design.preset != "paper" else {}
+        settings = replace(
+            task.settings, seed=task.settings.seed + ANOTHER, start_from=None, hyperparameters=chosen, anew=False
+        )
+
+        def shifted(now: TrainProgress) -> None:
+            task.progress(replace(now, steps=spent + now.steps, total_steps=spent + now.total_steps))
+
+        other = _reference(**chosen).search(replace(task, settings=settings, steps=left, progress=shifted))
+        if self._kept is not None and (verdicts.best or 0.0) > (other.imagined_return or -np.inf):
+            mine = self._found(self._kept, whole=other.whole)
+            return replace(mine, virtual_steps=spent + other.virtual_steps, networks=mine.networks + other.networks)
+        return replace(other, virtual_steps=spent + other.virtual_steps, networks=verdicts.networks + other.networks)
+
+
+def units_of(spec: EnvironmentSpec) -> tuple[int, ...]:
+    """Units of the actor's hidden layers: the paper's for its preset, two wider ones otherwise."""
+    return (64, 64) if spec.design.preset == "default" else (32,)
+
+
+def _saved(learner: Learner) -> LearnedNetwork:
+    return LearnedNetwork(learner.policy(), learner.state())
+
+
+def _reference(**hyperparameters: Any) -> PolicySearch:
+    """``PPO`` of Stable-Baselines3. Raises ModuleNotFoundError where that is not installed."""
+    return SEARCHES.get(REFERENCE)(**hyperparameters)
+
+
+@contextmanager
+def _lanes(task: SearchTask) -> Iterator[Lanes]:
+    settings = task.settings
+    session = {"seed": settings.seed, "start_box": settings.start_box, **settings.session}
+    lanes = Lanes(task.port, session_request(settings.num_envs or 128, "same_step", session))
+    try:
+        yield lanes
+    finally:
+        lanes.close()

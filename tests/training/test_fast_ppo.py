@@ -1,0 +1,190 @@
+"""PPO in NumPy: it learns as Stable-Baselines3's does, and hands over what it can't learn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+
+from support.models import learn
+from support.ppo import RATE, batch_of, layers, linear, reference
+from support.real_steps import random_steps
+from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
+from surrogym_client.policies import UnusablePolicy, load_policy
+from surrogym_client.training import TrainingInterrupted, TrainSettings, train
+from surrogym_client.training.fast_ppo import search as searches
+from surrogym_client.training.fast_ppo.actions import Bounded, Choices
+from surrogym_client.training.fast_ppo.learner import Learner, Objective, noisy
+from surrogym_client.training.fast_ppo.rollouts import Collector, RewardScale
+from surrogym_client.training.search import search_for
+from surrogym_client.training.verdicts import Verdicts
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.local import LocalSurrogate
+from surrogym_shared.spec import EnvironmentSpec, MultiDiscreteAction
+
+SMALL = {"n_steps": 16, "batch_size": 32, "n_epochs": 2}
+
+
+def short(spec: EnvironmentSpec) -> LocalSurrogate:
+    spec = spec.model_copy(update={"time_limit": 20})
+    return LocalSurrogate(spec, learn(definition_from_spec(spec), random_steps(spec, 12, seed=0)).model)
+
+
+@pytest.fixture(scope="module")
+def surrogate() -> LocalSurrogate:
+    return short(pendulum())
+
+
+def several() -> EnvironmentSpec:
+    """Two choices at once."""
+    return cartpole().model_copy(update={"action": MultiDiscreteAction(nvec=(3, 2))})
+
+
+@pytest.mark.parametrize("make", [pendulum, cartpole, several], ids=["continuous", "discrete", "several choices"])
+def test_an_update_is_that_of_stable_baselines3(make: Callable[[], EnvironmentSpec]):
+    """The same parameters after three updates of the same rollout, where some ratios are clipped."""
+    spec, rng = make(), np.random.default_rng(0)
+    size = len(spec.observation)
+    learner = Learner(spec, rng.normal(size=size), rng.uniform(0.5, 2, size), (64, 64), rng)
+    learner.actor.layers[-1][0][:] *= 100  # actions that differ
+    given, batch = batch_of(learner, rng)
+    made = reference(learner, spec, given)
+    for _ in range(3):
+        made.train()
+        learner.update(batch, Objective(), RATE)
+    for module, (weights, bias) in zip(linear(made), layers(learner), strict=True):
+        np.testing.assert_allclose(weights.T, module.weight.detach().numpy(), atol=2e-5)
+        np.testing.assert_allclose(bias, module.bias.detach().numpy(), atol=2e-5)
+    if hasattr(made.policy, "log_std"):
+        np.testing.assert_allclose(learner.further, made.policy.log_std.detach().numpy(), atol=2e-5)
+
+
+def test_rewards_are_scaled_as_by_vec_normalize():
+    rng, gamma = np.random.default_rng(1), 0.97
+    scale, statistics, returns = RewardScale(5, gamma), RunningMeanStd(shape=()), np.zeros(5)
+    for _ in range(50):
+        reward, ended = 20 * rng.normal(size=5), rng.random(5) < 0.1
+        returns = returns * gamma + reward
+        statistics.update(returns)
+        expected = np.clip(reward / np.sqrt(statistics.var + 1e-8), -10, 10)
+        returns[ended] = 0
+        np.testing.assert_allclose(scale(reward, ended), expected, rtol=1e-12)
+
+
+def test_advantages_are_those_of_a_rollout_buffer():
+    rng, steps, lanes = np.random.default_rng(2), 30, 4
+    rewards, values = (rng.normal(size=(steps, lanes)).astype(np.float32) for _ in range(2))
+    ended, last = rng.random((steps, lanes)) < 0.2, rng.normal(size=lanes).astype(np.float32)
+    space = spaces.Box(-1, 1, (1,))
+    buffer = RolloutBuffer(steps, space, space, gae_lambda=0.95, gamma=0.98, n_envs=lanes)
+    starts = np.concatenate([np.zeros((1, lanes)), ended[:-1]])
+    for t in range(steps):
+        nothing = np.zeros((lanes, 1))
+        value, log = torch.from_numpy(values[t]), torch.zeros(lanes)
+        buffer.add(nothing, nothing, rewards[t], starts[t], value, log)
+    buffer.compute_returns_and_advantage(torch.from_numpy(last), ended[-1])
+    collector = Collector.__new__(Collector)
+    collector._gamma, collector._lambda = 0.98, 0.95
+    np.testing.assert_allclose(
+        collector._advantages(rewards, ended, values, last), buffer.advantages, rtol=1e-4, atol=1e-5
+    )
+
+
+def test_choices_are_drawn_by_their_probabilities():
+    scores = np.array([[1.0, 0.0, -1.0, 0.5, 0.0]], dtype=np.float32)
+    choices, rng = Choices((3, 2)), np.random.default_rng(0)
+    actions, logs = choices.sample(np.repeat(scores, 40_000, 0), choices.further(), rng)
+    np.testing.assert_allclose(logs, choices.log_probability(np.repeat(scores, 40_000, 0), logs[:0], actions))
+    for i, part in enumerate(np.split(scores[0], [3])):
+        expected = np.exp(part) / np.exp(part).sum()
+        found = np.bincount(actions[:, i].astype(int)) / len(actions)
+        np.testing.assert_allclose(found, expected, atol=0.01)
+    assert choices.sent(actions).shape == (40_000, 2)
+
+
+def test_a_bounded_action_is_noise_around_its_mean_and_sent_within_its_bounds():
+    bounded, rng = Bounded(np.float32([1.0]), np.float32([2.0])), np.random.default_rng(0)
+    outputs = np.full((40_000, 1), 0.5, dtype=np.float32)
+    actions, logs = bounded.sample(outputs, bounded.further(), rng)
+    assert actions.mean() == pytest.approx(1 + 2 * np.tanh(0.5), abs=0.02)
+    assert actions.std() == pytest.approx(1.0, abs=0.02)
+    np.testing.assert_allclose(logs, bounded.log_probability(outputs, bounded.further(), actions), atol=1e-5)
+    assert actions.max() > 3
+    assert bounded.sent(actions).max() == 3
+
+
+def test_it_learns(tmp_path: Path):
+    """An untrained CartPole falls after some twenty steps."""
+    spec = cartpole().model_copy(update={"time_limit": 100})
+    port = LocalSurrogate(spec, learn(definition_from_spec(spec), random_steps(spec, 40, seed=0)).model)
+    settings = TrainSettings(algorithm="fastppo", total_steps=50_000, num_envs=32, prolong=False)
+    assert train(port, tmp_path / "policy.zip", settings).imagined_return > 80
+
+
+def test_what_it_saves_acts_with_and_without_noise(surrogate, tmp_path: Path):
+    settings = TrainSettings(algorithm="fastppo", total_steps=512, num_envs=16, hyperparameters=SMALL)
+    path = train(surrogate, tmp_path / "policy.zip", settings).path
+    observations = np.random.default_rng(0).normal(size=(2_000, 3)).astype(np.float32)
+    surely, first, again = (act(observations) for act in (load_policy(path), noisy(path), noisy(path)))
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - surely).mean() > 0.1
+    assert np.abs(first).max() <= 2
+
+
+def test_it_goes_on_from_what_it_saved(surrogate, tmp_path: Path):
+    """Parameters and the moments of Adam; a policy alone is refused."""
+    settings = TrainSettings(algorithm="fastppo", total_steps=512, num_envs=16, hyperparameters=SMALL, prolong=False)
+    first = train(surrogate, tmp_path / "first.zip", settings).path
+    resumed = replace(settings, start_from=first)
+    train(surrogate, tmp_path / "second.zip", resumed)
+    load_policy(first).save(tmp_path / "alone.zip")
+    with pytest.raises(UnusablePolicy, match="got a policy alone"):
+        train(
+            surrogate,
+            tmp_path / "third.zip",
+            TrainSettings(**{**resumed.__dict__, "start_from": tmp_path / "alone.zip"}),
+        )
+
+
+def test_a_network_that_is_given_up_is_followed_by_stable_baselines3(tmp_path: Path, monkeypatch):
+    """Steps of both together stay within what was asked for, and the policy is the reference's."""
+
+    class Strict(Verdicts):
+        def judge(self) -> bool:
+            self.given_up = self.own_steps >= 512
+            return self.given_up
+
+    monkeypatch.setattr(searches, "Verdicts", Strict)
+    seen: list[int] = []
+    settings = TrainSettings(algorithm="fastppo", total_steps=4_096, num_envs=16, hyperparameters=SMALL, prolong=False)
+    surrogate = short(mountain_car_continuous())
+    result = train(surrogate, tmp_path / "policy.zip", settings, lambda now: seen.append(now.steps))
+    assert seen == sorted(seen)
+    assert result.networks == 2
+    assert result.virtual_steps <= settings.total_steps
+    load_policy(result.path, result.algorithm)
+
+
+def test_ctrl_c_keeps_the_best_policy_so_far(surrogate, tmp_path: Path):
+    def interrupt(now) -> None:
+        if now.imagined_return is not None:
+            raise KeyboardInterrupt
+
+    settings = TrainSettings(algorithm="fastppo", total_steps=8_192, num_envs=16, hyperparameters=SMALL)
+    with pytest.raises(TrainingInterrupted) as interruption:
+        train(surrogate, tmp_path / "policy.zip", settings, interrupt)
+    assert 0 < interruption.value.result.virtual_steps < 8_192
+    load_policy(interruption.value.result.path)
+
+
+@pytest.mark.parametrize(("name", "value"), [("n_steps", 0), ("clip_range", -1.0), ("gamma", 2.0), ("n_epochs", "x")])
+def test_impossible_settings_are_refused(name: str, value: object):
+    with pytest.raises(ValueError, match=f"{name}: expected .* got {value!r}"):
+        search_for(TrainSettings(algorithm="fastppo", hyperparameters={name: value}))
