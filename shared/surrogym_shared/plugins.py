@@ -2,11 +2,16 @@
 
 A package adds a member by an entry point in the group of the registry. It is loaded on the machine of the person who
 installed it, when a name that is not built in is first looked up or the names are listed.
+
+Whatever a package raises while it is loaded is kept as one sentence, and all else works: ``sys.exit`` too, and the
+exceptions of tools that end what they run. ``KeyboardInterrupt`` alone goes on: one that a module raised by itself
+can't be told from a real Ctrl-C, which must end the program.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Generic, TypeVar
@@ -16,6 +21,16 @@ T = TypeVar("T")
 
 class UnknownMember(ValueError):
     """No member has this name, or its package is broken; the message lists the names that there are."""
+
+
+class _Unfit(ValueError):
+    """An entry point that breaks a rule of its group; the message says all."""
+
+
+def one_line(error: BaseException) -> str:
+    """An exception in one line, which says its type: ``SystemExit: 1``."""
+    said = " ".join(str(error).split())
+    return f"{type(error).__name__}: {said}" if said else type(error).__name__
 
 
 class Registry(Generic[T]):
@@ -48,18 +63,22 @@ class Registry(Generic[T]):
         self._others()
         return self._broken
 
+    def why_broken(self, name: str) -> str | None:
+        """The sentence of an entry point that can't be used; None where there is none of this name."""
+        return next((why for known, why in self.broken.items() if known.casefold() == name.casefold()), None)
+
     def name_of(self, name: str) -> str:
-        """A name as the registry has it.
+        """A name as the registry has it. Other packages are loaded only if it is not built in.
 
         Raises:
             UnknownMember: no member has it.
         """
-        for known in (self._built_in, self._others()):
-            for member in known:
-                if member.casefold() == name.casefold():
-                    return member
-        why = f" ({self.broken[name]})" if name in self.broken else ""
-        raise UnknownMember(f"{self.kind}: expected one of {', '.join(self.names)}, got {name!r}{why}")
+        member = _same(name, self._built_in) or _same(name, self._others())
+        if member is None:
+            why = self.why_broken(name)
+            because = "" if why is None else f" ({why})"
+            raise UnknownMember(f"{self.kind}: expected one of {', '.join(self.names)}, got {name!r}{because}")
+        return member
 
     def get(self, name: str) -> type[T]:
         """The class of a name. Raises as ``name_of``."""
@@ -75,30 +94,53 @@ class Registry(Generic[T]):
 
     def _others(self) -> dict[str, type[T]]:
         if self._installed is None:
-            self._installed = {}
-            for entry in entry_points(group=self._group):
-                self._add(entry, self._installed)
+            installed, broken = dict[str, type[T]](), dict[str, str]()
+            for entries in _by_name(entry_points(group=self._group)):
+                try:
+                    installed[entries[0].name] = self._load(entries)
+                except KeyboardInterrupt:
+                    raise
+                except BaseException as error:  # another package's code may raise anything
+                    said = str(error) if isinstance(error, _Unfit) else one_line(error)
+                    broken[entries[0].name] = f"{self._described(entries)}: {said}"
+            self._installed, self._broken = installed, broken
         return self._installed
 
-    def _add(self, entry: EntryPoint, installed: dict[str, type[T]]) -> None:
-        """Add the class of an entry point, or say why it can't be used."""
-        try:
-            self._check_name(entry.name)
-            member = entry.load()
-            self._check_class(member)
-            installed[entry.name] = member
-        except Exception as error:  # another package's code may raise anything
-            package = "a package" if entry.dist is None else f"package {entry.dist.name!r}"
-            self._broken[entry.name] = (
-                f"{package}, entry point {entry.name} = {entry.value!r} of {self._group}: {error}"
-            )
+    def _described(self, entries: list[EntryPoint]) -> str:
+        """Where the entry points of a name come from: "package 'a', entry point x = 'a:X' of surrogym.models"."""
+        parts = [f"{_package(entry)}, entry point {entry.name} = {entry.value!r}" for entry in entries]
+        return f"{'; '.join(parts)} of {self._group}"
 
-    def _check_name(self, name: str) -> None:
-        if name.casefold() in (known.casefold() for known in self._built_in):
-            raise ValueError(f"expected another name than the built-in {', '.join(self._built_in)}")
+    def _load(self, entries: list[EntryPoint]) -> type[T]:
+        """The class of a name. Raises what its module does, or ``_Unfit``.
 
-    def _check_class(self, member: object) -> None:
+        Of several packages none is taken: which one came first on the search path is nobody's choice.
+        """
+        if len(entries) > 1:
+            raise _Unfit("they have the same name, and none of them is used: uninstall all but one")
+        (entry,) = entries
+        if _same(entry.name, self._built_in):
+            raise _Unfit(f"expected another name than the built-in {', '.join(self._built_in)}")
+        member = entry.load()
         if not (isinstance(member, type) and issubclass(member, self._base)):
-            raise TypeError(f"expected a subclass of {self._base.__module__}.{self._base.__name__}, got {member!r}")
+            raise _Unfit(f"expected a subclass of {self._base.__module__}.{self._base.__name__}, got {member!r}")
         if missing := sorted(getattr(member, "__abstractmethods__", ())):
-            raise TypeError(f"expected {', '.join(missing)} to be implemented in {member.__name__}")
+            raise _Unfit(f"expected {', '.join(missing)} to be implemented in {member.__name__}")
+        return member
+
+
+def _same(name: str, known: Iterable[str]) -> str | None:
+    """The one of these names that this is, in upper or lower case."""
+    return next((member for member in known if member.casefold() == name.casefold()), None)
+
+
+def _by_name(entries: Iterable[EntryPoint]) -> list[list[EntryPoint]]:
+    """Entry points that have the same name together, in an order that no search path decides."""
+    together = defaultdict[str, list[EntryPoint]](list)
+    for entry in sorted(entries, key=lambda entry: (entry.name.casefold(), _package(entry), entry.name, entry.value)):
+        together[entry.name.casefold()].append(entry)
+    return list(together.values())
+
+
+def _package(entry: EntryPoint) -> str:
+    return "a package" if entry.dist is None else f"package {entry.dist.name!r}"

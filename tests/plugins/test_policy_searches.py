@@ -20,6 +20,8 @@ from surrogym_client.training import TrainSettings
 from surrogym_client.training.search import SEARCHES
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
+from surrogym_server.models.registry import MODELS
+from surrogym_server.sampling.acquisition import ACQUISITIONS
 from surrogym_shared.port import SurrogatePort
 
 ROOT = Path(__file__).parents[2]
@@ -46,11 +48,11 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def broken(folder: Path, name: str, value: str) -> None:
+def broken(folder: Path, name: str, value: str, group: str = "policy_searches") -> None:
     written = folder / f"package_of_{name}-1.0.dist-info"
     written.mkdir()
     (written / "METADATA").write_text(f"Metadata-Version: 2.1\nName: package_of_{name}\nVersion: 1.0\n")
-    (written / "entry_points.txt").write_text(f"[surrogym.policy_searches]\n{name} = {value}\n")
+    (written / "entry_points.txt").write_text(f"[surrogym.{group}]\n{name} = {value}\n")
 
 
 @pytest.fixture
@@ -105,6 +107,24 @@ def test_the_doctor_names_packages_that_can_not_be_used():
     problems = [finding for finding in installation() if finding.way_out]
     assert [finding.name for finding in problems] == ["plug-in"] * 3
     assert "package 'package_of_no_search', entry point no_search = " in " ".join(f.said for f in problems)
+
+
+def test_the_doctor_names_packages_of_the_server_too_one_line_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "talkative.py").write_text("raise RuntimeError('one line\\nand another')\n")
+    (tmp_path / "leaving.py").write_text("import sys\nsys.exit(3)\n")
+    broken(tmp_path, "talkative", "talkative:Missing", "acquisitions")
+    broken(tmp_path, "leaving", "leaving:Missing", "models")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for registry in (SEARCHES, ACQUISITIONS, MODELS):
+        monkeypatch.setattr(registry, "_installed", None)
+        monkeypatch.setattr(registry, "_broken", {})
+    said = [finding.said for finding in installation() if finding.way_out]
+    assert [line.partition(" is left out")[0] for line in said] == [
+        "the acquisition 'talkative'",
+        "the model 'leaving'",
+    ]
+    assert "RuntimeError: one line and another" in said[0]
+    assert "SystemExit: 3" in said[1]
 
 
 @pytest.fixture(scope="module")

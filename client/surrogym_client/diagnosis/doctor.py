@@ -6,9 +6,12 @@ import platform
 import statistics
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
-from importlib.metadata import version
+from importlib import import_module
+from importlib.metadata import entry_points, version
 from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
 
@@ -22,10 +25,15 @@ from surrogym_client.runtime.ways_out import EXTRAS, GIVE_TOKEN, START_SERVER
 from surrogym_client.sampler.sample_conversion import sample_of
 from surrogym_client.training.search import SEARCHES
 from surrogym_client.transport.api import Api
+from surrogym_shared.plugins import Registry
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.wire import PROTOCOL, StepQuery
 
 ROUND_TRIPS = 20
+OF_THE_SERVER = {  # registries by the group of their entry points; they are there where a server can run
+    "surrogym.acquisitions": "surrogym_server.sampling.acquisition:ACQUISITIONS",
+    "surrogym.models": "surrogym_server.models.registry:MODELS",
+}
 
 
 @dataclass(frozen=True)
@@ -44,8 +52,20 @@ def installation() -> Iterator[Finding]:
     lacking = [extra for extra, modules in EXTRAS.items() if not all(find_spec(module) for module in modules)]
     without = f"; not installed: {', '.join(f'surrogym[{extra}]' for extra in lacking)}" if lacking else ""
     yield Finding("packages", packages + without)
-    for why in SEARCHES.broken.values():
-        yield Finding("plug-in", f"left out: {why}", "bring the package up to date, or remove it")
+    for registry in _registries():
+        for name, why in registry.broken.items():
+            said = f"the {registry.kind} {name!r} is left out: {why}"
+            yield Finding("plug-in", said, "bring the package up to date, or remove it")
+
+
+def _registries() -> Iterator[Registry[Any]]:
+    """What packages of this machine may add to. The server's load torch, so only those that a package adds to."""
+    yield SEARCHES
+    for group, place in OF_THE_SERVER.items():
+        module, _, name = place.partition(":")
+        if entry_points(group=group):
+            with suppress(ImportError):  # no server can run on this machine, so nothing here would use the package
+                yield getattr(import_module(module), name)
 
 
 def service(api: Api) -> Iterator[Finding]:
