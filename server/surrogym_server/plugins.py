@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar, get_type_hints
 
-from surrogym_server.errors import InvalidSpec
+from surrogym_server.errors import InvalidSpec, SurrogymError
 from surrogym_shared import plugins
 
 T = TypeVar("T")
+TYPES: dict[Any, tuple[str, tuple[type, ...]]] = {  # of settings, in words, and what a specification gives for them
+    float: ("a number", (int, float)),
+    int: ("a whole number", (int,)),
+    bool: ("true or false", (bool,)),
+    str: ("a text", (str,)),
+}
 
 
 @dataclass(frozen=True)
@@ -41,11 +49,48 @@ class Registry(plugins.Registry[T]):
             InvalidSpec: an unknown name, or settings that it does not have or take.
         """
         kind, settings = self.get(choice.name), dict(choice.settings)
-        known: list[str] = [field.name for field in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else []
-        if unknown := sorted(set(settings) - set(known)):
-            expected = f"one of {', '.join(known)}" if known else "none"
-            raise InvalidSpec(f"{self.kind} {choice.name}: expected as settings {expected}, got {unknown[0]!r}")
-        try:
+        with guarded(f"{self.kind} {choice.name}", InvalidSpec):
+            _check_settings(kind, settings)
             return kind(**settings)
-        except (TypeError, ValueError) as error:
-            raise InvalidSpec(f"{self.kind} {choice.name}: {error}") from None
+
+
+@contextmanager
+def guarded(what: str, failure: type[SurrogymError]) -> Iterator[None]:
+    """Run code that may be another package's: whatever it raises becomes a ``failure`` that begins with ``what``.
+
+    A ``ValueError`` is how this code refuses a specification, so that its message says all where ``failure`` is
+    ``InvalidSpec``; the type of anything else is told. ``KeyboardInterrupt`` goes on, as while a package is loaded.
+    """
+    try:
+        yield
+    except (SurrogymError, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        refused = isinstance(error, ValueError) and failure is InvalidSpec
+        said = " ".join(str(error).split()) if refused else plugins.one_line(error)
+        raise failure(f"{what}: {said}") from error
+
+
+def _check_settings(kind: type, settings: dict[str, float | bool | str]) -> None:
+    """Raises ``ValueError``: one that the class does not have, one that is missing, or one of another type."""
+    fields = [field for field in dataclasses.fields(kind) if field.init] if dataclasses.is_dataclass(kind) else []
+    names = ", ".join(field.name for field in fields)
+    if unknown := sorted(set(settings) - {field.name for field in fields}):
+        raise ValueError(f"expected as settings {f'one of {names}' if names else 'none'}, got {unknown[0]!r}")
+    for field in fields:
+        needed = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        if needed and field.name not in settings:
+            raise ValueError(f"expected the setting {field.name}, which has no default; its settings are {names}")
+    types = _types(kind)
+    for name, given in settings.items():
+        expected = TYPES.get(types.get(name))
+        if expected is not None and type(given) not in expected[1]:
+            raise ValueError(f"expected {name} to be {expected[0]}, got {given!r}")
+
+
+def _types(kind: type) -> dict[str, Any]:
+    """Types of the fields of a class; none where it names what only a type checker imports."""
+    try:
+        return get_type_hints(kind)
+    except Exception:
+        return {}

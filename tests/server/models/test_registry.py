@@ -35,6 +35,9 @@ def test_settings_of_the_specification_override_those_of_the_preset():
         (Choice("gaussian_process", (("depth", 3.0),)), "expected as settings one of kernel, reward_jumps, symmetry"),
         (Choice("gaussian_process", (("kernel", "cubic"),)), "kernel to be one of composite, squared_exponential"),
         (Choice("gaussian_process", (("reward_jumps", 1.0),)), "reward_jumps to be true or false, got 1.0"),
+        (Choice("gaussian_process", (("kernel", 1.0),)), "expected kernel to be a text, got 1.0"),
+        (Choice("ensemble", (("members", "many"),)), "ensemble: expected members to be a whole number, got 'many'"),
+        (Choice("ensemble", (("members", True),)), "ensemble: expected members to be a whole number, got True"),
     ],
 )
 def test_what_is_unknown_or_set_wrong_is_refused(choice, said):
