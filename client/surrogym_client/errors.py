@@ -30,6 +30,7 @@ SurrogymClientError
     │   └── BeyondBudget    an admin raises the budget, or fewer real steps are asked for
     ├── Unavailable         was tried again until the retry budget ran out
     │   └── Overloaded
+    ├── NotInstalled        the surrogate needs a plug-in that the server lacks; reading works without it
     └── ServerFailure       a defect of the server, or of what it has stored
 
 Every error pickles, so that it can cross from a worker process to its parent.
@@ -172,6 +173,10 @@ class Overloaded(Unavailable):
     """A queue or a cap of the server is full."""
 
 
+class NotInstalled(ProblemError):
+    """The surrogate needs a plug-in that the server lacks; whoever runs the server installs it."""
+
+
 class ServerFailure(ProblemError):
     """A defect of the server; its log says more."""
 
@@ -203,6 +208,7 @@ BY_CODE: dict[Code, type[ProblemError]] = {
     Code.DEADLINE_EXCEEDED: Unavailable,
     Code.UNAVAILABLE: Unavailable,
     Code.DAMAGED: ServerFailure,
+    Code.NOT_INSTALLED: NotInstalled,
     Code.INTERNAL: ServerFailure,
 }
 

@@ -36,7 +36,7 @@ from surrogym_server.api.guards import BodyLimit, KnownHosts, OwnPages
 from surrogym_server.api.observe import Observed
 from surrogym_server.api.state import Services
 from surrogym_server.api.turns import Turns
-from surrogym_server.convert import definition_from_spec
+from surrogym_server.convert import definition_from_spec, stored_definition
 from surrogym_server.convert.stored import read_stored
 from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
 from surrogym_server.engine.fits import Fits
@@ -156,7 +156,8 @@ async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: 
     torch.set_num_threads(settings.threads)
     engine = _build_engine(settings, design)
     app.state.notices = engine.notices
-    services, sweeper = _build_services(settings, design, storage, engine, app.state.metrics)
+    definitions = Definitions(storage, _stored_definition)
+    services, sweeper = _build_services(settings, design, storage, definitions, engine, app.state.metrics)
     for registry in (ACQUISITIONS, MODELS):
         logger.info("%ss: %s", registry.kind, ", ".join(registry.names))
         for name, why in registry.broken.items():
@@ -165,7 +166,8 @@ async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: 
     restored = services.sessions.restore()
     if restored:
         logger.info("sessions that came back: %d", restored)
-    tasks = [asyncio.create_task(services.designer.run()), asyncio.create_task(sweeper.run())]
+    looking = asyncio.to_thread(_name_lacking, definitions)
+    tasks = [asyncio.create_task(work) for work in (services.designer.run(), sweeper.run(), looking)]
     try:
         yield {"services": services}
     finally:
@@ -193,9 +195,13 @@ def _build_engine(settings: Settings, design: DesignPort) -> _Engine:
 
 
 def _build_services(
-    settings: Settings, design: DesignPort, storage: Storage, engine: _Engine, metrics: ProcessMetrics
+    settings: Settings,
+    design: DesignPort,
+    storage: Storage,
+    definitions: Definitions,
+    engine: _Engine,
+    metrics: ProcessMetrics,
 ) -> tuple[Services, Sweeper]:
-    definitions = Definitions(storage, _define)
     cache = ModelCache(
         load=lambda surrogate, version: load_model(storage, definitions, surrogate, version),
         newest=storage.models.newest,
@@ -214,7 +220,7 @@ def _build_services(
     samplers = Samplers()
     services = Services(
         surrogates=SurrogateService(
-            storage, _define, _complete, design.plan, cache, engine.live, engine.notices, samplers
+            storage, definitions, _define, _complete, design.plan, cache, engine.live, engine.notices, samplers
         ),
         queries=QueryService(storage, definitions, engine.notices, samplers),
         samples=SampleService(storage, definitions, engine.notices, samplers),
@@ -229,9 +235,18 @@ def _build_services(
     return services, Sweeper(storage, engine.live, cache, settings.sweep_seconds, metrics)
 
 
+def _name_lacking(definitions: Definitions) -> None:
+    for sentence in definitions.lacking():
+        logger.warning("%s; what reads it works, fits and sessions are refused", sentence)
+
+
 def _define(spec: dict[str, Any]) -> EnvironmentDefinition:
-    """Of a specification as it is stored: the wire has checked what comes in."""
-    return definition_from_spec(read_stored(EnvironmentSpec, "a stored specification", spec))
+    """Of a new specification, as JSON: the wire has checked what comes in."""
+    return definition_from_spec(EnvironmentSpec.model_validate(spec))
+
+
+def _stored_definition(spec: dict[str, Any]) -> EnvironmentDefinition:
+    return stored_definition(read_stored(EnvironmentSpec, "a stored specification", spec))
 
 
 def _complete(spec: dict[str, Any]) -> dict[str, Any]:

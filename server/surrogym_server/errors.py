@@ -26,6 +26,7 @@ SurrogymError
 │   ├── Damaged             what is stored can't be read as it was written; whoever runs the server restores a copy
 │   ├── Overloaded          a queue or a cap is full; try again later
 │   └── DeadlineExceeded    its answer would come after the deadline it brought
+├── NotInstalled            a stored surrogate needs a plug-in that this server lacks; whoever runs it installs it
 └── NumericalFailure        a covariance matrix that no jitter repairs
 """
 
@@ -138,6 +139,10 @@ class Overloaded(Unavailable):
 
 class DeadlineExceeded(Unavailable):
     """The answer would come after the deadline of the request; nothing was computed."""
+
+
+class NotInstalled(SurrogymError):
+    """What is stored needs a plug-in that this server lacks; nothing was changed; reading works without it."""
 
 
 class NumericalFailure(SurrogymError):

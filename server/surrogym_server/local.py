@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_server.convert import definition_from_spec, opening, session_view
+from surrogym_server.convert import opening, session_view, stored_definition
 from surrogym_server.engine.session import (
     Session,
     check_opening,
@@ -64,7 +64,7 @@ class LocalSurrogate:
     @classmethod
     def from_bytes(cls, spec: EnvironmentSpec, model: bytes) -> Self:
         """A surrogate of a specification and a model's file. Raises ``InvalidInput``: no model of it."""
-        return cls(spec, from_bytes(definition_from_spec(spec), model))
+        return cls(spec, from_bytes(stored_definition(spec), model))
 
     @classmethod
     def from_file(cls, path: str | Path) -> Self:

@@ -31,6 +31,22 @@ class Choice:
 class Registry(plugins.Registry[T]):
     """Classes by name, and members made of them. Nothing is loaded because of what a request holds beside a name."""
 
+    def lack(self, choice: Choice) -> str | None:
+        """What this machine lacks for a choice that was once made, to go on after "it needs"; None: nothing."""
+        what = f"the {self.noun} {choice.name!r}"
+        try:
+            self.name_of(choice.name)
+        except plugins.UnknownMember:
+            why = self.why_broken(choice.name)
+            if why is None:
+                return f"{what}, which no installed package brings: install it on the server and restart"
+            return f"{what}, which can't be loaded: mend it on the server and restart ({why})"
+        try:
+            self.make(choice)
+        except InvalidSpec as error:
+            return f"another version of {what}: install it on the server and restart ({error})"
+        return None
+
     def get(self, name: str) -> type[T]:
         """The class of a name.
 

@@ -38,6 +38,7 @@ class Code(StrEnum):
     DEADLINE_EXCEEDED = "deadline_exceeded"  # it would have been late, so it was not computed
     UNAVAILABLE = "unavailable"
     DAMAGED = "damaged"  # what the server has stored can't be read as it was written
+    NOT_INSTALLED = "not_installed"  # what is stored needs a plug-in that the server lacks
     INTERNAL = "internal"
 
 
@@ -68,6 +69,7 @@ STATUS: dict[Code, int] = {
     Code.DEADLINE_EXCEEDED: 503,
     Code.UNAVAILABLE: 503,
     Code.DAMAGED: 500,
+    Code.NOT_INSTALLED: 501,
     Code.INTERNAL: 500,
 }
 

@@ -38,14 +38,18 @@ class Registry(Generic[T]):
 
     Args:
         kind: what its members are, for messages: "algorithm".
+        noun: the same where it stands before a name, if that is not ``kind``: "model family".
         group: of the entry points of other packages.
         base: what each member is a subclass of.
         built_in: classes by name, or ``module:class``, imported when it is first asked for; no other package may take
             these names.
     """
 
-    def __init__(self, kind: str, group: str, base: type[T], built_in: Mapping[str, type[T] | str]) -> None:
+    def __init__(
+        self, kind: str, group: str, base: type[T], built_in: Mapping[str, type[T] | str], noun: str = ""
+    ) -> None:
         self.kind = kind
+        self.noun = noun or kind
         self._group = group
         self._base = base
         self._built_in = dict(built_in)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from support.searched import with_path
 from support.server import ServerProcess, running_server
 
 ROOT = Path(__file__).parents[2]
@@ -34,8 +35,3 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def plugin_server(installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
     with running_server(tmp_path_factory.mktemp("server"), PYTHONPATH=with_path(installed)) as server:
         yield server
-
-
-def with_path(folder: Path) -> str:
-    """This process's own search path too: the tests may run from a checkout."""
-    return ":".join([str(folder), *(path for path in sys.path if path.endswith(("server", "client", "shared")))])

@@ -30,6 +30,7 @@ POINT_ERRORS = documented(
     Code.UNKNOWN_SURROGATE,
     Code.UNKNOWN_MODEL,
     Code.NO_MODEL,
+    Code.NOT_INSTALLED,
     Code.INVALID_REQUEST,
     Code.TOO_LARGE,
     Code.TOO_MANY_REQUESTS,
@@ -70,7 +71,7 @@ def get(name: str, version: int, use: Use, format: Literal["json", "safetensors"
     summary="Import a model",
     dependencies=[ADMIN],
     openapi_extra={"requestBody": {"required": True, "content": FILE}},
-    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST, Code.TOO_LARGE),
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST, Code.TOO_LARGE, Code.NOT_INSTALLED),
 )
 async def add(name: str, request: Request, use: Use) -> ModelView:
     """The body is a file that the export gave, of the same outputs. It becomes the newest version."""

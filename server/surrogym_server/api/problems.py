@@ -39,6 +39,7 @@ CODES: dict[type[errors.SurrogymError], Code] = {
     errors.DeadlineExceeded: Code.DEADLINE_EXCEEDED,
     errors.Damaged: Code.DAMAGED,
     errors.Unavailable: Code.UNAVAILABLE,
+    errors.NotInstalled: Code.NOT_INSTALLED,
     errors.NumericalFailure: Code.INTERNAL,
 }
 

@@ -36,6 +36,7 @@ SESSION_ERRORS = (Code.UNKNOWN_SESSION, Code.SESSION_EXPIRED, Code.INVALID_REQUE
     responses=documented(
         Code.UNKNOWN_SURROGATE,
         Code.NO_MODEL,
+        Code.NOT_INSTALLED,
         Code.UNKNOWN_MODEL,
         Code.IDEMPOTENCY_CONFLICT,
         Code.TOO_MANY_REQUESTS,
@@ -83,7 +84,7 @@ async def close_session(id: str, use: Use) -> Response:
     "/sessions/{id}/occupancy",
     summary="Submit the visited states",
     dependencies=[TRAIN],
-    responses=documented(*SESSION_ERRORS, Code.NOT_RESET, Code.UNKNOWN_SURROGATE),
+    responses=documented(*SESSION_ERRORS, Code.NOT_RESET, Code.UNKNOWN_SURROGATE, Code.NOT_INSTALLED),
 )
 async def submit_occupancy(
     id: str, body: Annotated[SubmitOccupancy, example(examples.OCCUPANCY)], use: Use

@@ -48,6 +48,7 @@ ERRORS = documented(
     Code.TOO_MANY_REQUESTS,
     Code.DEADLINE_EXCEEDED,
     Code.UNAVAILABLE,
+    Code.NOT_INSTALLED,
 )
 
 

@@ -1,6 +1,6 @@
 """Wire <-> core, in pairs."""
 
-from surrogym_server.convert.definitions import default_budget, definition_from_spec
+from surrogym_server.convert.definitions import default_budget, definition_from_spec, stored_definition
 from surrogym_server.convert.numbers import numbers
 from surrogym_server.convert.resources import (
     added_samples,
@@ -64,6 +64,7 @@ __all__ = [
     "session_view",
     "step_frame",
     "step_reply",
+    "stored_definition",
     "surrogate_list",
     "surrogate_view",
     "uncertainty",

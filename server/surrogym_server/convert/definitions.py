@@ -21,11 +21,24 @@ LONGEST_ROLLOUT = 200  # where the specification names none
 
 
 def definition_from_spec(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
-    """The core's view of a specification, every default of its preset resolved.
+    """The core's view of a specification for a new design, every default of its preset resolved.
 
     Raises:
         InvalidSpec: the preset can't represent this environment, or an acquisition or a family of models
-            that is not installed.
+            that is not installed, or does not take its settings.
+    """
+    definition = stored_definition(spec)
+    learner_of(definition.learning.model)
+    acquisition_of(definition.design.acquisition)
+    return definition
+
+
+def stored_definition(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
+    """The core's view of a specification that was once taken: what it names need not be installed any more, and only
+    who uses it will miss it.
+
+    Raises:
+        InvalidSpec: the preset can't represent this environment.
     """
     names = spec.coordinate_names
     definition = core.EnvironmentDefinition(
@@ -79,7 +92,7 @@ def _design(spec: wire.EnvironmentSpec) -> core.DesignDefinition:
     return core.DesignDefinition(
         initial=initial,
         hypercube_tries=1 if paper else HYPERCUBE_TRIES,
-        acquisition=_acquisition(design, "uncertainty_index" if paper else "integrated_variance"),
+        acquisition=_choice(design.acquisition, "uncertainty_index" if paper else "integrated_variance"),
         tolerance=design.tolerance or ("raw" if paper else "relative"),
         monte_carlo=design.monte_carlo or MONTE_CARLO,
         visited_candidates=not paper,
@@ -87,12 +100,6 @@ def _design(spec: wire.EnvironmentSpec) -> core.DesignDefinition:
         stopping="confidence" if paper else "tested_confidence",
         seed=design.seed,
     )
-
-
-def _acquisition(design: wire.Design, usual: str) -> Choice:
-    choice = _choice(design.acquisition, usual)
-    acquisition_of(choice)
-    return choice
 
 
 def _learning(spec: wire.EnvironmentSpec) -> core.LearningDefinition:
@@ -111,7 +118,6 @@ def _model(design: wire.Design) -> Choice:
             "symmetry": design.symmetry,
         }
         choice = Choice(choice.name, tuple({**preset, **dict(choice.settings)}.items()))
-    learner_of(choice)
     return choice
 
 

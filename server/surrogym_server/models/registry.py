@@ -18,6 +18,7 @@ MODELS: Registry[Learner] = Registry(
         GAUSSIAN_PROCESS: GaussianProcesses,
         "ensemble": NetworkEnsembles,
     },
+    noun="model family",
 )
 
 

@@ -11,15 +11,22 @@ from numpy.typing import NDArray
 
 from surrogym_server.environment.actions import model_actions
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.errors import InvalidInput
+from surrogym_server.errors import InvalidInput, NotInstalled, SurrogymError
+from surrogym_server.models.registry import MODELS
+from surrogym_server.sampling.acquisition import ACQUISITIONS
 from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import SurrogateRecord
 
 Array = NDArray[np.float64]
 Define = Callable[[dict[str, Any]], EnvironmentDefinition]
 
 
 class Definitions:
-    """Definition of each surrogate by name; made once."""
+    """Definition of each surrogate by name; made once.
+
+    A surrogate may outlive the package that brought its family of models or its acquisition. What reads samples and
+    states takes its definition by ``get`` and works without the package; what needs it asks here for more.
+    """
 
     def __init__(self, storage: Storage, define: Define) -> None:
         self._storage = storage
@@ -29,13 +36,45 @@ class Definitions:
 
     def get(self, name: str) -> EnvironmentDefinition:
         """Raises ``UnknownSurrogate``."""
-        record = self._storage.surrogates.get(name)
+        return self.of(self._storage.surrogates.get(name))
+
+    def of(self, record: SurrogateRecord) -> EnvironmentDefinition:
+        """The definition of a surrogate that was read."""
         with self._lock:
-            id, definition = self._made.get(name, (None, None))
+            id, definition = self._made.get(record.name, (None, None))
             if definition is None or id != record.id:
                 definition = self._define(record.spec)
-                self._made[name] = (record.id, definition)
+                self._made[record.name] = (record.id, definition)
             return definition
+
+    def for_model(self, name: str) -> EnvironmentDefinition:
+        """Where a model is to be read. Raises ``UnknownSurrogate``, or ``NotInstalled``: its family is not here."""
+        definition = self.get(name)
+        _require(name, MODELS.lack(definition.learning.model))
+        return definition
+
+    def for_design(self, name: str) -> EnvironmentDefinition:
+        """Where a round is to be made. Raises as ``for_model``, and ``NotInstalled``: its acquisition is not here."""
+        definition = self.for_model(name)
+        _require(name, ACQUISITIONS.lack(definition.design.acquisition))
+        return definition
+
+    def lacking(self) -> list[str]:
+        """One sentence for each stored surrogate that needs what is not here; one that can't be read is left out."""
+        found = []
+        for summary in self._storage.surrogates.summaries():
+            try:
+                self.for_design(summary.name)
+            except NotInstalled as error:
+                found.append(str(error))
+            except SurrogymError:  # deleted meanwhile, or damaged, which who reads it is told
+                continue
+        return found
+
+
+def _require(name: str, lack: str | None) -> None:
+    if lack is not None:
+        raise NotInstalled(f"surrogate {name} needs {lack}")
 
 
 def check_coordinates(definition: EnvironmentDefinition, what: str, rows: Array) -> Array:

@@ -11,7 +11,15 @@ import numpy as np
 
 from surrogym_server.engine.design_job import DesignJob, DesignResult
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.errors import Damaged, InvalidInput, LeaseExpired, SurrogymError, Unavailable, UnknownSurrogate
+from surrogym_server.errors import (
+    Damaged,
+    InvalidInput,
+    LeaseExpired,
+    NotInstalled,
+    SurrogymError,
+    Unavailable,
+    UnknownSurrogate,
+)
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.notices import Notices
@@ -23,6 +31,7 @@ from surrogym_server.storage.records import (
     NewDesign,
     NewModel,
 )
+from surrogym_shared.plugins import one_line
 
 logger = logging.getLogger(__name__)
 
@@ -135,7 +144,7 @@ class Designer:
             self._metrics.failed_fits += 1
             logger.warning("the fit of %s failed: %s", name, error, exc_info=not isinstance(error, SurrogymError))
             again = isinstance(error, Unavailable) and self._may_try_again(name)
-            await asyncio.to_thread(self._abort, lease, None if again else f"the fit failed: {error}")
+            await asyncio.to_thread(self._abort, lease, None if again else _failure(name, error))
         finally:
             keeper.cancel()
             self._notices.post(name)
@@ -161,7 +170,7 @@ class Designer:
         steps = [query for query in pending if query.kind == "step"]
         visited = None if lease.checkpoint is None else self._storage.occupancy.get(name, lease.checkpoint)
         return DesignJob(
-            definition=self._definitions.get(name).with_tolerances(record.tolerances),
+            definition=self._definitions.for_design(name).with_tolerances(record.tolerances),
             coordinates=samples.coordinates,
             action=samples.action,
             next_coordinates=samples.next_coordinates,
@@ -212,3 +221,14 @@ class Designer:
                 error = f"all {len(set_aside)} initial queries were set aside; the last said: {set_aside[-1].error}"
                 self._storage.surrogates.set_phase(name, "failed", error)
                 self._notices.post(name)
+
+
+def _failure(name: str, error: Exception) -> str:
+    """Why a round failed, and what to do about it, for the status of its surrogate."""
+    match error:
+        case NotInstalled():
+            return f"{error}; then: surrogym change {name} --resume"
+        case SurrogymError():
+            return f"the fit failed: {error}"
+        case _:
+            return f"the fit failed: {one_line(error)}"

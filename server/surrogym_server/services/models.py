@@ -43,10 +43,11 @@ def load_model(storage: Storage, definitions: Definitions, surrogate: int, versi
 
     Raises:
         UnknownModel, UnknownSurrogate: as the classes say.
+        NotInstalled: its family is not here.
         Damaged: as ``stored_model``, or this program can't read it.
     """
     name = storage.surrogates.name_of(surrogate)
-    definition, data = definitions.get(name), stored_model(storage, name, version)
+    definition, data = definitions.for_model(name), stored_model(storage, name, version)
     try:
         return from_bytes(definition, data)
     except InvalidInput as error:
@@ -95,9 +96,10 @@ class ModelService:
 
         Raises:
             InvalidInput: no model of this surrogate.
+            NotInstalled: its family is not here.
         """
         record = self._storage.surrogates.get(name)
-        model = from_bytes(self._definitions.get(name).with_tolerances(record.tolerances), data)
+        model = from_bytes(self._definitions.for_model(name).with_tolerances(record.tolerances), data)
         new = NewModel(
             samples=model.samples,
             data_hash=model.digest,

@@ -18,7 +18,7 @@ from surrogym_server.engine.sessions import LiveSessions
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput, NoModel, SpecConflict
 from surrogym_server.services.activity import Samplers
-from surrogym_server.services.definitions import Define
+from surrogym_server.services.definitions import Define, Definitions
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import (
@@ -59,6 +59,7 @@ class SurrogateService:
     def __init__(
         self,
         storage: Storage,
+        definitions: Definitions,
         define: Define,
         complete: Complete,
         plan: Plan,
@@ -70,12 +71,14 @@ class SurrogateService:
         """
         Args:
             storage: holds them.
-            define: the definition of a spec.
+            definitions: of those in it.
+            define: the definition of a new spec; raises ``InvalidSpec`` where it asks for what is not installed.
             complete: a spec with every field that this program knows, as JSON; an older one lacked some.
             plan: the first queries under a budget: (state, coordinates (m, C), action (m, F), rollouts (T, F) each).
             models, live, notices, samplers: of this process.
         """
         self._storage = storage
+        self._definitions = definitions
         self._define = define
         self._complete = complete
         self._plan = plan
@@ -138,7 +141,7 @@ class SurrogateService:
             UnknownSurrogate: there is none of this name.
             InvalidInput: a tolerance for what is no output.
         """
-        outputs = self._define(self._storage.surrogates.get(name).spec).outputs
+        outputs = self._definitions.get(name).outputs
         if unknown := sorted(set(tolerances or ()) - set(outputs)):
             raise InvalidInput(f"tolerances: unknown output {unknown[0]!r}, expected some of {list(outputs)}")
         self._storage.surrogates.change(name, paused=paused, budget=budget, target=target, tolerances=tolerances)
@@ -162,7 +165,7 @@ class SurrogateService:
         return SurrogateStatus(
             summary=self._storage.surrogates.summary(name),
             record=record,
-            outputs=self._define(record.spec).outputs,
+            outputs=self._definitions.of(record).outputs,
             model=model,
             budget_left=self._storage.designs.left(name),
             samplers=tuple(self._samplers.by_surrogate().get(name, ())),

@@ -150,7 +150,7 @@ def test_a_fit_that_fails_says_why_and_is_tried_again_with_new_samples(answered:
 def test_an_error_nobody_thought_of_fails_the_design_and_not_the_designer(answered: Storage, designer, runner: Runner):
     runner.function = refuse(ZeroDivisionError("surprise"))
     fit_all(designer)
-    assert answered.surrogates.get(NAME).error == "the fit failed: surprise"
+    assert answered.surrogates.get(NAME).error == "the fit failed: ZeroDivisionError: surprise"
 
 
 def test_a_fit_whose_process_is_killed_is_tried_again(answered: Storage, designer, runner: Runner):
