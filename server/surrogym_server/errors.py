@@ -27,6 +27,7 @@ SurrogymError
 │   ├── Overloaded          a queue or a cap is full; try again later
 │   └── DeadlineExceeded    its answer would come after the deadline it brought
 ├── NotInstalled            a stored surrogate needs a plug-in that this server lacks; whoever runs it installs it
+├── PluginFailed            an acquisition or a family of models raised, or gave back what breaks its laws
 └── NumericalFailure        a covariance matrix that no jitter repairs
 """
 
@@ -143,6 +144,10 @@ class DeadlineExceeded(Unavailable):
 
 class NotInstalled(SurrogymError):
     """What is stored needs a plug-in that this server lacks; nothing was changed; reading works without it."""
+
+
+class PluginFailed(SurrogymError):
+    """An acquisition or a family of models raised, or gave back what breaks its laws; says which, and what."""
 
 
 class NumericalFailure(SurrogymError):

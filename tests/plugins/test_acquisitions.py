@@ -41,7 +41,22 @@ def test_the_design_asks_by_an_installed_acquisition(plugin_server: ServerProces
         ("nobody", {}, "expected one of integrated_variance, variance, uncertainty_index, latin_hypercube, focused_"),
         ("broken", {}, f"package '{BROKEN}', entry point broken = 'nowhere_to_be_found:Missing'"),
         ("focused_variance", {"sigma": 1.0}, "expected as settings one of coordinate, near, width, got 'sigma'"),
-        ("focused_variance", {}, "coordinate"),
+        (
+            "focused_variance",
+            {},
+            "acquisition focused_variance: expected the setting coordinate, which has no default; "
+            "its settings are coordinate, near, width",
+        ),
+        (
+            "focused_variance",
+            {"coordinate": "speed", "width": "abc"},
+            "acquisition focused_variance: expected width to be a number, got 'abc'",
+        ),
+        (
+            "focused_variance",
+            {"coordinate": "x"},
+            "acquisition focused_variance: expected coordinate to be one of theta, speed, got 'x'",
+        ),
         ("focused_variance", {"coordinate": "speed", "width": -1.0}, "expected a positive width, got -1.0"),
         ("variance", {"width": 1.0}, "expected as settings none, got 'width'"),
     ],

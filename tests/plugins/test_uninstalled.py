@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +20,7 @@ from surrogym_client.transport import Api
 from surrogym_shared.spec import AcquisitionChoice, Design
 from surrogym_shared.wire import NewSample
 
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "plugins.md"
 FOCUSED = AcquisitionChoice(name="focused_variance", settings={"coordinate": "speed"})
 INSTALL = "which no installed package brings: install it on the server and restart"
 LIN = f"surrogate lin needs the model family 'bayesian_linear', {INSTALL}"
@@ -108,6 +110,16 @@ def test_a_round_that_is_due_fails_and_says_what_to_do(
     seen = surrogym("status", name).output
     assert f"{name}: Pendulum-v1, failed" in seen
     assert f"last error: {lacks}; then: surrogym change {name} --resume" in seen
+
+
+def test_the_samples_go_along_to_a_new_design_as_the_page_says(left: ServerProcess, surrogym: Callable[..., Result]):
+    (program,) = re.findall(
+        r"^```py\n(from surrogym_client.transport.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE
+    )
+    assert surrogym("register", "Pendulum-v1", "--name", "new", "--initial", "2").exit_code == 0
+    exec(program.replace("http://127.0.0.1:8000", left.url).replace('"old"', '"foc"'), {})
+    with Api(left.url) as api:
+        assert api.surrogate("new").ledger.manual == api.surrogate("foc").ledger.total
 
 
 def test_it_can_be_deleted(left: ServerProcess, surrogym: Callable[..., Result]):

@@ -25,7 +25,9 @@ def options(*names: str) -> set[str]:
     command = command_line()
     for name in names:
         command = command.commands[name]
-    return {spelling for parameter in command.params for spelling in parameter.opts} | {"--help"}
+    return {spelling for parameter in command.params for spelling in (*parameter.opts, *parameter.secondary_opts)} | {
+        "--help"
+    }
 
 
 def parse(arguments: list[str]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,10 @@ def answer(job: DesignJob) -> DesignResult:
 
 def refuse(job: DesignJob) -> DesignResult:
     raise ValueError("no such luck")
+
+
+def leave(job: DesignJob) -> DesignResult:
+    sys.exit("no licence")
 
 
 def die(job: DesignJob) -> DesignResult:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.sampling.acquisition import Acquisition, CandidateView
 
 
@@ -29,6 +30,11 @@ class FocusedVariance(Acquisition):
     def __post_init__(self) -> None:
         if not self.width > 0:
             raise ValueError(f"expected a positive width, got {self.width}")
+
+    def check(self, definition: EnvironmentDefinition) -> None:
+        names = definition.coordinate_names
+        if self.coordinate not in names:
+            raise ValueError(f"expected coordinate to be one of {', '.join(names)}, got {self.coordinate!r}")
 
     def value(self, candidates: CandidateView) -> Tensor:
         column = candidates.model.definition.coordinate_names.index(self.coordinate)

@@ -40,6 +40,7 @@ CODES: dict[type[errors.SurrogymError], Code] = {
     errors.Damaged: Code.DAMAGED,
     errors.Unavailable: Code.UNAVAILABLE,
     errors.NotInstalled: Code.NOT_INSTALLED,
+    errors.PluginFailed: Code.INTERNAL,
     errors.NumericalFailure: Code.INTERNAL,
 }
 

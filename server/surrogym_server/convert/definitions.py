@@ -11,7 +11,7 @@ from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.errors import InvalidSpec
 from surrogym_server.models.registry import GAUSSIAN_PROCESS, learner_of
 from surrogym_server.plugins import Choice
-from surrogym_server.sampling.acquisition import acquisition_of
+from surrogym_server.sampling.acquisition import check_acquisition
 from surrogym_shared import spec as wire
 
 PENALTY = {"default": 0.0, "paper": 3.0}  # k of eq. 14
@@ -25,11 +25,11 @@ def definition_from_spec(spec: wire.EnvironmentSpec) -> core.EnvironmentDefiniti
 
     Raises:
         InvalidSpec: the preset can't represent this environment, or an acquisition or a family of models
-            that is not installed, or does not take its settings.
+            that is not installed, does not take its settings, or does not fit this environment.
     """
     definition = stored_definition(spec)
     learner_of(definition.learning.model)
-    acquisition_of(definition.design.acquisition)
+    check_acquisition(definition)
     return definition
 
 

@@ -15,7 +15,8 @@ from multiprocessing.process import BaseProcess
 from threading import Thread
 
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
-from surrogym_server.errors import Unavailable
+from surrogym_server.errors import PluginFailed, Unavailable
+from surrogym_shared.plugins import one_line
 
 NICENESS = 10  # to a step on the same core a fit leaves nine tenths of it
 
@@ -48,14 +49,19 @@ class Fits:
 
         Raises:
             Unavailable: the process died twice.
+            PluginFailed: code of a package asked to exit; that must not end this process.
             Exception: whatever the job raises.
         """
         for _ in range(2):
             if self._pool is None:
                 self.start()
             assert self._pool is not None
-            with suppress(BrokenProcessPool):
+            try:
                 return await asyncio.wrap_future(self._pool.submit(self._function, job))
+            except BrokenProcessPool:
+                pass
+            except SystemExit as error:
+                raise PluginFailed(f"the fit failed: a package called sys.exit: {one_line(error)}") from error
             self.close()
         raise Unavailable("the process that fits died twice on the same job: is there enough memory?")
 

@@ -4,8 +4,10 @@ An acquisition values candidates, or predicted paths, for the sake of one output
 
 - it is a pure function of its arguments and its settings: no state, no random numbers of its own;
 - it returns one value for each candidate (m,), or for each beginning of each path (b, T); only their order counts;
-- more is better, and no value is NaN;
+- more is better, and every value is finite;
 - it changes nothing that it was given.
+
+``value_of`` and ``path_value_of`` are where it is asked; they refuse what has another shape, or is not finite.
 
 Its settings are the fields of a frozen dataclass: numbers, booleans and strings, as the specification carries them.
 """
@@ -16,13 +18,16 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import torch
 from torch import Tensor
 
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
+from surrogym_server.errors import InvalidSpec, PluginFailed
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.plugins import Choice, Registry
+from surrogym_server.plugins import Choice, Registry, guarded
 from surrogym_server.sampling.confidence import log_model_uncertainty, log_uncertainty_index
 
 GROUP = "surrogym.acquisitions"
@@ -73,6 +78,10 @@ class Acquisition(ABC):
     adaptive: ClassVar[bool] = True  # False: the whole budget is asked before the first fit
     reads_reference: ClassVar[bool] = False  # whether ``variance_reduction`` is asked for
     reads_probability: ClassVar[bool] = False  # whether ``log_probability`` is asked for
+
+    def check(self, definition: EnvironmentDefinition) -> None:  # noqa: B027  most take every environment
+        """Asked once, when a surrogate is registered, before any real step. Raises ``ValueError`` where the settings
+        do not fit its environment, with what was expected and what came."""
 
     @abstractmethod
     def value(self, candidates: CandidateView) -> Tensor:
@@ -131,7 +140,7 @@ class LatinHypercube(Acquisition):
     adaptive: ClassVar[bool] = False
 
     def value(self, candidates: CandidateView) -> Tensor:
-        return candidates.distance
+        return candidates.distance.nan_to_num()  # infinite before the first query
 
 
 ACQUISITIONS: Registry[Acquisition] = Registry(
@@ -150,3 +159,35 @@ ACQUISITIONS: Registry[Acquisition] = Registry(
 def acquisition_of(choice: Choice) -> Acquisition:
     """The acquisition of a name and settings. Raises InvalidSpec."""
     return ACQUISITIONS.make(choice)
+
+
+def check_acquisition(definition: EnvironmentDefinition) -> None:
+    """Raises ``InvalidSpec``: no such acquisition, settings that it does not take, or that do not fit the
+    environment."""
+    choice = definition.design.acquisition
+    acquisition = acquisition_of(choice)
+    with guarded(f"acquisition {choice.name}", InvalidSpec):
+        acquisition.check(definition)
+
+
+def value_of(choice: Choice, candidates: CandidateView) -> Tensor:
+    """What an acquisition gives for each of m candidates, (m,). Raises ``PluginFailed``: it broke the laws."""
+    return _asked(choice, acquisition_of(choice).value, candidates, candidates.distance.shape)
+
+
+def path_value_of(choice: Choice, paths: PathView) -> Tensor:
+    """What an acquisition gives for each beginning of b paths, (b, T). Raises ``PluginFailed``: it broke the laws."""
+    return _asked(choice, acquisition_of(choice).path_value, paths, paths.weight.shape)
+
+
+def _asked(choice: Choice, ask: Callable[[Any], Tensor], view: Any, shape: torch.Size) -> Tensor:
+    what = f"the choice of the next queries failed: acquisition {choice.name}"
+    with guarded(what, PluginFailed):
+        values: object = ask(view)
+    if not isinstance(values, Tensor):
+        raise PluginFailed(f"{what}: expected a tensor of shape {tuple(shape)}, got {type(values).__name__}")
+    if values.shape != shape:
+        raise PluginFailed(f"{what}: expected a tensor of shape {tuple(shape)}, got {tuple(values.shape)}")
+    if bad := int((~values.isfinite()).sum()):
+        raise PluginFailed(f"{what}: expected finite values, got {bad} of {values.numel()} that are infinite or NaN")
+    return values

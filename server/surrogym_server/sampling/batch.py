@@ -12,7 +12,7 @@ from surrogym_server.environment.features import distances
 from surrogym_server.environment.points import Points
 from surrogym_server.models.abilities import OutputOutlook
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.sampling.acquisition import CandidateView, acquisition_of
+from surrogym_server.sampling.acquisition import CandidateView, acquisition_of, value_of
 from surrogym_server.sampling.candidates import Candidates
 from surrogym_server.sampling.outlook import outlook_of
 
@@ -43,9 +43,10 @@ def choose(
         Indices of candidates; fewer than wanted where nothing distinct is left.
     """
     definition, points = model.definition, candidates.points
-    acquisition = acquisition_of(definition.design.acquisition)
+    acquisition = definition.design.acquisition
     # The covariances of the reference cost the most.
-    reference = candidates.reference if acquisition.reads_reference else candidates.reference[:0]
+    reads = acquisition_of(acquisition).reads_reference
+    reference = candidates.reference if reads else candidates.reference[:0]
     outlook = outlook_of(model, points, reference, assumed)
     distance = nearest(definition, points, taken)
     picks: list[int] = []
@@ -55,7 +56,8 @@ def choose(
             break
         value = distance
         if output is not None:
-            value = acquisition.value(candidate_view(model, candidates, column, output, tolerances[column], distance))
+            view = candidate_view(model, candidates, column, output, tolerances[column], distance)
+            value = value_of(acquisition, view)
         if reserved is not None and not picks and bool((allowed & reserved).any()):
             allowed &= reserved
         elif output is not None:

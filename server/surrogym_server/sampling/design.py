@@ -15,8 +15,10 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples, increments
+from surrogym_server.errors import PluginFailed
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.models.registry import learner_of
+from surrogym_server.plugins import guarded
 from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.batch import choose
 from surrogym_server.sampling.candidates import Candidates, candidates_of
@@ -96,8 +98,15 @@ def initial_rollouts(definition: EnvironmentDefinition, budget: int) -> list[Ten
 
 
 def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignState, request: Request) -> Decision:
-    """One round. Raises InvalidInput or NumericalFailure as ``Learner.learn`` does."""
-    learned = learner_of(definition.learning.model).learn(definition, samples, state.warm)
+    """One round.
+
+    Raises:
+        InvalidInput, NumericalFailure: as ``Learner.learn`` does.
+        PluginFailed: the family of models raised anything else, or the acquisition broke its laws.
+    """
+    family = definition.learning.model
+    with guarded(f"the fit failed: model family {family.name}", PluginFailed):
+        learned = learner_of(family).learn(definition, samples, state.warm)
     usual = state.usual or usual_tolerances(definition, sizes_of(definition, samples))
     tolerances = definition.tolerances_over(usual)
     points = Points(*monte_carlo(definition))

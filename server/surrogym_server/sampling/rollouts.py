@@ -19,7 +19,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.distributions import scaling
 from surrogym_server.models.abilities import PathOutlook, PredictedSteps
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.sampling.acquisition import PathView, acquisition_of
+from surrogym_server.sampling.acquisition import PathView, path_value_of
 from surrogym_server.sampling.endings import edge_in_doubt, in_doubt
 from surrogym_server.sampling.occupancy import log_occupancy
 from surrogym_server.sampling.outlook import as_if_answered, path_outlook
@@ -142,13 +142,13 @@ def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor) -> Path
 
 def path_values(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
     """What the acquisition gives for each beginning of paths (b, T), summed over the outputs of the aim: (b, T)."""
-    acquisition = acquisition_of(model.definition.design.acquisition)
+    acquisition = model.definition.design.acquisition
     weight = _weights(model.definition, aim, paths)
     total = torch.zeros_like(weight)
     steps = PredictedSteps(paths.q, paths.u, paths.q_next)
     for column in aim.columns:
         if (output := path_outlook(model, steps, column)) is not None:
-            total += acquisition.path_value(_view(output, weight * output.learns, aim.tolerances[column]))
+            total += path_value_of(acquisition, _view(output, weight * output.learns, aim.tolerances[column]))
     return total
 
 

@@ -16,6 +16,7 @@ from surrogym_server.errors import (
     InvalidInput,
     LeaseExpired,
     NotInstalled,
+    PluginFailed,
     SurrogymError,
     Unavailable,
     UnknownSurrogate,
@@ -142,7 +143,8 @@ class Designer:
             logger.info("the fit of %s is made again: it was changed, or another server fits it", name)
         except Exception as error:
             self._metrics.failed_fits += 1
-            logger.warning("the fit of %s failed: %s", name, error, exc_info=not isinstance(error, SurrogymError))
+            ours = isinstance(error, SurrogymError) and not isinstance(error, PluginFailed)
+            logger.warning("the round of %s failed: %s", name, error, exc_info=not ours)
             again = isinstance(error, Unavailable) and self._may_try_again(name)
             await asyncio.to_thread(self._abort, lease, None if again else _failure(name, error))
         finally:
@@ -228,6 +230,8 @@ def _failure(name: str, error: Exception) -> str:
     match error:
         case NotInstalled():
             return f"{error}; then: surrogym change {name} --resume"
+        case PluginFailed():
+            return str(error)
         case SurrogymError():
             return f"the fit failed: {error}"
         case _:

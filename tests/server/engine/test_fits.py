@@ -14,7 +14,7 @@ import pytest
 from support import jobs
 from surrogym_server.engine.design_job import DesignJob, DesignResult
 from surrogym_server.engine.fits import NICENESS, Fits
-from surrogym_server.errors import Unavailable
+from surrogym_server.errors import PluginFailed, Unavailable
 
 Started = Callable[[Callable[[DesignJob], DesignResult]], Fits]
 
@@ -53,6 +53,11 @@ def test_it_yields_to_whoever_steps(started: Started):
     process = int(run(started(jobs.answer)).data_hash)
     mine = os.getpriority(os.PRIO_PROCESS, 0)
     assert os.getpriority(os.PRIO_PROCESS, process) == min(mine + NICENESS, 19)
+
+
+def test_a_package_that_exits_ends_one_fit_and_no_server(started: Started):
+    with pytest.raises(PluginFailed, match=r"a package called sys\.exit: SystemExit: no licence"):
+        run(started(jobs.leave))
 
 
 def test_what_a_job_raises_comes_here(started: Started):

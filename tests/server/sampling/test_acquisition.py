@@ -10,9 +10,10 @@ from scipy.stats import norm
 from surrogym_client.original.classic import cartpole
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.points import Points
+from surrogym_server.errors import PluginFailed
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.plugins import Choice
-from surrogym_server.sampling.acquisition import acquisition_of
+from surrogym_server.sampling.acquisition import PathView, Variance, acquisition_of, path_value_of
 from surrogym_server.sampling.batch import NEAR, candidate_view, choose, nearest
 from surrogym_server.sampling.candidates import Candidates
 from surrogym_server.sampling.confidence import deviations
@@ -119,3 +120,36 @@ def test_another_discrete_action_is_another_query(definition):
     discrete = replace(definition, action=definition_from_spec(cartpole()).action)
     q, left, right = torch.zeros(1, 2).double(), torch.zeros(1, 1).double(), torch.ones(1, 1).double()
     assert nearest(discrete, Points(q, left), Points(q, right))[0] > NEAR
+
+
+def leave(_: torch.Tensor) -> object:
+    raise SystemExit("no licence")
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (lambda deviation: deviation.sum(), r"expected a tensor of shape \(60,\), got \(\)"),
+        (lambda deviation: deviation[:7], r"expected a tensor of shape \(60,\), got \(7,\)"),
+        (lambda deviation: deviation[:, None], r"expected a tensor of shape \(60,\), got \(60, 1\)"),
+        (lambda deviation: deviation.numpy(), r"expected a tensor of shape \(60,\), got ndarray"),
+        (lambda deviation: deviation * torch.nan, "expected finite values, got 60 of 60 that are infinite or NaN"),
+        (lambda _: ("angle", "speed").index("x"), r"ValueError: tuple.index\(x\): x not in tuple"),
+        (leave, "SystemExit: no licence"),
+    ],
+)
+def test_an_answer_that_breaks_the_laws_names_the_acquisition(model, candidates, monkeypatch, answer, said):
+    """By its values the design spends real steps; argmax of NaN or of a scalar would choose without a word."""
+    monkeypatch.setattr(Variance, "value", lambda _, view: answer(view.deviation))
+    nothing = candidates.points[:0]
+    expected = f"^the choice of the next queries failed: acquisition variance: {said}"
+    with pytest.raises(PluginFailed, match=expected):
+        choose(by(model, "variance"), candidates, nothing, nothing, [0], TOLERANCES)
+
+
+def test_an_answer_along_paths_is_held_to_the_laws_too(monkeypatch):
+    weight = torch.ones(2, 3)
+    paths = PathView(0.1, weight, lambda: weight, lambda: weight)
+    monkeypatch.setattr(Variance, "path_value", lambda _, view: view.weight / 0)
+    with pytest.raises(PluginFailed, match="acquisition variance: expected finite values, got 6 of 6"):
+        path_value_of(Choice("variance"), paths)

@@ -15,7 +15,7 @@ import pytest
 from support import pendulum
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.errors import InvalidInput, NoModel, NumericalFailure, Unavailable
+from surrogym_server.errors import InvalidInput, NoModel, NumericalFailure, PluginFailed, Unavailable
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import ATTEMPTS, Designer
 from surrogym_server.services.metrics import ProcessMetrics
@@ -151,6 +151,13 @@ def test_an_error_nobody_thought_of_fails_the_design_and_not_the_designer(answer
     runner.function = refuse(ZeroDivisionError("surprise"))
     fit_all(designer)
     assert answered.surrogates.get(NAME).error == "the fit failed: ZeroDivisionError: surprise"
+
+
+def test_an_acquisition_that_fails_is_named_and_not_the_fit(answered: Storage, designer, runner: Runner):
+    said = "the choice of the next queries failed: acquisition focused: ValueError: x not in tuple"
+    runner.function = refuse(PluginFailed(said))
+    fit_all(designer)
+    assert answered.surrogates.get(NAME).error == said
 
 
 def test_a_fit_whose_process_is_killed_is_tried_again(answered: Storage, designer, runner: Runner):
