@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -17,7 +18,7 @@ from alembic.config import Config
 
 from surrogym_server.errors import Damaged, NoModel, SurrogymError
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.records import NewDesign, NewSample
+from surrogym_server.storage.records import NewDesign, NewSample, NewSurrogate
 from surrogym_server.storage.sql import open_storage
 from surrogym_server.storage.sql.checks import check_pages
 from surrogym_server.storage.sql.database import connect
@@ -279,3 +280,21 @@ def changed_copy(file: Path, place: str) -> Path:
     with closing(sqlite3.connect(copy)) as connection, connection:
         connection.execute(f"UPDATE {table} SET {column} = x'ff00' WHERE rowid = (SELECT min(rowid) FROM {table})")
     return copy
+
+
+def test_an_index_that_lost_its_entries_is_found_at_the_start(tmp_path: Path) -> None:
+    """As after one file was copied over another under a running server; ``quick_check`` does not see it."""
+    file = tmp_path / "surrogym.db"
+    storage = open_storage(f"sqlite:///{file}")
+    storage.surrogates.create(NewSurrogate("r", {}, 30, 0.9))
+    storage.close()
+    with closing(sqlite3.connect(file)) as database:
+        wanted = "SELECT rootpage FROM sqlite_master WHERE type = 'index' AND tbl_name = 'surrogates'"
+        [page], [size] = database.execute(wanted).fetchone(), database.execute("PRAGMA page_size").fetchone()
+    with file.open("r+b") as damaged:
+        damaged.seek((page - 1) * size)
+        damaged.write(struct.pack(">BHHHB", 10, 0, 0, size, 0).ljust(size, b"\0"))  # a leaf without entries
+    with closing(sqlite3.connect(file)) as database:
+        assert database.execute("PRAGMA quick_check").fetchall() == [("ok",)]
+    with pytest.raises(Damaged, match="missing from index"):
+        open_storage(f"sqlite:///{file}")

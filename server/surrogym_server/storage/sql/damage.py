@@ -24,6 +24,10 @@ def means_damage(error: sa.exc.DBAPIError) -> bool:
     """Whether an error of the driver says that what is stored can't be read, or has other tables."""
     if getattr(error.orig, "sqlstate", None) in SQLSTATES:
         return True
-    extended = getattr(error.orig, "sqlite_errorcode", 0)
     said = str(error.orig)
-    return extended & 0xFF in SQLITE_CODES or UNDECODABLE in said or OTHER_SCHEMA.search(said) is not None
+    return are_broken_pages(error) or UNDECODABLE in said or OTHER_SCHEMA.search(said) is not None
+
+
+def are_broken_pages(error: sa.exc.DBAPIError) -> bool:
+    """Whether an error of the driver says that a file's structure is broken, which nothing mends while it is open."""
+    return getattr(error.orig, "sqlite_errorcode", 0) & 0xFF in SQLITE_CODES

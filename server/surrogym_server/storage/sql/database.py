@@ -18,10 +18,11 @@ import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL, Connection, Engine
 
-from surrogym_server.errors import InvalidInput, Unavailable
+from surrogym_server.errors import Damaged, InvalidInput, Unavailable
 from surrogym_server.storage.records import Synchronous
-from surrogym_server.storage.sql.damage import damaged, means_damage
+from surrogym_server.storage.sql.damage import are_broken_pages, damaged, means_damage
 from surrogym_server.storage.sql.filelock import FileLock
+from surrogym_server.storage.sql.write_ahead_log import marks
 
 BUSY_SECONDS = 5  # how long a statement waits for what another program or thread keeps
 POOL = {"pool_size": 8, "max_overflow": 56, "pool_timeout": BUSY_SECONDS}
@@ -47,38 +48,60 @@ class Database:
         self._lock = lock
         self._writing = engine.execution_options(begin="BEGIN IMMEDIATE")
         # SQLite's own waiting polls; a lock in this process wakes the next writer at once
-        self._turn = threading.Lock() if engine.dialect.name == "sqlite" else None
+        self._turn = threading.RLock() if engine.dialect.name == "sqlite" else None
         self._held: Connection | None = None
+        self._broken: str | None = None
 
     def hold_open(self) -> None:
-        """Keep one connection to a SQLite file until ``close``, and watch the files that SQLite keeps beside it.
+        """Keep one connection to a SQLite file until ``close``, and watch the file and those that SQLite keeps beside.
 
         SQLite deletes its write-ahead log with the last connection. While this one is open, a log that is missing or
-        another one was changed by somebody else.
+        another one was changed by somebody else. What the log holds is merged first, so that no copy that was made
+        while no server ran begins as the file does from now on.
         """
         if self._lock is None:
             return
-        with _translated():
+        with self._translated():
             self._held = self._engine.connect()
+            driver = self._held.connection.driver_connection
+            assert driver is not None
+            driver.execute("PRAGMA wal_checkpoint").close()
             self._held.execute(sa.text("SELECT count(*) FROM sqlite_master"))
             self._held.rollback()
-        self._lock.watch_beside()
+        self._lock.watch()
 
     @contextlib.contextmanager
     def read(self) -> Iterator[Connection]:
-        self._require_in_place()
-        with _translated(), self._engine.begin() as connection:
+        self._require_own()
+        with self._translated(), self._engine.begin() as connection:
             yield connection
 
     @contextlib.contextmanager
     def write(self) -> Iterator[Connection]:
-        self._require_in_place()
-        with self._take_turn(), _translated(), self._writing.begin() as connection:
-            yield connection
+        with self._take_turn():
+            self._require_own()
+            with self._translated(), self._writing.begin() as connection:
+                self._mark_log(connection)
+                yield connection
 
-    def _require_in_place(self) -> None:
-        if self._lock is not None:
-            self._lock.require_in_place()
+    def require_sound(self) -> None:
+        """Raise ``Damaged`` once pages of the file were found broken; other damage may be mended under the server."""
+        if self._broken is not None:
+            raise Damaged(f"{self._broken}; {self.way_out}")
+
+    def _require_own(self) -> None:
+        """Check that what this server wrote is what it will read; see ``FileLock``."""
+        if self._lock is None:
+            return
+        self._lock.require_in_place()
+        if not self._lock.is_as_noted():
+            with self._take_turn():  # whoever merged the log has ended then
+                self._lock.require_own_content()
+
+    def _mark_log(self, connection: Connection) -> None:
+        if self._lock is not None and self._lock.log_is_merged():
+            for statement in marks(self._lock.header()):
+                connection.exec_driver_sql(statement)
 
     def close(self) -> None:
         if self._held is not None:
@@ -98,6 +121,29 @@ class Database:
             yield
         finally:
             self._turn.release()
+
+    @contextlib.contextmanager
+    def _translated(self) -> Iterator[None]:
+        try:
+            yield
+        except UNSTORABLE as error:
+            raise InvalidInput(f"expected a value the database can store: {_reason(error)}") from error
+        except UnicodeDecodeError as error:  # SQLite's message names something broken, and the driver can't read it
+            raise self._damaged(error.object.decode(errors="replace"), pages=True) from error
+        except sa.exc.TimeoutError as error:
+            raise Unavailable(f"the database can't be used now: {error}") from error
+        except sa.exc.DBAPIError as error:
+            if means_damage(error):
+                raise self._damaged(_reason(error), pages=are_broken_pages(error)) from error
+            if type(error) in UNUSABLE:
+                raise Unavailable(f"the database can't be used now: {_reason(error)}") from error
+            raise
+
+    def _damaged(self, reason: str, *, pages: bool) -> Damaged:
+        found = damaged(reason)
+        if pages:
+            self._broken = str(found)
+        return found
 
 
 def clock(connection: Connection) -> sa.ColumnElement[float]:
@@ -120,7 +166,7 @@ def connect(url: str, synchronous: Synchronous = "full") -> Database:
 
     Raises:
         InvalidInput: another kind of address.
-        Unavailable: another server holds the SQLite file.
+        Unavailable: another server holds the SQLite file, or a log lies beside it that isn't its own.
     """
     try:
         parsed = sa.make_url(url)
@@ -170,24 +216,6 @@ def _postgresql(url: URL) -> Database:
 # exactly these: IntegrityError and ProgrammingError derive from DatabaseError, and are our own bugs
 UNUSABLE = (sa.exc.OperationalError, sa.exc.InternalError, sa.exc.InterfaceError, sa.exc.DatabaseError)
 UNSTORABLE = (sa.exc.DataError, OverflowError, UnicodeEncodeError)
-
-
-@contextlib.contextmanager
-def _translated() -> Iterator[None]:
-    try:
-        yield
-    except UNSTORABLE as error:
-        raise InvalidInput(f"expected a value the database can store: {_reason(error)}") from error
-    except UnicodeDecodeError as error:  # SQLite's message names something broken, and the driver can't read it
-        raise damaged(error.object.decode(errors="replace")) from error
-    except sa.exc.TimeoutError as error:
-        raise Unavailable(f"the database can't be used now: {error}") from error
-    except sa.exc.DBAPIError as error:
-        if means_damage(error):
-            raise damaged(_reason(error)) from error
-        if type(error) in UNUSABLE:
-            raise Unavailable(f"the database can't be used now: {_reason(error)}") from error
-        raise
 
 
 def _reason(error: Exception) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import struct
@@ -9,9 +10,11 @@ import threading
 from pathlib import Path
 
 from surrogym_server.errors import Unavailable
+from surrogym_server.storage.sql import write_ahead_log
 
 LOCKED_BYTE = 2**62  # beyond any database, and far from the bytes at 2**30 that SQLite locks
 WHOLE_DESCRIPTION = getattr(fcntl, "F_OFD_SETLK", None)  # Linux
+SQLITE_SHARED = (2**30 + 2, 510)  # the bytes that SQLite's readers lock together, and who merges the log alone
 BUSY = (BlockingIOError, PermissionError)  # EAGAIN, EACCES
 
 BESIDE = ("-wal", "-shm")  # what SQLite puts behind the name of a database: its write-ahead log, and the log's index
@@ -29,44 +32,112 @@ class FileLock:
     Close it after SQLite's connections: closing any descriptor of a file drops the locks that SQLite has on it.
 
     Raises:
-        Unavailable: another server holds it, or the file can't be read and written.
+        Unavailable: another server holds it, the file can't be read and written, or a write-ahead log lies beside it
+            that was written for another database.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        resolved = path.resolve()  # SQLite keeps its files where a symbolic link leads
+        self._log, self._index = (resolved.with_name(resolved.name + suffix) for suffix in BESIDE)
+        self._beside: dict[Path, Identity | None] = {}
+        self._noted: bytes | None = None
+        self._overwritten = False
         with _turn:
+            if not path.exists():
+                self._require_own_log(b"")
             if _identity(path) in _held:  # and don't open it, for the reason above
                 raise _taken(path)
-            self._descriptor: int | None = _lock_byte(path) if WHOLE_DESCRIPTION else _lock_beside(path)
+            self._descriptors = [_lock_byte(path)] if WHOLE_DESCRIPTION else [_lock_beside(path), _open(path)]
+            self._index_descriptor: int | None = None
             identity = _identity(path)
             assert identity is not None
             self._identity = identity
-            self._beside: dict[Path, Identity | None] = {}
             _held.add(identity)
+        try:
+            self._require_own_log(self.header())
+        except Unavailable:
+            self.close()
+            raise
 
-    def watch_beside(self) -> None:
-        """Note which write-ahead log and which index of it belong to the file from now on."""
-        resolved = self._path.resolve()  # SQLite keeps them where a symbolic link leads
-        paths = [resolved.with_name(resolved.name + suffix) for suffix in BESIDE]
-        self._beside = {path: _identity(path) for path in paths}
+    def header(self) -> bytes:
+        """The first bytes of the file as it lies on the disk, without what only its log has."""
+        return os.pread(self._descriptors[-1], write_ahead_log.HEADER_BYTES, 0)
+
+    def log_is_merged(self) -> bool:
+        """Whether the next transaction may begin a new log; to be asked by whoever has the right to write."""
+        if self._index_descriptor is None:
+            self._index_descriptor = os.open(self._index, os.O_RDONLY | os.O_CLOEXEC)  # SQLite has made it by now
+        return write_ahead_log.is_merged(os.pread(self._index_descriptor, write_ahead_log.INDEX_BYTES, 0))
+
+    def watch(self) -> None:
+        """Note what the file begins with from now on, and which write-ahead log and index belong to it."""
+        self._beside = {path: _identity(path) for path in (self._log, self._index)}
+        self._noted = self.header()
 
     def require_in_place(self) -> None:
         """Check that the path still leads to the locked file, with the files beside it that were noted.
 
         Raises:
-            Unavailable: one of them was moved, replaced or deleted.
+            Unavailable: one of them was moved, replaced or deleted, or the file was found overwritten.
         """
+        if self._overwritten:
+            raise self._foreign()
         if _identity(self._path) != self._identity:
             raise _displaced(self._path, "put it back to its place")
         for path, identity in self._beside.items():
             if _identity(path) != identity:
                 raise _displaced(path, "stop the server without killing it: then it saves what it still holds")
 
+    def is_as_noted(self) -> bool:
+        """Whether the file begins as it was noted: nobody wrote to it, and no log was merged into it."""
+        return self._noted is None or self.header() == self._noted
+
+    def require_own_content(self) -> None:
+        """Find out whether a file that doesn't begin as it was noted has got its beginning from its log, and note it.
+        The caller keeps others from writing.
+
+        Raises:
+            Unavailable: something else was written over it. Nothing is merged into it from then on.
+        """
+        if self.is_as_noted():
+            return
+        header = self.header()
+        if not write_ahead_log.belongs(self._log, header):
+            self._overwritten = True
+            self._forbid_merging()
+            raise self._foreign()
+        self._noted = header
+
     def close(self) -> None:
-        if self._descriptor is not None:
-            os.close(self._descriptor)
+        index = [] if self._index_descriptor is None else [self._index_descriptor]
+        for descriptor in self._descriptors + index:
+            os.close(descriptor)
+        if self._descriptors:
             _held.discard(self._identity)
-            self._descriptor = None
+        self._descriptors, self._index_descriptor = [], None
+
+    def _require_own_log(self, header: bytes) -> None:
+        if not write_ahead_log.belongs(self._log, header):
+            raise Unavailable(
+                f"expected a write-ahead log of {self._path}, got {self._log}, which was written for another database "
+                f"or another state of it; nothing was changed: to go on with {self._path} as it is, for example after "
+                f"you restored it, move {self._log.name} and {self._index.name} away; to go on with what the log "
+                f"holds, put the database that it was written for back in place of {self._path.name}"
+            )
+
+    def _forbid_merging(self) -> None:
+        """Or SQLite would merge the log of the file as it was, when its last connection is closed."""
+        if WHOLE_DESCRIPTION:
+            with contextlib.suppress(OSError):
+                fcntl.fcntl(self._descriptors[-1], WHOLE_DESCRIPTION, _range(fcntl.F_RDLCK, *SQLITE_SHARED))
+
+    def _foreign(self) -> Unavailable:
+        return Unavailable(
+            f"the database can't be used now: {self._path} was overwritten under the running server, and what it held "
+            f"can't be saved; stop the server, move {self._log.name} and {self._index.name} away, make sure that "
+            f"{self._path.name} is a whole copy, and start again"
+        )
 
 
 def _identity(path: Path) -> Identity | None:
@@ -80,19 +151,22 @@ def _identity(path: Path) -> Identity | None:
 def _lock_byte(path: Path) -> int:
     """An open file description lock: no other kind of lock meets it on this byte, and only its descriptor ends it."""
     descriptor = _open(path)
-    request = struct.pack("hhqqi0q", fcntl.F_WRLCK, os.SEEK_SET, LOCKED_BYTE, 1, 0)  # struct flock
     assert WHOLE_DESCRIPTION is not None
     try:
-        fcntl.fcntl(descriptor, WHOLE_DESCRIPTION, request)
+        fcntl.fcntl(descriptor, WHOLE_DESCRIPTION, _range(fcntl.F_WRLCK, LOCKED_BYTE, 1))
     except OSError as error:
         os.close(descriptor)
         raise _taken(path, error) from None
     return descriptor
 
 
+def _range(kind: int, first: int, count: int) -> bytes:
+    """A struct flock."""
+    return struct.pack("hhqqi0q", kind, os.SEEK_SET, first, count, 0)
+
+
 def _lock_beside(path: Path) -> int:
     """Where a byte can't be locked so, the lock of a file beside the database: the same for every symbolic link."""
-    os.close(_open(path))
     resolved = path.resolve()
     descriptor = _open(resolved.with_name(resolved.name + ".lock"))
     try:

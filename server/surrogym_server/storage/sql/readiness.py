@@ -27,7 +27,9 @@ class Readiness:
         self._begun = 0.0
 
     def require(self) -> None:
-        """Raise ``Unavailable`` unless all tables are there and a write has just been durable."""
+        """Raise ``Unavailable`` unless all tables are there, a write has just been durable, and no page was ever found
+        broken: what is written to such a file may be lost."""
+        self._database.require_sound()
         probe = self._latest()
         wait([probe], PATIENCE_SECONDS)
         if not probe.done():
