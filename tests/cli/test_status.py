@@ -45,6 +45,21 @@ def test_all_say_what_was_spent_and_what_is_asked_for(on_server, server_process,
     assert (summary["budget"], summary["target"], summary["queries"]["pending"]) == (8, 0.999, 4)
 
 
+def test_a_design_that_failed_by_its_machine_names_the_way_on(on_server, server_process, name):
+    on_server("register", "Pendulum-v1", "--name", name, "--budget", "8", "--initial", "4")
+    with Api(server_process.url) as api:
+        while api.surrogate(name).phase != "failed":
+            for query in api.claim(name, "w", max_queries=4, wait_seconds=1.0, lease_seconds=60.0).queries:
+                api.fail(name, query.id, query.lease_token, "no power", begun=True)
+    assert f"4 set aside as they failed; surrogym change {name} --resume asks those again" in on_server(
+        "status", name
+    ).out.replace("\n", " ")
+    sampled = on_server("sample", name, "--until-done")
+    assert sampled.code == 1
+    assert f"surrogym change {name} --resume" in sampled.out.replace("\n", " ")
+    assert "collecting" in on_server("change", name, "--resume").out
+
+
 def test_watching_shows_changes_alone_and_ends_cleanly(on_server, server_process, name, looks):
     """Not on a terminal: as lines."""
     on_server("register", "Pendulum-v1", "--name", name)

@@ -25,9 +25,8 @@ def options(*names: str) -> set[str]:
     command = command_line()
     for name in names:
         command = command.commands[name]
-    return {spelling for parameter in command.params for spelling in (*parameter.opts, *parameter.secondary_opts)} | {
-        "--help"
-    }
+    spellings = {spelling for parameter in command.params for spelling in (*parameter.opts, *parameter.secondary_opts)}
+    return spellings | {"--help"}
 
 
 def parse(arguments: list[str]) -> dict[str, Any]:

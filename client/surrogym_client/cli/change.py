@@ -27,14 +27,18 @@ def command(
     tolerance: Tolerances = None,
     budget: Annotated[int | None, typer.Option(min=2, help="Real steps the design may take.")] = None,
     target: Annotated[float | None, typer.Option(help="Confidence index to reach.")] = None,
-    paused: Annotated[bool | None, typer.Option("--pause/--resume", help="Stop asking for queries, or go on.")] = None,
+    paused: Annotated[
+        bool | None,
+        typer.Option("--pause/--resume", help="Stop asking for queries, or go on, also with those set aside."),
+    ] = None,
     *,
     service: Service,
     output: Output,
 ) -> None:
     """Change a living surrogate. Its model is judged anew, and what is left out stays.
 
-    Queries that the design had chosen before, and that no sampler has begun, are withdrawn and chosen anew.
+    Queries that the design had chosen before, and that no sampler has begun, are withdrawn and chosen anew. --resume
+    also asks again what was set aside as it kept failing, and takes up a design that has failed.
 
     Example: surrogym change pendulum --tolerance theta=0.01 --budget 30
 

@@ -160,4 +160,8 @@ def _words(surrogate: str, report: SamplerReport) -> str:
     said = f"{report.answered} queries answered with {report.steps} real steps{apart} in {report.seconds:.1f} s"
     if report.phase in IN_WORDS:
         said += f"; {IN_WORDS[report.phase]}"
+    if report.phase == "failed":
+        said += (
+            f": surrogym status {surrogate} says why, surrogym change {surrogate} --resume asks anew what was set aside"
+        )
     return f"{said}; next: surrogym train {surrogate}" if report.phase in COMPLETED else said

@@ -122,6 +122,8 @@ def _detail(view: SurrogateView) -> str:
         f"({ledger.failed} failed)",
         f"queries: {view.queries.pending} pending, {view.queries.leased} leased, {view.queries.set_aside} set aside",
     ]
+    if view.queries.set_aside:
+        lines[-1] += f" as they failed; surrogym change {view.name} --resume asks those again"
     if view.error:
         lines.append(f"last error: {view.error}")
     if view.fidelity is not None:

@@ -8,6 +8,7 @@ OriginalError
 ├── NotParallel             one instance is open, and the environment does not say that another may be
 ├── PolicyMisfit            the policy gives actions that the environment does not have
 ├── QueryRefused            a query asks for what the environment does not allow; nothing was sent to it
+├── MachineFails            the environment failed at so many queries that the fault may be its own; the worker ends
 ├── EvaluationFailed        the environment or the policy failed after real steps had been taken
 └── StepFailed              the environment did not give a step; the query fails, the worker goes on
     ├── StepTimedOut        it took longer than its limit and was killed; the next step starts a fresh one
@@ -50,6 +51,10 @@ class PolicyMisfit(OriginalError, ValueError):
 
 class QueryRefused(OriginalError):
     """A query lies outside the environment's own specification; nothing was sent to the environment."""
+
+
+class MachineFails(OriginalError):
+    """The environment failed at one query after the other; what was claimed went back into the queue."""
 
 
 class EvaluationFailed(OriginalError):

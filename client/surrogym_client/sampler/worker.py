@@ -16,6 +16,7 @@ from surrogym_client.errors import InvalidInput, LeaseExpired, NotThere
 from surrogym_client.original.errors import QueryRefused, StepFailed
 from surrogym_client.original.protocol import Environment, OriginalEnvironment, RolloutEnvironment
 from surrogym_client.original.rollouts import answering
+from surrogym_client.sampler.failures import Failures
 from surrogym_client.sampler.leases import AWAY, LeaseEnded, Leases
 from surrogym_client.sampler.query_limits import check_environment, check_query
 from surrogym_client.sampler.sample_conversion import reset_seed, sample_of
@@ -82,6 +83,9 @@ class Sampler:
     No real step is begun after the lease of its query has ended, as it has when the machine was suspended: another
     sampler may have taken it. A step that is under way then is finished and handed in.
 
+    After failures at several different queries in a row it waits longer and longer, and then it ends: a fault of the
+    machine is not a fault of the queries, which have three attempts each.
+
     The server is not trusted with the environment: each query is checked against the environment's own specification,
     and one that lies outside is given back as not begun before anything is sent to the environment.
 
@@ -112,6 +116,7 @@ class Sampler:
         self._report = report
         self._counts: dict[Outcome, int] = {"answered": 0, "failed": 0, "dropped": 0, "refused": 0}
         self._refused: set[int] = set()  # ids; the server offers these queries again
+        self._failures = Failures()
         self._steps = 0
         self._phase: Phase | None = None
         self._spec: EnvironmentSpec
@@ -133,6 +138,7 @@ class Sampler:
             UnknownSurrogate: there is none of this name, or it was deleted.
             ServerUnreachable, Unavailable: the server, or its storage, stayed away for too long.
             UnknownEnvironment: the environment can't be made, or is another one than the surrogate's.
+            MachineFails: it failed at one query after the other.
         """
         self._started = time.monotonic()
         self._check()
@@ -167,7 +173,7 @@ class Sampler:
         """Queries, and when they were asked for by the leases' clock."""
         s, since = self._settings, self._leases.clock()
         waits = not (s.until_done and (self._phase is None or self._phase in ENDED))
-        left = s.wait_seconds if s.time_limit is None else min(s.wait_seconds, max(0.0, self._time_left()))
+        left = self._within_time(s.wait_seconds)
         claimed = self._api.claim(
             self._surrogate,
             s.name,
@@ -182,7 +188,11 @@ class Sampler:
         left, begun = list(queries), None
         self._leases.hold(left, since)
         try:
-            while left and not self._stopped() and not self._out_of_time():
+            while left:
+                self._failures.check([query.id for query in left])
+                self._pause(self._within_time(self._failures.delay()))
+                if self._stopped() or self._out_of_time():
+                    break
                 begun = left[0]
                 self._answer(begun)
                 self._leases.release(left.pop(0))
@@ -286,6 +296,10 @@ class Sampler:
             if query.id in self._refused:
                 return
             self._refused.add(query.id)
+        if outcome == "answered":
+            self._failures.answered()
+        elif outcome == "failed":
+            self._failures.failed(query.id, error)
         self._counts[outcome] += 1
         if self._report is not None:
             self._report(query, outcome, error)
@@ -306,6 +320,9 @@ class Sampler:
 
     def _time_left(self) -> float:
         return self._started + (self._settings.time_limit or 0.0) - time.monotonic()
+
+    def _within_time(self, seconds: float) -> float:
+        return seconds if self._settings.time_limit is None else min(seconds, max(0.0, self._time_left()))
 
     def _enough(self, claimed: ClaimedQueries) -> bool:
         if self._settings.once and claimed.queries:

@@ -86,7 +86,8 @@ class Surrogates(ABC):
         tolerances: dict[str, float | None] | None = None,
     ) -> SurrogateRecord:
         """Change what is not None; of ``tolerances`` those of the outputs named, of which None takes one back. Another
-        budget, target or tolerance, or resuming a failed design, makes a fit due.
+        budget, target or tolerance, or resuming a failed design, makes a fit due. Resuming (``paused`` False, even
+        where it was not paused) asks the queries that were set aside again, each with ``MAX_ATTEMPTS`` more.
 
         What the design chose by another target or tolerance, or by a larger budget, is withdrawn as far as no sampler
         has begun it, and a fit that is running loses its right: the next one judges and chooses anew. What ``ask``

@@ -134,6 +134,26 @@ def test_a_query_whose_leases_all_run_out_is_set_aside(
     assert storage.ledger.read(name) == LedgerRecord(unresolved=MAX_ATTEMPTS, failed=0)
 
 
+def test_resuming_asks_what_was_set_aside_again(storage: Storage, make: Callable[..., str]) -> None:
+    """With all attempts, of which giving back unbegun is none, and as often as somebody resumes."""
+    name = make(queries=1)
+
+    def fail(*, begun: bool = True) -> str:
+        [leased] = storage.queries.claim(name, "a", 1, LONG)
+        return storage.queries.fail(name, leased.id, leased.token, "no power", begun=begun).status
+
+    for _ in range(2):
+        assert [fail() for _ in range(MAX_ATTEMPTS)] == ["pending", "pending", "set_aside"]
+        storage.surrogates.set_phase(name, "failed", "all were set aside")
+        resumed = storage.surrogates.change(name, paused=False)
+        assert (resumed.phase, resumed.error) == ("collecting", None)
+        assert storage.designs.hopeless() == []
+        assert fail(begun=False) == "pending"
+    assert storage.queries.counts(name).pending == 1
+    told = [event.body for event in storage.events.list(name) if "asked_again" in event.body]
+    assert [body["asked_again"] for body in told] == [1, 1]
+
+
 def test_an_answer_after_a_failure_resolves_it(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:

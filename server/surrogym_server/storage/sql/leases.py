@@ -121,7 +121,7 @@ def sweep(connection: Connection, held: Row[Any]) -> int:
     )
     ids = [int(id) for id in ended.scalars()]
     if ids:
-        give_back(connection, held, ids, EXPIRED)
+        give_back(connection, held, ids, EXPIRED, begun=True)
     return len(ids)
 
 
@@ -136,14 +136,16 @@ def shorten(connection: Connection) -> None:
     connection.execute(too_long.values(expires=clock(connection) + leases.c.seconds))
 
 
-def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], error: str) -> None:
-    """Make leased queries pending again, or set them aside after their last attempt; the leases have their outcome."""
+def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], error: str, *, begun: bool) -> None:
+    """Make leased queries pending again, or set them aside after the last of the attempts that they have each time they
+    are asked; one that was not ``begun`` is none. The leases have their outcome."""
     spent = (
         sa.select(sa.func.count())
         .where(leases.c.query_id == queries.c.id, leases.c.outcome.in_(("failed", "expired")))
         .scalar_subquery()
     )
-    next_status = sa.case((spent >= MAX_ATTEMPTS, "set_aside"), else_="pending")
+    last = sa.true() if begun else sa.false()
+    next_status = sa.case((last & (spent % MAX_ATTEMPTS == 0), "set_aside"), else_="pending")
     rows = connection.execute(
         sa.update(queries)
         .where(queries.c.id.in_(query_ids), queries.c.status == "leased")
@@ -155,3 +157,9 @@ def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], 
         append_event(connection, held, "set_aside", query_id=query_id, error=error)
     if set_aside:
         touch(connection, held)
+
+
+def ask_again(connection: Connection, held: Row[Any]) -> int:
+    """Make the queries that were set aside pending, with as many attempts as a new one has; returns how many."""
+    set_aside = (queries.c.surrogate_id == held.id) & (queries.c.status == "set_aside")
+    return connection.execute(sa.update(queries).where(set_aside).values(status="pending")).rowcount

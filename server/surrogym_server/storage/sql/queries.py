@@ -96,7 +96,7 @@ class SqlQueries(port.Queries):
             lease = leasing.of_query(connection, held.id, query_id, token)
             if lease.outcome == "open" and lease.expires > held.now:
                 leasing.set_outcome(connection, [lease.id], outcome)
-                leasing.give_back(connection, held, [query_id], error)
+                leasing.give_back(connection, held, [query_id], error, begun=begun)
             elif lease.outcome != outcome:
                 raise _ended(query_id)
             return _read(connection, held.id, query_id)

@@ -11,6 +11,7 @@ from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage import port
 from surrogym_server.storage.records import NewSurrogate, Phase, SurrogateRecord, SurrogateSummary
 from surrogym_server.storage.sql.database import Database, clock, conflict_insert
+from surrogym_server.storage.sql.leases import ask_again
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, touch, unknown_surrogate
 from surrogym_server.storage.sql.summaries import read_summaries
 from surrogym_server.storage.sql.tables import leases, queries, samples, surrogates
@@ -79,13 +80,16 @@ class SqlSurrogates(port.Surrogates):
             }
             if paused is False and before.phase == "failed":
                 changes |= {"phase": resting_phase(before.round), "error": None}
-            if not changes:
+            again = ask_again(connection, held) if paused is False else 0
+            if not changes and not again:
                 return before
             smaller = budget if budget is not None and budget < before.budget else None
             if smaller is not None or changes.keys() & {"target", "tolerances"}:
                 changes |= _ask_anew(connection, held, before, smaller)
-            _apply(connection, held, changes)
-            append_event(connection, held, "phase", **{"phase": before.phase, **changes})
+            if changes:
+                _apply(connection, held, changes)
+            told = {"asked_again": again} if again else {}
+            append_event(connection, held, "phase", **{"phase": before.phase, **changes, **told})
             return read(connection, name)
 
     def set_phase(self, name: str, phase: Phase, error: str | None = None) -> None:

@@ -1,0 +1,113 @@
+"""A fault of the machine is not one of the queries: it does not use up their attempts, and a mended machine goes on."""
+
+from __future__ import annotations
+
+import uuid
+
+import pytest
+
+from support.moody import SPEC, Line
+from surrogym_client.original.errors import MachineFails
+from surrogym_client.sampler import Sampler, SamplerSettings
+from surrogym_client.sampler import failures as limits
+from surrogym_client.sampler.failures import FIRST_FEW, LONGEST_DELAY, MANY, Failures
+from surrogym_client.transport import Api
+
+UNTIL_DONE = SamplerSettings(name="worker", until_done=True, time_limit=60.0)
+
+
+class Switched(Line):
+    """A machine that can be off."""
+
+    on = False
+
+    def step_from(self, coordinates, action):
+        if not self.on:
+            raise OSError("[Errno 5] the bus is off")
+        return super().step_from(coordinates, action)
+
+
+@pytest.fixture
+def api(server_process):
+    with Api(server_process.url) as api:
+        yield api
+
+
+@pytest.fixture
+def line(api):
+    name = f"line-{uuid.uuid4().hex[:8]}"
+    api.create_surrogate(name, SPEC)
+    yield name
+    api.delete_surrogate(name)
+
+
+@pytest.fixture(autouse=True)
+def _no_delay(monkeypatch):
+    monkeypatch.setattr(limits, "FIRST_DELAY", 0.0)
+
+
+@pytest.mark.parametrize("batch", [2, 4])
+def test_a_machine_that_is_off_ends_the_sampler_before_every_query_is_set_aside(api, line, batch):
+    machine = Switched()
+    settings = SamplerSettings(name="worker", until_done=True, batch=batch, time_limit=60.0)
+    with pytest.raises(MachineFails, match=r"different queries in a row.*the bus is off; mend it"):
+        Sampler(api, line, machine, settings).run()
+    view = api.surrogate(line)
+    assert (view.phase, view.queries.set_aside, view.queries.pending) == ("collecting", 0, 6)
+    machine.on = True
+    report = Sampler(api, line, machine, UNTIL_DONE).run()
+    assert (report.answered, report.failed) == (6, 0)
+
+
+def test_a_design_that_failed_by_a_fault_of_the_machine_goes_on_when_it_is_resumed(api, line):
+    """Somebody started the sampler again and again beside the broken machine."""
+    machine = Switched()
+    for _ in range(20):
+        if api.surrogate(line).phase == "failed":
+            break
+        try:
+            Sampler(api, line, machine, UNTIL_DONE).run()
+        except MachineFails:
+            continue
+    assert api.surrogate(line).phase == "failed"
+    machine.on = True
+    assert Sampler(api, line, machine, UNTIL_DONE).run().phase == "failed"
+    resumed = api.patch_surrogate(line, paused=False)
+    assert (resumed.phase, resumed.queries.pending, resumed.error) == ("collecting", 6, None)
+    report = Sampler(api, line, machine, UNTIL_DONE).run()
+    assert (report.answered, report.phase in ("ready", "over_budget")) == (6, True)
+
+
+def test_a_machine_that_answers_in_between_is_never_taken_for_broken():
+    failures = Failures()
+    for query in range(100):
+        failures.failed(query, "a wall")
+        failures.check([query + 1])
+        assert failures.delay() == 0.0
+        failures.answered()
+
+
+def test_one_query_alone_never_ends_the_sampler():
+    failures = Failures()
+    for _ in range(10):
+        failures.failed(1, "a wall")
+        failures.check([1])
+
+
+def test_after_answers_the_sampler_waits_longer_and_longer_and_then_ends(monkeypatch):
+    monkeypatch.setattr(limits, "FIRST_DELAY", 1.0)
+    failures = Failures()
+    failures.failed(0, "a wall")
+    failures.answered()
+    delays = []
+    for query in range(1, MANY):
+        failures.failed(query, "no power")
+        failures.check([query])
+        delays.append(failures.delay())
+    assert delays == [0.0] * (FIRST_FEW - 1) + [1.0, 2.0, 4.0, 8.0]
+    for _ in range(10):
+        failures.failed(1, "no power")
+    assert failures.delay() == LONGEST_DELAY
+    failures.failed(MANY, "no power")
+    with pytest.raises(MachineFails, match=f"failed at {MANY} different queries in a row.*no power"):
+        failures.check([1])
