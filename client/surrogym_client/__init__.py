@@ -1,10 +1,10 @@
 """The Surrogym client: remote environments, the sampler, training and evaluation.
 
-Importing it enters ``surrogym/Remote-v0`` into Gymnasium's registry: the one thing an import does here,
-because Gymnasium has looked for no plugins by itself since 1.0.
+Importing it enters ``surrogym/Remote-v0`` into Gymnasium's registry: at once where Gymnasium is loaded, otherwise as
+soon as it is. Most commands never load it. Gymnasium has looked for no plugins by itself since 1.0.
 ``gymnasium.make("surrogym_client:surrogym/Remote-v0", ...)`` needs no import.
 """
 
-from surrogym_client.registration import register
+from surrogym_client.runtime.after_import import after_import
 
-register()
+after_import("gymnasium", "surrogym_client.registration:register")

@@ -7,7 +7,6 @@ from functools import partial
 import gymnasium
 import pytest
 
-import surrogym_client
 from surrogym_client.registration import ENVIRONMENT_ID, register
 
 
@@ -20,6 +19,24 @@ def run(code: str) -> str:
 def test_importing_the_package_registers_the_environment():
     code = "import gymnasium, surrogym_client; print(gymnasium.spec('surrogym/Remote-v0').entry_point)"
     assert run(code).strip() == "surrogym_client.environments.gym_factories:make_env"
+
+
+def test_gymnasium_may_be_imported_later():
+    code = (
+        "import sys, surrogym_client; before = 'gymnasium' in sys.modules\n"
+        "import gymnasium; loader = type(gymnasium.__spec__.loader).__name__\n"
+        "print(before, gymnasium.spec('surrogym/File-v0').entry_point, loader)"
+    )
+    assert run(code).split() == ["False", "surrogym_client.environments.file_factories:make_env", "SourceFileLoader"]
+
+
+def test_help_loads_nothing_that_it_does_not_need():
+    """Most of the time of a command that asks a server would be these."""
+    code = (
+        "import sys\nfrom surrogym_client.cli import build\nbuild()\n"
+        "print({name for name in ('gymnasium', 'numpy', 'torch', 'httpx', 'pydantic', 'scipy') if name in sys.modules})"
+    )
+    assert run(code).strip() == "set()"
 
 
 def test_the_id_may_name_the_package_to_import():
@@ -43,7 +60,6 @@ def test_registering_twice_is_harmless():
     before = gymnasium.spec(ENVIRONMENT_ID)
     register()
     assert gymnasium.spec(ENVIRONMENT_ID) is before
-    assert surrogym_client.register is register
 
 
 @pytest.mark.parametrize(

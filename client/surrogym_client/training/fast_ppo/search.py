@@ -48,7 +48,7 @@ class FastPpo(PolicySearch):
     noise by the state.
     """
 
-    n_steps: int = 32  # of a lane in a rollout
+    n_steps: int = 64  # of a lane in a rollout
     n_epochs: int = 10
     batch_size: int | None = None  # None: about 1,024
     learning_rate: float | None = None  # None: falls from 3e-3 to a fiftieth of it
@@ -58,7 +58,7 @@ class FastPpo(PolicySearch):
     vf_coef: float = 0.5
     max_grad_norm: float = 0.5
 
-    suggested_steps = 300_000
+    suggested_steps = 450_000
     prolongable = True
 
     def __post_init__(self) -> None:
