@@ -216,6 +216,7 @@ def _build_services(
         owner=uuid4().hex,
         threads=settings.threads,
         look_seconds=settings.sweep_seconds,
+        fit_seconds=settings.fit_seconds,
     )
     samplers = Samplers()
     services = Services(

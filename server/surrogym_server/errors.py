@@ -28,6 +28,7 @@ SurrogymError
 │   └── DeadlineExceeded    its answer would come after the deadline it brought
 ├── NotInstalled            a stored surrogate needs a plug-in that this server lacks; whoever runs it installs it
 ├── PluginFailed            an acquisition or a family of models raised, or gave back what breaks its laws
+│   └── ChoiceFailed        an acquisition did: the model could be fitted, its next queries not chosen
 └── NumericalFailure        a covariance matrix that no jitter repairs
 """
 
@@ -148,6 +149,10 @@ class NotInstalled(SurrogymError):
 
 class PluginFailed(SurrogymError):
     """An acquisition or a family of models raised, or gave back what breaks its laws; says which, and what."""
+
+
+class ChoiceFailed(PluginFailed):
+    """An acquisition did: the model could be fitted, and its next queries could not be chosen."""
 
 
 class NumericalFailure(SurrogymError):

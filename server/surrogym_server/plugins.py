@@ -71,20 +71,33 @@ class Registry(plugins.Registry[T]):
 
 
 @contextmanager
-def guarded(what: str, failure: type[SurrogymError]) -> Iterator[None]:
-    """Run code that may be another package's: whatever it raises becomes a ``failure`` that begins with ``what``.
+def guarded(what: str, failure: type[SurrogymError], *, interrupts: bool = False) -> Iterator[None]:
+    """Run code that may be another package's: whatever it raises becomes a ``failure`` that begins with ``what``; what
+    is raised on purpose stays what it is.
 
     A ``ValueError`` is how this code refuses a specification, so that its message says all where ``failure`` is
-    ``InvalidSpec``; the type of anything else is told. ``KeyboardInterrupt`` goes on, as while a package is loaded.
+    ``InvalidSpec``; the type of anything else is told. ``KeyboardInterrupt`` goes on, as while a package is loaded,
+    unless ``interrupts``: in a server's requests, where a person's Ctrl-C comes in another way.
     """
     try:
         yield
-    except (SurrogymError, KeyboardInterrupt):
+    except SurrogymError:
         raise
     except BaseException as error:
-        refused = isinstance(error, ValueError) and failure is InvalidSpec
-        said = " ".join(str(error).split()) if refused else plugins.one_line(error)
-        raise failure(f"{what}: {said}") from error
+        if isinstance(error, KeyboardInterrupt) and not interrupts:
+            raise
+        raise failed(what, failure, error) from error
+
+
+def failed(what: str, failure: type[SurrogymError], error: BaseException) -> SurrogymError:
+    """What ``guarded`` raises."""
+    refused = isinstance(error, ValueError) and failure is InvalidSpec
+    return failure(f"{what}: {plugins.one_line(error, typed=not refused)}")
+
+
+def in_one_line(error: BaseException) -> str:
+    """What went wrong, for a person: the message of what the server raises on purpose, the type before any other's."""
+    return plugins.one_line(error, typed=not isinstance(error, SurrogymError))
 
 
 def _check_settings(kind: type, settings: dict[str, float | bool | str]) -> None:

@@ -17,6 +17,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
+MOST_CHARACTERS = 500  # of what an exception of anybody's code says
 
 
 class UnknownMember(ValueError):
@@ -27,10 +28,18 @@ class _Unfit(ValueError):
     """An entry point that breaks a rule of its group; the message says all."""
 
 
-def one_line(error: BaseException) -> str:
-    """An exception in one line, which says its type: ``SystemExit: 1``."""
-    said = " ".join(str(error).split())
-    return f"{type(error).__name__}: {said}" if said else type(error).__name__
+def one_line(error: BaseException, *, typed: bool = True) -> str:
+    """An exception in one line, which says its type where it is ``typed``, or says nothing else: ``SystemExit: 1``.
+
+    Never raises, whatever the exception's own code does.
+    """
+    try:
+        said = " ".join(str(error).split())
+    except BaseException:
+        said = ""
+    if typed or not said:
+        said = f"{type(error).__name__}: {said}" if said else type(error).__name__
+    return said if len(said) <= MOST_CHARACTERS else f"{said[:MOST_CHARACTERS]}..."
 
 
 class Registry(Generic[T]):

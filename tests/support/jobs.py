@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
+from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from surrogym_server.engine.design_job import DesignJob, DesignResult
+from surrogym_server.errors import ChoiceFailed, InvalidInput
 
 HANGING_SECONDS = 600
 
@@ -35,12 +36,35 @@ def answer(job: DesignJob) -> DesignResult:
     return result()
 
 
+class TwoArguments(Exception):
+    """One that can be pickled and not unpickled."""
+
+    def __init__(self, output: str, why: str) -> None:
+        super().__init__(f"{output}: {why}")
+
+
+class Unspeakable(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("no words")
+
+
+RAISED: dict[str, BaseException] = {
+    "ValueError": ValueError("no such\n   luck"),
+    "SystemExit": SystemExit(3),
+    "KeyboardInterrupt": KeyboardInterrupt(),
+    "CancelledError": CancelledError(),
+    "TwoArguments": TwoArguments("x", "boom"),
+    "Unspeakable": Unspeakable(),
+    "InvalidInput": InvalidInput("on purpose"),
+    "ChoiceFailed": ChoiceFailed("on purpose too"),
+}
+
+
 def refuse(job: DesignJob) -> DesignResult:
-    raise ValueError("no such luck")
-
-
-def leave(job: DesignJob) -> DesignResult:
-    sys.exit("no licence")
+    """``job.state["raised"]`` names what it raises, where it is not asked to ``answer``."""
+    if "answer" in job.state:
+        return result()
+    raise RAISED[job.state["raised"]]
 
 
 def die(job: DesignJob) -> DesignResult:
@@ -57,6 +81,9 @@ def die_once(job: DesignJob) -> DesignResult:
 
 
 def hang(job: DesignJob) -> DesignResult:
+    """Unless it is asked to ``answer``."""
+    if "answer" in job.state:
+        return result()
     Path(job.state["mark"]).write_text(str(os.getpid()))
     time.sleep(HANGING_SECONDS)
     return result()

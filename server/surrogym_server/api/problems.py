@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -43,6 +44,8 @@ CODES: dict[type[errors.SurrogymError], Code] = {
     errors.PluginFailed: Code.INTERNAL,
     errors.NumericalFailure: Code.INTERNAL,
 }
+
+logger = logging.getLogger(__name__)
 
 HTTP_CODES = {
     400: Code.INVALID_REQUEST,  # FastAPI could not parse the body
@@ -87,6 +90,9 @@ def problem_of(error: Exception) -> Problem:
     match error:
         case errors.SeqConflict():
             return _problem(Code.SEQ_CONFLICT, str(error), expected_seq=error.expected)
+        case errors.PluginFailed():
+            logger.error("%s", error, exc_info=error)  # its author needs the traceback
+            return _problem(Code.INTERNAL, str(error))
         case errors.SurrogymError():
             return _problem(code_of(error), str(error))
         case FrameError():

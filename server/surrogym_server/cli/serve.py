@@ -38,6 +38,9 @@ Threads = Annotated[int | None, typer.Option(help="Threads of one torch operatio
 SessionIdleSeconds = Annotated[
     float | None, typer.Option(help="Idle time after which a session expires. [default: 3600]")
 ]
+FitSeconds = Annotated[
+    float | None, typer.Option(help="Time after which a fit is ended, and has failed. [default: 3600]")
+]
 LogLevel = Annotated[str | None, typer.Option(help="critical, error, warning, info or debug. [default: info]")]
 LogFormat = Annotated[str | None, typer.Option(help="text, or json: one object a line. [default: text]")]
 ReadyFile = Annotated[Path | None, typer.Option(help="File to write the URL to, once the server accepts requests.")]
@@ -69,6 +72,7 @@ def serve(
     device: Device = None,
     threads: Threads = None,
     session_idle_seconds: SessionIdleSeconds = None,
+    fit_seconds: FitSeconds = None,
     log_level: LogLevel = None,
     log_format: LogFormat = None,
     ready_file: ReadyFile = None,

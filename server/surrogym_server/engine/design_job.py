@@ -5,6 +5,7 @@ It is a pure function of its job, so it runs in a process of its own, and the sa
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -19,6 +20,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.files import to_bytes
+from surrogym_server.models.guard import asking
 from surrogym_server.sampling.design import Decision, DesignState, Request, advance, initial_design, initial_rollouts
 
 Array = NDArray[np.float64]
@@ -82,14 +84,16 @@ def initial_queries(
 
 
 def run_design_job(job: DesignJob) -> DesignResult:
-    """Fit, judge, choose. Raises InvalidInput or NumericalFailure."""
+    """Fit, judge, choose. Raises as ``advance``."""
     started = time.perf_counter()
     torch.set_num_threads(job.threads)
     with threadpool_limits(job.threads):  # many small products: threads cost more than they give
         decision, samples = _decide(job)
+    with asking(job.definition):
+        stored = to_bytes(decision.model)
     return DesignResult(
-        model=to_bytes(decision.model),
-        description=decision.model.description,
+        model=stored,
+        description=json.loads(json.dumps(decision.model.description)),  # plain data, whatever a family gives
         fidelity=fidelity_fields(decision.model, decision.confidences, decision.tolerances, job.target),
         data_hash=samples.digest,
         state=decision.state.to_json(),

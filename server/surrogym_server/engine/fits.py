@@ -1,80 +1,133 @@
-"""Fits run in one process of their own, so that steps never wait for them."""
+"""Fits run in processes of their own, so that steps never wait for them, and so that any of them can be ended."""
 
 from __future__ import annotations
 
 import asyncio
 import os
 import signal
+import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from multiprocessing import active_children, get_context
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from threading import Thread
+from threading import Lock, Thread
 
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
-from surrogym_server.errors import PluginFailed, Unavailable
-from surrogym_shared.plugins import one_line
+from surrogym_server.errors import ChoiceFailed, PluginFailed, SurrogymError, Unavailable
+from surrogym_server.plugins import in_one_line
 
 NICENESS = 10  # to a step on the same core a fit leaves nine tenths of it
+Function = Callable[[DesignJob], DesignResult]
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """What a job raised, as words: the exception itself may be one that can't be sent, or that ends who receives it."""
+
+    kind: type[PluginFailed]
+    said: str
+    details: str  # the traceback, of what nobody raised on purpose
 
 
 class Fits:
-    """A pool of one process. It ends with this one, however this one ends.
+    """A process for each fit that runs, and one that waits for the next. They end with this one, however it ends."""
+
+    def __init__(self, function: Function = run_design_job) -> None:
+        self._function = function
+        self._idle: list[_Process] = []
+        self._busy: list[_Process] = []
+
+    def start(self) -> None:
+        """Start a process, and let it import what a fit needs before the first one comes."""
+        self._idle.append(_Process())
+
+    async def run(self, job: DesignJob) -> DesignResult:
+        """Do a job; a process that died is replaced and the job done once more. Cancelling ends its process.
+
+        Raises:
+            Unavailable: the process died twice.
+            PluginFailed: the job raised, whatever it was; notes have the traceback of what nobody raised on purpose.
+            ChoiceFailed: the job did.
+        """
+        for _ in range(2):
+            process = self._idle.pop() if self._idle else _Process()
+            self._busy.append(process)
+            whole = False
+            try:
+                outcome = await asyncio.wrap_future(process.pool.submit(_done, self._function, job))
+                whole = True
+            except BrokenProcessPool:
+                continue
+            except Exception as error:  # the result can't be sent
+                raise PluginFailed(in_one_line(error)) from error
+            finally:
+                self._give_back(process, whole)
+            if isinstance(outcome, _Failure):
+                raise _failure(outcome)
+            return outcome
+        raise Unavailable("the process that fits died twice on the same job: is there enough memory?")
+
+    def close(self) -> None:
+        """End all processes, in the middle of a fit or of its start too; harmless when they have ended."""
+        for process in (*self._idle, *self._busy):
+            process.close()
+        self._idle = []
+
+    def _give_back(self, process: _Process, whole: bool) -> None:
+        """Keep a process for the next fit; end it where another waits already, or in the middle of a job."""
+        self._busy.remove(process)
+        if whole and not self._idle:
+            self._idle.append(process)
+        else:
+            process.close()
+
+
+class _Process:
+    """A pool of one process, that ends with this one.
 
     The process holds one end of a pipe whose other end is here and never written: when ours closes by death, it ends
     at once, in the middle of a fit too.
     """
 
-    def __init__(self, function: Callable[[DesignJob], DesignResult] = run_design_job) -> None:
-        self._function = function
-        self._pool: ProcessPoolExecutor | None = None
-        self._lifeline: Connection | None = None
-        self._processes: list[BaseProcess] = []
-
-    def start(self) -> None:
-        """Start the process, and let it import what a fit needs before the first one comes."""
+    def __init__(self) -> None:
         context = get_context("spawn")
         theirs, self._lifeline = context.Pipe(duplex=False)
-        self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=_live_with, initargs=(theirs,))
+        self.pool = ProcessPoolExecutor(1, mp_context=context, initializer=_live_with, initargs=(theirs,))
+        self._closing = Lock()
         others = active_children()
         with _terminal_blocked(), theirs:
-            self._pool.submit(_warm)
-        self._processes = [child for child in active_children() if child not in others]
-
-    async def run(self, job: DesignJob) -> DesignResult:
-        """Do a job; a process that died is replaced and the job done once more.
-
-        Raises:
-            Unavailable: the process died twice.
-            PluginFailed: code of a package asked to exit; that must not end this process.
-            Exception: whatever the job raises.
-        """
-        for _ in range(2):
-            if self._pool is None:
-                self.start()
-            assert self._pool is not None
-            try:
-                return await asyncio.wrap_future(self._pool.submit(self._function, job))
-            except BrokenProcessPool:
-                pass
-            except SystemExit as error:
-                raise PluginFailed(f"the fit failed: a package called sys.exit: {one_line(error)}") from error
-            self.close()
-        raise Unavailable("the process that fits died twice on the same job: is there enough memory?")
+            self.pool.submit(_warm)
+        self._processes: list[BaseProcess] = [child for child in active_children() if child not in others]
 
     def close(self) -> None:
-        """End the process, in the middle of a fit or of its start too; harmless when it has ended."""
-        for process in self._processes:
-            process.kill()
-        if self._lifeline is not None:
+        """End it, in the middle of a job or of its start too; harmless when it has ended. Any thread may call."""
+        with self._closing:
+            for process in self._processes:
+                process.kill()
+            self._processes = []
             self._lifeline.close()
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
-        self._lifeline = self._pool = None
-        self._processes = []
+            self.pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _done(function: Function, job: DesignJob) -> DesignResult | _Failure:
+    """In the other process. Nothing that a job raises leaves it as an exception, not even what would end a process."""
+    try:
+        return function(job)
+    except BaseException as error:
+        on_purpose = isinstance(error, SurrogymError) and error.__cause__ is None
+        kind = ChoiceFailed if isinstance(error, ChoiceFailed) else PluginFailed
+        return _Failure(kind, in_one_line(error), "" if on_purpose else traceback.format_exc())
+
+
+def _failure(outcome: _Failure) -> PluginFailed:
+    failure = outcome.kind(outcome.said)
+    if outcome.details:
+        failure.add_note(outcome.details)
+    return failure
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
-from surrogym_server.errors import InvalidSpec, PluginFailed
+from surrogym_server.errors import ChoiceFailed, InvalidSpec
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.plugins import Choice, Registry, guarded
 from surrogym_server.sampling.confidence import log_model_uncertainty, log_uncertainty_index
@@ -171,23 +171,23 @@ def check_acquisition(definition: EnvironmentDefinition) -> None:
 
 
 def value_of(choice: Choice, candidates: CandidateView) -> Tensor:
-    """What an acquisition gives for each of m candidates, (m,). Raises ``PluginFailed``: it broke the laws."""
+    """What an acquisition gives for each of m candidates, (m,). Raises ``ChoiceFailed``: it broke the laws."""
     return _asked(choice, acquisition_of(choice).value, candidates, candidates.distance.shape)
 
 
 def path_value_of(choice: Choice, paths: PathView) -> Tensor:
-    """What an acquisition gives for each beginning of b paths, (b, T). Raises ``PluginFailed``: it broke the laws."""
+    """What an acquisition gives for each beginning of b paths, (b, T). Raises ``ChoiceFailed``: it broke the laws."""
     return _asked(choice, acquisition_of(choice).path_value, paths, paths.weight.shape)
 
 
 def _asked(choice: Choice, ask: Callable[[Any], Tensor], view: Any, shape: torch.Size) -> Tensor:
     what = f"the choice of the next queries failed: acquisition {choice.name}"
-    with guarded(what, PluginFailed):
+    with guarded(what, ChoiceFailed):
         values: object = ask(view)
     if not isinstance(values, Tensor):
-        raise PluginFailed(f"{what}: expected a tensor of shape {tuple(shape)}, got {type(values).__name__}")
+        raise ChoiceFailed(f"{what}: expected a tensor of shape {tuple(shape)}, got {type(values).__name__}")
     if values.shape != shape:
-        raise PluginFailed(f"{what}: expected a tensor of shape {tuple(shape)}, got {tuple(values.shape)}")
+        raise ChoiceFailed(f"{what}: expected a tensor of shape {tuple(shape)}, got {tuple(values.shape)}")
     if bad := int((~values.isfinite()).sum()):
-        raise PluginFailed(f"{what}: expected finite values, got {bad} of {values.numel()} that are infinite or NaN")
+        raise ChoiceFailed(f"{what}: expected finite values, got {bad} of {values.numel()} that are infinite or NaN")
     return values

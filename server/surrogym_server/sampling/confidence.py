@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from surrogym_server.models.abilities import LeaveOneOut, LeaveOneOutErrors, offers
+from surrogym_server.models.guard import require_shapes
 from surrogym_server.models.port import DynamicsModel
 
 SUREST = 1e9  # tolerances over a deviation: what is known better counts as known so well
@@ -31,6 +32,7 @@ class OutputConfidence:
 def deviations(model: DynamicsModel, q: Tensor, u: Tensor) -> Tensor:
     """Latent deviation of every output, the reward last, at q (m, C) and u (m, F): (m, O)."""
     transition = model.transition(q, u, deviations=True, reward_deviation=True)
+    require_shapes(model, transition, q, deviations=True)
     assert transition.deviation is not None
     assert transition.reward_deviation is not None
     return torch.cat([transition.deviation, transition.reward_deviation[:, None]], -1)

@@ -15,10 +15,8 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples, increments
-from surrogym_server.errors import PluginFailed
+from surrogym_server.models.guard import asking, learn, require_deviations
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.models.registry import learner_of
-from surrogym_server.plugins import guarded
 from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.batch import choose
 from surrogym_server.sampling.candidates import Candidates, candidates_of
@@ -102,16 +100,17 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
 
     Raises:
         InvalidInput, NumericalFailure: as ``Learner.learn`` does.
-        PluginFailed: the family of models raised anything else, or the acquisition broke its laws.
+        PluginFailed: the family of models raised anything else, or its model can't be used.
+        ChoiceFailed: the acquisition broke its laws.
     """
-    family = definition.learning.model
-    with guarded(f"the fit failed: model family {family.name}", PluginFailed):
-        learned = learner_of(family).learn(definition, samples, state.warm)
+    learned = learn(definition, samples, state.warm)
     usual = state.usual or usual_tolerances(definition, sizes_of(definition, samples))
     tolerances = definition.tolerances_over(usual)
     points = Points(*monte_carlo(definition))
-    deviation = deviations(learned.model, points.q, points.u)
-    confidences = tuple(confidences_of(learned.model, deviation, tolerances))
+    with asking(definition):
+        deviation = deviations(learned.model, points.q, points.u)
+        require_deviations(learned.model, deviation)
+        confidences = tuple(confidences_of(learned.model, deviation, tolerances))
     rng = _rng(definition, f"visited {state.round}")
     candidates = candidates_of(learned.model, points, request.states, rng)
     reserved = ending(learned.model, samples, candidates.points)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from contextlib import suppress
 from typing import Protocol
 
@@ -12,6 +13,7 @@ import numpy as np
 from surrogym_server.engine.design_job import DesignJob, DesignResult
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.errors import (
+    ChoiceFailed,
     Damaged,
     InvalidInput,
     LeaseExpired,
@@ -21,6 +23,7 @@ from surrogym_server.errors import (
     Unavailable,
     UnknownSurrogate,
 )
+from surrogym_server.plugins import in_one_line
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.notices import Notices
@@ -32,19 +35,42 @@ from surrogym_server.storage.records import (
     NewDesign,
     NewModel,
 )
-from surrogym_shared.plugins import one_line
 
 logger = logging.getLogger(__name__)
 
 FIT_LEASE_SECONDS = 30.0
 RENEWALS_PER_LEASE = 3
 ATTEMPTS = 5  # of a fit whose process is killed, or whose result can't be stored
+LONG_SECONDS = 60.0  # a fit that takes longer is told in the log, and others pass it
+MOST_PASSED = 3  # fits that others pass: each is a process
+PAUSE_SECONDS = 1.0  # between looks at whether a fit is still wanted
 
 
 class FitRunner(Protocol):
     """Where jobs are done; ``engine.fits.Fits`` is one."""
 
-    async def run(self, job: DesignJob) -> DesignResult: ...
+    async def run(self, job: DesignJob) -> DesignResult:
+        """The result of a job. Cancelling ends the job, whatever it is doing."""
+
+
+class _Turn:
+    """One fit at a time; one that takes long lets others pass, as long as there are few such."""
+
+    def __init__(self, one: asyncio.Semaphore, passed: asyncio.Semaphore) -> None:
+        self._one, self._passed, self._held = one, passed, one
+
+    async def __aenter__(self) -> _Turn:
+        await self._one.acquire()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._held.release()
+
+    async def let_others_pass(self) -> None:
+        if self._held is self._one and not self._passed.locked():
+            await self._passed.acquire()
+            self._held = self._passed
+            self._one.release()
 
 
 class Designer:
@@ -60,6 +86,7 @@ class Designer:
         owner: str,
         threads: int,
         look_seconds: float,
+        fit_seconds: float,
     ) -> None:
         """
         Args:
@@ -72,6 +99,7 @@ class Designer:
             owner: name of this server in the right to fit.
             threads: of torch in a fit.
             look_seconds: how often to look for what no notice told.
+            fit_seconds: a fit that takes longer is ended, and has failed.
         """
         self._storage = storage
         self._definitions = definitions
@@ -82,30 +110,53 @@ class Designer:
         self._owner = owner
         self._threads = threads
         self._look_seconds = look_seconds
+        self._fit_seconds = fit_seconds
+        self._one, self._passed = asyncio.Semaphore(1), asyncio.Semaphore(MOST_PASSED)
+        self._tasks: dict[str, asyncio.Task[None]] = {}  # of the surrogates that are fitted, or wait for their turn
         self._unavailable: dict[str, int] = {}  # fits in a row that had no process, or no storage, by surrogate
 
     async def run(self) -> None:
         """Fit what is due, for ever; ends by cancellation, and what was being fitted stays due."""
-        with self._notices.listen() as listener:
-            while True:
-                try:
-                    await self.fit_all_due()
-                except Unavailable as error:
-                    logger.warning("storage is away or damaged, the design waits: %s", error)
-                except Exception:  # one surrogate's trouble must not end the design of all others
-                    logger.exception("a look for what is due failed; the next one follows")
-                await listener.wait(self._look_seconds)
+        try:
+            with self._notices.listen() as listener:
+                while True:
+                    try:
+                        await self._begin_all_due()
+                    except Unavailable as error:
+                        logger.warning("storage is away or damaged, the design waits: %s", error)
+                    except Exception:  # one surrogate's trouble must not end the design of all others
+                        logger.exception("a look for what is due failed; the next one follows")
+                    await listener.wait(self._look_seconds)
+        finally:
+            tasks = list(self._tasks.values())
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
 
     async def fit_all_due(self) -> None:
-        """Fit every surrogate that is due, one after the other."""
+        """Fit every surrogate that is due, and return when all of them are."""
+        await self._begin_all_due()
+        await asyncio.gather(*self._tasks.values())
+
+    async def _begin_all_due(self) -> None:
         for name in await asyncio.to_thread(self._storage.designs.due):
-            try:
-                await self._fit(name)
-            except Damaged as error:
-                logger.warning("the design of %s waits: %s", name, error)
-            except SurrogymError as error:  # deleted or taken by another server meanwhile
-                logger.debug("%s is not fitted: %s", name, error)
+            if name not in self._tasks:
+                self._tasks[name] = asyncio.create_task(self._fit_in_turn(name))
         await asyncio.to_thread(self._give_up_hopeless)
+
+    async def _fit_in_turn(self, name: str) -> None:
+        """Whatever comes of it ends this fit alone."""
+        try:
+            async with _Turn(self._one, self._passed) as turn:
+                await self._fit(name, turn)
+        except Damaged as error:
+            logger.warning("the design of %s waits: %s", name, error)
+        except SurrogymError as error:  # deleted or taken by another server meanwhile, or the storage is away
+            logger.debug("%s is not fitted: %s", name, error)
+        except Exception:
+            logger.exception("the fit of %s could not be begun or ended; the next look follows", name)
+        finally:
+            del self._tasks[name]
 
     def improve(
         self, name: str, queries: int, checkpoint: str | None, key: str | None, *, raise_budget: bool
@@ -125,30 +176,28 @@ class Designer:
         self._notices.post(name)
         return granted
 
-    async def _fit(self, name: str) -> None:
+    async def _fit(self, name: str, turn: _Turn) -> None:
         lease = await asyncio.to_thread(self._storage.designs.begin, name, self._owner, FIT_LEASE_SECONDS)
         if lease is None:
             return
         self._notices.post(name)
-        keeper = asyncio.create_task(self._keep(lease))
         try:
-            result = await self._fits.run(await asyncio.to_thread(self._job, lease))
+            result = await self._result(lease, turn)
             await asyncio.to_thread(self._commit, lease, result)
             self._metrics.fits.observe(result.seconds)
             self._unavailable.pop(name, None)
         except asyncio.CancelledError:
             self._abort(lease, None)
             raise
-        except LeaseExpired:
-            logger.info("the fit of %s is made again: it was changed, or another server fits it", name)
+        except (LeaseExpired, UnknownSurrogate):
+            logger.info("the fit of %s is dropped: it was deleted or changed, or another server fits it", name)
         except Exception as error:
             self._metrics.failed_fits += 1
-            ours = isinstance(error, SurrogymError) and not isinstance(error, PluginFailed)
-            logger.warning("the round of %s failed: %s", name, error, exc_info=not ours)
+            surprise = hasattr(error, "__notes__") or not isinstance(error, SurrogymError)
+            logger.warning("the round of %s failed: %s", name, in_one_line(error), exc_info=surprise)
             again = isinstance(error, Unavailable) and self._may_try_again(name)
             await asyncio.to_thread(self._abort, lease, None if again else _failure(name, error))
         finally:
-            keeper.cancel()
             self._notices.post(name)
 
     def _may_try_again(self, name: str) -> bool:
@@ -158,11 +207,52 @@ class Designer:
             self._unavailable[name] = attempts
         return attempts < ATTEMPTS
 
-    async def _keep(self, lease: FitLease) -> None:
-        while True:
-            await asyncio.sleep(FIT_LEASE_SECONDS / RENEWALS_PER_LEASE)
-            with suppress(SurrogymError):  # the commit will say so
-                await asyncio.to_thread(self._storage.designs.renew, lease, FIT_LEASE_SECONDS)
+    async def _result(self, lease: FitLease, turn: _Turn) -> DesignResult:
+        """What the job of a lease gives; the job is ended when nobody wants it any more, or it takes too long.
+
+        Raises:
+            LeaseExpired, UnknownSurrogate: nobody wants it any more.
+            PluginFailed: it took too long.
+            Exception: whatever the job raises.
+        """
+        job = await asyncio.to_thread(self._job, lease)
+        work = asyncio.create_task(self._fits.run(job))
+        keeper = asyncio.create_task(self._keep(lease, turn))
+        try:
+            await asyncio.wait({work, keeper}, timeout=self._fit_seconds, return_when=asyncio.FIRST_COMPLETED)
+            if work.done():
+                return work.result()
+            if keeper.done():
+                keeper.result()
+            family = job.definition.learning.model.name
+            raise PluginFailed(
+                f"the model family {family!r} took longer than {self._fit_seconds:g} s, and was ended: "
+                "surrogym serve --fit-seconds allows more"
+            )
+        finally:
+            for task in (work, keeper):
+                task.cancel()
+            await asyncio.gather(work, keeper, return_exceptions=True)
+
+    async def _keep(self, lease: FitLease, turn: _Turn) -> None:
+        """Hold the right to a fit while it is wanted, and tell of one that takes long. Raises ``LeaseExpired`` or
+        ``UnknownSurrogate`` when nobody wants it any more."""
+        began, tell_after = time.monotonic(), LONG_SECONDS
+        with self._notices.listen(lease.surrogate) as listener:
+            while True:
+                await listener.wait(FIT_LEASE_SECONDS / RENEWALS_PER_LEASE)
+                try:
+                    await asyncio.to_thread(self._storage.designs.renew, lease, FIT_LEASE_SECONDS)
+                except (LeaseExpired, UnknownSurrogate):
+                    raise
+                except SurrogymError as error:  # the commit will say so
+                    logger.debug("the right to fit %s is not renewed: %s", lease.surrogate, error)
+                if (took := time.monotonic() - began) > tell_after:
+                    tell_after *= 2
+                    name, most = lease.surrogate, self._fit_seconds
+                    logger.warning("the fit of %s has been running for %.0f s, and is ended at %g s", name, took, most)
+                    await turn.let_others_pass()
+                await asyncio.sleep(PAUSE_SECONDS)
 
     def _job(self, lease: FitLease) -> DesignJob:
         name = lease.surrogate
@@ -230,9 +320,7 @@ def _failure(name: str, error: Exception) -> str:
     match error:
         case NotInstalled():
             return f"{error}; then: surrogym change {name} --resume"
-        case PluginFailed():
-            return str(error)
-        case SurrogymError():
-            return f"the fit failed: {error}"
+        case ChoiceFailed():
+            return in_one_line(error)
         case _:
-            return f"the fit failed: {one_line(error)}"
+            return f"the fit failed: {in_one_line(error)}"

@@ -12,14 +12,16 @@ from numpy.typing import NDArray
 from surrogym_server.engine.fidelity import fidelity_of
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.environment.actions import model_actions
-from surrogym_server.errors import Damaged, InvalidInput
+from surrogym_server.errors import Damaged, InvalidInput, PluginFailed
 from surrogym_server.models.files import from_bytes
+from surrogym_server.models.guard import POINTS, asking, require_sound
 from surrogym_server.models.port import DynamicsModel
+from surrogym_server.sampling.design import monte_carlo
 from surrogym_server.sampling.uncertainty import UncertaintyResult, query_uncertainty
 from surrogym_server.services.definitions import Definitions, check_coordinates, check_points
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.records import ModelRecord, NewModel
+from surrogym_server.storage.records import ModelRecord, NewModel, SurrogateRecord
 from surrogym_server.virtual.imagined import Imagined, imagine
 from surrogym_server.virtual.single_step import PointPrediction, predict_points
 
@@ -49,7 +51,8 @@ def load_model(storage: Storage, definitions: Definitions, surrogate: int, versi
     name = storage.surrogates.name_of(surrogate)
     definition, data = definitions.for_model(name), stored_model(storage, name, version)
     try:
-        return from_bytes(definition, data)
+        with asking(definition, interrupts=True):
+            return from_bytes(definition, data)
     except InvalidInput as error:
         raise Damaged(f"model {version} of {name!r} can't be read: {error}") from error
 
@@ -99,15 +102,12 @@ class ModelService:
             NotInstalled: its family is not here.
         """
         record = self._storage.surrogates.get(name)
-        model = from_bytes(self._definitions.for_model(name).with_tolerances(record.tolerances), data)
-        new = NewModel(
-            samples=model.samples,
-            data_hash=model.digest,
-            fidelity=fidelity_of(model, record.state.get("usual", ()), record.target),
-            description=model.description,
-            fit_seconds=0.0,
-            blob=data,
-        )
+        definition = self._definitions.for_model(name).with_tolerances(record.tolerances)
+        try:
+            with asking(definition, interrupts=True):
+                new = _imported(from_bytes(definition, data), record, data)
+        except PluginFailed as error:
+            raise InvalidInput(str(error)) from error
         version = self._storage.models.add(name, new)
         self._models.publish(record.id, version)
         self._notices.post(name)
@@ -119,10 +119,12 @@ class ModelService:
         Raises:
             InvalidInput: wrong shape, or an action out of bounds.
             NoModel, UnknownModel: as the classes say.
+            PluginFailed: the family's code failed.
         """
         version, model = self._model(name, version)
         q, u = check_points(model.definition, q, u)
-        return Said(version, model.definition.outputs, predict_points(model, q, u))
+        with asking(model.definition, interrupts=True):
+            return Said(version, model.definition.outputs, predict_points(model, q, u))
 
     def query_uncertainty(self, name: str, q: Array, u: Array, version: int | None) -> Said[UncertaintyResult]:
         """Uncertainty at q (n, C) under u (n, F), weighted by the latest occupancy; raises as ``predict``."""
@@ -131,16 +133,31 @@ class ModelService:
         tolerances = np.array(self._storage.models.get(name, version).tolerances)
         occupancy = self._storage.occupancy.latest(name)
         states = None if occupancy is None else occupancy.states
-        return Said(version, model.definition.outputs, query_uncertainty(model, q, u, tolerances, states))
+        with asking(model.definition, interrupts=True):
+            return Said(version, model.definition.outputs, query_uncertainty(model, q, u, tolerances, states))
 
     def imagine(self, name: str, q: Array, u: Array, *, draws: int, seed: int, version: int | None) -> Said[Imagined]:
         """Episodes from q (C,) under u (T, F); raises as ``predict``."""
         version, model = self._model(name, version)
         start = check_coordinates(model.definition, "coordinates", q[None])[0]
         actions = model_actions(model.definition.action, u)
-        return Said(version, model.definition.outputs, imagine(model, start, actions, draws=draws, seed=seed))
+        with asking(model.definition, interrupts=True):
+            return Said(version, model.definition.outputs, imagine(model, start, actions, draws=draws, seed=seed))
 
     def _model(self, name: str, version: int | None) -> tuple[int, DynamicsModel]:
         surrogate = self._storage.surrogates.get(name).id
         version = self._models.refresh(surrogate) if version is None else version
         return version, self._models.get(surrogate, version)
+
+
+def _imported(model: DynamicsModel, record: SurrogateRecord, data: bytes) -> NewModel:
+    q, u = monte_carlo(model.definition)
+    require_sound(model, q[:POINTS], u[:POINTS])
+    return NewModel(
+        samples=model.samples,
+        data_hash=model.digest,
+        fidelity=fidelity_of(model, record.state.get("usual", ()), record.target),
+        description=model.description,
+        fit_seconds=0.0,
+        blob=data,
+    )

@@ -32,6 +32,7 @@ from surrogym_server.engine.sessions import LiveSessions, Work
 from surrogym_server.environment.actions import policy_actions
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import Damaged, InvalidInput, NotReset, SurrogymError, TooLarge
+from surrogym_server.models.guard import asking, failure_of
 from surrogym_server.sampling.uncertainty import visited_confidence
 from surrogym_server.services.activity import SessionActivity, Tallies
 from surrogym_server.services.definitions import Definitions
@@ -150,7 +151,7 @@ class SessionService:
         Raises:
             InvalidInput: wrong shape, not finite, out of bounds.
             NotReset: a lane to step has not been reset.
-            SeqConflict, UnknownSession, SessionExpired, Overloaded, DeadlineExceeded: as the classes say.
+            SeqConflict, UnknownSession, SessionExpired, Overloaded, DeadlineExceeded, PluginFailed: as the classes say.
         """
 
         def work(session: Session) -> tuple[Session, Outcome]:
@@ -275,20 +276,27 @@ class SessionService:
         )
 
     def _step(self, session: Session, u: Array, mask: Bools | None, deviations: bool) -> tuple[Session, Any]:
-        return step_session(
-            session,
-            u,
-            mask,
-            deviations,
-            lambda version: self._models.get(session.surrogate_id, version, self._device),
-            self._latest(session),
-        )
+        try:
+            return step_session(
+                session,
+                u,
+                mask,
+                deviations,
+                lambda version: self._models.get(session.surrogate_id, version, self._device),
+                self._latest(session),
+            )
+        except SurrogymError:
+            raise
+        except BaseException as error:  # of a family's code; written out, as ``asking`` costs each step more
+            raise failure_of(session.definition, error) from error
 
     def _submit(self, session: Session, checkpoint: str, states: Array) -> float:
         """Store visited states; the confidence index there. By the id: the name may be another surrogate's by now."""
         name, version = self._storage.surrogates.name_of(session.surrogate_id), self._latest(session)
         tolerances = self._storage.models.get(name, version).tolerances
-        index = visited_confidence(self._models.get(session.surrogate_id, version), states, tolerances)
+        model = self._models.get(session.surrogate_id, version)
+        with asking(model.definition, interrupts=True):
+            index = visited_confidence(model, states, tolerances)
         self._storage.occupancy.put(name, checkpoint, states)
         return index
 

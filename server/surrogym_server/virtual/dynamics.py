@@ -11,6 +11,7 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.step_rules import paid
+from surrogym_server.models.guard import require_shapes
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual.paths import function_draws
 
@@ -44,6 +45,7 @@ def move_mean(
     (N, W); ``process`` (N, M), standard normal, adds the learned noise."""
     step = model.transition if paths is None else partial(function_draws(model).transition_along, paths)
     transition = step(q, u, process=process, deviations=deviations, reward_deviation=deviations or penalty > 0)
+    require_shapes(model, transition, q)
     over, spread = model.terminated(transition.q_next), transition.reward_deviation
     mean = paid(model.terminal_reward, transition.reward, over)
     reward = mean if spread is None else penalised(mean, penalty, spread)
@@ -75,6 +77,7 @@ def move_particles(
     transition = model.transition(
         q, action, noise=flat_noise, process=flat_process, deviations=True, reward_deviation=True
     )
+    require_shapes(model, transition, q)
     spread = transition.reward_deviation
     assert transition.deviation is not None
     assert spread is not None

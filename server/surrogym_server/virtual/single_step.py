@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from surrogym_server.environment.step_rules import paid
+from surrogym_server.models.guard import require_shapes
 from surrogym_server.models.port import DynamicsModel
 
 Array = NDArray[np.float64]
@@ -28,6 +29,7 @@ def predict_points(model: DynamicsModel, q: Array, u: Array) -> PointPrediction:
     """One mean step from each of q (n, C) under u (n, F)."""
     at, action = torch.from_numpy(q), torch.from_numpy(u)
     predicted = model.transition(at, action, reward_deviation=True)
+    require_shapes(model, predicted, at)
     q_next, deviation = predicted.q_next, predicted.reward_deviation
     assert deviation is not None
     over = model.terminated(q_next)

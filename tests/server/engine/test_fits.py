@@ -14,7 +14,7 @@ import pytest
 from support import jobs
 from surrogym_server.engine.design_job import DesignJob, DesignResult
 from surrogym_server.engine.fits import NICENESS, Fits
-from surrogym_server.errors import PluginFailed, Unavailable
+from surrogym_server.errors import ChoiceFailed, PluginFailed, Unavailable
 
 Started = Callable[[Callable[[DesignJob], DesignResult]], Fits]
 
@@ -55,14 +55,46 @@ def test_it_yields_to_whoever_steps(started: Started):
     assert os.getpriority(os.PRIO_PROCESS, process) == min(mine + NICENESS, 19)
 
 
-def test_a_package_that_exits_ends_one_fit_and_no_server(started: Started):
-    with pytest.raises(PluginFailed, match=r"a package called sys\.exit: SystemExit: no licence"):
-        run(started(jobs.leave))
+@pytest.mark.parametrize(
+    ("raised", "said"),
+    [
+        ("ValueError", "ValueError: no such luck"),
+        ("SystemExit", "SystemExit: 3"),
+        ("KeyboardInterrupt", "KeyboardInterrupt"),
+        ("CancelledError", "CancelledError"),
+        ("TwoArguments", "TwoArguments: x: boom"),
+        ("Unspeakable", "Unspeakable"),
+        ("InvalidInput", "on purpose"),
+        ("ChoiceFailed", "on purpose too"),
+    ],
+)
+def test_what_a_job_raises_comes_here_as_words_and_ends_nothing(started: Started, raised: str, said: str):
+    """Not as the exception: one could end who receives it, and another can't be sent."""
+    fits = started(jobs.refuse)
+    process = run(fits, answer=True).data_hash
+    with pytest.raises(PluginFailed) as caught:
+        run(fits, raised=raised)
+    assert str(caught.value) == said
+    assert isinstance(caught.value, ChoiceFailed) == (raised == "ChoiceFailed"), "it does not say that the fit failed"
+    assert hasattr(caught.value, "__notes__") == (not said.startswith("on purpose")), "the traceback, for the log"
+    assert run(fits, answer=True).data_hash == process
 
 
-def test_what_a_job_raises_comes_here(started: Started):
-    with pytest.raises(ValueError, match="no such luck"):
-        run(started(jobs.refuse))
+def test_a_job_that_is_cancelled_is_ended_and_others_do_not_wait_for_it(started: Started, tmp_path: Path):
+    fits, mark = started(jobs.hang), tmp_path / "mark"
+
+    async def cancel_while_it_hangs() -> int:
+        hanging = asyncio.create_task(fits.run(cast(DesignJob, Job(mark=str(mark)))))
+        while not mark.exists() or not mark.read_text():
+            await asyncio.sleep(0.01)
+        assert (await fits.run(cast(DesignJob, Job(answer=True)))).data_hash != mark.read_text()
+        hanging.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await hanging
+        return int(mark.read_text())
+
+    process = asyncio.run(cancel_while_it_hangs())
+    assert not _alive(process)
 
 
 def test_a_process_that_dies_is_replaced_and_the_job_done_again(started: Started, tmp_path: Path):

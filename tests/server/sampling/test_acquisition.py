@@ -10,7 +10,7 @@ from scipy.stats import norm
 from surrogym_client.original.classic import cartpole
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.points import Points
-from surrogym_server.errors import PluginFailed
+from surrogym_server.errors import ChoiceFailed
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.plugins import Choice
 from surrogym_server.sampling.acquisition import PathView, Variance, acquisition_of, path_value_of
@@ -143,7 +143,7 @@ def test_an_answer_that_breaks_the_laws_names_the_acquisition(model, candidates,
     monkeypatch.setattr(Variance, "value", lambda _, view: answer(view.deviation))
     nothing = candidates.points[:0]
     expected = f"^the choice of the next queries failed: acquisition variance: {said}"
-    with pytest.raises(PluginFailed, match=expected):
+    with pytest.raises(ChoiceFailed, match=expected):
         choose(by(model, "variance"), candidates, nothing, nothing, [0], TOLERANCES)
 
 
@@ -151,5 +151,5 @@ def test_an_answer_along_paths_is_held_to_the_laws_too(monkeypatch):
     weight = torch.ones(2, 3)
     paths = PathView(0.1, weight, lambda: weight, lambda: weight)
     monkeypatch.setattr(Variance, "path_value", lambda _, view: view.weight / 0)
-    with pytest.raises(PluginFailed, match="acquisition variance: expected finite values, got 6 of 6"):
+    with pytest.raises(ChoiceFailed, match="acquisition variance: expected finite values, got 6 of 6"):
         path_value_of(Choice("variance"), paths)

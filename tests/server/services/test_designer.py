@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import sqlite3
 from collections.abc import Callable
+from concurrent.futures import CancelledError
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -13,16 +14,18 @@ import numpy as np
 import pytest
 
 from support import pendulum
-from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.errors import InvalidInput, NoModel, NumericalFailure, PluginFailed, Unavailable
+from surrogym_server.errors import ChoiceFailed, InvalidInput, NoModel, NumericalFailure, Unavailable
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import ATTEMPTS, Designer
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.models import load_model
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.records import NewSurrogate, SurrogateRecord
+from surrogym_server.storage.records import NewSample, NewSurrogate, SurrogateRecord
+from surrogym_shared.spec import EnvironmentSpec
 
 NAME = "pendulum"
 
@@ -34,11 +37,16 @@ class Runner:
         self.function = function
         self.jobs: list[DesignJob] = []
         self.hang = False
+        self.hang_at_budget = 0
+        self.ended = 0
 
     async def run(self, job: DesignJob) -> DesignResult:
         self.jobs.append(job)
-        if self.hang:
-            await asyncio.sleep(3600)
+        if self.hang or job.budget == self.hang_at_budget:
+            try:
+                await asyncio.sleep(3600)
+            finally:
+                self.ended += 1
         return self.function(job)
 
 
@@ -65,9 +73,18 @@ def cache(storage: Storage, definitions: Definitions) -> ModelCache:
 def designer(storage: Storage, definitions: Definitions, cache: ModelCache, runner: Runner):
     """Makes a designer of the running event loop."""
 
-    def make() -> Designer:
+    def make(fit_seconds: float = 3600) -> Designer:
         return Designer(
-            storage, definitions, runner, cache, Notices(), ProcessMetrics(), owner="here", threads=1, look_seconds=0.05
+            storage,
+            definitions,
+            runner,
+            cache,
+            Notices(),
+            ProcessMetrics(),
+            owner="here",
+            threads=1,
+            look_seconds=0.05,
+            fit_seconds=fit_seconds,
         )
 
     return make
@@ -155,7 +172,7 @@ def test_an_error_nobody_thought_of_fails_the_design_and_not_the_designer(answer
 
 def test_an_acquisition_that_fails_is_named_and_not_the_fit(answered: Storage, designer, runner: Runner):
     said = "the choice of the next queries failed: acquisition focused: ValueError: x not in tuple"
-    runner.function = refuse(PluginFailed(said))
+    runner.function = refuse(ChoiceFailed(said))
     fit_all(designer)
     assert answered.surrogates.get(NAME).error == said
 
@@ -222,6 +239,91 @@ def test_a_surrogate_deleted_during_its_fit_is_no_failure(answered: Storage, des
     runner.function = delete
     fit_all(designer)
     assert answered.surrogates.summaries() == []
+
+
+@pytest.fixture
+def watchful(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A designer that looks after its fits all the time, and to which each is a long one."""
+    monkeypatch.setattr("surrogym_server.services.designer.RENEWALS_PER_LEASE", 3000)
+    monkeypatch.setattr("surrogym_server.services.designer.PAUSE_SECONDS", 0.01)
+    monkeypatch.setattr("surrogym_server.services.designer.LONG_SECONDS", 0.1)
+
+
+def test_a_fit_that_takes_too_long_is_ended_and_named(answered: Storage, designer, runner: Runner):
+    runner.hang = True
+
+    async def run() -> None:
+        async with asyncio.timeout(60):
+            await designer(fit_seconds=0.2).fit_all_due()
+
+    asyncio.run(run())
+    record = answered.surrogates.get(NAME)
+    assert (record.phase, runner.ended) == ("failed", 1)
+    assert record.error == (
+        "the fit failed: the model family 'gaussian_process' took longer than 0.2 s, and was ended: "
+        "surrogym serve --fit-seconds allows more"
+    )
+
+
+@pytest.mark.usefixtures("watchful")
+def test_a_fit_whose_surrogate_is_deleted_is_ended(answered: Storage, designer, runner: Runner):
+    runner.hang = True
+
+    async def run() -> None:
+        async with asyncio.timeout(60):
+            fitting = asyncio.create_task(designer().fit_all_due())
+            while not runner.jobs:
+                await asyncio.sleep(0.01)
+            answered.surrogates.delete(NAME)
+            await fitting
+
+    asyncio.run(run())
+    assert runner.ended == 1
+
+
+@pytest.mark.usefixtures("watchful")
+def test_a_fit_that_takes_long_is_told_and_passed(answered: Storage, designer, runner: Runner, caplog):
+    teach_another(answered, budget=29)
+    runner.hang_at_budget = pendulum.BUDGET
+
+    async def run() -> None:
+        task = asyncio.create_task(designer().run())
+        async with asyncio.timeout(60):
+            while answered.surrogates.get("another").phase != "sampling":
+                await asyncio.sleep(0.01)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    asyncio.run(run())
+    assert runner.ended == 1
+    assert answered.designs.due() == [NAME]
+    assert f"the fit of {NAME} has been running for 0 s, and is ended at 3600 s" in caplog.text
+
+
+def teach_another(storage: Storage, budget: int) -> None:
+    """A second surrogate whose fit is due."""
+    spec = pendulum.spec()
+    state, q, u, _ = initial_queries(definition_from_spec(EnvironmentSpec.model_validate(spec)), budget)
+    storage.surrogates.create(NewSurrogate("another", spec, budget, 0.999, state, q, u))
+    for query in storage.queries.claim("another", "tester", 100, 60):
+        step = pendulum.real_step(list(query.coordinates), list(query.action))
+        storage.samples.add("another", "tester", [NewSample(**step, query_id=query.id, lease_token=query.token)])
+
+
+@pytest.mark.parametrize("error", [CancelledError(), RuntimeError("line 1\n  line 2")])
+def test_whatever_comes_of_one_fit_the_next_one_follows(answered: Storage, designer, runner: Runner, error: Exception):
+    teach_another(answered, budget=29)
+
+    def function(job: DesignJob) -> DesignResult:
+        if job.budget == 29:
+            return run_design_job(job)
+        raise error
+
+    runner.function = function
+    fit_all(designer)
+    said = " ".join(str(error).split())
+    assert answered.surrogates.get(NAME).error == f"the fit failed: {type(error).__name__}{': ' if said else ''}{said}"
+    assert answered.surrogates.get("another").phase == "sampling"
 
 
 def test_a_surrogate_whose_row_is_broken_keeps_no_other_from_its_fit(answered: Storage, designer, tmp_path: Path):

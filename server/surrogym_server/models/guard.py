@@ -1,0 +1,125 @@
+"""What stands between a family's code, which may be anybody's, and all else: its errors in words, its arrays checked.
+
+Shapes as in ``models.port``.
+"""
+
+from __future__ import annotations
+
+import json
+from contextlib import AbstractContextManager
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.samples import Samples
+from surrogym_server.errors import PluginFailed, SurrogymError
+from surrogym_server.models.port import DynamicsModel, Learned, Transition, Warm
+from surrogym_server.models.registry import learner_of
+from surrogym_server.plugins import failed, guarded, in_one_line
+
+POINTS = 16  # at which a model is tried before it is taken
+
+
+def failure_of(definition: EnvironmentDefinition, error: BaseException) -> SurrogymError:
+    """What a family's code raised, as one sentence that names the family."""
+    return failed(_family(definition), PluginFailed, error)
+
+
+def asking(definition: EnvironmentDefinition, *, interrupts: bool = False) -> AbstractContextManager[None]:
+    """Whatever the code of a definition's family raises within is a ``PluginFailed``; see ``guarded``."""
+    return guarded(_family(definition), PluginFailed, interrupts=interrupts)
+
+
+def learn(definition: EnvironmentDefinition, samples: Samples, warm: Warm | None) -> Learned:
+    """A model of the specified family, tried at a few of its own samples.
+
+    Raises:
+        InvalidInput, NumericalFailure: as ``Learner.learn``.
+        PluginFailed: the family's code raised anything else, or what it gave is no model.
+    """
+    with asking(definition):
+        learned = learner_of(definition.learning.model).learn(definition, samples, warm)
+        model: object = getattr(learned, "model", learned)
+        if not isinstance(model, DynamicsModel):
+            raise _wrong(definition, "expected a DynamicsModel, in Learned, from learn", type(model).__name__)
+        for name, array in learned.warm.items():
+            if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
+                raise _wrong(definition, f"expected an array of numbers as warm start {name!r}", type(array).__name__)
+        every = max(1, len(samples) // POINTS)
+        require_sound(learned.model, samples.q[::every][:POINTS], samples.u[::every][:POINTS])
+    return learned
+
+
+def require_sound(model: DynamicsModel, q: Tensor, u: Tensor) -> None:
+    """Raise ``PluginFailed`` unless what a model says of itself, and predicts at q (m, C) under u (m, F), has the
+    shapes of the port and is finite, deviations are not negative, and chances are within 0 and 1."""
+    definition, outputs = model.definition, len(model.definition.outputs)
+    predicted = model.transition(q, u, deviations=True, reward_deviation=True)
+    require_shapes(model, predicted, q, deviations=True)
+    require_numbers(definition, "next coordinates", predicted.q_next, q.shape)
+    require_numbers(definition, "reward", predicted.reward, q.shape[:1])
+    assert predicted.deviation is not None
+    assert predicted.reward_deviation is not None
+    require_deviations(model, torch.cat([predicted.deviation, predicted.reward_deviation[:, None]], -1))
+    require_numbers(definition, "means", model.means(q, u), (len(q), outputs))
+    require_numbers(definition, "scales", model.scales, (outputs,))
+    if definition.learns_termination:
+        ends = model.learned_termination(q)
+        require_numbers(definition, "learned termination", ends, q.shape[:1])
+        if bool(((ends < 0) | (ends > 1)).any()):
+            raise _wrong(definition, "learned termination: expected chances within 0 and 1", f"{_worst(ends):g}")
+    try:
+        json.dumps([model.description, list(model.structures)], allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise _wrong(definition, "expected a description that JSON can carry", in_one_line(error)) from error
+
+
+def require_shapes(model: DynamicsModel, predicted: Transition, q: Tensor, *, deviations: bool = False) -> None:
+    """Raise ``PluginFailed`` unless a prediction from q (m, C) has the shapes of the port; ``deviations`` says that
+    they have to be there."""
+    definition, rows = model.definition, len(q)
+    if not isinstance(predicted, Transition):
+        raise _wrong(definition, "expected a Transition from transition", type(predicted).__name__)
+    _require_shape(definition, "next coordinates", predicted.q_next, q.shape)
+    _require_shape(definition, "reward", predicted.reward, (rows,))
+    if deviations or predicted.deviation is not None:
+        _require_shape(definition, "deviation", predicted.deviation, (rows, len(definition.outputs) - 1))
+    if deviations or predicted.reward_deviation is not None:
+        _require_shape(definition, "deviation of the reward", predicted.reward_deviation, (rows,))
+
+
+def require_deviations(model: DynamicsModel, deviation: Tensor) -> None:
+    """Raise ``PluginFailed`` unless deviations (m, O) of all outputs are finite and not negative."""
+    for name, column in zip(model.definition.outputs, deviation.T, strict=True):
+        require_numbers(model.definition, f"deviation of {name!r}", column, column.shape)
+        if bool((column < 0).any()):
+            raise _wrong(model.definition, f"deviation of {name!r}: expected at least 0", f"{float(column.min()):g}")
+
+
+def require_numbers(definition: EnvironmentDefinition, what: str, values: Tensor, shape: tuple[int, ...]) -> None:
+    """Raise ``PluginFailed`` unless a tensor has a shape and finite numbers."""
+    _require_shape(definition, what, values, shape)
+    if not bool(torch.isfinite(values).all()):
+        raise _wrong(definition, f"{what}: expected finite numbers", f"{_worst(values):g}")
+
+
+def _require_shape(definition: EnvironmentDefinition, what: str, values: Tensor | None, shape: tuple[int, ...]) -> None:
+    got = getattr(values, "shape", None)
+    if got != shape:
+        came = type(values).__name__ if got is None else str(tuple(got))
+        raise _wrong(definition, f"{what}: expected the shape {tuple(shape)}", came)
+
+
+def _worst(values: Tensor) -> float:
+    """One that is not finite, or else the one farthest from 0."""
+    return float(values.flatten()[torch.where(values.isfinite(), values.abs(), torch.inf).argmax()])
+
+
+def _wrong(definition: EnvironmentDefinition, expected: str, got: str) -> PluginFailed:
+    return PluginFailed(f"{_family(definition)}: {expected}, got {got}")
+
+
+def _family(definition: EnvironmentDefinition) -> str:
+    return f"the model family {definition.learning.model.name!r}"

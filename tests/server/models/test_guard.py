@@ -1,0 +1,81 @@
+"""What a family gives is looked at before it is taken: nothing that is no prediction is ever judged or served."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from support import pendulum, unruly
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.engine.design_job import DesignJob, initial_queries, run_design_job
+from surrogym_server.environment.samples import Samples
+from surrogym_server.errors import InvalidInput, PluginFailed
+from surrogym_server.models import guard
+from surrogym_server.plugins import in_one_line
+from surrogym_server.virtual.single_step import predict_points
+from surrogym_shared.spec import EnvironmentSpec
+
+
+def job(**changes: object) -> DesignJob:
+    definition = definition_from_spec(EnvironmentSpec.model_validate(pendulum.spec()))
+    state, q, u, _ = initial_queries(definition, pendulum.BUDGET)
+    steps = [pendulum.real_step(list(at), list(action)) for at, action in zip(q, u, strict=True)]
+    reward = np.array([step["reward"] for step in steps])
+    q_next = np.array([step["next_coordinates"] for step in steps])
+    return DesignJob(definition, q, u, q_next, reward, np.zeros(len(q), dtype=bool), state, pendulum.BUDGET, 0.999)
+
+
+@pytest.mark.parametrize(
+    ("mode", "said"),
+    [
+        ("nan", ": next coordinates: expected finite numbers, got nan"),
+        ("reward", ": reward: expected finite numbers, got nan"),
+        ("negative", r": deviation of 'theta': expected at least 0, got -"),
+        ("shape", r": reward: expected the shape \(5,\), got \(5, 1\)"),
+        ("narrow", r": next coordinates: expected the shape \(5, 2\), got \(5, 1\)"),
+        ("nothing", ": expected a Transition from transition, got NoneType"),
+        ("raise", ": RuntimeError: line 1 line 2"),
+        ("exit", ": SystemExit: 3"),
+        ("learn.exit", ": SystemExit: 3"),
+        ("learn.cancel", ": CancelledError"),
+        ("learn.nothing", ": expected a DynamicsModel, in Learned, from learn, got NoneType"),
+        ("warm", ": expected an array of numbers as warm start 'theta', got str"),
+        ("tensor", ": expected a description that JSON can carry, got TypeError: "),
+        ("infinite", ": expected a description that JSON can carry, got ValueError: "),
+    ],
+)
+def test_a_model_that_is_none_fails_its_fit_in_one_sentence(monkeypatch: pytest.MonkeyPatch, mode: str, said: str):
+    monkeypatch.setattr(guard, "learner_of", lambda _: unruly.Unruly(mode))
+    with pytest.raises(PluginFailed, match=f"^the model family 'gaussian_process'{said}"):
+        run_design_job(job())
+
+
+def test_ctrl_c_in_a_fit_of_ones_own_process_stays_ctrl_c(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(guard, "learner_of", lambda _: unruly.Unruly("interrupt"))
+    with pytest.raises(KeyboardInterrupt):
+        run_design_job(job())
+
+
+def test_a_prediction_of_a_wrong_shape_is_named_when_it_is_asked_for(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(guard, "learner_of", lambda _: unruly.Unruly())
+    made = job()
+    samples = [torch.from_numpy(a) for a in (made.coordinates, made.action, made.next_coordinates, made.reward)]
+    inner = guard.learn(made.definition, Samples(*samples, torch.from_numpy(made.terminated)), None).model.inner
+    with pytest.raises(PluginFailed, match=r"reward: expected the shape \(5,\), got \(5, 1\)"):
+        predict_points(unruly.Bent(inner, "shape"), made.coordinates, made.action)
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (InvalidInput("expected\n  this"), "expected this"),
+        (AttributeError("'NoneType' object has no attribute 'model'"), "AttributeError: 'NoneType' object has no"),
+        (KeyError("x"), "KeyError: 'x'"),
+        (InvalidInput(""), "InvalidInput"),
+    ],
+)
+def test_an_error_is_one_line_that_says_what_it_is(error: Exception, said: str):
+    assert in_one_line(error).startswith(said)
+    assert "\n" not in in_one_line(error)
+    assert len(in_one_line(ValueError("x" * 10_000))) < 600
