@@ -43,7 +43,7 @@ from surrogym_shared.spec import Design as DesignSettings
 
 if TYPE_CHECKING:
     from surrogym.design import Design, QueriesOpen, Query
-    from surrogym.environments import make, make_vec
+    from surrogym.environments import make, make_sb3, make_vec
     from surrogym_client.original.protocol import RealStep
     from surrogym_client.transport.api import Api as Client
 
@@ -77,6 +77,7 @@ __all__ = [
     "Term",
     "Uniform",
     "make",
+    "make_sb3",
     "make_vec",
 ]
 
@@ -85,6 +86,7 @@ _LAZY = {  # name: module, its name there, the extra that brings what the module
     "Query": ("surrogym.design", "Query", "server"),
     "QueriesOpen": ("surrogym.design", "QueriesOpen", "server"),
     "make": ("surrogym.environments", "make", ""),
+    "make_sb3": ("surrogym.environments", "make_sb3", ""),
     "make_vec": ("surrogym.environments", "make_vec", ""),
     "RealStep": ("surrogym_client.original.protocol", "RealStep", ""),
     "Client": ("surrogym_client.transport.api", "Api", ""),

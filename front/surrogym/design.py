@@ -19,17 +19,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from surrogym import checks
+from surrogym.files import existing
 from surrogym_client.original.protocol import RealStep
 from surrogym_server.convert import default_budget, definition_from_spec
-from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
-from surrogym_server.environment.actions import model_actions
+from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, judge_stored, run_design_job
 from surrogym_server.errors import InvalidInput
 from surrogym_server.local import LocalSurrogate
-from surrogym_server.services.definitions import check_coordinates
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
 
 Floats = NDArray[np.float64]
+LEAST_SAMPLES = 2  # that a model can be learned from
 Phase = Literal["collecting", "sampling", "ready", "over_budget"]
 
 
@@ -62,12 +63,13 @@ class Design:
 
     Args:
         spec: what is known of the real environment.
-        budget: real steps, at most; None takes that of the specification.
-        target: confidence index to reach for each output; None takes that of the specification.
+        budget: real steps, at most, 2 or more; None takes that of the specification.
+        target: confidence index to reach for each output, above 0.5 and below 1; None takes that of the specification.
         threads: of a fit.
 
     Raises:
-        InvalidInput: the budget is below 2, or the specification asks for something that is not installed.
+        InvalidInput: no specification, or another argument is out of its range; or the specification asks for something
+            that is not installed.
 
     Example:
         >>> design = Design(spec, budget=20)
@@ -80,16 +82,17 @@ class Design:
     def __init__(
         self, spec: EnvironmentSpec, *, budget: int | None = None, target: float | None = None, threads: int = 1
     ) -> None:
+        if not isinstance(spec, EnvironmentSpec):
+            raise InvalidInput(f"spec: expected an EnvironmentSpec, got {type(spec).__name__}")
         self.spec = spec
-        self.budget = default_budget(spec) if budget is None else budget
-        self.target = spec.design.target if target is None else target
-        if self.budget < 2:
-            raise InvalidInput(f"budget: expected at least 2 real steps, got {self.budget}")
+        self.budget = default_budget(spec) if budget is None else checks.whole("budget", budget, 2, checks.MOST_STEPS)
+        self.target = spec.design.target if target is None else checks.share("target", target)
+        self._threads = checks.whole("threads", threads, 1, checks.MOST_THREADS)
         self._definition = definition_from_spec(spec)
-        self._threads = threads
         self._ids = itertools.count(1)
         self._samples: list[RealStep] = []
         self._open: dict[int, Query] = {}
+        self._answered: list[Query] = []
         self._given_up: list[Query] = []
         self._extra = 0
         self._visited: Floats | None = None
@@ -119,11 +122,16 @@ class Design:
 
         Raises:
             QueriesOpen: the rest of this round was asked already, and is not answered.
-            InvalidInput: nothing can be fitted, since fewer than two samples were told.
-            NumericalFailure: a covariance can't be factored.
+            InvalidInput: nothing can be fitted, since fewer than two steps were told, and the other queries given up.
+            NumericalFailure, PluginFailed: the fit fails.
         """
         if not self._queue and self._open:
             raise QueriesOpen(sorted(self._open))
+        if not self._queue and len(self._samples) < LEAST_SAMPLES:
+            raise InvalidInput(
+                f"a model needs at least {LEAST_SAMPLES} samples, got {len(self._samples)}, and no query is left: "
+                "tell(None, steps) adds steps of your own"
+            )
         if not self._queue and (len(self._samples) + len(self._given_up) > self._settled or self._extra):
             self._fit()
         if not self._queue:
@@ -140,18 +148,17 @@ class Design:
             steps: what happened, with the coordinates and the action that were achieved.
 
         Raises:
-            InvalidInput: the query is not open; or a step has another shape, is not finite, or is out of bounds. Then
-                nothing is kept.
+            InvalidInput: the query is not open; or a step has another shape, is not finite, absurdly far from where the
+                environment is sampled, or its action out of bounds. Then nothing is kept.
         """
-        taken = [steps] if isinstance(steps, RealStep) else list(steps)
+        taken = checks.steps_of(steps)
         if query is not None:
             self._require_open(query)
         if not taken or (query is not None and len(taken) > len(query.actions)):
-            most = "any number" if query is None else len(query.actions)
-            raise InvalidInput(f"expected 1 to {most} steps, got {len(taken)}")
-        self._samples += [self._checked(step) for step in taken]
+            raise InvalidInput(f"expected {_count_of(query)}, got {len(taken)}")
+        self._samples += [checks.real_step(self._definition, step) for step in taken]
         if query is not None:
-            del self._open[query.id]
+            self._answered.append(self._open.pop(query.id))
 
     def give_up(self, query: Query) -> None:
         """Leave a query without an answer: it counts against the budget, and others like it are not asked.
@@ -167,35 +174,38 @@ class Design:
 
         Args:
             steps: how many.
-            visited: states that a policy visits, (v, C): queries are then chosen for where it goes.
+            visited: states that a policy visits, (v, C), at least one: queries are then chosen for where it goes.
 
         Raises:
-            InvalidInput: the budget has not as many left, or the states have another shape.
+            InvalidInput: the budget has not as many left, or the states have another shape or are not finite.
         """
         left = self.budget - self._spoken_for()
-        if not 1 <= steps <= left:
-            raise InvalidInput(f"steps: expected 1 to {left}, which is what the budget has left, got {steps}")
-        self._visited = None if visited is None else check_coordinates(self._definition, "visited", np.array(visited))
-        self._extra = steps
+        wanted = checks.whole("steps", steps, 1, left, why=", which is what the budget has left")
+        self._visited = None if visited is None else checks.states(self._definition, "visited", visited)
+        self._extra = wanted
 
     def surrogate(self) -> LocalSurrogate:
         """The model of the last fit, to be stepped in this process. Raises ``InvalidInput`` before the first fit."""
         return LocalSurrogate.from_bytes(self.spec, self._last().model)
 
     def save(self, path: str | Path, name: str = "surrogate") -> None:
-        """Write specification, model and samples into one file, which ``surrogym import`` gives to a server.
+        """Write specification, model and samples into one file, which ``surrogym import`` gives to a server, and from
+        which ``load`` goes on. The specification there has the budget, less what was given up, and the target.
 
         Raises:
             InvalidInput: there is no model yet.
             OSError: the file can't be written.
         """
-        arrays = self._arrays()
+        result, arrays = self._last(), self._arrays()
         samples = RealSamples(*arrays, truncated=np.array([step.truncated for step in self._samples], dtype=np.bool_))
-        Path(path).write_bytes(SurrogateFile(name, self.spec, self._last().model, samples).to_bytes())
+        tolerances = {output["name"]: output["tolerance"] for output in result.fidelity["outputs"]}
+        file = SurrogateFile(name, self._spec_to_save(), result.model, samples, tolerances)
+        Path(path).write_bytes(file.to_bytes())
 
     @classmethod
     def load(cls, path: str | Path, **options: Any) -> Self:
-        """A design with the samples that ``save`` or ``surrogym export`` wrote. The next ``ask`` fits them.
+        """A design that goes on from what ``save`` or ``surrogym export`` wrote: its model, its samples, how well the
+        model is known, and the phase that follows from that. It asks for no query where none is missing.
 
         Args:
             path: the file.
@@ -203,14 +213,42 @@ class Design:
 
         Raises:
             OSError, NotASurrogateFile: the file can't be read, or is none.
+            InvalidInput: its model is none of its specification, or an option is out of its range.
         """
-        file = SurrogateFile.load(path)
+        file = SurrogateFile.load(existing(path))
         design = cls(file.spec, **options)
         fields = (file.samples.coordinates, file.samples.action, file.samples.next_coordinates, file.samples.reward)
         rows = zip(*fields, file.samples.terminated, file.samples.truncated, strict=True)
-        design.tell(None, [RealStep(q, u, n, float(r), bool(e), bool(t)) for q, u, n, r, e, t in rows])
+        if len(file.samples):
+            design.tell(None, [RealStep(q, u, n, float(r), bool(e), bool(t)) for q, u, n, r, e, t in rows])
         design._queue.clear()
+        design._take_up(file)
         return design
+
+    def _take_up(self, file: SurrogateFile) -> None:
+        """Be where the round that made the file's model left off. Where samples have come since, or the budget or the
+        target asks for more, the next ``ask`` fits."""
+        known = [file.tolerances.get(output) for output in self._definition.outputs]
+        usual = [tolerance for tolerance in known if tolerance is not None]
+        if len(usual) == len(known):
+            self._state = self._state | {"usual": usual}
+        self._result = judge_stored(self._job(), file.model)
+        if self._result.verdict == "continue":
+            self._phase = "sampling"
+        else:
+            self._phase, self._settled = self._result.phase, len(self._samples)
+
+    def _spec_to_save(self) -> EnvironmentSpec:
+        budget = max(2, self.budget - sum(len(query.actions) for query in self._given_up))
+        initial = self.spec.design.initial
+        changed = {
+            "budget": budget,
+            "target": self.target,
+            "initial": None if initial is None else min(initial, budget),
+        }
+        if self.budget == default_budget(self.spec) and not self._given_up:
+            changed = {"target": self.target}
+        return self.spec.model_copy(update={"design": self.spec.design.model_copy(update=changed)})
 
     def _fit(self) -> None:
         threads = torch.get_num_threads()
@@ -263,18 +301,14 @@ class Design:
         asked += [((), tuple(map(tuple, actions.tolist()))) for actions in rollouts]
         return [Query(next(self._ids), purpose, coordinates, actions) for coordinates, actions in asked]
 
-    def _checked(self, step: RealStep) -> RealStep:
-        q = check_coordinates(self._definition, "coordinates", _row(step.coordinates))
-        q_next = check_coordinates(self._definition, "next_coordinates", _row(step.next_coordinates))
-        u = model_actions(self._definition.action, _row(step.action))
-        for what, values in (("coordinates", q), ("next_coordinates", q_next), ("reward", np.array(step.reward))):
-            if not np.isfinite(values).all():
-                raise InvalidInput(f"{what}: expected finite numbers, got {values.tolist()}")
-        return RealStep(q[0], u[0], q_next[0], float(step.reward), bool(step.terminated), bool(step.truncated))
-
     def _require_open(self, query: Query) -> None:
-        if query.id not in self._open:
-            raise InvalidInput(f"expected an open query, one of {sorted(self._open)}, got {query.id}")
+        if not isinstance(query, Query):
+            raise InvalidInput(f"expected a Query that was asked, got {type(query).__name__}")
+        if self._open.get(query.id) == query:
+            return
+        why = "was answered already" if query in self._answered else "is not one of this design's"
+        why = "was given up" if query in self._given_up else why
+        raise InvalidInput(f"expected an open query, got query {query.id}, which {why}")
 
     def _spoken_for(self) -> int:
         waiting = [*self._queue, *self._open.values(), *self._given_up]
@@ -286,5 +320,7 @@ class Design:
         return self._result
 
 
-def _row(values: Any) -> Floats:
-    return np.asarray(values, dtype=np.float64).reshape(1, -1)
+def _count_of(query: Query | None) -> str:
+    if query is None:
+        return "at least 1 step"
+    return "1 step" if len(query.actions) == 1 else f"1 to {len(query.actions)} steps"

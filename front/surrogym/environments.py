@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
 import surrogym_client  # noqa: F401  enters the environments into Gymnasium's registry
+from surrogym.files import SUFFIX, existing
 from surrogym_client.environments.env import RemoteEnv
+from surrogym_client.environments.file_factories import open_file
 from surrogym_client.environments.vector import RemoteVectorEnv
 from surrogym_client.registration import ENVIRONMENT_ID, FILE_ID
 from surrogym_shared.port import SurrogatePort
 
-SUFFIX = ".surrogate"
+if TYPE_CHECKING:
+    from surrogym_client.sb3 import SurrogateVecEnv
 
 
 def make(surrogate: Any, **options: Any) -> gymnasium.Env[Any, Any]:
@@ -28,6 +31,7 @@ def make(surrogate: Any, **options: Any) -> gymnasium.Env[Any, Any]:
     Raises:
         TypeError: none of these, or an unknown option.
         ImportError: a file or a design needs the extra ``server``.
+        OSError: the file can't be read, or is not there.
         SurrogymClientError: the server can't be reached or refuses.
 
     Example:
@@ -50,9 +54,25 @@ def make_vec(surrogate: Any, num_envs: int = 1, **options: Any) -> gymnasium.vec
     return RemoteVectorEnv(_port(surrogate), num_envs, **options)
 
 
+def make_sb3(surrogate: Any, num_envs: int = 16, **options: Any) -> SurrogateVecEnv:
+    """A vector environment of Stable-Baselines3 with ``num_envs`` lanes; arguments and errors as of ``make``, but that
+    ``options`` are those of ``SurrogateVecEnv``. It needs the extra ``train``.
+
+    Example:
+        >>> PPO("MlpPolicy", surrogym.make_sb3(design)).learn(100_000)
+    """
+    from surrogym_client.sb3 import SurrogateVecEnv
+
+    if not isinstance(surrogate, str | Path):
+        return SurrogateVecEnv.from_port(_port(surrogate), num_envs, **options)
+    if Path(surrogate).suffix == SUFFIX:
+        return SurrogateVecEnv.from_port(open_file(existing(surrogate)), num_envs, **options)
+    return SurrogateVecEnv(options.pop("url", None), str(surrogate), num_envs, **options)
+
+
 def _registered(surrogate: str | Path) -> dict[str, Any]:
     if Path(surrogate).suffix == SUFFIX:
-        return {"id": FILE_ID, "file": surrogate}
+        return {"id": FILE_ID, "file": existing(surrogate)}
     return {"id": ENVIRONMENT_ID, "surrogate": str(surrogate)}
 
 

@@ -99,8 +99,13 @@ def test_without_any_answer_nothing_can_be_fitted():
     for query in (design.ask(), design.ask()):
         assert query is not None
         design.give_up(query)
-    with pytest.raises(InvalidInput, match="a model needs at least 2 samples, got 0"):
-        design.ask()
+    for _ in range(2):
+        with pytest.raises(InvalidInput, match="a model needs at least 2 samples, got 0, and no query is left"):
+            design.ask()
+    steps = [surrogym.RealStep([0.1 * i, 0.0], [0.1], [0.1 * i, 0.1], -0.1 * i) for i in range(4)]
+    design.tell(None, steps)
+    assert design.ask() is None
+    assert design.phase == "over_budget"
 
 
 @pytest.mark.parametrize(
@@ -110,7 +115,21 @@ def test_without_any_answer_nothing_can_be_fitted():
         ({"next_coordinates": [0.0, 0.0, 0.0]}, r"next_coordinates: expected \(n, 2\)"),
         ({"next_coordinates": [0.0, np.nan]}, "next_coordinates: expected finite numbers"),
         ({"action": [9.0]}, "got 9"),
-        ({"reward": np.inf}, "reward: expected finite numbers"),
+        ({"reward": np.inf}, "reward: expected a finite number"),
+        ({"reward": "x"}, "reward: expected numbers, got 'x'"),
+        ({"reward": None}, "reward: expected numbers, got None"),
+        ({"reward": 1e300}, "reward: expected a finite number within 1e[+]12, got 1e[+]300"),
+        (
+            {"coordinates": [1e300, 0.0]},
+            "coordinates: expected '.*' within .*, which is far beyond its range, got 1e[+]300",
+        ),
+        ({"next_coordinates": [0.0, 1e9]}, "next_coordinates: expected '.*' within 1.6e[+]07, .*, got 1e[+]09"),
+        ({"coordinates": ["a", "b"]}, "coordinates: expected numbers, got"),
+        ({"coordinates": [1j, 0.0]}, "coordinates: expected numbers, got"),
+        ({"coordinates": None}, "coordinates: expected numbers, got None"),
+        ({"terminated": "no"}, "terminated: expected True or False, got 'no'"),
+        ({"terminated": None}, "terminated: expected True or False, got None"),
+        ({"truncated": 2}, "truncated: expected True or False, got 2"),
     ],
 )
 def test_a_step_that_can_not_be_is_refused_and_the_query_stays_open(change: dict[str, Any], said: str):
@@ -121,10 +140,91 @@ def test_a_step_that_can_not_be_is_refused_and_the_query_stays_open(change: dict
         design.tell(query, surrogym.RealStep(**step | change))
     assert design.steps == 0
     design.tell(query, surrogym.RealStep(**step))
-    with pytest.raises(InvalidInput, match="expected an open query"):
+    with pytest.raises(InvalidInput, match="expected an open query, got query 1, which was answered already"):
         design.tell(query, surrogym.RealStep(**step))
-    with pytest.raises(InvalidInput, match="expected 1 to 1 steps, got 0"):
-        design.tell(design.ask(), [])
+    second = design.ask()
+    with pytest.raises(InvalidInput, match="expected 1 step, got 0"):
+        design.tell(second, [])
+    with pytest.raises(InvalidInput, match=r"expected a RealStep, or a list of them, got 1"):
+        design.tell(second, (1, 2))
+    assert design.steps == 1
+
+
+def test_a_step_as_far_out_as_one_may_be_can_be_fitted():
+    """What can't be fitted is refused when it is told: no later ``ask`` could mend it."""
+    design, real = surrogym.Design(small()), GymnasiumEnvironment(small())
+    design.tell(None, surrogym.RealStep([0.0, 1.6e7], [0.0], [0.0, -1.6e7], 1e12))
+    while (query := design.ask()) is not None and query.purpose == "initial":
+        design.tell(query, real.step_from(np.array(query.coordinates), np.array(query.action)))
+    assert design.fidelity
+
+
+def test_a_query_of_another_design_is_refused():
+    design, other = surrogym.Design(small()), surrogym.Design(pendulum(), budget=20)
+    mine, theirs = design.ask(), other.ask()
+    assert mine is not None
+    assert theirs is not None
+    step = surrogym.RealStep(theirs.coordinates, theirs.action, [0.0, 0.0], 0.0)
+    for refused in (design.tell, lambda query, _: design.give_up(query)):
+        with pytest.raises(InvalidInput, match="got query 1, which is not one of this design's"):
+            refused(theirs, step)
+    with pytest.raises(InvalidInput, match="expected a Query that was asked, got str"):
+        design.tell("x", step)  # type: ignore[arg-type]
+    design.give_up(mine)
+    with pytest.raises(InvalidInput, match="got query 1, which was given up"):
+        design.tell(mine, step)
+    assert design.steps == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        *[
+            ({"budget": wrong}, "budget: expected a whole number from 2")
+            for wrong in (1, 2.5, "20", True, np.nan, np.inf)
+        ],
+        *[
+            ({"target": wrong}, "target: expected a number above 0.5")
+            for wrong in (np.nan, -1, 0.5, 1, 2, "x", None, True)
+        ],
+        *[({"threads": wrong}, "threads: expected a whole number from 1") for wrong in (0, 1.5, 10**9, "1")],
+    ],
+)
+def test_an_option_out_of_its_range_is_refused(options: dict[str, Any], said: str):
+    if options == {"target": None}:
+        assert surrogym.Design(small(), **options).target == small().design.target
+        return
+    with pytest.raises(InvalidInput, match=said):
+        surrogym.Design(small(), **options)
+
+
+def test_what_is_no_specification_is_refused():
+    with pytest.raises(InvalidInput, match="spec: expected an EnvironmentSpec, got dict"):
+        surrogym.Design({})  # type: ignore[arg-type]
+
+
+def test_numbers_of_numpy_are_numbers():
+    assert surrogym.Design(small(), budget=np.int64(6), target=np.float64(0.9)).budget == 6
+
+
+@pytest.mark.parametrize(
+    ("steps", "visited", "said"),
+    [
+        (1.5, None, "steps: expected a whole number from 1 to"),
+        (True, None, "steps: expected a whole number from 1 to"),
+        (np.nan, None, "steps: expected a whole number from 1 to"),
+        (1, [[np.nan, 0.0]], "visited: expected finite numbers"),
+        (1, np.zeros((0, 2)), "visited: expected at least one state, got none"),
+        (1, "x", "visited: expected numbers, got 'x'"),
+        (1, [[1e308, 0.0]], "visited: expected '.*' within"),
+    ],
+)
+def test_asking_for_more_in_a_way_that_can_not_be_changes_nothing(steps: Any, visited: Any, said: str):
+    design = surrogym.Design(pendulum(), budget=20)
+    before = (design._extra, design._visited)
+    with pytest.raises(InvalidInput, match=said):
+        design.improve(steps, visited)
+    assert (design._extra, design._visited) == before
 
 
 def test_more_can_be_asked_for_within_the_budget_where_a_policy_goes():
@@ -158,6 +258,58 @@ def test_it_is_saved_and_goes_on(done: surrogym.Design, tmp_path: Path):
     assert again.steps <= BUDGET + 2
 
 
+@pytest.mark.parametrize(
+    ("budget", "target", "phase"), [(30, None, "ready"), (INITIAL, None, "over_budget"), (30, 0.6, "ready")]
+)
+def test_a_design_that_has_ended_is_loaded_as_it_was(tmp_path: Path, budget: int, target: float | None, phase: str):
+    """Nothing is missing: no fit and no real step is needed to use its model, or to hear that it is known."""
+    design = surrogym.Design(small(budget=20), budget=budget, target=target)
+    run(design)
+    assert design.phase == phase
+    design.save(tmp_path / "it.surrogate", "it")
+    again = surrogym.Design.load(tmp_path / "it.surrogate")
+    assert (again.phase, again.steps, again.budget, again.target) == (phase, design.steps, budget, design.target)
+    assert again.fidelity == design.fidelity
+    assert surrogym.make(again).reset(seed=0)[0].shape == (3,)
+    assert again.ask() is None
+    assert again.phase == phase
+    again.save(tmp_path / "again.surrogate", "it")
+    assert (tmp_path / "again.surrogate").read_bytes() == (tmp_path / "it.surrogate").read_bytes()
+    if phase == "ready":
+        again.improve(1)
+        assert again.ask() is not None
+
+
+def test_a_design_that_was_under_way_is_loaded_and_asks_for_more(tmp_path: Path):
+    design, real = surrogym.Design(small(budget=20), target=0.99999), GymnasiumEnvironment(small())
+    while (query := design.ask()) is not None and query.purpose == "initial":
+        design.tell(query, real.step_from(np.array(query.coordinates), np.array(query.action)))
+    assert query is not None
+    design.give_up(query)
+    design.save(tmp_path / "it.surrogate", "it")
+    again = surrogym.Design.load(tmp_path / "it.surrogate")
+    assert (again.phase, again.steps, again.budget) == ("sampling", INITIAL, 19)
+    assert again.fidelity == design.fidelity
+    assert again.ask() is not None
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path):
+    for opened in (surrogym.make, surrogym.make_vec, surrogym.make_sb3, surrogym.Design.load):
+        with pytest.raises(
+            FileNotFoundError, match=r"expected a file that Design.save or surrogym export wrote, got no"
+        ):
+            opened(tmp_path / "nofile.surrogate")
+
+
+def test_a_policy_of_stable_baselines_trains_on_it(done: surrogym.Design, tmp_path: Path):
+    from stable_baselines3 import PPO
+
+    done.save(tmp_path / "it.surrogate", "it")
+    policy = PPO("MlpPolicy", surrogym.make_sb3(done, num_envs=4), n_steps=16, batch_size=64, n_epochs=1)
+    assert policy.learn(64).num_timesteps == 64
+    assert surrogym.make_sb3(tmp_path / "it.surrogate", 2, time_limit=5).reset().shape == (2, 3)
+
+
 def test_where_no_state_can_be_set_it_asks_for_rollouts():
     spec = cartpole().model_copy(update={"query": "rollout", "max_rollout": 10})
     spec = spec.model_copy(update={"design": spec.design.model_copy(update={"initial": 10})})
@@ -169,12 +321,13 @@ def test_where_no_state_can_be_set_it_asks_for_rollouts():
         surrogym.RealStep([0.1 * i, 0, 0, 0], action, [0.1 * (i + 1), 0, 0, 0], 1.0)
         for i, action in enumerate(query.actions)
     ]
-    with pytest.raises(InvalidInput, match=f"expected 1 to {len(steps)} steps, got {len(steps) + 1}"):
+    most = "1 step" if len(steps) == 1 else f"1 to {len(steps)} steps"
+    with pytest.raises(InvalidInput, match=f"expected {most}, got {len(steps) + 1}"):
         design.tell(query, [*steps, steps[0]])
     design.tell(query, steps[:1])
     assert design.steps == 1
 
 
 def test_a_budget_that_is_none_is_refused():
-    with pytest.raises(InvalidInput, match="budget: expected at least 2 real steps, got 1"):
+    with pytest.raises(InvalidInput, match="budget: expected a whole number from 2 to 100000, got 1"):
         surrogym.Design(pendulum(), budget=1)

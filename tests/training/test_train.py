@@ -3,6 +3,7 @@
 import itertools
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -405,3 +406,10 @@ def test_policies_are_compared_by_what_was_asked_for_and_not_by_what_they_learn_
     kept = PPO.load(result.path, device="cpu")
     assert imagined_return(surrogate, kept, asked) == pytest.approx(result.imagined_return)
     assert imagined_return(surrogate, kept, small(session=session)) < result.imagined_return, "a fourth cost more"
+
+
+@pytest.mark.parametrize("threads", [0, 10**9, 1.5, True])
+def test_as_many_threads_as_no_machine_has_are_refused(threads: Any):
+    """Torch would start them, and the process end."""
+    with pytest.raises(ValueError, match="threads: expected a whole number from 1 to 1024, got"):
+        TrainSettings(threads=threads)

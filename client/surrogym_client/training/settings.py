@@ -15,6 +15,8 @@ SUGGESTED_STEPS = 1_000_000  # virtual ones, the most that is suggested for all 
 DRAWS: dict[str, Any] = {"variant": "probabilistic", "particles": 1, "spread": 0.0}  # each step of a lane is a draw
 FUNCTIONS: dict[str, Any] = {"variant": "pathwise"}  # each episode follows one function
 
+MOST_THREADS = 1_024  # torch starts as many as it is told, and the process ends where the system has no more
+
 TENSORBOARD = "tensorboard"  # folder beside the policy
 
 Tracker = Literal["tensorboard", "wandb", "mlflow"]
@@ -25,7 +27,7 @@ class TrainSettings:
     """What to train. None takes what the specification suggests.
 
     ``session`` holds further fields of ``OpenSession`` (variant, particles, model, penalty, ...); ``hyperparameters``
-    go to the algorithm's constructor, over the defaults.
+    go to the algorithm's constructor, over the defaults. Raises ValueError for ``threads`` that no machine has.
     """
 
     algorithm: str = "PPO"  # name of a ``PolicySearch``, in any case
@@ -45,6 +47,10 @@ class TrainSettings:
     session: dict[str, Any] = field(default_factory=dict)
     judge: dict[str, Any] | None = None  # session fields by which policies are compared; None: those they learn in
     hyperparameters: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if type(self.threads) is not int or not 1 <= self.threads <= MOST_THREADS:
+            raise ValueError(f"threads: expected a whole number from 1 to {MOST_THREADS}, got {self.threads!r}")
 
     @property
     def judging(self) -> dict[str, Any]:

@@ -19,9 +19,18 @@ from surrogym_server.engine.fidelity import fidelity_fields
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.files import to_bytes
+from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.guard import asking
-from surrogym_server.sampling.design import Decision, DesignState, Request, advance, initial_design, initial_rollouts
+from surrogym_server.sampling.design import (
+    Decision,
+    DesignState,
+    Request,
+    advance,
+    initial_design,
+    initial_rollouts,
+    judge_model,
+    usual_tolerances,
+)
 
 Array = NDArray[np.float64]
 Verdict = Literal["continue", "ready", "over_budget"]
@@ -105,12 +114,38 @@ def run_design_job(job: DesignJob) -> DesignResult:
     )
 
 
-def _decide(job: DesignJob) -> tuple[Decision, Samples]:
-    samples = Samples(
-        *(torch.from_numpy(a) for a in (job.coordinates, job.action, job.next_coordinates, job.reward, job.terminated))
+def judge_stored(job: DesignJob, stored: bytes) -> DesignResult:
+    """What the round said that made a stored model of the job's samples, as far as model and samples tell: nothing is
+    fitted and nothing chosen. A model of other samples has the verdict ``continue``.
+
+    Raises:
+        InvalidInput: no model of the job's definition.
+    """
+    started = time.perf_counter()
+    model, samples = from_bytes(job.definition, stored), _samples(job)
+    usual = job.state.get("usual") or usual_tolerances(job.definition, model.scales.tolist())
+    judged = judge_model(model, samples, usual, _request(job), job.state.get("round", 0))
+    return DesignResult(
+        model=stored,
+        description=model.description,
+        fidelity=fidelity_fields(model, judged.confidences, judged.tolerances, job.target),
+        data_hash=model.digest,
+        state=job.state,
+        verdict=judged.verdict if model.digest == samples.digest else "continue",
+        seconds=time.perf_counter() - started,
     )
+
+
+def _decide(job: DesignJob) -> tuple[Decision, Samples]:
+    samples = _samples(job)
     decision = advance(job.definition, samples, DesignState.from_json(job.state), _request(job))
     return decision, samples
+
+
+def _samples(job: DesignJob) -> Samples:
+    return Samples(
+        *(torch.from_numpy(a) for a in (job.coordinates, job.action, job.next_coordinates, job.reward, job.terminated))
+    )
 
 
 def _request(job: DesignJob) -> Request:

@@ -105,18 +105,10 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     """
     learned = learn(definition, samples, state.warm)
     usual = state.usual or usual_tolerances(definition, sizes_of(definition, samples))
-    tolerances = definition.tolerances_over(usual)
-    points = Points(*monte_carlo(definition))
-    with asking(definition):
-        deviation = deviations(learned.model, points.q, points.u)
-        require_deviations(learned.model, deviation)
-        confidences = tuple(confidences_of(learned.model, deviation, tolerances))
-    rng = _rng(definition, f"visited {state.round}")
-    candidates = candidates_of(learned.model, points, request.states, rng)
-    reserved = ending(learned.model, samples, candidates.points)
-    settled = reserved is None or not definition.learns_termination
-    verdict = judge(definition, confidences, tolerances, len(samples), request, settled)
-    chosen, rollouts = points[:0], tuple[Tensor, ...]()
+    judged = judge_model(learned.model, samples, usual, request, state.round)
+    confidences, tolerances, verdict = judged.confidences, judged.tolerances, judged.verdict
+    candidates, reserved = judged.candidates, judged.reserved
+    chosen, rollouts = candidates.points[:0], tuple[Tensor, ...]()
     if definition.max_rollout is None:
         chosen = _choose(learned.model, samples, candidates, confidences, tolerances, verdict, request, reserved)
     else:
@@ -126,6 +118,35 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         verdict = "over_budget"  # the rest of the budget is pending, or nothing distinct is left to ask
     new_state = DesignState(state.round + 1, usual, learned.warm)
     return Decision(learned.model, confidences, tolerances, new_state, verdict, chosen.q, chosen.u, rollouts)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """How well a model is known, and what follows."""
+
+    confidences: tuple[OutputConfidence, ...]  # per output
+    tolerances: tuple[float, ...]  # per output
+    verdict: Verdict
+    candidates: Candidates  # m
+    reserved: Tensor | None  # (m,) bool: which of them are to be asked first; see ``endings``
+
+
+def judge_model(
+    model: DynamicsModel, samples: Samples, usual: Sequence[float], request: Request, round_: int
+) -> Judged:
+    """Judge a model by the ``usual`` tolerances (O,), over which those of its definition go. Raises PluginFailed."""
+    definition = model.definition
+    tolerances = definition.tolerances_over(usual)
+    points = Points(*monte_carlo(definition))
+    with asking(definition):
+        deviation = deviations(model, points.q, points.u)
+        require_deviations(model, deviation)
+        confidences = tuple(confidences_of(model, deviation, tolerances))
+    candidates = candidates_of(model, points, request.states, _rng(definition, f"visited {round_}"))
+    reserved = ending(model, samples, candidates.points)
+    settled = reserved is None or not definition.learns_termination
+    verdict = judge(definition, confidences, tolerances, len(samples), request, settled)
+    return Judged(confidences, tolerances, verdict, candidates, reserved)
 
 
 def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
