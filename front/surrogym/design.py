@@ -11,9 +11,10 @@ from __future__ import annotations
 import itertools
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Self
+from uuid import uuid4
 
 import numpy as np
 import torch
@@ -51,6 +52,7 @@ class Query:
     purpose: Literal["initial", "adaptive"]
     coordinates: tuple[float, ...]  # (C,); empty for a rollout
     actions: tuple[tuple[float, ...], ...]  # (T, F); T is 1 for a step
+    design: str = field(default="", repr=False)  # which one asked: equal specifications begin with equal queries
 
     @property
     def action(self) -> tuple[float, ...]:
@@ -89,6 +91,7 @@ class Design:
         self.target = spec.design.target if target is None else checks.share("target", target)
         self._threads = checks.whole("threads", threads, 1, checks.MOST_THREADS)
         self._definition = definition_from_spec(spec)
+        self._name = uuid4().hex
         self._ids = itertools.count(1)
         self._samples: list[RealStep] = []
         self._open: dict[int, Query] = {}
@@ -299,7 +302,7 @@ class Design:
             (tuple(row), (tuple(action),)) for row, action in zip(q.tolist(), u.tolist(), strict=True)
         ]
         asked += [((), tuple(map(tuple, actions.tolist()))) for actions in rollouts]
-        return [Query(next(self._ids), purpose, coordinates, actions) for coordinates, actions in asked]
+        return [Query(next(self._ids), purpose, at, actions, self._name) for at, actions in asked]
 
     def _require_open(self, query: Query) -> None:
         if not isinstance(query, Query):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -159,8 +161,10 @@ def test_a_step_as_far_out_as_one_may_be_can_be_fitted():
     assert design.fidelity
 
 
-def test_a_query_of_another_design_is_refused():
-    design, other = surrogym.Design(small()), surrogym.Design(pendulum(), budget=20)
+@pytest.mark.parametrize("spec", [small(), pendulum()])
+def test_a_query_of_another_design_is_refused(spec: surrogym.EnvironmentSpec):
+    """Also one that is equal: the other design's machine may be another, and its query would stay open."""
+    design, other = surrogym.Design(small()), surrogym.Design(spec)
     mine, theirs = design.ask(), other.ask()
     assert mine is not None
     assert theirs is not None
@@ -196,6 +200,16 @@ def test_an_option_out_of_its_range_is_refused(options: dict[str, Any], said: st
         return
     with pytest.raises(InvalidInput, match=said):
         surrogym.Design(small(), **options)
+
+
+def test_a_query_may_come_back_from_another_process():
+    design = surrogym.Design(small())
+    query = pickle.loads(pickle.dumps(design.ask()))
+    design.give_up(query)
+    copied = copy.deepcopy(design)
+    second = copied.ask()
+    assert second is not None
+    copied.give_up(second)
 
 
 def test_what_is_no_specification_is_refused():
