@@ -2,39 +2,105 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import shutil
+import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import httpx
 import pytest
 from typer.testing import CliRunner, Result
 
-from support.searched import with_path
+from support import pendulum
+from support.searched import searching, with_path, write_package
 from support.server import ServerProcess, running_server
-from support.teaching import teach
 from surrogym_client.cli import build
-from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
-from surrogym_shared.spec import AcquisitionChoice, Design
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
+from surrogym_server.engine.models import ModelCache
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.models.port import DynamicsModel
+from surrogym_server.services.definitions import Definitions
+from surrogym_server.services.designer import Designer
+from surrogym_server.services.metrics import ProcessMetrics
+from surrogym_server.services.models import load_model
+from surrogym_server.services.notices import Notices
+from surrogym_server.storage import records
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.sql import open_storage
+from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import NewSample
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "plugins.md"
-FOCUSED = AcquisitionChoice(name="focused_variance", settings={"coordinate": "speed"})
+EXAMPLES = Path(__file__).parents[2] / "examples" / "plugins"
+DESIGNS = {
+    "lin": {"model": {"name": "bayesian_linear"}},
+    "foc": {"acquisition": {"name": "focused_variance", "settings": {"coordinate": "theta"}}},
+}
+TARGET = 0.99999
 INSTALL = "which no installed package brings: install it on the server and restart"
 LIN = f"surrogate lin needs the model family 'bayesian_linear', {INSTALL}"
 FOC = f"surrogate foc needs the acquisition 'focused_variance', {INSTALL}"
 
 
+class Here:
+    """Fits in this process, which has the packages while it is ``searching``."""
+
+    async def run(self, job: DesignJob) -> DesignResult:
+        return run_design_job(job)
+
+
+def define(spec: dict[str, object]) -> EnvironmentDefinition:
+    return definition_from_spec(EnvironmentSpec.model_validate(spec))
+
+
+def teach(storage: Storage, name: str, spec: dict[str, object]) -> None:
+    """Register a surrogate, and answer its queries: a round is due."""
+    state, q, u, _ = initial_queries(define(spec), pendulum.INITIAL)
+    storage.surrogates.create(records.NewSurrogate(name, spec, pendulum.INITIAL, TARGET, state, q, u))
+    for query in storage.queries.claim(name, "tester", pendulum.INITIAL, 60):
+        step = pendulum.real_step(list(query.coordinates), list(query.action))
+        answer = records.NewSample(**step, query_id=query.id, lease_token=query.token)
+        storage.samples.add(name, "tester", [answer])
+
+
+def fit_all_due(storage: Storage) -> None:
+    """One round of each surrogate that is due."""
+    definitions = Definitions(storage, define)
+
+    def load(surrogate: int, version: int) -> DynamicsModel:
+        return load_model(storage, definitions, surrogate, version)
+
+    async def fit() -> None:
+        cache, notices, metrics = ModelCache(load, storage.models.newest), Notices(), ProcessMetrics()
+        options = {"owner": "here", "threads": 1, "look_seconds": 1.0, "fit_seconds": 60.0}
+        await Designer(storage, definitions, Here(), cache, notices, metrics, **options).fit_all_due()
+
+    asyncio.run(fit())
+
+
 @pytest.fixture(scope="module")
-def left(installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
-    """A server on the database of another one that had the packages: they are gone."""
+def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("packages")
+    for kind in ("acquisition", "model"):
+        write_package(EXAMPLES / kind, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def left(packages: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
+    """A server on a database of fits that had the packages: they are gone."""
     folder = tmp_path_factory.mktemp("left")
-    with running_server(folder, PYTHONPATH=with_path(installed)) as server, Api(server.url) as api:
-        small = Design(target=0.99999, model="bayesian_linear")
-        teach(api, "lin", pendulum().model_copy(update={"design": small}), queries=6)
-        teach(api, "foc", pendulum().model_copy(update={"design": Design(acquisition=FOCUSED)}), queries=6)
+    with searching(packages), closing(open_storage(f"sqlite:///{folder / 'surrogym.db'}")) as storage:
+        for name, design in DESIGNS.items():
+            spec = pendulum.spec(budget=pendulum.INITIAL, target=TARGET, **design)
+            teach(storage, name, EnvironmentSpec.model_validate(spec).model_dump(mode="json"))
+        fit_all_due(storage)
+        assert {name: storage.surrogates.get(name).error for name in DESIGNS} == dict.fromkeys(DESIGNS)
     with running_server(folder, PYTHONPATH=with_path(folder)) as server:
         yield server
 
@@ -106,7 +172,9 @@ def test_a_round_that_is_due_fails_and_says_what_to_do(
         step = {"coordinates": [1.0, 2.0], "action": [0.5], "next_coordinates": [1.1, 2.5], "reward": -1.0}
         api.add_samples(name, "tester", [NewSample.model_validate({**step, "terminated": False})])
         api.improve(name, 1)
-        api.claim(name, "tester", wait_seconds=30.0)
+        deadline = time.monotonic() + 60
+        while api.surrogate(name).phase != "failed" and time.monotonic() < deadline:
+            time.sleep(0.05)
     seen = surrogym("status", name).output
     assert f"{name}: Pendulum-v1, failed" in seen
     assert f"last error: {lacks}; then: surrogym change {name} --resume" in seen
@@ -127,13 +195,15 @@ def test_it_can_be_deleted(left: ServerProcess, surrogym: Callable[..., Result])
     assert httpx.get(f"{left.url}/v1/surrogates/lin", timeout=60).status_code == 404
 
 
-def test_installed_again_the_design_goes_on(left: ServerProcess, installed: Path, tmp_path: Path):
+def test_installed_again_the_design_goes_on(left: ServerProcess, packages: Path, tmp_path: Path):
     """The way out that the status names: install, restart, resume."""
     left.stop()
     shutil.copy(left.folder / "surrogym.db", tmp_path / "surrogym.db")
-    with running_server(tmp_path, PYTHONPATH=with_path(installed)) as server, Api(server.url) as api:
-        assert api.surrogate("foc").phase == "failed"
-        api.patch_surrogate("foc", paused=False)
-        claimed = api.claim("foc", "tester", wait_seconds=60.0)
-        assert claimed.phase != "failed"
-        assert api.surrogate("foc").error is None
+    with searching(packages), closing(open_storage(f"sqlite:///{tmp_path / 'surrogym.db'}")) as storage:
+        before = storage.surrogates.get("foc")
+        assert before.phase == "failed"
+        storage.surrogates.change("foc", paused=False)
+        fit_all_due(storage)
+        after = storage.surrogates.get("foc")
+        assert (after.round, after.error) == (before.round + 1, None)
+        assert after.phase != "failed"
