@@ -153,4 +153,8 @@ def _exit_when_closed(lifeline: Connection) -> None:
 
 
 def _warm() -> None:
+    import scipy.linalg.lapack
+    import scipy.optimize
+    import scipy.spatial.distance  # noqa: F401
+
     import surrogym_server.models.registry  # noqa: F401
