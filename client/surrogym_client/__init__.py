@@ -8,3 +8,10 @@ soon as it is. Most commands never load it. Gymnasium has looked for no plugins 
 from surrogym_client.runtime.after_import import after_import
 
 after_import("gymnasium", "surrogym_client.registration:register")
+
+
+def register() -> None:
+    """Enter the ids now, where importing this package did not: in a process that was forked or given a copy of it."""
+    from surrogym_client.registration import register as enter
+
+    enter()

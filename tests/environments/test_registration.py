@@ -7,6 +7,7 @@ from functools import partial
 import gymnasium
 import pytest
 
+import surrogym_client
 from surrogym_client.registration import ENVIRONMENT_ID, register
 
 
@@ -59,6 +60,7 @@ def test_without_a_surrogate_the_error_says_what_is_missing():
 def test_registering_twice_is_harmless():
     before = gymnasium.spec(ENVIRONMENT_ID)
     register()
+    surrogym_client.register()
     assert gymnasium.spec(ENVIRONMENT_ID) is before
 
 

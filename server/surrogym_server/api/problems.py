@@ -42,6 +42,7 @@ CODES: dict[type[errors.SurrogymError], Code] = {
     errors.Unavailable: Code.UNAVAILABLE,
     errors.NotInstalled: Code.NOT_INSTALLED,
     errors.PluginFailed: Code.INTERNAL,
+    errors.ChoiceFailed: Code.INTERNAL,
     errors.NumericalFailure: Code.INTERNAL,
 }
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,7 +11,7 @@ import typer
 from surrogym_client.cli.options import AsJson, Quiet, require_known
 
 if TYPE_CHECKING:
-    from surrogym_client.experiments.reproduce.cells import Progress
+    from surrogym_client.experiments.reproduce.cells import Cell, Progress
     from surrogym_client.experiments.reproduce.rows import Row
 
 
@@ -57,21 +57,14 @@ def command(
     """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.cli.reproduce.table import present
-    from surrogym_client.experiments.arms import ARMS
-    from surrogym_client.experiments.reproduce.cells import cells, done_already, run_cells, study
+    from surrogym_client.experiments.reproduce.cells import done_already, run_cells
     from surrogym_client.experiments.reproduce.rows import read_rows
-    from surrogym_client.experiments.tasks import TASKS
     from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_shared.terminal import on_interrupt, progress, say
 
-    named, numbers = _chosen("task", tasks, TASKS), range(first_seed, first_seed + seeds)
-    if algorithm is not None:
-        require_known(algorithm)
-    each: dict[str, Any] = {"shares": _shares(shares), "steps": steps, "episodes": episodes, "algorithm": algorithm}
-    if arms == STUDY:
-        wanted = list(study(named, numbers, **each))
-    else:
-        wanted = list(cells(named, _chosen("arm", arms, ARMS, STUDY), numbers, **each))
+    numbers = range(first_seed, first_seed + seeds)
+    chosen = {"shares": _shares(shares), "steps": steps, "episodes": episodes, "algorithm": algorithm}
+    wanted = _wanted(tasks, arms, numbers, chosen)
     rows = read_rows(out / "rows.csv")
     todo = wanted if again else [cell for cell in wanted if not done_already(cell, rows)]
     say(f"{len(wanted)} runs, {len(wanted) - len(todo)} of them done already", quiet=quiet)
@@ -87,6 +80,20 @@ def command(
     present(rows, out, as_json=as_json, quiet=quiet)
     if bad := [row for row in rows if row.error and row.key in {cell.key for cell in wanted}]:
         raise CommandError(f"{len(bad)} runs ended badly, the first with {bad[0].error}; logs: {out / 'logs'}")
+
+
+def _wanted(tasks: str, arms: str, seeds: Sequence[int], chosen: dict[str, Any]) -> list[Cell]:
+    """The runs of these tasks and arms."""
+    from surrogym_client.experiments.arms import ARMS
+    from surrogym_client.experiments.reproduce.cells import cells, study
+    from surrogym_client.experiments.tasks import TASKS
+
+    named = _chosen("task", tasks, TASKS)
+    if chosen["algorithm"] is not None:
+        require_known(chosen["algorithm"])
+    if arms == STUDY:
+        return list(study(named, seeds, **chosen))
+    return list(cells(named, _chosen("arm", arms, ARMS, STUDY), seeds, **chosen))
 
 
 def _chosen(what: str, given: str, known: Iterable[str], *words: str) -> list[str]:
