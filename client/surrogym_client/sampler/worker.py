@@ -29,6 +29,7 @@ from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, StepQu
 PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)  # with a server or a storage that is away
 LOOK_SECONDS = 0.1  # how often a worker that waits looks whether it was stopped
 LAST_SECONDS = 5.0  # a sampler that was stopped asks on for so long, with a real step that is not handed in yet
+END_SECONDS = 2.0  # at most, until a worker that waits for the end of a design sees one that came before it asked
 AGAIN_SECONDS = 1.0  # until the next claim, after one in which no query could be begun
 STOPPED = "the sampler was stopped"
 
@@ -173,7 +174,7 @@ class Sampler:
         """Queries, and when they were asked for by the leases' clock."""
         s, since = self._settings, self._leases.clock()
         waits = not (s.until_done and (self._phase is None or self._phase in ENDED))
-        left = self._within_time(s.wait_seconds)
+        left = self._within_time(min(s.wait_seconds, END_SECONDS) if s.until_done else s.wait_seconds)
         claimed = self._api.claim(
             self._surrogate,
             s.name,

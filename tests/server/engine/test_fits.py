@@ -55,29 +55,29 @@ def test_it_yields_to_whoever_steps(started: Started):
     assert os.getpriority(os.PRIO_PROCESS, process) == min(mine + NICENESS, 19)
 
 
-@pytest.mark.parametrize(
-    ("raised", "said"),
-    [
-        ("ValueError", "ValueError: no such luck"),
-        ("SystemExit", "SystemExit: 3"),
-        ("KeyboardInterrupt", "KeyboardInterrupt"),
-        ("CancelledError", "CancelledError"),
-        ("TwoArguments", "TwoArguments: x: boom"),
-        ("Unspeakable", "Unspeakable"),
-        ("InvalidInput", "on purpose"),
-        ("ChoiceFailed", "on purpose too"),
-    ],
-)
-def test_what_a_job_raises_comes_here_as_words_and_ends_nothing(started: Started, raised: str, said: str):
-    """Not as the exception: one could end who receives it, and another can't be sent."""
+RAISED = {
+    "ValueError": "ValueError: no such luck",
+    "SystemExit": "SystemExit: 3",
+    "KeyboardInterrupt": "KeyboardInterrupt",
+    "CancelledError": "CancelledError",
+    "TwoArguments": "TwoArguments: x: boom",
+    "Unspeakable": "Unspeakable",
+    "InvalidInput": "on purpose",
+    "ChoiceFailed": "on purpose too",
+}
+
+
+def test_what_a_job_raises_comes_here_as_words_and_ends_nothing(started: Started):
+    """Not as the exception: one could end who receives it, and another can't be sent. One process does all."""
     fits = started(jobs.refuse)
     process = run(fits, answer=True).data_hash
-    with pytest.raises(PluginFailed) as caught:
-        run(fits, raised=raised)
-    assert str(caught.value) == said
-    assert isinstance(caught.value, ChoiceFailed) == (raised == "ChoiceFailed"), "it does not say that the fit failed"
-    assert hasattr(caught.value, "__notes__") == (not said.startswith("on purpose")), "the traceback, for the log"
-    assert run(fits, answer=True).data_hash == process
+    for raised, said in RAISED.items():
+        with pytest.raises(PluginFailed) as caught:
+            run(fits, raised=raised)
+        assert str(caught.value) == said
+        assert isinstance(caught.value, ChoiceFailed) == (raised == "ChoiceFailed"), "which of the two failed"
+        assert hasattr(caught.value, "__notes__") == (not said.startswith("on purpose")), "the traceback, for the log"
+        assert run(fits, answer=True).data_hash == process
 
 
 def test_a_job_that_is_cancelled_is_ended_and_others_do_not_wait_for_it(started: Started, tmp_path: Path):
