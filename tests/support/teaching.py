@@ -7,11 +7,10 @@ import time
 import numpy as np
 
 from surrogym_client.original.gymnasium import GymnasiumEnvironment
+from surrogym_client.surrogates.phases import COMPLETED
 from surrogym_client.transport import Api
 from surrogym_shared import wire
 from surrogym_shared.spec import EnvironmentSpec
-
-FINISHED = ("ready", "over_budget")
 
 
 def teach(
@@ -23,7 +22,7 @@ def teach(
     original, deadline = GymnasiumEnvironment(spec), time.monotonic() + seconds
     while time.monotonic() < deadline:
         claimed = api.claim(name, "teacher", max_queries=queries, wait_seconds=1.0)
-        if claimed.phase in FINISHED:
+        if claimed.phase in COMPLETED:
             return api.surrogate(name)
         if claimed.phase == "failed":
             raise AssertionError(f"the design of {name} failed: {api.surrogate(name).error}")

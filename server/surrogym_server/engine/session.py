@@ -17,7 +17,7 @@ from surrogym_server.engine.occupancy import Reservoir
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import IdempotencyConflict, InvalidInput, SeqConflict
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.virtual import LaneState, Transition, VirtualSettings, create, reset, step
+from surrogym_server.virtual import LaneState, LaneTransition, VirtualSettings, create, reset, step
 from surrogym_shared.port import ResetResult, StepResult, quick
 
 Bools = NDArray[np.bool_]
@@ -182,7 +182,7 @@ def step_session(
 
 def _step_versions(
     session: Session, action: Floats, mask: Bools | None, deviations: bool, model_of: ModelOf
-) -> tuple[LaneState, Transition]:
+) -> tuple[LaneState, LaneTransition]:
     first = session.versions[0]
     if (session.versions == first).all():
         return step(model_of(int(first)), session.settings, session.lanes, action, mask, deviations)
@@ -202,7 +202,7 @@ def _step_versions(
     return lanes, _join(parts)
 
 
-def _join(parts: Sequence[tuple[NDArray[np.intp], Transition]]) -> Transition:
+def _join(parts: Sequence[tuple[NDArray[np.intp], LaneTransition]]) -> LaneTransition:
     """One transition of all lanes from those of disjoint groups, each with its lane numbers."""
     order = np.argsort(np.concatenate([index for index, _ in parts]))
 
@@ -215,7 +215,7 @@ def _join(parts: Sequence[tuple[NDArray[np.intp], Transition]]) -> Transition:
     final_order = np.argsort(final_lanes)
     deviation = [t.deviation for t in transitions if t.deviation is not None]
     untrusted = [t.untrusted for t in transitions if t.untrusted is not None]
-    return Transition(
+    return LaneTransition(
         observation=lanewise([t.observation for t in transitions]),
         reward=lanewise([t.reward for t in transitions]),
         terminated=lanewise([t.terminated for t in transitions]),
@@ -229,7 +229,7 @@ def _join(parts: Sequence[tuple[NDArray[np.intp], Transition]]) -> Transition:
     )
 
 
-def _result(transition: Transition, versions: Versions) -> StepResult:
+def _result(transition: LaneTransition, versions: Versions) -> StepResult:
     return quick(
         StepResult,
         observation=transition.observation,

@@ -1,6 +1,6 @@
 """The virtual environment: N lanes at once, frozen state in, new state out; noise is a pure function of its key."""
 
-from surrogym_server.virtual.environment import Transition, VirtualSettings, create, expected_bytes, reset, step
+from surrogym_server.virtual.environment import LaneTransition, VirtualSettings, create, expected_bytes, reset, step
 from surrogym_server.virtual.lanes import LaneState
 
-__all__ = ["LaneState", "Transition", "VirtualSettings", "create", "expected_bytes", "reset", "step"]
+__all__ = ["LaneState", "LaneTransition", "VirtualSettings", "create", "expected_bytes", "reset", "step"]

@@ -44,7 +44,7 @@ class VirtualSettings:
 
 
 @dataclass(frozen=True)
-class Transition:
+class LaneTransition:
     """What one step of N lanes gives, as numpy. Lanes outside the mask have reward 0 and no flags."""
 
     observation: Floats  # (N, D) float32
@@ -114,7 +114,7 @@ def step(
     u: Floats,
     mask: Bools | None = None,
     deviations: bool = False,
-) -> tuple[LaneState, Transition]:
+) -> tuple[LaneState, LaneTransition]:
     """Step all lanes, or those of the mask (N,), under u (N, F), the model's actions.
 
     Raises:
@@ -143,7 +143,7 @@ def step(
         after = _begin(definition, settings, after, beginning)
     reward = _array(_scatter(moving, moved.reward))
     penalised = moved.reward is not moved.reward_mean
-    return after, Transition(
+    return after, LaneTransition(
         observation=_observe(definition, after),
         reward=reward,
         terminated=_array(terminated),

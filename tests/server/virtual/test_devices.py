@@ -17,7 +17,7 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.gp import serving
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.tensors import CPU, to_device
-from surrogym_server.virtual import LaneState, Transition, VirtualSettings, create, environment, reset, step
+from surrogym_server.virtual import LaneState, LaneTransition, VirtualSettings, create, environment, reset, step
 
 LANES, STEPS = 6, 4
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -38,7 +38,7 @@ def model(request: pytest.FixtureRequest) -> GaussianProcessModel:
     return learn(definition_from_spec(spec), random_steps(spec, 14, seed=0)).model
 
 
-def run(model: GaussianProcessModel, settings: VirtualSettings) -> tuple[LaneState, list[Transition]]:
+def run(model: GaussianProcessModel, settings: VirtualSettings) -> tuple[LaneState, list[LaneTransition]]:
     """Some steps from a seeded reset, some lanes of which are reset again."""
     definition, rng = model.definition, np.random.default_rng(0)
     low, high = definition.action.limits if definition.action.low else (0, np.array(definition.action.nvec) - 1)
@@ -57,7 +57,7 @@ def test_steps_agree_with_those_on_the_cpu(model, variant, device):
     here, there = run(model, settings), run(model.on(device), settings)
     assert {getattr(there[0], field.name).device.type for field in fields(LaneState)} == {device.type}
     for ours, theirs in zip(here[1], there[1], strict=True):
-        for field in fields(Transition):
+        for field in fields(LaneTransition):
             if (expected := getattr(ours, field.name)) is not None:
                 np.testing.assert_allclose(getattr(theirs, field.name), expected, rtol=1e-6, atol=1e-6)
 
