@@ -157,9 +157,8 @@ def test_a_network_that_is_given_up_is_followed_by_stable_baselines3(tmp_path: P
     """Steps of both together stay within what was asked for, and the policy is the reference's."""
 
     class Strict(Verdicts):
-        def judge(self) -> bool:
+        def judge(self) -> None:
             self.given_up = self.own_steps >= 512
-            return self.given_up
 
     monkeypatch.setattr(searches, "Verdicts", Strict)
     seen: list[int] = []
@@ -184,7 +183,10 @@ def test_ctrl_c_keeps_the_best_policy_so_far(surrogate, tmp_path: Path):
     load_policy(interruption.value.result.path)
 
 
-@pytest.mark.parametrize(("name", "value"), [("n_steps", 0), ("clip_range", -1.0), ("gamma", 2.0), ("n_epochs", "x")])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("n_steps", 0), ("n_steps", 2.5), ("n_steps", True), ("clip_range", -1.0), ("gamma", 2.0), ("n_epochs", "x")],
+)
 def test_impossible_settings_are_refused(name: str, value: object):
     with pytest.raises(ValueError, match=f"{name}: expected .* got {value!r}"):
         search_for(TrainSettings(algorithm="fastppo", hyperparameters={name: value}))

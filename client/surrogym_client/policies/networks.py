@@ -17,14 +17,19 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 
-from surrogym_client.policies.schedule import decaying
+from surrogym_client.policies.defaults import CRITIC, EXPLORATION, HIDDEN, decaying
+from surrogym_client.policies.defaults import WIDER as WIDER_ACTOR
 
-HIDDEN = 32
-CRITIC = (64, 64)
-WIDER = {"pi": [64, 64], "vf": list(CRITIC)}  # in place of the paper's, which lies 20 below it on Pendulum
-EXPLORATION = 0.5  # first deviation of a continuous action, as a share of half its range
+WIDER = {"pi": list(WIDER_ACTOR), "vf": list(CRITIC)}
 
-__all__ = ["WIDER", "Bounded", "PaperPolicy", "Standardise", "decaying"]  # files name ``decaying`` as of this module
+__all__ = [
+    "HIDDEN",
+    "WIDER",
+    "Bounded",
+    "PaperPolicy",
+    "Standardise",
+    "decaying",
+]  # files name ``decaying`` as of this module
 
 
 class Standardise(BaseFeaturesExtractor):

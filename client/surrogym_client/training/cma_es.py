@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from surrogym_client.evaluation.imagined import (
     Imagined,
     imagine,
-    imagined_returns,
     observation_statistics,
 )
 from surrogym_client.original.protocol import LONGEST_EPISODE
 from surrogym_client.training.search import Found, PolicySearch, SearchTask
-from surrogym_client.training.settings import CHECK_EPISODES, CHECKS, TrainProgress, TrainSettings
+from surrogym_client.training.settings import CHECKS, TrainProgress, TrainSettings
+from surrogym_client.training.verdicts import checked
 from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
 
@@ -127,9 +127,7 @@ class _Distribution:
 
     def imagined(self) -> float:
         """Imagined return of the mean."""
-        settings = self._settings
-        returns = imagined_returns(self._port, self.policy, CHECK_EPISODES, settings.seed, **settings.judging)
-        return float(returns.mean())
+        return checked(self._port, self.policy, self._settings)
 
     def _network(self, vector: NDArray[np.float64]) -> Network:
         return Network.of(self._spec, self._mean, self._deviation, self.choices.units, vector)

@@ -53,6 +53,11 @@ class TrainSettings:
             raise ValueError(f"threads: expected a whole number from 1 to {MOST_THREADS}, got {self.threads!r}")
 
     @property
+    def learning(self) -> dict[str, Any]:
+        """Session fields of the lanes that a policy learns in."""
+        return {"seed": self.seed, "start_box": self.start_box, **self.session}
+
+    @property
     def judging(self) -> dict[str, Any]:
         return self.session if self.judge is None else self.judge
 

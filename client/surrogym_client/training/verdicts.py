@@ -5,7 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from surrogym_client.training.settings import CHECKS
+from surrogym_client.evaluation.imagined import imagined_returns
+from surrogym_client.policies.predict import Predict
+from surrogym_client.training.settings import CHECK_EPISODES, CHECKS, TrainSettings
+from surrogym_shared.port import SurrogatePort
 
 PATIENCE = 0.25  # of the steps, in which a network has to learn something
 PROOF = 0.5  # of the steps, in which it has to earn half of what the saved policy earns beyond that
@@ -101,7 +104,7 @@ class Verdicts:
         return self.steps * CHECKS >= (self._checked + 1) * self._planned
 
     def check(self, imagined: float) -> bool:
-        """A check measured the policy as it is; whether that is the best so far. May give up the network."""
+        """A check measured the policy as it is; whether that is the best so far."""
         self._checked = int(self.steps * CHECKS / self._planned)
         self.latest = imagined
         best = self.best is None or imagined >= self.best
@@ -109,14 +112,13 @@ class Verdicts:
         self._bests.append((self.steps, self.best))
         return best
 
-    def judge(self) -> bool:
-        """Whether this network is given up."""
+    def judge(self) -> None:
+        """Give this network up, or not."""
         assert self.best is not None
         tried = self._rollouts >= PATIENT_ROLLOUTS and self._now >= PATIENCE * self._planned
         bar = self._half_way if self._now >= PROOF * self._planned else self._nothing
         left = self._planned - self.steps >= PATIENCE * self._planned
         self.given_up = tried and self.best <= max(bar, self._nothing) and left
-        return self.given_up
 
     def knows(self, imagined: float) -> tuple[bool, bool]:
         """A policy from before earns so much: whether it is the best so far, and whether it learned anything."""
@@ -129,3 +131,8 @@ class Verdicts:
     def _nothing(self) -> float:
         """The imagined return up to which nothing was learned."""
         return self.floor + LEARNED * (self._seen - self.floor)
+
+
+def checked(port: SurrogatePort, predict: Predict, settings: TrainSettings) -> float:
+    """The mean imagined return of a policy as it is now, on the same starts at every check."""
+    return float(imagined_returns(port, predict, CHECK_EPISODES, settings.seed, **settings.judging).mean())

@@ -8,9 +8,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_client.policies.defaults import EXPLORATION
 from surrogym_shared.network import Activation
 
-EXPLORATION = 0.5  # first deviation of a continuous action, as a share of half its range
 HALF_LOG_TAU = 0.5 * float(np.log(2 * np.pi))
 
 Array = NDArray[np.floating[Any]]  # float32 in a training

@@ -21,14 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.policies.card import UnusablePolicy
+from surrogym_client.policies.defaults import CRITIC
 from surrogym_client.policies.predict import Predict
 from surrogym_client.training.fast_ppo.actions import distribution_of
-from surrogym_client.training.fast_ppo.mlp import Array, Mlp, layers_of, orthogonal
+from surrogym_client.training.fast_ppo.mlp import Array, Mlp, orthogonal
 from surrogym_shared.archives import Header, read_arrays, read_entries
 from surrogym_shared.network import MAX_BYTES, Layer, Network, bounds_of, counts_of
 from surrogym_shared.spec import EnvironmentSpec
 
-CRITIC = (64, 64)
 HIDDEN_GAIN, ACTION_GAIN, VALUE_GAIN = 2**0.5, 0.01, 1.0
 FIRST_DECAY, SECOND_DECAY, EPSILON = 0.9, 0.999, 1e-5  # of Adam
 LEARNER = "learner.npz"  # entry of a policy's file, for those who go on from it
@@ -64,7 +64,7 @@ class Learner:
         units: tuple[int, ...],
         rng: np.random.Generator,
     ) -> None:
-        self._spec, self._units = spec, units
+        self._spec = spec
         self.mean, self.deviation = mean.astype(np.float32), deviation.astype(np.float32)
         self.distribution = distribution_of(counts_of(spec), *bounds_of(spec))
         inputs, further = len(spec.observation), self.distribution.further()
@@ -74,16 +74,13 @@ class Learner:
         self._gradient = np.zeros_like(self.parameters)
         self._first, self._second = np.zeros_like(self.parameters), np.zeros_like(self.parameters)
         self._updates = 0
-        spans = [slice(0, ends[0]), slice(ends[0], ends[1])]
-        self.actor, self.critic = (
-            Mlp(sizes, activation, self.parameters[span], self._gradient[span])
-            for sizes, activation, span in zip((actor, critic), (self.distribution.activation,) * 2, spans, strict=True)
-        )
+        activation, first, second = self.distribution.activation, slice(0, ends[0]), slice(ends[0], ends[1])
+        self.actor = Mlp(actor, activation, self.parameters[first], self._gradient[first])
+        self.critic = Mlp(critic, activation, self.parameters[second], self._gradient[second])
         self.further, self._further_gradient = self.parameters[ends[1] :], self._gradient[ends[1] :]
         self.further[:] = further
         _initialise(self.actor, ACTION_GAIN, rng)
         _initialise(self.critic, VALUE_GAIN, rng)
-        self._actor_sizes = actor
 
     def standardised(self, observation: NDArray[Any]) -> Array:
         x: Array = ((observation - self.mean) / self.deviation).astype(np.float32, copy=False)
@@ -133,7 +130,7 @@ class Learner:
 
     def policy(self) -> Network:
         """The actor's most probable actions as they are now."""
-        layers = layers_of(self._actor_sizes, self.parameters[: Mlp.count(self._actor_sizes)].copy())
+        layers = self.actor.layers
         return Network(
             self.mean.astype(np.float64),
             self.deviation.astype(np.float64),
@@ -144,10 +141,9 @@ class Learner:
         )
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Everything that learning goes on from."""
+        """What a later training needs beside the policy: all parameters, and the moments of Adam."""
         vectors = zip(VECTORS, (self.parameters, self._first, self._second), strict=True)
-        further = {"further": self.further.copy(), "updates": np.array(self._updates)}
-        return further | {name: vector.copy() for name, vector in vectors}
+        return {"updates": np.array(self._updates), **{name: vector.copy() for name, vector in vectors}}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Go back to what ``state`` gave."""
@@ -157,7 +153,7 @@ class Learner:
 
     def require(self, headers: Mapping[str, Header]) -> None:
         """Raise ValueError unless these are the arrays of a state of this network."""
-        shapes = {**dict.fromkeys(VECTORS, self.parameters.shape), "further": self.further.shape, "updates": ()}
+        shapes = {**dict.fromkeys(VECTORS, self.parameters.shape), "updates": ()}
         found = {name: header.shape for name, header in headers.items()}
         if found != shapes:
             raise ValueError(f"expected a network of {self.parameters.size} parameters, got arrays of shapes {found}")
@@ -165,7 +161,7 @@ class Learner:
 
 @dataclass(frozen=True)
 class LearnedNetwork:
-    """A policy with all that learning goes on from."""
+    """A policy, and the state of its learner."""
 
     policy: Network
     state: Mapping[str, NDArray[Any]]
@@ -196,10 +192,16 @@ def noisy(path: Path) -> Predict:
     """A saved policy that acts with its noise, the same each time it is read. Raises as ``restored``."""
     policy = _policy(path)
     distribution = distribution_of(policy.counts, policy.low, policy.high)
-    further, rng = _state(path, lambda _: None)["further"], np.random.default_rng(0)
+    parameters, rng = _state(path, _require_parameters)["parameters"], np.random.default_rng(0)
+    further = parameters[len(parameters) - len(distribution.further()) :]
     return lambda observation: distribution.sent(
         distribution.sample(policy.outputs(observation).astype(np.float32), further, rng)[0]
     )
+
+
+def _require_parameters(headers: Mapping[str, Header]) -> None:
+    if "parameters" not in headers or len(headers["parameters"].shape) != 1:
+        raise ValueError("expected a vector of parameters")
 
 
 def _policy(path: Path) -> Network:

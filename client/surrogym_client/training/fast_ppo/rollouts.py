@@ -55,7 +55,7 @@ class Collector:
         return float(np.mean(self._penalties)) if self._penalties else None
 
     def collect(self, learner: Learner, steps: int) -> Rollout:
-        """Let the policy act with its noise for so many steps of every lane."""
+        """Take ``steps`` steps with every lane; the policy acts with its noise."""
         n = self._lanes.num_envs
         observations, actions, logs = [], [], []
         rewards, ended = np.empty((steps, n), dtype=np.float32), np.empty((steps, n), dtype=bool)
@@ -73,14 +73,14 @@ class Collector:
             result = step.result
             ended[t] = result.terminated | result.truncated
             rewards[t] = self._scale(result.reward, ended[t])
+            penalty = result.reward_mean - result.reward
+            self._earned += result.reward
+            self._penalty += penalty
             if ended[t].any():
                 cut.append((t, *_truncated(step)))
-                earned += self._episodes(step, ended[t])
-            else:
-                self._earned += result.reward
-                self._penalty += result.reward_mean - result.reward
+                earned += self._end(ended[t], step.cut)
             size += float(np.abs(result.reward_mean).sum())
-            taken += float(np.abs(result.reward_mean - result.reward).sum())
+            taken += float(np.abs(penalty).sum())
             lost += int(step.cut.sum())
             self._observation = result.observation
         seen = np.concatenate(observations)
@@ -99,12 +99,9 @@ class Collector:
             lost,
         )
 
-    def _episodes(self, step: LaneStep, ended: NDArray[np.bool_]) -> list[float]:
-        """Count a step in which episodes ended; what these earned, but for those that were lost."""
-        result = step.result
-        self._earned += result.reward
-        self._penalty += result.reward_mean - result.reward
-        earned: list[float] = self._earned[ended & ~step.cut].tolist()
+    def _end(self, ended: NDArray[np.bool_], lost: NDArray[np.bool_]) -> list[float]:
+        """End the episodes of these lanes (N,); what they earned, but for those that were lost."""
+        earned: list[float] = self._earned[ended & ~lost].tolist()
         if self._lanes.view.penalty > 0:
             self._penalties.extend(self._penalty[ended].tolist())
         self._earned[ended] = 0.0

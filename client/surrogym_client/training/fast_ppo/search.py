@@ -6,26 +6,29 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from surrogym_client.environments.lanes import Lanes, session_request
-from surrogym_client.evaluation.imagined import imagined_returns, observation_statistics
+from surrogym_client.evaluation.imagined import observation_statistics
+from surrogym_client.policies.defaults import ATTEMPT_SEED, HIDDEN, LANES, WIDER, decaying
 from surrogym_client.policies.predict import Predict
-from surrogym_client.policies.schedule import decaying
 from surrogym_client.training.fast_ppo.learner import Batch, LearnedNetwork, Learner, Objective, noisy, restored
 from surrogym_client.training.fast_ppo.rollouts import Collector, Rollout
 from surrogym_client.training.proportions import even_batch, suggested_gamma
 from surrogym_client.training.search import SEARCHES, Found, PolicySearch, SearchTask
-from surrogym_client.training.settings import CHECK_EPISODES, TrainProgress
-from surrogym_client.training.verdicts import Verdicts
+from surrogym_client.training.settings import TrainProgress
+from surrogym_client.training.verdicts import Verdicts, checked
 from surrogym_shared.network import Network
-from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_shared.spec import EnvironmentSpec
+
+if TYPE_CHECKING:
+    from surrogym_client.training.stable_baselines.search import StableBaselinesSearch
 
 REFERENCE = "PPO"  # of Stable-Baselines3
-RANGES = {
+RANGES = {  # whole numbers have whole bounds
     "n_steps": (1, 100_000),
     "n_epochs": (1, 1_000),
     "batch_size": (1, 10_000_000),
@@ -36,7 +39,6 @@ RANGES = {
     "vf_coef": (0.0, 100.0),
     "max_grad_norm": (0.0, 1e6),
 }
-ANOTHER = 1_000_003  # between the seeds of one training's networks
 
 
 @dataclass(frozen=True)
@@ -64,13 +66,13 @@ class FastPpo(PolicySearch):
     def __post_init__(self) -> None:
         for name, (low, high) in RANGES.items():
             value = getattr(self, name)
-            if value is not None and not (isinstance(value, int | float) and low <= value <= high):
+            if value is not None and not (type(value) in (int, type(low)) and low <= value <= high):
                 raise ValueError(f"{name}: expected {low} to {high}, got {value!r}")
 
     def search(self, task: SearchTask) -> Found:
         start = task.settings.start_from
         if start is not None and not Network.is_at(start):
-            return _reference().search(task)  # a policy of Stable-Baselines3 goes on there
+            return _reference().search(task)  # only Stable-Baselines3 can train its own policies further
         with threadpool_limits(limits=task.settings.threads), _lanes(task) as lanes:
             return _Training(self, task, lanes).run()
 
@@ -133,7 +135,7 @@ class _Training:
                 yield self._new
 
     def _learn(self, learner: Learner, steps: int) -> None:
-        """Take so many steps with one network, or fewer if it is given up."""
+        """Train one network for ``steps`` virtual steps. It stops early where the network is given up."""
         verdicts, search = self._verdicts, self._search
         verdicts.begin()
         before = verdicts.own_steps
@@ -179,10 +181,7 @@ class _Training:
             self._kept = _saved(learner)
 
     def _imagined(self, learner: Learner) -> float:
-        settings = self._task.settings
-        policy = learner.policy()
-        returns = imagined_returns(self._task.port, policy, CHECK_EPISODES, settings.seed, **settings.judging)
-        return float(returns.mean())
+        return checked(self._task.port, learner.policy(), self._task.settings)
 
     def _found(self, policy: LearnedNetwork, *, whole: bool) -> Found:
         verdicts = self._verdicts
@@ -204,41 +203,39 @@ class _Training:
         """What ``PPO`` of Stable-Baselines3 finds in the steps that are left, or what is kept where that earns more."""
         verdicts, task = self._verdicts, self._task
         spent, left = verdicts.steps, max(verdicts.left, 1)
-        by_state = isinstance(self._spec.action, BoxAction) and not self._spec.action.bins
-        chosen = {"use_sde": True} if by_state and self._spec.design.preset != "paper" else {}
-        settings = replace(
-            task.settings, seed=task.settings.seed + ANOTHER, start_from=None, hyperparameters=chosen, anew=False
-        )
+        chosen = _reference().exploring_by_state(self._spec)
+        seed = task.settings.seed + ATTEMPT_SEED
+        settings = replace(task.settings, seed=seed, start_from=None, hyperparameters=chosen, anew=False)
 
         def shifted(now: TrainProgress) -> None:
             task.progress(replace(now, steps=spent + now.steps, total_steps=spent + now.total_steps))
 
         other = _reference(**chosen).search(replace(task, settings=settings, steps=left, progress=shifted))
-        if self._kept is not None and (verdicts.best or 0.0) > (other.imagined_return or -np.inf):
-            mine = self._found(self._kept, whole=other.whole)
-            return replace(mine, virtual_steps=spent + other.virtual_steps, networks=mine.networks + other.networks)
-        return replace(other, virtual_steps=spent + other.virtual_steps, networks=verdicts.networks + other.networks)
+        theirs, best = other.imagined_return, other
+        if self._kept is not None and verdicts.best is not None and (theirs is None or verdicts.best > theirs):
+            best = self._found(self._kept, whole=other.whole)
+        networks = verdicts.networks + other.networks
+        return replace(best, virtual_steps=spent + other.virtual_steps, networks=networks)
 
 
 def units_of(spec: EnvironmentSpec) -> tuple[int, ...]:
     """Units of the actor's hidden layers: the paper's for its preset, two wider ones otherwise."""
-    return (64, 64) if spec.design.preset == "default" else (32,)
+    return WIDER if spec.design.preset == "default" else (HIDDEN,)
 
 
 def _saved(learner: Learner) -> LearnedNetwork:
     return LearnedNetwork(learner.policy(), learner.state())
 
 
-def _reference(**hyperparameters: Any) -> PolicySearch:
+def _reference(**hyperparameters: Any) -> StableBaselinesSearch:
     """``PPO`` of Stable-Baselines3. Raises ModuleNotFoundError where that is not installed."""
-    return SEARCHES.get(REFERENCE)(**hyperparameters)
+    return cast("StableBaselinesSearch", SEARCHES.get(REFERENCE)(**hyperparameters))
 
 
 @contextmanager
 def _lanes(task: SearchTask) -> Iterator[Lanes]:
     settings = task.settings
-    session = {"seed": settings.seed, "start_box": settings.start_box, **settings.session}
-    lanes = Lanes(task.port, session_request(settings.num_envs or 128, "same_step", session))
+    lanes = Lanes(task.port, session_request(settings.num_envs or LANES, "same_step", settings.learning))
     try:
         yield lanes
     finally:

@@ -8,12 +8,13 @@ from __future__ import annotations
 from typing import Any
 
 import stable_baselines3
-from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
+from surrogym_client.policies.defaults import LANES
 from surrogym_client.policies.networks import WIDER, PaperPolicy, decaying
 from surrogym_client.training.proportions import even_batch
 from surrogym_client.training.stable_baselines.search import StableBaselinesSearch
+from surrogym_shared.network import counts_of
 from surrogym_shared.spec import EnvironmentSpec
 
 
@@ -21,7 +22,7 @@ class OnPolicySearch(StableBaselinesSearch):
     """Many lanes, the paper's policies."""
 
     suggested_steps = 600_000
-    lanes = 128
+    lanes = LANES
     policy = PaperPolicy
 
     def network(self, spec: EnvironmentSpec) -> dict[str, Any]:
@@ -52,11 +53,11 @@ class PPO(OnPolicySearch):
             "batch_size": even_batch(rollout),
         }
 
-    def exploring_by_state(self, env: VecNormalize, spec: EnvironmentSpec) -> dict[str, Any]:
+    def exploring_by_state(self, spec: EnvironmentSpec) -> dict[str, Any]:
         """Noise drawn anew at every step may never reach what takes many steps in one direction; noise that is a
         function of the state, and stays for a rollout, pushes a lane its own way (gSDE, Raffin et al. 2022). For
         continuous actions; the rollouts of the other algorithms are too short."""
-        able = isinstance(env.action_space, spaces.Box) and spec.design.preset != "paper"
+        able = not counts_of(spec) and spec.design.preset != "paper"
         return {"use_sde": True} if able else {}
 
 

@@ -18,20 +18,21 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from surrogym_client.evaluation.imagined import imagined_returns, observation_statistics
+from surrogym_client.evaluation.imagined import observation_statistics
+from surrogym_client.policies.defaults import ATTEMPT_SEED
 from surrogym_client.policies.files import load_learner, save_policy
 from surrogym_client.policies.networks import Standardise
 from surrogym_client.policies.predict import Predict
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.training.proportions import suggested_gamma
 from surrogym_client.training.search import Found, PolicySearch, SearchTask
-from surrogym_client.training.settings import CHECK_EPISODES, TrainSettings
+from surrogym_client.training.settings import TrainSettings
 from surrogym_client.training.stable_baselines.early_stopping import Checks
 from surrogym_client.training.stable_baselines.tracking import tracking
+from surrogym_client.training.verdicts import checked
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import EnvironmentSpec
 
-ATTEMPT_SEED = 1_000_003  # between the seeds of one training's networks
 Statistics = tuple[Sequence[float], Sequence[float]]  # mean and deviation of observations, (D,) each
 
 
@@ -79,7 +80,7 @@ class StableBaselinesSearch(PolicySearch):
         """Keywords of the policy beside its standardisation."""
         return {}
 
-    def exploring_by_state(self, env: VecNormalize, spec: EnvironmentSpec) -> dict[str, Any]:  # noqa: ARG002
+    def exploring_by_state(self, spec: EnvironmentSpec) -> dict[str, Any]:  # noqa: ARG002
         """Hyperparameters of a network that follows one which was given up."""
         return {}
 
@@ -87,8 +88,7 @@ class StableBaselinesSearch(PolicySearch):
     def _environment(self, task: SearchTask, gamma: float) -> Iterator[VecNormalize]:
         settings = task.settings
         lanes = settings.num_envs or self.lanes
-        session = {"seed": settings.seed, "start_box": settings.start_box, **settings.session}
-        env = SurrogateVecEnv.from_port(task.port, lanes, **session)
+        env = SurrogateVecEnv.from_port(task.port, lanes, **settings.learning)
         wrapped = VecNormalize(VecMonitor(env), norm_obs=False, norm_reward=True, gamma=gamma)
         try:
             yield wrapped
@@ -172,7 +172,7 @@ class _Training:
         settings = self._task.settings
         asked = replace(settings, seed=settings.seed + ATTEMPT_SEED * attempt, start_from=start_from)
         if attempt and start_from is None:
-            by_state = self._search.exploring_by_state(self._env, self._spec)
+            by_state = self._search.exploring_by_state(self._spec)
             asked = replace(asked, hyperparameters=by_state | asked.hyperparameters)
         return make_learner(self._search, self._env, asked, self._spec, self._statistics, self._gamma)
 
@@ -222,7 +222,7 @@ def imagined_return(port: SurrogatePort, learner: BaseAlgorithm, settings: Train
     def predict(observation: Any) -> Any:
         return learner.predict(observation, deterministic=True)[0]
 
-    return float(imagined_returns(port, predict, CHECK_EPISODES, settings.seed, **settings.judging).mean())
+    return checked(port, predict, settings)
 
 
 def effective(learner: BaseAlgorithm) -> dict[str, Any]:
