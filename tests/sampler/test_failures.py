@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import uuid
-
 import pytest
 
-from support.moody import SPEC, Line
+from support.moody import Line
 from surrogym_client.original.errors import MachineFails
 from surrogym_client.sampler import Sampler, SamplerSettings
 from surrogym_client.sampler import failures as limits
 from surrogym_client.sampler.failures import FIRST_FEW, LONGEST_DELAY, MANY, Failures
-from surrogym_client.transport import Api
 
 UNTIL_DONE = SamplerSettings(name="worker", until_done=True, time_limit=60.0)
 
@@ -25,20 +22,6 @@ class Switched(Line):
         if not self.on:
             raise OSError("[Errno 5] the bus is off")
         return super().step_from(coordinates, action)
-
-
-@pytest.fixture
-def api(server_process):
-    with Api(server_process.url) as api:
-        yield api
-
-
-@pytest.fixture
-def line(api):
-    name = f"line-{uuid.uuid4().hex[:8]}"
-    api.create_surrogate(name, SPEC)
-    yield name
-    api.delete_surrogate(name)
 
 
 @pytest.fixture(autouse=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import uuid
 from functools import partial
 
 import pytest
@@ -19,20 +18,6 @@ from surrogym_shared.codes import Code, Problem
 from surrogym_shared.spec import BoxAction
 
 ONE_ROUND = SamplerSettings(name="worker", max_queries=6, wait_seconds=5.0, time_limit=60.0)
-
-
-@pytest.fixture
-def api(server_process):
-    with Api(server_process.url) as api:
-        yield api
-
-
-@pytest.fixture
-def line(api):
-    name = f"line-{uuid.uuid4().hex[:8]}"
-    api.create_surrogate(name, SPEC)
-    yield name
-    api.delete_surrogate(name)
 
 
 def test_every_query_is_answered_and_the_worker_stops_when_the_design_is_done(api, line):
