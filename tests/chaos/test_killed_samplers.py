@@ -67,7 +67,7 @@ def test_a_sampler_that_slept_beyond_its_lease_takes_no_step_that_others_have_ta
             [other] = samplers.working.keys() - {sleeper}
             samplers.kill(other)
             samplers.signal(sleeper, signal.SIGCONT)
-            [asked] = api.ask("slept", [[0.5, 0.5]], [[0.0]])
+            [asked] = api.add_queries("slept", [[0.5, 0.5]], [[0.0]])
             assert until(lambda: api.queries("slept")[-1].status == "answered"), "it goes on"
             assert samplers.notes_in(sleeper).begun == [*before, tuple(asked.coordinates or ())]
             assert until(lambda: not samplers.in_a_step())

@@ -57,7 +57,7 @@ def asked(api, rail):
             api.fail(rail, query.id, query.lease_token, "not today")
             again = api.claim(rail, "nobody", max_queries=1).queries
             query = again[0] if again else query
-    api.ask(rail, rollouts=[[LEFT, LEFT, RIGHT, LEFT]])
+    api.add_queries(rail, rollouts=[[LEFT, LEFT, RIGHT, LEFT]])
     return rail
 
 
@@ -79,7 +79,7 @@ def test_a_design_is_answered_by_resetting_and_acting(api, rail):
 
 
 def test_an_episode_that_ends_early_gives_the_rest_of_its_steps_back(api, rail):
-    api.ask(rail, rollouts=[[RIGHT] * 20])
+    api.add_queries(rail, rollouts=[[RIGHT] * 20])
     Sampler(api, rail, Rail(), SamplerSettings(max_queries=4, wait_seconds=5.0, time_limit=60.0)).run()
     last = list(api.samples(rail))[-1]
     assert last.terminated
@@ -103,7 +103,7 @@ def test_a_hang_in_the_middle_is_killed_and_the_steps_before_it_are_the_answer(a
 
 
 def test_a_failure_at_the_first_step_fails_the_query(api, asked):
-    api.ask(asked, rollouts=[[RIGHT, LEFT]])
+    api.add_queries(asked, rollouts=[[RIGHT, LEFT]])
     settings = SamplerSettings(name="worker", max_queries=2, batch=1, wait_seconds=5.0)
     report = Sampler(api, asked, RaisesRight(), settings).run()
     assert (report.answered, report.failed, report.steps) == (1, 1, 2)
@@ -194,11 +194,11 @@ def test_the_server_refuses_a_trajectory_that_jumps_or_goes_on_after_an_end(api,
 
 def test_a_query_of_the_wrong_kind_or_too_long_is_refused(api, rail):
     with pytest.raises(InvalidInput, match="can only be reset and act"):
-        api.ask(rail, [[0.0]], [[0.0]])
+        api.add_queries(rail, [[0.0]], [[0.0]])
     with pytest.raises(InvalidInput, match="at most 20 actions, got 21"):
-        api.ask(rail, rollouts=[[LEFT] * 21])
+        api.add_queries(rail, rollouts=[[LEFT] * 21])
     with pytest.raises(InvalidInput, match=r"entry 0 in \[-1, 1\], got 3"):
-        api.ask(rail, rollouts=[[LEFT], [[3.0]]])
+        api.add_queries(rail, rollouts=[[LEFT], [[3.0]]])
 
 
 def test_an_environment_that_answers_another_kind_of_query_is_refused(api, rail):

@@ -21,7 +21,7 @@ from surrogym_client.original.classic import pendulum
 from surrogym_client.original.gymnasium import GymnasiumEnvironment
 from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.training import TrainProgress, TrainResult, TrainSettings, train
-from surrogym_client.training.closed_loop import VISIT_LANES, LoopSettings, shares, train_in_closed_loop
+from surrogym_client.training.closed_loop import VISIT_LANES, ClosedLoop, LoopSettings, shares
 from surrogym_client.training.search import search_for
 from surrogym_client.training.settings import DRAWS, chosen_for
 from surrogym_client.transport import Api, HttpSurrogate
@@ -96,7 +96,7 @@ def test_rounds_go_on_until_the_policys_region_is_known_or_the_design_is_ready(
         with sampling(own_server.url, name, spec), HttpSurrogate(own_server.url, name) as port:
             wait_for_design(api, name, 60)
             improve = LoopSettings(queries=3, rounds=2, patience_seconds=60)
-            result = train_in_closed_loop(api, name, port, tmp_path / "p.zip", settings, improve, seen.append)
+            result = ClosedLoop(api, name, port, tmp_path / "p.zip", settings, improve, seen.append).train()
         view = api.surrogate(name)
     assert view.ledger.total == real_steps
     assert view.ledger.initial == initial

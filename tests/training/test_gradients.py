@@ -14,7 +14,7 @@ from surrogym_client.original.classic import cartpole
 from surrogym_client.policies import load_policy
 from surrogym_client.surrogates.transfer import export_surrogate
 from surrogym_client.training import TrainSettings, train
-from surrogym_client.training.closed_loop import LoopSettings, train_in_closed_loop
+from surrogym_client.training.closed_loop import ClosedLoop, LoopSettings
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_server.gradients import GradientSettings, optimise
 from surrogym_shared.network import Network
@@ -95,4 +95,4 @@ def test_rounds_are_refused_before_a_real_step(pendulum_server: ServerProcess, t
         Api(pendulum_server.url) as api,
         pytest.raises(ValueError, match="gradient can't start from a policy: expected no rounds"),
     ):
-        train_in_closed_loop(api, "pendulum", port, tmp_path / "policy.zip", few(), LoopSettings(queries=1))
+        ClosedLoop(api, "pendulum", port, tmp_path / "policy.zip", few(), LoopSettings(queries=1)).train()

@@ -349,14 +349,14 @@ def _train(
     surrogate: str,
     out: Path,
     settings: TrainSettings,
-    improve: LoopSettings | None,
+    rounds: LoopSettings | None,
     progress_file: Path | None,
     *,
     quiet: bool,
 ) -> TrainResult:
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.training import train
-    from surrogym_client.training.closed_loop import train_in_closed_loop
+    from surrogym_client.training.closed_loop import ClosedLoop
     from surrogym_client.training.settings import chosen_for
     from surrogym_client.transport import Api, HttpSurrogate
     from surrogym_shared.terminal import progress
@@ -368,9 +368,9 @@ def _train(
         _recording(progress_file, update) as record,
     ):
         try:
-            if improve is None:
+            if rounds is None:
                 return train(port, out, chosen_for(api.surrogate(surrogate), settings), record)
-            return train_in_closed_loop(api, surrogate, port, out, settings, improve, record, _waiting(update))
+            return ClosedLoop(api, surrogate, port, out, settings, rounds, record, _waiting(update)).train()
         except ValueError as error:
             raise CommandError(str(error)) from error
 

@@ -216,8 +216,8 @@ class Lanes:
         return None
 
 
-def _none(lanes: int) -> Bools:
-    return np.zeros(lanes, dtype=bool)
+def _none(num_envs: int) -> Bools:
+    return np.zeros(num_envs, dtype=bool)
 
 
 def _successor(seed: int, losses: int) -> int:

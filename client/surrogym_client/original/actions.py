@@ -11,16 +11,16 @@ from surrogym_client.original.protocol import Array
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
 
 
-def decode_actions(spec: EnvironmentSpec, raw: NDArray[Any], lanes: int) -> Array:
+def decode_actions(spec: EnvironmentSpec, raw: NDArray[Any], num_envs: int) -> Array:
     """A policy's actions as the environment takes them, (N, F); the bins of a continuous action are undone.
 
     Raises:
         ValueError: wrong shape.
     """
     rows = np.asarray(raw, dtype=np.float64)
-    if rows.size != lanes * spec.action.size:
-        raise ValueError(f"expected actions of shape ({lanes}, {spec.action.size}), got {np.shape(raw)}")
-    rows = rows.reshape(lanes, spec.action.size)
+    if rows.size != num_envs * spec.action.size:
+        raise ValueError(f"expected actions of shape ({num_envs}, {spec.action.size}), got {np.shape(raw)}")
+    rows = rows.reshape(num_envs, spec.action.size)
     if isinstance(spec.action, BoxAction) and spec.action.bins is None:
         if not np.isfinite(rows).all():
             raise ValueError(f"expected finite actions, got {rows.tolist()}")

@@ -47,18 +47,18 @@ class IsolatedEnvironment:
         self._pipe: Connection | None = None
 
     def spec(self) -> EnvironmentSpec:
-        return EnvironmentSpec.model_validate(self._ask("spec", (), self._step_limit))
+        return EnvironmentSpec.model_validate(self._call("spec", (), self._step_limit))
 
     def step_from(self, coordinates: Array, action: Array) -> RealStep:
-        step: RealStep = self._ask("step_from", (coordinates, action), self._step_limit)
+        step: RealStep = self._call("step_from", (coordinates, action), self._step_limit)
         return step
 
     def begin(self, seed: int | None = None) -> Array:
-        start: Array = self._ask("begin", (seed,), self._step_limit)
+        start: Array = self._call("begin", (seed,), self._step_limit)
         return start
 
     def act(self, action: Array) -> RealStep:
-        step: RealStep = self._ask("act", (action,), self._step_limit)
+        step: RealStep = self._call("act", (action,), self._step_limit)
         return step
 
     def close(self) -> None:
@@ -66,7 +66,7 @@ class IsolatedEnvironment:
         try:
             if self._pipe is not None and self._process is not None and self._process.is_alive():
                 with suppress(StepFailed):
-                    self._ask("close", (), self._step_limit + CLOSE_LIMIT)
+                    self._call("close", (), self._step_limit + CLOSE_LIMIT)
         finally:
             self._kill()
 
@@ -78,7 +78,7 @@ class IsolatedEnvironment:
     ) -> None:
         self.close()
 
-    def _ask(self, method: str, arguments: tuple[Any, ...], limit: float) -> Any:
+    def _call(self, method: str, arguments: tuple[Any, ...], limit: float) -> Any:
         pipe = self._start()
         self._number += 1
         try:
@@ -147,12 +147,12 @@ class _Ending:
     """Ends the child on SIGTERM, but not in the middle of a step."""
 
     def __init__(self) -> None:
-        self._working = self._asked = False
-        signal.signal(signal.SIGTERM, self._ask)
+        self._working = self._ending = False
+        signal.signal(signal.SIGTERM, self._end_soon)
 
-    def _ask(self, number: int, frame: FrameType | None) -> None:
+    def _end_soon(self, number: int, frame: FrameType | None) -> None:
         del number, frame
-        self._asked = True
+        self._ending = True
         if not self._working:
             sys.exit()
 
@@ -161,7 +161,7 @@ class _Ending:
 
     def __exit__(self, *_: object) -> None:
         self._working = False
-        if self._asked:
+        if self._ending:
             sys.exit()
 
 

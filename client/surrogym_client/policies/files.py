@@ -94,7 +94,7 @@ def _loaded(kind: type[BaseAlgorithm], path: Path, trust: bool, changes: dict[st
     if trust:
         return kind.load(path, device="cpu", **changes)
     try:
-        file, objects = read(path, lanes=_lanes(changes.get("env")), replaced=set(changes))
+        file, objects = read(path, num_envs=_num_envs(changes.get("env")), replaced=set(changes))
     except PickledObjects as error:
         raise UnusablePolicy(
             f"{path} holds pickled objects ({', '.join(error.names)}), and reading them would run any code that is in "
@@ -103,7 +103,7 @@ def _loaded(kind: type[BaseAlgorithm], path: Path, trust: bool, changes: dict[st
     return kind.load(file, device="cpu", custom_objects=objects, **changes)
 
 
-def _lanes(env: object) -> int:
+def _num_envs(env: object) -> int:
     """How many environments step at once; 0 without an environment."""
     return 0 if env is None else getattr(env, "num_envs", 1)
 

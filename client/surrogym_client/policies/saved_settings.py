@@ -81,12 +81,14 @@ class PolicySettings(BaseModel):
         """Attributes of the algorithm that the file gives, by name."""
         return self.model_dump(by_alias=True, exclude_none=True)
 
-    def require_memory(self, lanes: int, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+    def require_memory(
+        self, num_envs: int, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+    ) -> None:
         """Raise ValueError if the experience for learning needs more than ``MAX_EXPERIENCE_BYTES``."""
         numbers = 2 * _size(observation_space) + _size(action_space) + 4  # rewards, ends, values and the like
-        steps = max(self.buffer_size or 0, (self.n_steps or 0) * lanes)
+        steps = max(self.buffer_size or 0, (self.n_steps or 0) * num_envs)
         if (needed := 4 * numbers * steps) > MAX_EXPERIENCE_BYTES:
-            asked = f"n_steps={self.n_steps}, buffer_size={self.buffer_size}, {lanes} lanes"
+            asked = f"n_steps={self.n_steps}, buffer_size={self.buffer_size}, {num_envs} lanes"
             raise ValueError(f"expected at most {MAX_EXPERIENCE_BYTES} bytes of experience, got {needed} ({asked})")
 
 

@@ -147,14 +147,14 @@ def describe(learner: BaseAlgorithm) -> Structure | None:
     )
 
 
-def read(path: Path, *, lanes: int, replaced: set[str]) -> tuple[io.BytesIO, dict[str, Any]]:
+def read(path: Path, *, num_envs: int, replaced: set[str]) -> tuple[io.BytesIO, dict[str, Any]]:
     """A policy's file without anything pickled, and the objects that belong in the place of what was.
 
     Both are for ``load`` of a Stable-Baselines3 algorithm: the file, and ``custom_objects``.
 
     Args:
         path: what ``save`` wrote.
-        lanes: of the environment on which the algorithm continues to learn; 0 if it only acts, which leaves out the
+        num_envs: of the environment on which the algorithm continues to learn; 0 if it only acts, which leaves out the
             objects that only learning needs.
         replaced: attributes that the caller sets, so that the file's are not needed.
 
@@ -166,15 +166,15 @@ def read(path: Path, *, lanes: int, replaced: set[str]) -> tuple[io.BytesIO, dic
     data = dict(json.loads(_entry(entries, "data")))
     pickled = [name for name, value in data.items() if isinstance(value, dict) and PICKLED in value]
     structure = Structure.model_validate_json(entries[ENTRY]) if ENTRY in entries else None
-    objects: dict[str, Any] = dict.fromkeys((*REMADE, *replaced)) | ({} if lanes else IDLE)
+    objects: dict[str, Any] = dict.fromkeys((*REMADE, *replaced)) | ({} if num_envs else IDLE)
     if structure is not None:
         _require_weights(structure, _entry(entries, "policy" + WEIGHTS))
         objects |= structure.objects()
     if unknown := [name for name in pickled if name not in objects]:
         raise PickledObjects(unknown)
     settings = _settings(data, {*objects, *pickled, *NEEDED})
-    if lanes and structure is not None:
-        settings.require_memory(lanes, objects["observation_space"], objects["action_space"])
+    if num_envs and structure is not None:
+        settings.require_memory(num_envs, objects["observation_space"], objects["action_space"])
     placeholders = dict.fromkeys(({*pickled} - replaced) | {*NEEDED})  # load takes the objects for them
     data = {"verbose": 0, **settings.attributes, **placeholders}
     weights = {name: _plain(content) for name, content in entries.items() if name.endswith(WEIGHTS)}

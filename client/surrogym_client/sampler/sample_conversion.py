@@ -29,7 +29,7 @@ def sample_of(query: Query, step: RealStep, size: int, number: int = 0) -> NewSa
             lease_token=query.lease_token,
             step=number,
             coordinates=_numbers(step.coordinates, size, "coordinates"),
-            action=_numbers(step.action, len(_asked(query)[number]), "action"),
+            action=_numbers(step.action, len(_requested_actions(query)[number]), "action"),
             next_coordinates=_numbers(step.next_coordinates, size, "next_coordinates"),
             reward=float(step.reward),
             terminated=bool(step.terminated),
@@ -41,7 +41,7 @@ def sample_of(query: Query, step: RealStep, size: int, number: int = 0) -> NewSa
         raise StepFailed(f"a step that can't be used: {_first(error)}") from error
 
 
-def _asked(query: Query) -> list[list[float]]:
+def _requested_actions(query: Query) -> list[list[float]]:
     """The actions (T, F) of a query."""
     return [query.action] if isinstance(query, StepQuery) else query.actions
 

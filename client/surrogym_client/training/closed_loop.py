@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,107 +38,94 @@ class LoopSettings:
     patience_seconds: float = 3_600.0  # for the sampler to answer one round
 
 
-def train_in_closed_loop(
-    api: Api,
-    name: str,
-    port: SurrogatePort,
-    out: Path,
-    settings: TrainSettings,
-    improve: LoopSettings,
-    progress: Callable[[TrainProgress], None] | None = None,
-    waiting: Callable[[SurrogateView], None] | None = None,
-) -> TrainResult:
+@dataclass
+class ClosedLoop:
     """Learn a policy, with rounds of queries where it goes until that is known, or the design is ready.
 
     Each round submits the states that the policy visits from the declared starts, as a checkpoint of its own, so the
     same seeds ask the same queries. Where the model is as sure over these states as the design wants it over the whole
-    range, nothing more is asked. The rounds move lanes by the mean: their policies go where the model promises most.
-    The last training is ``chosen_for`` what the design came to. It alone is prolonged: what a round's policy lacks, the
-    next has.
+    range, no more queries follow. The rounds move lanes by the mean: their policies go where the model promises most.
+    The settings of the last training are ``chosen_for`` the phase that the design has then. Only the last training may
+    be prolonged: the next round makes up for what a round's policy lacks.
 
-    Args:
+    Attributes:
         api: the server.
         name: of the surrogate.
         port: the surrogate.
         out: where the policy goes, after every round.
         settings: of each training.
-        improve: of the rounds.
+        rounds: how many rounds, of how many queries.
         progress: called after every rollout, with steps summed over the rounds.
         waiting: called with every look at a round's queries, while a sampler answers them.
-
-    Raises:
-        DesignUnfinished: the queries of a round were not answered in time.
-        TrainingInterrupted: Ctrl-C came when there was a policy already.
-        ValueError, SurrogymClientError: as ``train``.
+        trained: the trainings so far.
     """
-    loop = _Loop(api, name, port, out, settings, improve, progress, waiting)
-    try:
-        for _ in range(improve.rounds):
-            if not loop.round():
-                break
-        loop.last()
-    except TrainingInterrupted as interruption:
-        loop.trained.append(interruption.result)
-        raise TrainingInterrupted(loop.result()) from None
-    except KeyboardInterrupt:
-        if loop.trained:
-            raise TrainingInterrupted(loop.result()) from None
-        raise
-    return loop.result()
 
+    api: Api
+    name: str
+    port: SurrogatePort
+    out: Path
+    settings: TrainSettings
+    rounds: LoopSettings
+    progress: Callable[[TrainProgress], None] | None = None
+    waiting: Callable[[SurrogateView], None] | None = None
+    trained: list[TrainResult] = field(default_factory=list, init=False)
+    _visited: int = field(default=0, init=False)  # virtual steps beside the trainings
+    _known: list[float | None] = field(default_factory=list, init=False)  # confidence where each round's policy went
+    _region_known: bool = field(default=False, init=False)
 
-class _Loop:
-    """The trainings so far, and what is known of where their policies went."""
+    def __post_init__(self) -> None:
+        algorithm = self.settings.algorithm
+        if not search_for(self.settings).resumable:
+            raise ValueError(f"{algorithm} can't start from a policy: expected no rounds, or another algorithm")
+        self._whole, self._part = shares(self.settings, self.rounds.rounds)
+        self._prolong = is_prolonged(self.settings, self.port.spec())
 
-    def __init__(
-        self,
-        api: Api,
-        name: str,
-        port: SurrogatePort,
-        out: Path,
-        settings: TrainSettings,
-        improve: LoopSettings,
-        progress: Callable[[TrainProgress], None] | None,
-        waiting: Callable[[SurrogateView], None] | None,
-    ) -> None:
-        self._api, self._name, self._port, self._out = api, name, port, out
-        self._settings, self._improve = settings, improve
-        self._progress, self._waiting = progress, waiting
-        self._whole, self._part = shares(settings, improve.rounds)
-        self._prolong = is_prolonged(settings, port.spec())
-        if not search_for(settings).resumable:
-            raise ValueError(
-                f"{settings.algorithm} can't start from a policy: expected no rounds, or another algorithm"
-            )
-        self._visited = 0  # virtual steps beside the trainings
-        self._known: list[float | None] = []  # confidence index where the policy went, of each round
-        self._region_known = False
-        self.trained: list[TrainResult] = []
+    def train(self) -> TrainResult:
+        """Run the rounds and the last training.
+
+        Raises:
+            DesignUnfinished: the queries of a round were not answered in time.
+            TrainingInterrupted: Ctrl-C came when there was a policy already.
+            ValueError, SurrogymClientError: as ``train``.
+        """
+        try:
+            for _ in range(self.rounds.rounds):
+                if not self.round():
+                    break
+            self.last()
+        except TrainingInterrupted as interruption:
+            self.trained.append(interruption.result)
+            raise TrainingInterrupted(self.result()) from None
+        except KeyboardInterrupt:
+            if self.trained:
+                raise TrainingInterrupted(self.result()) from None
+            raise
+        return self.result()
 
     def round(self) -> bool:
         """Train a little, see where the policy goes, and query there; whether another round may follow."""
-        view = self._api.surrogate(self._name)
+        view = self.api.surrogate(self.name)
         if view.phase == "ready":
             return False
-        self._learn(self._part, self._whole, replace(self._settings, prolong=False))
-        checkpoint = f"seed {self._settings.seed}, round {view.round}"
-        steps, index = visit(self._port, self.trained[-1], self._settings, checkpoint)
+        self._learn(self._part, self._whole, replace(self.settings, prolong=False))
+        checkpoint = f"seed {self.settings.seed}, round {view.round}"
+        steps, index = visit(self.port, self.trained[-1], self.settings, checkpoint)
         self._visited += steps
         self._known.append(index)
         self._region_known = index is not None and index >= view.target
         if self._region_known:
             return False
-        self._api.improve(self._name, self._improve.queries, checkpoint=checkpoint)
-        patience = self._improve.patience_seconds
-        wait_for_design(self._api, self._name, patience, self._waiting, after_round=view.round)
+        self.api.improve(self.name, self.rounds.queries, checkpoint=checkpoint)
+        patience = self.rounds.patience_seconds
+        wait_for_design(self.api, self.name, patience, self.waiting, after_round=view.round)
         return True
 
     def last(self) -> None:
         """Train the policy that is used, by what the design came to."""
-        settings, taken = self._settings, self._steps
+        settings, taken = self.settings, self._steps
         left = self._whole - taken
         left = max(left if settings.total_steps else min(planned_steps(settings), left), 1)
-        last = _for_use(self._api.surrogate(self._name), settings, region_known=self._region_known)
+        last = _for_use(self.api.surrogate(self.name), settings, region_known=self._region_known)
         self._learn(left, taken + self._visited + left, replace(last, prolong=self._prolong))
 
     def result(self) -> TrainResult:
@@ -158,10 +145,10 @@ class _Loop:
     def _learn(self, steps: int, whole: int, settings: TrainSettings) -> None:
         now = replace(settings, total_steps=steps)
         if self.trained:
-            now = replace(now, start_from=self._out, trust_policy=False)
+            now = replace(now, start_from=self.out, trust_policy=False)
         known = self._known[-1] if self._known else None
-        progress = _shifted(self._progress, self._steps + self._visited, whole, known)
-        self.trained.append(train(self._port, self._out, now, progress))
+        progress = _shifted(self.progress, self._steps + self._visited, whole, known)
+        self.trained.append(train(self.port, self.out, now, progress))
 
 
 def _for_use(view: SurrogateView, settings: TrainSettings, *, region_known: bool) -> TrainSettings:

@@ -96,7 +96,7 @@ class PolicySearch(ABC):
     def search(self, task: SearchTask) -> Found:
         """Find a policy. See the laws at the top of this file."""
 
-    def explorer(self, policy: Path, algorithm: str, lanes: int) -> Predict:  # noqa: ARG002  for those that have noise
+    def explorer(self, policy: Path, algorithm: str, num_envs: int) -> Predict:  # noqa: ARG002  for those that have noise
         """A saved policy as it explores while it learns; its most probable actions where it has no noise."""
         return load_policy(policy, algorithm)
 

@@ -215,7 +215,7 @@ class Api:
         body = wire.FailQuery(lease_token=lease_token, error=error, begun=begun)
         self._send(f"{routes.surrogate(name)}/queries/{query_id}:fail", body)
 
-    def ask(
+    def add_queries(
         self,
         name: str,
         coordinates: Sequence[Sequence[float]] = (),
@@ -226,7 +226,7 @@ class Api:
     ) -> list[wire.QueryView]:
         """Put queries of one's own into the queue: coordinates (n, C) and action (n, F); or, where the original
         environment can only be reset, action sequences, each (T, F)."""
-        body = wire.AskQueries(
+        body = wire.AddQueries(
             coordinates=[list(row) for row in coordinates] or None,
             action=[list(row) for row in action] or None,
             rollouts=[[list(row) for row in actions] for actions in rollouts] or None,

@@ -18,7 +18,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import FeatureMap, encode
 from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.environment.samples import Samples, increments, saturated
-from surrogym_server.environment.step_rules import moved, paid
+from surrogym_server.environment.step_rules import moved, paid, placed
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.abilities import Differentiable, FunctionDraws, LeaveOneOut, LeaveOneOutErrors
 from surrogym_server.models.port import DynamicsModel, Learned, Learner, ModelCodec, StoredModel, Transition, Warm
@@ -155,10 +155,7 @@ class LinearModel(DynamicsModel, FunctionDraws, LeaveOneOut, Differentiable):
     ) -> Transition:
         """The step of changes (m, M), paid by weights ``pay`` (d, 1), or (m, d, 1) of each row's own function."""
         change = change if process is None else change + self.changes.noise * process
-        if not self.definition.moves_observation:
-            columns = torch.tensor(self.definition.moving, device=q.device)
-            change = torch.zeros_like(q).index_copy(1, columns, change)
-        q_next = moved(self.definition, self._inverse, q, change)
+        q_next = moved(self.definition, self._inverse, q, placed(self.definition, change))
         state = q_next if self.definition.reward_timing == "after" else q
         x = features(self.definition, state, u)
         reward, doubt = (x[:, None] @ pay)[:, 0, 0], self.pay.deviation(x)[:, 0]

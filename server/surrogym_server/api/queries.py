@@ -16,7 +16,7 @@ from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
-    AskQueries,
+    AddQueries,
     ClaimedQueries,
     ClaimQueries,
     FailQuery,
@@ -81,12 +81,12 @@ def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.F
     openapi_extra=json_up_to(128),
     responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.INVALID_REQUEST),
 )
-def ask(name: str, body: Annotated[AskQueries, example(examples.ASK)], use: Use) -> QueryList:
+def add_queries(name: str, body: Annotated[AddQueries, example(examples.ADD_QUERIES)], use: Use) -> QueryList:
     """Queued behind those of the design, whose model learns from the answers too."""
     q = convert.numbers("coordinates", body.coordinates or ())
     u = convert.numbers("action", body.action or ())
     rollouts = [convert.numbers("rollouts", actions) for actions in body.rollouts or ()]
-    return convert.query_list(use.queries.ask(name, q, u, body.idempotency_key, rollouts))
+    return convert.query_list(use.queries.add(name, q, u, body.idempotency_key, rollouts))
 
 
 @router.get(

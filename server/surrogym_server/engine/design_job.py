@@ -20,7 +20,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.files import from_bytes, to_bytes
-from surrogym_server.models.guard import asking
+from surrogym_server.models.guard import plugin_calls
 from surrogym_server.sampling.design import (
     Decision,
     DesignState,
@@ -98,7 +98,7 @@ def run_design_job(job: DesignJob) -> DesignResult:
     torch.set_num_threads(job.threads)
     with threadpool_limits(job.threads):  # many small products: threads cost more than they give
         decision, samples = _decide(job)
-    with asking(job.definition):
+    with plugin_calls(job.definition):
         stored = to_bytes(decision.model)
     return DesignResult(
         model=stored,

@@ -252,9 +252,9 @@ def _visited(session: Session, chosen: Bools | None) -> Session:
     return replace(session, visited=session.visited.visit(states if chosen is None else states[chosen]))
 
 
-def _check_mask(mask: Bools | None, lanes: int) -> None:
-    if mask is not None and mask.shape != (lanes,):
-        raise InvalidInput(f"mask: expected {lanes} entries, one a lane, got {len(mask)}")
+def _check_mask(mask: Bools | None, num_envs: int) -> None:
+    if mask is not None and mask.shape != (num_envs,):
+        raise InvalidInput(f"mask: expected {num_envs} entries, one a lane, got {len(mask)}")
 
 
 def check_opening(session: Session, digest: str) -> Session:

@@ -14,13 +14,13 @@ Array = NDArray[np.float64]
 FLOAT32_SLACK = 1e-6
 
 
-def policy_actions(action: ActionDefinition, raw: NDArray[Any], lanes: int) -> Array:
+def policy_actions(action: ActionDefinition, raw: NDArray[Any], num_envs: int) -> Array:
     """Check a policy's actions, (N, F) or (N,) where F = 1, and give the model's, (N, F).
 
     Raises:
         InvalidInput: wrong shape, not finite, not an integer, or out of bounds.
     """
-    rows = _rows(raw, (lanes, action.size))
+    rows = _rows(raw, (num_envs, action.size))
     if counts := action.policy_counts:
         _require_counts(rows, counts)
         return decode_bins(action, rows) if action.bins else rows

@@ -164,6 +164,11 @@ class EnvironmentDefinition:
         """Indices of the coordinates that the dynamics move."""
         return tuple(i for i, c in enumerate(self.coordinates) if c.kind != "constant")
 
+    @cached
+    def moving_columns(self) -> Tensor:
+        """``moving`` as a tensor of the device."""
+        return torch.tensor(self.moving, device=self.device)
+
     @cached_property
     def outputs(self) -> tuple[str, ...]:
         """Modelled outputs by name: the moving coordinates or the observation entries, then the reward."""

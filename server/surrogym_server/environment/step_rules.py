@@ -34,6 +34,15 @@ def settle(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
     return inside
 
 
+def placed(definition: EnvironmentDefinition, change: Tensor) -> Tensor:
+    """Changes (m, M) of the moving coordinates as changes (m, C) of all, as ``moved`` takes them. Changes of the
+    observation stay as they are."""
+    if definition.moves_observation:
+        return change
+    every = change.new_zeros(len(change), len(definition.coordinates))
+    return every.index_copy(1, definition.moving_columns, change)
+
+
 def moved(definition: EnvironmentDefinition, inverse: ObservationInverse | None, q: Tensor, change: Tensor) -> Tensor:
     """Where coordinates q (m, C) arrive that change by (m, C), or whose observation does, by (m, D), given its inverse;
     as the environment leaves them."""

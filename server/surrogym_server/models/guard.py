@@ -27,7 +27,7 @@ def failure_of(definition: EnvironmentDefinition, error: BaseException) -> Surro
     return failed(_family(definition), PluginFailed, error)
 
 
-def asking(definition: EnvironmentDefinition, *, interrupts: bool = False) -> AbstractContextManager[None]:
+def plugin_calls(definition: EnvironmentDefinition, *, interrupts: bool = False) -> AbstractContextManager[None]:
     """Whatever the code of a definition's family raises within is a ``PluginFailed``; see ``guarded``."""
     return guarded(_family(definition), PluginFailed, interrupts=interrupts)
 
@@ -39,7 +39,7 @@ def learn(definition: EnvironmentDefinition, samples: Samples, warm: Warm | None
         InvalidInput, NumericalFailure: as ``Learner.learn``.
         PluginFailed: the family's code raised anything else, or what it gave is no model.
     """
-    with asking(definition):
+    with plugin_calls(definition):
         learned = learner_of(definition.learning.model).learn(definition, samples, warm)
         model: object = getattr(learned, "model", learned)
         if not isinstance(model, DynamicsModel):

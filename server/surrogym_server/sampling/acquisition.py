@@ -172,18 +172,18 @@ def check_acquisition(definition: EnvironmentDefinition) -> None:
 
 def value_of(choice: Choice, candidates: CandidateView) -> Tensor:
     """What an acquisition gives for each of m candidates, (m,). Raises ``ChoiceFailed``: it broke the laws."""
-    return _asked(choice, acquisition_of(choice).value, candidates, candidates.distance.shape)
+    return _criterion_values(choice, acquisition_of(choice).value, candidates, candidates.distance.shape)
 
 
 def path_value_of(choice: Choice, paths: PathView) -> Tensor:
     """What an acquisition gives for each beginning of b paths, (b, T). Raises ``ChoiceFailed``: it broke the laws."""
-    return _asked(choice, acquisition_of(choice).path_value, paths, paths.weight.shape)
+    return _criterion_values(choice, acquisition_of(choice).path_value, paths, paths.weight.shape)
 
 
-def _asked(choice: Choice, ask: Callable[[Any], Tensor], view: Any, shape: torch.Size) -> Tensor:
+def _criterion_values(choice: Choice, criterion: Callable[[Any], Tensor], view: Any, shape: torch.Size) -> Tensor:
     what = f"the choice of the next queries failed: acquisition {choice.name}"
     with guarded(what, ChoiceFailed):
-        values: object = ask(view)
+        values: object = criterion(view)
     if not isinstance(values, Tensor):
         raise ChoiceFailed(f"{what}: expected a tensor of shape {tuple(shape)}, got {type(values).__name__}")
     if values.shape != shape:

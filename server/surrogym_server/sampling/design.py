@@ -15,7 +15,7 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples, increments
-from surrogym_server.models.guard import asking, learn, require_deviations
+from surrogym_server.models.guard import learn, plugin_calls, require_deviations
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.batch import choose
@@ -138,7 +138,7 @@ def judge_model(
     definition = model.definition
     tolerances = definition.tolerances_over(usual)
     points = Points(*monte_carlo(definition))
-    with asking(definition):
+    with plugin_calls(definition):
         deviation = deviations(model, points.q, points.u)
         require_deviations(model, deviation)
         confidences = tuple(confidences_of(model, deviation, tolerances))

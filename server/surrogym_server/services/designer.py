@@ -172,7 +172,9 @@ class Designer:
             raise InvalidInput(f"no occupancy was submitted as {checkpoint!r}: submit it from a session first")
         if checkpoint is None and (latest := self._storage.occupancy.latest(name)) is not None:
             checkpoint = latest.checkpoint
-        granted = self._storage.designs.ask(name, queries, checkpoint=checkpoint, key=key, raise_budget=raise_budget)
+        granted = self._storage.designs.improve(
+            name, queries, checkpoint=checkpoint, key=key, raise_budget=raise_budget
+        )
         self._notices.post(name)
         return granted
 

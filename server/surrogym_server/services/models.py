@@ -14,7 +14,7 @@ from surrogym_server.engine.models import ModelCache
 from surrogym_server.environment.actions import model_actions
 from surrogym_server.errors import Damaged, InvalidInput, PluginFailed
 from surrogym_server.models.files import from_bytes
-from surrogym_server.models.guard import POINTS, asking, require_sound
+from surrogym_server.models.guard import POINTS, plugin_calls, require_sound
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.design import monte_carlo
 from surrogym_server.sampling.uncertainty import UncertaintyResult, query_uncertainty
@@ -51,7 +51,7 @@ def load_model(storage: Storage, definitions: Definitions, surrogate: int, versi
     name = storage.surrogates.name_of(surrogate)
     definition, data = definitions.for_model(name), stored_model(storage, name, version)
     try:
-        with asking(definition, interrupts=True):
+        with plugin_calls(definition, interrupts=True):
             return from_bytes(definition, data)
     except InvalidInput as error:
         raise Damaged(f"model {version} of {name!r} can't be read: {error}") from error
@@ -104,7 +104,7 @@ class ModelService:
         record = self._storage.surrogates.get(name)
         definition = self._definitions.for_model(name).with_tolerances(record.tolerances)
         try:
-            with asking(definition, interrupts=True):
+            with plugin_calls(definition, interrupts=True):
                 new = _imported(from_bytes(definition, data), record, data)
         except PluginFailed as error:
             raise InvalidInput(str(error)) from error
@@ -123,7 +123,7 @@ class ModelService:
         """
         version, model = self._model(name, version)
         q, u = check_points(model.definition, q, u)
-        with asking(model.definition, interrupts=True):
+        with plugin_calls(model.definition, interrupts=True):
             return Said(version, model.definition.outputs, predict_points(model, q, u))
 
     def query_uncertainty(self, name: str, q: Array, u: Array, version: int | None) -> Said[UncertaintyResult]:
@@ -133,7 +133,7 @@ class ModelService:
         tolerances = np.array(self._storage.models.get(name, version).tolerances)
         occupancy = self._storage.occupancy.latest(name)
         states = None if occupancy is None else occupancy.states
-        with asking(model.definition, interrupts=True):
+        with plugin_calls(model.definition, interrupts=True):
             return Said(version, model.definition.outputs, query_uncertainty(model, q, u, tolerances, states))
 
     def imagine(self, name: str, q: Array, u: Array, *, draws: int, seed: int, version: int | None) -> Said[Imagined]:
@@ -141,7 +141,7 @@ class ModelService:
         version, model = self._model(name, version)
         start = check_coordinates(model.definition, "coordinates", q[None])[0]
         actions = model_actions(model.definition.action, u)
-        with asking(model.definition, interrupts=True):
+        with plugin_calls(model.definition, interrupts=True):
             return Said(version, model.definition.outputs, imagine(model, start, actions, draws=draws, seed=seed))
 
     def _model(self, name: str, version: int | None) -> tuple[int, DynamicsModel]:

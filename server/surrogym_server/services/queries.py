@@ -85,7 +85,7 @@ class QueryService:
         self._notices.post(name)
         return record
 
-    def ask(
+    def add(
         self, name: str, coordinates: Array, action: Array, key: str | None, rollouts: Sequence[Array] = ()
     ) -> list[QueryRecord]:
         """Queue queries by hand: coordinates (m, C) and action (m, F), or action sequences, each (T, F).

@@ -32,7 +32,7 @@ from surrogym_server.engine.sessions import LiveSessions, Work
 from surrogym_server.environment.actions import policy_actions
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import Damaged, InvalidInput, NotReset, SurrogymError, TooLarge
-from surrogym_server.models.guard import asking, failure_of
+from surrogym_server.models.guard import failure_of, plugin_calls
 from surrogym_server.sampling.uncertainty import visited_confidence
 from surrogym_server.services.activity import SessionActivity, Tallies
 from surrogym_server.services.definitions import Definitions
@@ -287,7 +287,7 @@ class SessionService:
             )
         except SurrogymError:
             raise
-        except BaseException as error:  # of a family's code; written out, as ``asking`` costs each step more
+        except BaseException as error:  # of a family's code; written out, as ``plugin_calls`` costs each step more
             raise failure_of(session.definition, error) from error
 
     def _submit(self, session: Session, checkpoint: str, states: Array) -> float:
@@ -295,7 +295,7 @@ class SessionService:
         name, version = self._storage.surrogates.name_of(session.surrogate_id), self._latest(session)
         tolerances = self._storage.models.get(name, version).tolerances
         model = self._models.get(session.surrogate_id, version)
-        with asking(model.definition, interrupts=True):
+        with plugin_calls(model.definition, interrupts=True):
             index = visited_confidence(model, states, tolerances)
         self._storage.occupancy.put(name, checkpoint, states)
         return index

@@ -106,7 +106,7 @@ class Designs(ABC):
     """The right to fit: at any time at most one server fits a surrogate."""
 
     @abstractmethod
-    def ask(
+    def improve(
         self,
         name: str,
         queries: int,

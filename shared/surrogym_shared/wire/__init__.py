@@ -44,8 +44,8 @@ from surrogym_shared.wire.models import (
 )
 from surrogym_shared.wire.queries import (
     AddedSamples,
+    AddQueries,
     AddSamples,
-    AskQueries,
     ClaimedQueries,
     ClaimQueries,
     FailQuery,
@@ -113,9 +113,9 @@ __all__ = [
     "ActionRow",
     "ActionSpace",
     "Actions",
+    "AddQueries",
     "AddSamples",
     "AddedSamples",
-    "AskQueries",
     "AutoresetMode",
     "BoxSpace",
     "ClaimQueries",

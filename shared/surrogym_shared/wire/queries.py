@@ -99,7 +99,7 @@ class QueryList(Reply):
     queries: list[QueryView]
 
 
-class AskQueries(Request):
+class AddQueries(Request):
     """Queries by hand: steps from ``coordinates`` under ``action``, or, where the original environment can only be
     reset, ``rollouts`` of action sequences."""
 

@@ -17,7 +17,7 @@ EXAMPLES = {
     "CLAIM": wire.ClaimQueries,
     "RENEW": wire.RenewLease,
     "FAIL": wire.FailQuery,
-    "ASK": wire.AskQueries,
+    "ADD_QUERIES": wire.AddQueries,
     "ADD_SAMPLE": wire.AddSamples,
     "LEDGER": wire.ReportSteps,
     "IMPROVE": wire.Improve,

@@ -128,7 +128,7 @@ def test_a_fit_leaves_a_model_and_the_next_queries(answered: Storage, designer, 
 
 def test_the_job_has_what_the_design_knows(answered: Storage, designer, runner: Runner):
     answered.occupancy.put(NAME, "visited", np.ones((3, 2)))
-    answered.designs.ask(NAME, 2, checkpoint="visited")
+    answered.designs.improve(NAME, 2, checkpoint="visited")
     fit_all(designer)
     job = runner.jobs[0]
     assert (len(job.reward), job.extra_queries, job.budget) == (pendulum.INITIAL, 2, pendulum.BUDGET)
@@ -137,7 +137,7 @@ def test_the_job_has_what_the_design_knows(answered: Storage, designer, runner: 
 
 def test_a_budget_lowered_after_somebody_asked_holds_all_the_same(answered: Storage, designer, runner: Runner):
     """What was promised within the old budget is not asked beyond the new one."""
-    answered.designs.ask(NAME, 2)
+    answered.designs.improve(NAME, 2)
     answered.surrogates.change(NAME, budget=pendulum.INITIAL + 1)
     fit_all(designer)
     assert runner.jobs[0].extra_queries == 1

@@ -54,7 +54,7 @@ def test_without_waiting_nothing_is_an_answer(emptied: Storage, definitions: Def
 def test_a_query_that_comes_wakes_who_waits(emptied: Storage, definitions: Definitions):
     async def run() -> tuple[Claim, float]:
         service = QueryService(emptied, definitions, Notices())
-        return await waiting_claim(service, lambda: service.ask(NAME, np.zeros((1, 2)), np.zeros((1, 1)), None))
+        return await waiting_claim(service, lambda: service.add(NAME, np.zeros((1, 2)), np.zeros((1, 1)), None))
 
     claim, seconds = asyncio.run(run())
     assert [query.purpose for query in claim.queries] == ["manual"]
@@ -89,7 +89,7 @@ def test_two_who_wait_share_what_comes(emptied: Storage, definitions: Definition
         service = QueryService(emptied, definitions, Notices())
         claims = [asyncio.create_task(service.claim(NAME, f"tester {i}", 1, 60, PATIENCE)) for i in range(2)]
         await asyncio.sleep(0.2)
-        service.ask(NAME, np.array([[0.0, 0.0], [1.0, 1.0]]), np.zeros((2, 1)), None)
+        service.add(NAME, np.array([[0.0, 0.0], [1.0, 1.0]]), np.zeros((2, 1)), None)
         return await asyncio.gather(*claims)
 
     ids = [query.id for claim in asyncio.run(run()) for query in claim.queries]

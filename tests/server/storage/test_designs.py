@@ -175,7 +175,7 @@ def test_what_somebody_asked_for_is_asked_for_again_unless_there_is_less_to_spen
     storage: Storage, due: str, design: Callable[..., NewDesign], change: dict[str, Any], again: int
 ) -> None:
     storage.designs.commit(begun(storage, due), design(phase="ready"))
-    storage.designs.ask(due, 3)
+    storage.designs.improve(due, 3)
     storage.designs.commit(begun(storage, due), replace(design(queries=3), extra=True))
     assert storage.surrogates.get(due).extra_queries == 0
     storage.queries.claim(due, "a", 1, LONG)
@@ -236,21 +236,21 @@ def test_asking_raises_the_budget_and_reaches_the_next_fit_once(
     storage.surrogates.change(due, budget=4)
     storage.designs.commit(begun(storage, due), design(phase="ready"))
     for _ in range(2):
-        granted = storage.designs.ask(due, 5, checkpoint="half-way", key="k", raise_budget=True)
+        granted = storage.designs.improve(due, 5, checkpoint="half-way", key="k", raise_budget=True)
         record = granted.record
         assert (record.extra_queries, record.budget, record.checkpoint) == (5, 8, "half-way")
         assert granted.raised == 4, "a repeat says what the first said"
     with pytest.raises(IdempotencyConflict):
-        storage.designs.ask(due, 6, checkpoint="half-way", key="k")
+        storage.designs.improve(due, 6, checkpoint="half-way", key="k")
     lease = begun(storage, due)
     assert (lease.extra_queries, lease.checkpoint) == (5, "half-way")
-    storage.designs.ask(due, 2, raise_budget=True)
+    storage.designs.improve(due, 2, raise_budget=True)
     storage.designs.commit(lease, design(queries=5))
     assert storage.surrogates.get(due).extra_queries == 2, "asked for after the fit began"
 
 
 def test_a_budget_that_is_large_enough_stays(storage: Storage, due: str) -> None:
-    granted = storage.designs.ask(due, 5, raise_budget=True)
+    granted = storage.designs.improve(due, 5, raise_budget=True)
     assert (granted.record.budget, granted.raised) == (30, 0)
 
 
@@ -262,12 +262,12 @@ def test_who_may_not_raise_the_budget_gets_what_it_has_left(storage: Storage, du
         storage.queries.fail(due, leased.id, leased.token, "unreachable")
     storage.surrogates.change(due, budget=10)
     assert storage.designs.left(due) == 10 - 3 - 2
-    storage.designs.ask(due, 4)
+    storage.designs.improve(due, 4)
     assert storage.designs.left(due) == 1
     with pytest.raises(BeyondBudget, match=r"at most 1 more queries.* 10 real steps.*got 2.*--budget 11"):
-        storage.designs.ask(due, 2)
+        storage.designs.improve(due, 2)
     assert (storage.designs.left(due), storage.surrogates.get(due).extra_queries) == (1, 4), "nothing was changed"
-    storage.designs.ask(due, 1)
+    storage.designs.improve(due, 1)
     storage.surrogates.change(due, budget=3)
     assert storage.designs.left(due) == 0
 
@@ -275,7 +275,7 @@ def test_who_may_not_raise_the_budget_gets_what_it_has_left(storage: Storage, du
 def test_many_who_ask_at_once_get_no_more_than_the_budget_has_left(storage: Storage, due: str) -> None:
     def ask(_: int) -> int:
         try:
-            return storage.designs.ask(due, 4).record.extra_queries
+            return storage.designs.improve(due, 4).record.extra_queries
         except BeyondBudget:
             return 0
 

@@ -75,11 +75,11 @@ def test_a_step_query_is_no_trajectory(storage: Storage, make: Callable[..., str
 def test_an_episode_that_ends_early_answers_its_query_and_gives_the_rest_of_its_steps_back(
     storage: Storage, name: str, long: LeasedQuery, answer: Answer
 ) -> None:
-    raised = storage.designs.ask(name, 30, raise_budget=True).record.budget
+    raised = storage.designs.improve(name, 30, raise_budget=True).record.budget
     assert raised == 3 + 1 + 30, "open rollouts are spoken for with all their steps"
     storage.samples.add(name, "a", [answer(long, step=0), answer(long, step=1, terminated=True)])
     assert storage.queries.get(name, long.id).status == "answered"
-    raised = storage.designs.ask(name, 1, raise_budget=True).record.budget
+    raised = storage.designs.improve(name, 1, raise_budget=True).record.budget
     assert raised == 34, "2 taken, 1 open, 31 asked for: the third step is free again"
     assert storage.ledger.read(name).total == 2
 

@@ -115,7 +115,7 @@ def test_every_operation_refuses_an_unknown_surrogate(storage: Storage, by_hand:
         lambda: storage.surrogates.change("no", paused=True),
         lambda: storage.surrogates.set_phase("no", "ready"),
         lambda: storage.surrogates.delete("no"),
-        lambda: storage.designs.ask("no", 1),
+        lambda: storage.designs.improve("no", 1),
         lambda: storage.designs.begin("no", "me", 1),
         lambda: storage.queries.enqueue("no", none, none),
         lambda: storage.queries.claim("no", "w", 1, 1),

@@ -76,9 +76,9 @@ class FastPpo(PolicySearch):
         with threadpool_limits(limits=task.settings.threads), _lanes(task) as lanes:
             return _Training(self, task, lanes).run()
 
-    def explorer(self, policy: Path, algorithm: str, lanes: int) -> Predict:
+    def explorer(self, policy: Path, algorithm: str, num_envs: int) -> Predict:
         if not Network.is_at(policy):
-            return _reference().explorer(policy, algorithm, lanes)
+            return _reference().explorer(policy, algorithm, num_envs)
         return noisy(policy)
 
 

@@ -65,11 +65,11 @@ class StableBaselinesSearch(PolicySearch):
         with self._environment(task, gamma) as env:
             return _Training(self, task, env, gamma).run()
 
-    def explorer(self, policy: Path, algorithm: str, lanes: int) -> Predict:
+    def explorer(self, policy: Path, algorithm: str, num_envs: int) -> Predict:
         learner = load_learner(policy, algorithm)
         if learner.use_sde:
             noisy: Any = learner.policy
-            noisy.reset_noise(lanes)  # each lane explores its own way
+            noisy.reset_noise(num_envs)  # each lane explores its own way
         return lambda observation: learner.predict(observation, deterministic=False)[0]
 
     def defaults(self, env: VecNormalize) -> dict[str, Any]:  # noqa: ARG002  for algorithms that have some

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.observation_inverse import ObservationInverse
-from surrogym_server.environment.step_rules import moved, paid
+from surrogym_server.environment.step_rules import moved, paid, placed
 from surrogym_server.models.abilities import Differentiable, FunctionDraws
 from surrogym_server.models.ensemble.inputs import Inputs
 from surrogym_server.models.ensemble.networks import Networks
@@ -161,17 +161,11 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, Differentiable):
         return self.reward(self._inputs.of_reward(q, u, q_next))[..., 0]
 
     def _arrived(self, q: Tensor, change: Tensor) -> Tensor:
-        if not self.definition.moves_observation:
-            change = torch.zeros_like(q).index_copy(1, self._moving, change)
-        return moved(self.definition, self._inverse, q, change)
+        return moved(self.definition, self._inverse, q, placed(self.definition, change))
 
     @cached_property
     def _inverse(self) -> ObservationInverse | None:
         return ObservationInverse.of(self.definition) if self.definition.moves_observation else None
-
-    @cached
-    def _moving(self) -> Tensor:
-        return torch.tensor(self.definition.moving, device=self.definition.device)
 
     @cached_property
     def _inputs(self) -> Inputs:

@@ -36,7 +36,7 @@ class SqlDesigns(port.Designs):
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def ask(
+    def improve(
         self,
         name: str,
         queries: int,

@@ -159,7 +159,7 @@ def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], 
         touch(connection, held)
 
 
-def ask_again(connection: Connection, held: Row[Any]) -> int:
+def requeue_set_aside(connection: Connection, held: Row[Any]) -> int:
     """Make the queries that were set aside pending, with as many attempts as a new one has; returns how many."""
     set_aside = (queries.c.surrogate_id == held.id) & (queries.c.status == "set_aside")
     return connection.execute(sa.update(queries).where(set_aside).values(status="pending")).rowcount

@@ -11,7 +11,7 @@ from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage import port
 from surrogym_server.storage.records import NewSurrogate, Phase, SurrogateRecord, SurrogateSummary
 from surrogym_server.storage.sql.database import Database, clock, conflict_insert
-from surrogym_server.storage.sql.leases import ask_again
+from surrogym_server.storage.sql.leases import requeue_set_aside
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, touch, unknown_surrogate
 from surrogym_server.storage.sql.summaries import read_summaries
 from surrogym_server.storage.sql.tables import leases, queries, samples, surrogates
@@ -80,12 +80,12 @@ class SqlSurrogates(port.Surrogates):
             }
             if paused is False and before.phase == "failed":
                 changes |= {"phase": resting_phase(before.round), "error": None}
-            again = ask_again(connection, held) if paused is False else 0
+            again = requeue_set_aside(connection, held) if paused is False else 0
             if not changes and not again:
                 return before
             smaller = budget if budget is not None and budget < before.budget else None
             if smaller is not None or changes.keys() & {"target", "tolerances"}:
-                changes |= _ask_anew(connection, held, before, smaller)
+                changes |= _withdraw_unbegun(connection, held, before, smaller)
             if changes:
                 _apply(connection, held, changes)
             told = {"asked_again": again} if again else {}
@@ -151,7 +151,9 @@ def _set_or_taken_back(before: dict[str, float], changes: dict[str, float | None
     return kept | {name: value for name, value in changes.items() if value is not None}
 
 
-def _ask_anew(connection: Connection, held: Row[Any], before: SurrogateRecord, budget: int | None) -> dict[str, Any]:
+def _withdraw_unbegun(
+    connection: Connection, held: Row[Any], before: SurrogateRecord, budget: int | None
+) -> dict[str, Any]:
     """Withdraw what the design chose by what was asked of it before, as far as no sampler has begun it, and the right
     of a fit that is running. What was asked for beyond the design is asked for again, unless there is a smaller
     ``budget``, beyond which initial queries are withdrawn too. Gives the changes of the surrogate that follow."""
