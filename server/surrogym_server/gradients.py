@@ -60,6 +60,7 @@ class Optimised:
     policy: Network
     imagined_return: float
     virtual_steps: int
+    whole: bool = True  # False where Ctrl-C ended the search
 
 
 def optimise(
@@ -75,6 +76,7 @@ def optimise(
         progress: called after every update.
 
     Raises:
+        KeyboardInterrupt: Ctrl-C came before the first check; later it ends the search with the best policy so far.
         InvalidInput: the policy's actions are discrete, or the model's family can't be differentiated; or the return
             does not depend on the actions anywhere, as where every step alive pays the same.
 
@@ -83,16 +85,21 @@ def optimise(
     """
     settings = settings or GradientSettings()
     search = _Search(surrogate, settings)
-    best, kept, latest = -np.inf, search.policy(), None
-    for number in range(1, settings.updates + 1):
-        search.update()
-        if number * CHECKS // settings.updates > (number - 1) * CHECKS // settings.updates:
-            latest = search.imagined_return()
-            if latest >= best:
-                best, kept = latest, search.policy()
-        if progress is not None:
-            progress(Update(number, latest))
-    return Optimised(kept, float(best), search.virtual_steps)
+    best, kept, latest, whole = -np.inf, search.policy(), None, True
+    try:
+        for number in range(1, settings.updates + 1):
+            search.update()
+            if number * CHECKS // settings.updates > (number - 1) * CHECKS // settings.updates:
+                latest = search.imagined_return()
+                if latest >= best:
+                    best, kept = latest, search.policy()
+            if progress is not None:
+                progress(Update(number, latest))
+    except KeyboardInterrupt:
+        if latest is None:
+            raise
+        whole = False
+    return Optimised(kept, float(best), search.virtual_steps, whole)
 
 
 class _Search:

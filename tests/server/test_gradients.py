@@ -1,5 +1,6 @@
 """Optimisation by gradients: the gradient is the true one, it learns, and what has none is refused."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_client.policies import load_policy
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import InvalidInput
-from surrogym_server.gradients import GradientSettings, _evened, optimise
+from surrogym_server.gradients import GradientSettings, Update, _evened, optimise
 from surrogym_server.local import LocalSurrogate
 from surrogym_shared.wire import OpenSession
 
@@ -84,6 +85,22 @@ def test_checks_and_steps_are_told(surrogate):
     assert [update.number for update in seen] == list(range(1, 13))
     assert found.imagined_return == max(update.imagined_return for update in seen)
     assert found.virtual_steps == 12 * (16 * 20 + 64 * 30)
+
+
+@pytest.mark.parametrize("updates", [1, 5], ids=["before a check", "after a check"])
+def test_ctrl_c_gives_the_best_policy_once_one_was_checked(surrogate, updates: int):
+    def interrupt(now: Update) -> None:
+        if now.number == updates:
+            raise KeyboardInterrupt
+
+    settings = replace(SMALL, updates=24)  # a check after every second update
+    if updates == 1:
+        with pytest.raises(KeyboardInterrupt):
+            optimise(surrogate, settings, interrupt)
+    else:
+        found = optimise(surrogate, settings, interrupt)
+        assert not found.whole
+        assert found.imagined_return > -np.inf
 
 
 def test_no_lane_outweighs_the_others():

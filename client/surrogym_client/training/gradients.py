@@ -25,7 +25,7 @@ ENTRY_POINTS = "surrogym.gradients"  # brought by the server's package
 
 @dataclass(frozen=True)
 class Gradients(PolicySearch):
-    """Climbs the gradient of the imagined return. Continuous actions only; Ctrl-C keeps nothing.
+    """Climbs the gradient of the imagined return. Continuous actions only.
 
     The model moves by its mean, whatever the session's variant. Another model than the latest, a penalty, a trust
     region and a policy to start from are refused.
@@ -56,7 +56,7 @@ class Gradients(PolicySearch):
         except library.InvalidInput as error:
             raise ValueError(str(error)) from error
         ran_with = {**asdict(settings), "total_steps": task.steps}
-        return Found(found.policy, found.virtual_steps, found.imagined_return, ran_with)
+        return Found(found.policy, found.virtual_steps, found.imagined_return, ran_with, whole=found.whole)
 
     def _settings(self, library: Any, task: SearchTask) -> Any:
         """As many updates as the steps allow, after those of the checks."""

@@ -6,12 +6,16 @@ import json
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from surrogym_server.errors import SurrogymError
-from surrogym_shared.terminal import give, on_interrupt, progress
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.terminal import give, on_interrupt, progress, say
+
+if TYPE_CHECKING:
+    from surrogym_server.gradients import GradientSettings, Optimised
 
 
 def register(app: typer.Typer) -> None:
@@ -37,8 +41,8 @@ def optimise(
 
     Example: surrogym optimise --spec spec.json --model model.safetensors --out policy.zip
     """
-    stays = "interrupted; nothing was saved, and the same command begins anew"
-    with on_interrupt(lambda: stays), progress("optimise", quiet=quiet) as update:
+    nothing = "interrupted; nothing was saved, and the same command begins anew"
+    with on_interrupt(lambda: nothing), progress("optimise", quiet=quiet) as update:
         update(0.0, "importing torch")
         import torch
 
@@ -62,20 +66,30 @@ def optimise(
         except (SurrogymError, OSError, ValueError) as error:
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(1) from None
-    seconds = time.perf_counter() - started
-    card = {
+    card = _write_card(out, surrogate.spec(), settings, found, time.perf_counter() - started)
+    result = {"policy": str(out), **{name: card[name] for name in card if name != "spec"}}
+    words = (
+        f"{out}: {found.virtual_steps} virtual steps in {card['seconds']:.1f} s, imagined return "
+        f"{found.imagined_return:.1f} (in the model); next: surrogym evaluate {out}"
+    )
+    give(result, lambda: words, as_json=as_json, quiet=quiet)
+    if not found.whole:
+        say(f"interrupted; the best policy so far is {out}")
+        raise typer.Exit(130)
+
+
+def _write_card(
+    out: Path, spec: EnvironmentSpec, settings: GradientSettings, found: Optimised, seconds: float
+) -> dict[str, Any]:
+    """Write the policy's card beside it; gives what is in the card."""
+    card: dict[str, Any] = {
         "algorithm": "gradient",
-        "spec": surrogate.spec().model_dump(mode="json"),
-        "seed": seed,
+        "spec": spec.model_dump(mode="json"),
+        "seed": settings.seed,
         "virtual_steps": found.virtual_steps,
         "seconds": seconds,
         "imagined_return": found.imagined_return,
         "settings": asdict(settings),
     }
     out.with_suffix(".json").write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
-    result = {"policy": str(out), **{name: card[name] for name in card if name != "spec"}}
-    words = (
-        f"{out}: {found.virtual_steps} virtual steps in {seconds:.1f} s, imagined return "
-        f"{found.imagined_return:.1f} (in the model); next: surrogym evaluate {out}"
-    )
-    give(result, lambda: words, as_json=as_json, quiet=quiet)
+    return card
