@@ -32,7 +32,7 @@ from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
 
 Floats = NDArray[np.float64]
 LEAST_SAMPLES = 2  # that a model can be learned from
-Phase = Literal["collecting", "sampling", "ready", "over_budget"]
+Phase = Literal["collecting", "sampling", "ready", "over_budget", "from_log"]
 
 
 class QueriesOpen(RuntimeError):

@@ -103,7 +103,7 @@ def _table(surrogates: Sequence[SurrogateSummary]) -> str:
 def _row(seen: SurrogateSummary) -> tuple[str | float | None, ...]:
     queries = seen.queries
     waiting = f"{queries.pending} pending, {queries.leased} leased" if queries.pending + queries.leased else "none"
-    steps = f"{seen.ledger.total} of {seen.budget}"
+    steps = _steps(seen)
     environment = seen.environment or "own"
     return (
         *(seen.name, environment, _phase(seen), steps, waiting),
@@ -118,12 +118,14 @@ def _detail(view: SurrogateView) -> str:
     lines = [
         f"{view.name}: {view.environment or 'own environment'}, {'paused, ' if view.paused else ''}{view.phase}",
         f"real steps: {ledger.initial} initial, {ledger.adaptive} adaptive, {ledger.manual} manual, "
-        f"{ledger.total} of {view.budget} in all; {ledger.evaluation} in evaluation, {ledger.unresolved} unresolved "
-        f"({ledger.failed} failed)",
+        f"{ledger.total} of {view.budget} in all; {ledger.logged} logged, {ledger.evaluation} in evaluation, "
+        f"{ledger.unresolved} unresolved ({ledger.failed} failed)",
         f"queries: {view.queries.pending} pending, {view.queries.leased} leased, {view.queries.set_aside} set aside",
     ]
     if view.queries.set_aside:
         lines[-1] += f" as they failed; surrogym change {view.name} --resume asks those again"
+    if hint := _hint(view):
+        lines.append(hint)
     if view.error:
         lines.append(f"last error: {view.error}")
     if view.fidelity is not None:
@@ -133,6 +135,26 @@ def _detail(view: SurrogateView) -> str:
             columns([FIDELITY, *(_judged(output) for output in view.fidelity.outputs)]),
         ]
     return "\n".join(lines)
+
+
+def _steps(seen: SurrogateSummary) -> str:
+    """Real steps of the budget, and those of a log, which cost none."""
+    ledger = seen.ledger
+    taken = f"{ledger.total} of {seen.budget}" if seen.budget or ledger.total else ""
+    logged = f"{ledger.logged} logged" if ledger.logged else ""
+    return ", ".join(part for part in (taken, logged) if part) or "none"
+
+
+def _hint(view: SurrogateView) -> str | None:
+    """What has to happen next, where nothing does by itself."""
+    if view.phase == "from_log":
+        return f"the model holds what the log shows, and no real step is asked for; next: surrogym train {view.name}"
+    if view.budget == 0 and view.model_version is None and not view.samples:
+        return f"it asks for no real step, and has no log yet; next: surrogym import LOG --to {view.name}"
+    if view.queries.pending and not view.samplers and not view.paused:
+        logged = "; the model of the log is served meanwhile" if view.ledger.logged and view.model_version else ""
+        return f"{view.queries.pending} queries wait for a sampler{logged}; next: surrogym sample {view.name}"
+    return None
 
 
 def _judged(output: OutputFidelity) -> tuple[str | float | None, ...]:

@@ -15,14 +15,15 @@ LOOK_SECONDS = 0.25
 
 def share_of_design(view: SurrogateView) -> float:
     """How much of a design is done, in [0, 1]: all of it when it ended, else by its budget."""
-    return 1.0 if view.phase in COMPLETED else min(1.0, view.ledger.total / view.budget)
+    return 1.0 if view.phase in COMPLETED else min(1.0, view.ledger.total / max(1, view.budget))
 
 
 def words_of_design(view: SurrogateView) -> str:
     """One look at a design."""
     ledger = view.ledger
     fidelity = "" if view.fidelity is None else f", confidence index {view.fidelity.confidence_index:.4f}"
-    return f"{ledger.total} of {view.budget} real steps ({ledger.adaptive} adaptive){fidelity}"
+    logged = f", {ledger.logged} logged" if ledger.logged else ""
+    return f"{ledger.total} of {view.budget} real steps ({ledger.adaptive} adaptive){logged}{fidelity}"
 
 
 class DesignUnfinished(SurrogymClientError):

@@ -246,21 +246,32 @@ class Api:
         sampler: str,
         samples: Sequence[wire.NewSample],
         *,
+        purpose: Literal["manual", "logged"] = "manual",
+        complete: bool = True,
         idempotency_key: str | None = None,
     ) -> wire.AddedSamples:
         """Hand in real steps; the answer comes after they are stored for good.
+
+        ``logged`` ones were recorded before: they cost no budget, and those that are there already change nothing. A
+        fit becomes due for them with the call that makes the log ``complete``.
 
         A batch of up to about 300 samples is stored whole or not at all. A larger one is sent in several requests, so
         that an error may leave its first part stored; the same call with the same key then adds the rest.
         """
         key = idempotency_key or new_key()
         batches = _batches(samples)
-        keys = [key] if len(batches) == 1 else [f"{key}/{number}" for number in range(len(batches))]
+        keys: list[str | None] = [key] if len(batches) == 1 else [f"{key}/{number}" for number in range(len(batches))]
         added = [
             self._post(
                 wire.AddedSamples,
                 f"{routes.surrogate(name)}/add_sample",
-                wire.AddSamples(sampler=sampler, samples=batch, idempotency_key=key),
+                wire.AddSamples(
+                    sampler=sampler,
+                    samples=batch,
+                    purpose=purpose,
+                    complete=complete and batch is batches[-1],
+                    idempotency_key=key,
+                ),
             )
             for key, batch in zip(keys, batches, strict=True)
         ]

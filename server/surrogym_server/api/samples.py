@@ -38,9 +38,12 @@ MAX_PAGE = 10_000
 )
 def add_sample(name: str, body: Annotated[AddSamples, example(examples.ADD_SAMPLE)], use: Use) -> AddedSamples:
     """One or many, all or none, with or without a query; stored for good when the reply comes. A repeat is
-    harmless: a sample of a query is known by its lease token, others by the idempotency key."""
+    harmless: a sample of a query is known by its lease token, a logged one by its numbers, others by the idempotency
+    key."""
     samples = [convert.new_sample(sample) for sample in body.samples]
-    return convert.added_samples(use.samples.add(name, body.sampler, samples, body.idempotency_key))
+    logged, key = body.purpose == "logged", body.idempotency_key
+    added = use.samples.add(name, body.sampler, samples, key, logged=logged, complete=body.complete)
+    return convert.added_samples(added)
 
 
 @router.get(

@@ -87,7 +87,7 @@ def _design(spec: wire.EnvironmentSpec) -> core.DesignDefinition:
         initial = 4 * (len(spec.coordinates) + spec.action.size)
     if design.initial is not None:
         initial = design.initial
-    if design.budget is not None:
+    if design.budget:
         initial = min(initial, design.budget)
     return core.DesignDefinition(
         initial=initial,

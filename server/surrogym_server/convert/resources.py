@@ -74,7 +74,7 @@ def _summary_fields(listed: Listed) -> dict[str, Any]:
         "phase": summary.phase,
         "paused": summary.paused,
         "round": summary.round,
-        "samples": summary.ledger.total,
+        "samples": summary.ledger.samples,
         "model_version": summary.model_version,
         "confidence_index": summary.confidence_index,
         "target": summary.target,

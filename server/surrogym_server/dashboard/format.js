@@ -44,6 +44,7 @@ export const PHASES = {
   sampling: "sampling",
   ready: "ready",
   over_budget: "over budget",
+  from_log: "from a log",
   failed: "failed",
 };
 
@@ -53,5 +54,6 @@ export const MEANING = {
   sampling: "the design chooses real steps where the model is not sure",
   ready: "the model is as sure as it was asked to be",
   over_budget: "the budget is spent before the target was reached; it is served all the same",
+  from_log: "the model holds what the log shows, and no real step is asked for",
   failed: "the design stopped with an error",
 };

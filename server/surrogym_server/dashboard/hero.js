@@ -63,6 +63,6 @@ export function cost({ ledger, budget, queries }) {
   const open = queries.pending + queries.leased;
   return card("What it cost",
     h("p", { class: "big" }, plural(ledger.total, "real step")), costBar(ledger, budget),
-    h("p", { class: "note" }, `${count(ledger.initial)} initial, ${count(ledger.adaptive)} adaptive${ledger.manual ? `, ${count(ledger.manual)} by hand` : ""}; the budget is ${count(budget)}${open ? `, ${count(open)} asked now` : ""}.`),
+    h("p", { class: "note" }, `${count(ledger.initial)} initial, ${count(ledger.adaptive)} adaptive${ledger.manual ? `, ${count(ledger.manual)} by hand` : ""}; the budget is ${count(budget)}${ledger.logged ? `; ${count(ledger.logged)} more came in a log, at no cost` : ""}${open ? `, ${count(open)} asked now` : ""}.`),
     h("p", { class: "note" }, `${ledger.unresolved ? `At most ${count(ledger.unresolved)} more under leases that failed or ran out. ` : ""}Evaluation, apart: ${count(ledger.evaluation)}.`));
 }

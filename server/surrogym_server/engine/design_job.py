@@ -33,7 +33,7 @@ from surrogym_server.sampling.design import (
 )
 
 Array = NDArray[np.float64]
-Verdict = Literal["continue", "ready", "over_budget"]
+Verdict = Literal["continue", "ready", "over_budget", "from_log"]
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ class DesignJob:
     extra_queries: int = 0  # real steps asked for with improve: chosen whatever the verdict
     occupancy: Array | None = None  # (m, C) states that policies visited
     threads: int = 1
+    logged: int = 0  # of the samples: they cost none of the budget
 
 
 @dataclass(frozen=True)
@@ -73,11 +74,11 @@ class DesignResult:
     query_rollouts: tuple[Array, ...] = ()  # each (T, F)
 
     @property
-    def phase(self) -> Literal["sampling", "ready", "over_budget"]:
+    def phase(self) -> Literal["sampling", "ready", "over_budget", "from_log"]:
         """What the design does next: it takes the chosen queries, or it has ended."""
         if len(self.query_coordinates) or self.query_rollouts:
             return "sampling"
-        return "ready" if self.verdict == "ready" else "over_budget"
+        return "over_budget" if self.verdict == "continue" else self.verdict
 
 
 def initial_queries(
@@ -86,6 +87,8 @@ def initial_queries(
     """The first round: (state, coordinates (m, C), action (m, F), rollouts (T, F) each): a Latin hypercube, or rollouts
     where no state can be set."""
     state, none = DesignState().to_json(), np.zeros((0, 0))
+    if budget == 0:
+        return state, none, none, ()
     if definition.max_rollout is not None:
         return state, none, none, tuple(actions.numpy() for actions in initial_rollouts(definition, budget))
     q, u = initial_design(definition, budget)
@@ -162,4 +165,5 @@ def _request(job: DesignJob) -> Request:
         pending_rollouts=tuple(torch.from_numpy(actions) for actions in job.pending_rollouts),
         extra=job.extra_queries,
         states=None if job.occupancy is None else torch.from_numpy(job.occupancy),
+        logged=job.logged,
     )

@@ -25,7 +25,7 @@ from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
 from surrogym_server.sampling.rollouts import Aim, first_rollouts, plan_round
 
-Verdict = Literal["continue", "ready", "over_budget"]
+Verdict = Literal["continue", "ready", "over_budget", "from_log"]
 SHORTEST_ROUND = 4  # real steps
 TOLERANCE = 0.05  # of the output's deviation over the initial design
 WARM = "thetas"  # in stored states, as it was called when it was always hyperparameters
@@ -64,6 +64,7 @@ class Request:
     extra: int = 0  # real steps to choose whatever the verdict
     states: Tensor | None = None  # (v, C) visited by policies
     pending_rollouts: tuple[Tensor, ...] = ()  # each (T, F)
+    logged: int = 0  # of the samples: they cost none of the budget
 
 
 @dataclass(frozen=True)
@@ -177,14 +178,18 @@ def judge(
 ) -> Verdict:
     """Whether to continue. A ``tested_confidence`` counts only when leave-one-out errors are known and agree, it is
     settled where episodes end, and adaptive queries, half as many as the initial design had, have tried to disprove
-    it."""
+    it. Logged samples stand for initial queries, never for adaptive ones: nobody chose them to disprove anything."""
+    initial, spent = definition.design.initial, samples - request.logged
     sure = all(c.confidence_index >= request.target for c in confidences)
     if definition.design.stopping == "tested_confidence":
         sure = sure and all(_agrees(c, t) for c, t in zip(confidences, tolerances, strict=True))
-        sure = sure and settled and samples >= math.ceil(1.5 * definition.design.initial)
+        sure = sure and settled and spent + min(request.logged, initial) >= math.ceil(1.5 * initial)
+        sure = sure and request.budget > 0
     if sure:
         return "ready"
-    return "continue" if samples < request.budget else "over_budget"
+    if request.budget == 0:
+        return "from_log"
+    return "continue" if spent < request.budget else "over_budget"
 
 
 def _agrees(confidence: OutputConfidence, tolerance: float) -> bool:
@@ -204,7 +209,7 @@ def _choose(
     """One query for each output below its target, least confident first; the first one of those reserved."""
     below = _below(confidences, request.target)
     if verdict == "continue":
-        wanted = below[: max(0, request.budget - len(samples) - len(request.pending))]
+        wanted = below[: max(0, request.budget + request.logged - len(samples) - len(request.pending))]
     else:
         wanted = [below[i % len(below)] for i in range(request.extra)]
     taken = Points.joined([Points(samples.q, samples.u), request.pending])
@@ -225,7 +230,9 @@ def _plan(
     is trusted with longer plans the more it has seen, and fits are few."""
     steps = request.extra
     if verdict == "continue":
-        room = request.budget - len(samples) - sum(len(actions) for actions in request.pending_rollouts)
+        room = (
+            request.budget + request.logged - len(samples) - sum(len(actions) for actions in request.pending_rollouts)
+        )
         steps = min(room, max(SHORTEST_ROUND, len(samples) // 4))
     longest = model.definition.max_rollout or 1
     ended = bool(samples.terminated.any())

@@ -260,7 +260,8 @@ class Designer:
         name = lease.surrogate
         record, samples = self._storage.surrogates.get(name), self._storage.samples.arrays(name)
         pending = self._storage.queries.list(name, (*OPEN_STATUSES, "set_aside"))
-        spoken = len(samples.reward) + sum(query.steps for query in pending)
+        logged = int(samples.logged.sum())
+        spoken = len(samples.reward) - logged + sum(query.steps for query in pending)
         steps = [query for query in pending if query.kind == "step"]
         visited = None if lease.checkpoint is None else self._storage.occupancy.get(name, lease.checkpoint)
         return DesignJob(
@@ -279,6 +280,7 @@ class Designer:
             extra_queries=min(lease.extra_queries, max(0, record.budget - spoken)),  # it may have been lowered since
             occupancy=None if visited is None else visited.states,
             threads=self._threads,
+            logged=logged,
         )
 
     def _commit(self, lease: FitLease, result: DesignResult) -> None:

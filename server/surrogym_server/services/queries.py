@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 NO_STEPS = (np.zeros((0, 0)), np.zeros((0, 0)))
 POLL_SECONDS = 2.0  # notices cross no process border, so another server's queries are found by looking
-FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "failed")
+FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "from_log", "failed")
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import numpy as np
 from surrogym_server.environment.actions import model_actions
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
+from surrogym_server.sampling.coverage import covered
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions, check_coordinates
 from surrogym_server.services.notices import Notices
@@ -35,22 +36,53 @@ class SampleService:
         self._notices = notices
         self._samplers = samplers or Samplers()
 
-    def add(self, name: str, sampler: str, samples: Sequence[NewSample], key: str | None) -> Added:
+    def add(
+        self,
+        name: str,
+        sampler: str,
+        samples: Sequence[NewSample],
+        key: str | None,
+        *,
+        logged: bool = False,
+        complete: bool = True,
+    ) -> Added:
         """Store real steps, all or nothing; committed when it returns.
 
+        ``logged`` ones were recorded before the design. When their log is ``complete``, the initial queries that it
+        covers are withdrawn.
+
         Raises:
-            InvalidInput: wrong shape, action out of bounds, or samples without a query and without a key.
+            InvalidInput: wrong shape, action out of bounds, or samples without a query and without a key. It names the
+                sample by its index.
             UnknownQuery, ForeignLease, IdempotencyConflict: as the classes say.
         """
         definition = self._definitions.get(name)
         checked = [_checked(definition, index, sample) for index, sample in enumerate(samples)]
         check_trajectories(checked)
-        if key is None and any(sample.query_id is None for sample in checked):
+        if key is None and not logged and any(sample.query_id is None for sample in checked):
             raise InvalidInput("samples without a query_id: expected an idempotency_key, got none")
-        added = self._storage.samples.add(name, sampler, checked, key=key)
+        added = self._storage.samples.add(name, sampler, checked, key=key, logged=logged, complete=complete)
+        if logged and complete:
+            self._withdraw_covered(name, definition)
         self._samplers.heard(name, sampler)
         self._notices.post(name)
         return Added(added.ids, added.duplicates, self._storage.ledger.read(name))
+
+    def _withdraw_covered(self, name: str, definition: EnvironmentDefinition) -> None:
+        pending = [query for query in self._storage.queries.list(name, ("pending",)) if query.purpose == "initial"]
+        if not pending:
+            return
+        taken = self._storage.samples.arrays(name)
+        q, u = taken.coordinates[taken.logged], taken.action[taken.logged]
+        if definition.max_rollout is not None:
+            steps = np.cumsum([query.steps for query in pending])
+            chosen = steps <= len(q)
+        else:
+            asked = [np.array([getattr(query, field) for query in pending]) for field in ("coordinates", "action")]
+            chosen = covered(definition, asked[0], asked[1], q, u)
+        covering = [query.id for query, one in zip(pending, chosen, strict=True) if one]
+        if covering:
+            self._storage.queries.withdraw(name, covering)
 
     def page(self, name: str, after: int, limit: int) -> list[SampleRecord]:
         """Up to ``limit`` samples with an id above ``after``."""
@@ -102,7 +134,10 @@ def _checked(definition: EnvironmentDefinition, index: int, sample: NewSample) -
     check_coordinates(definition, f"{where}.next_coordinates", np.array([sample.next_coordinates]))
     for what in ("observation", "next_observation"):
         _check_observation(definition, f"{where}.{what}", getattr(sample, what))
-    action = model_actions(definition.action, np.array([sample.action]))
+    try:
+        action = model_actions(definition.action, np.array([sample.action]))
+    except InvalidInput as error:
+        raise InvalidInput(f"{where}: {str(error).removesuffix(' in row 0')}") from error
     return replace(sample, action=tuple(action[0].tolist()))
 
 

@@ -136,7 +136,8 @@ class Designs(ABC):
         """Names of the surrogates to fit now, oldest first.
 
         Such a surrogate has samples, no pending or leased query, and something new since its last fit
-        (a sample, a query set aside, an ask, another budget or target, a damaged model). It isn't paused, and
+        (a sample, a query set aside, an ask, another budget or target, a damaged model). Where a log came in since,
+        it does not wait for queries. It isn't paused, and
         nobody holds the right; one with more time left than it was given, as the clock was set back, is nobody's.
         """
 
@@ -226,6 +227,10 @@ class Queries(ABC):
         """
 
     @abstractmethod
+    def withdraw(self, name: str, query_ids: Sequence[int]) -> int:
+        """Remove those of these queries that are pending and that no sampler has begun; returns how many."""
+
+    @abstractmethod
     def get(self, name: str, query_id: int) -> QueryRecord:
         """Raises ``UnknownQuery`` when there is none."""
 
@@ -248,7 +253,16 @@ class Samples(ABC):
     """Samples: never changed, never lost once acknowledged."""
 
     @abstractmethod
-    def add(self, name: str, sampler: str, samples: Sequence[NewSample], *, key: str | None = None) -> AddedSamples:
+    def add(
+        self,
+        name: str,
+        sampler: str,
+        samples: Sequence[NewSample],
+        *,
+        key: str | None = None,
+        logged: bool = False,
+        complete: bool = True,
+    ) -> AddedSamples:
         """Store a batch, all or nothing, and answer the queries it names; committed when it returns.
 
         A sample takes the purpose of its query, or ``manual``. Under a lease that has ended (by its time or a
@@ -256,10 +270,15 @@ class Samples(ABC):
         Under one lease there is one answer: a sample, or the first samples of a rollout, ``step`` 0, 1, ... up to the
         query's ``steps``. The same again is a duplicate and gets the same id.
 
+        ``logged`` samples answer no query, and count apart from the budget. One that equals a logged sample of the
+        surrogate in every number is a duplicate, whatever batch it came in. While a log is not ``complete``, no fit
+        becomes due for what has come of it.
+
         Raises:
             UnknownQuery: no such query.
             ForeignLease: a lease token that was never given out for the query, or none.
-            InvalidInput: an answer that lacks a step, or has more than the query asked for.
+            InvalidInput: a logged sample that names a query, or an answer that lacks a step or has more than the query
+                asked for.
             IdempotencyConflict: the same lease token, or key, with another sample.
         """
 

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 JSON = dict[str, Any]
 Vector = tuple[float, ...]
-Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "failed"]
-Purpose = Literal["initial", "adaptive", "manual"]
+Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "from_log", "failed"]
+Purpose = Literal["initial", "adaptive", "manual"]  # of queries
+SamplePurpose = Literal["initial", "adaptive", "manual", "logged"]
 QueryStatus = Literal["pending", "leased", "answered", "set_aside"]
 QueryKind = Literal["step", "rollout"]
 Synchronous = Literal["full", "normal"]  # of a SQLite file: wait for the disk at every commit, or not always
@@ -207,7 +208,7 @@ class AddedSamples:
 @dataclass(frozen=True)
 class SampleRecord:
     id: int
-    purpose: Purpose
+    purpose: SamplePurpose
     query_id: int | None
     sampler: str
     attempt: int  # 0 without a query
@@ -235,6 +236,7 @@ class SampleArrays:
     next_coordinates: Array  # (n, C)
     reward: Array  # (n,)
     terminated: NDArray[np.bool_]  # (n,)
+    logged: NDArray[np.bool_]  # (n,) those that cost no budget
 
 
 # The rest
@@ -248,6 +250,7 @@ class LedgerRecord:
     initial: int = 0
     adaptive: int = 0
     manual: int = 0
+    logged: int = 0
     evaluation: int = 0
     unresolved: int = 0
     failed: int = 0
@@ -256,6 +259,11 @@ class LedgerRecord:
     def total(self) -> int:
         """What the design cost."""
         return self.initial + self.adaptive + self.manual
+
+    @property
+    def samples(self) -> int:
+        """What the model learns from."""
+        return self.total + self.logged
 
 
 @dataclass(frozen=True)

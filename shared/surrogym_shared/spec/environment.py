@@ -35,7 +35,8 @@ class Design(Frozen):
     """The adaptive design of queries: what is chosen before the first one.
 
     ``preset``: ``default`` or ``paper`` (the method as printed, repaired only where it cannot work). Every None takes
-    the preset's value. ``budget`` counts every real step of the design, initial ones included. ``tolerance`` is what
+    the preset's value. ``budget`` counts every real step of the design, initial ones included;
+    0 asks for none, and the model is that of a log. ``tolerance`` is what
     eq. 9 divides by the deviation where none is declared: ``relative``, 5 % of the output's deviation over the initial
     design, or ``raw``, 1 in the output's own unit, as printed. ``symmetry``: ``auto`` looks whether the environment is
     its own mirror image, every coordinate and the action with their signs changed, ``none`` does not; preset ``paper``
@@ -50,7 +51,7 @@ class Design(Frozen):
     """
 
     preset: Literal["default", "paper"] = "default"
-    budget: Annotated[int, Field(ge=2, le=100_000, strict=True)] | None = None
+    budget: Annotated[int, Field(ge=0, le=100_000, strict=True)] | None = None
     initial: Annotated[int, Field(ge=2, le=100_000, strict=True)] | None = None
     target: Annotated[float, Field(gt=0.5, lt=1, strict=True)] = 0.999
     acquisition: Name | AcquisitionChoice | None = None
@@ -141,7 +142,8 @@ class EnvironmentSpec(Frozen):
             self.query == "step" or self.design.preset != "paper",
             "preset 'paper' starts from a Latin hypercube over states: expected query 'step', got 'rollout'",
         )
-        if self.design.budget is not None and self.design.initial is not None:
+        require(self.design.budget != 1, "design: expected a budget of 2 or more real steps, or 0 for none, got 1")
+        if self.design.budget and self.design.initial is not None:
             require(
                 self.design.initial <= self.design.budget,
                 f"design: initial {self.design.initial} exceeds the budget {self.design.budget}",

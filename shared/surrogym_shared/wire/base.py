@@ -19,8 +19,9 @@ MAX_IMAGINED = 500  # steps of an imagined episode
 MAX_DRAWS = 64
 MAX_MEASURED = 1e30  # beyond it variances overflow, and one such sample would leave no model to serve
 
-Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "failed"]
+Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "from_log", "failed"]
 Purpose = Literal["initial", "adaptive", "manual"]
+SamplePurpose = Literal["initial", "adaptive", "manual", "logged"]
 QueryKind = Literal["step", "rollout"]
 QueryStatus = Literal["pending", "leased", "answered", "set_aside"]
 Variant = Literal["deterministic", "probabilistic", "pathwise"]

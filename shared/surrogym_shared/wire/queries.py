@@ -18,6 +18,7 @@ from surrogym_shared.wire.base import (
     QueryStatus,
     Reply,
     Request,
+    SamplePurpose,
     Vector,
 )
 from surrogym_shared.wire.surrogates import Ledger
@@ -130,8 +131,17 @@ class NewSample(Request):
 class AddSamples(Request):
     sampler: Key
     samples: Annotated[list[NewSample], Field(min_length=1, max_length=4_096)]
+    purpose: Literal["manual", "logged"] = Field(
+        default="manual",
+        description="of samples without a query. ``logged``: they were recorded before and cost no budget; one that is "
+        "there already, the same in every number, is a duplicate",
+    )
+    complete: bool = Field(
+        default=True, description="false: more of the same log follows, so no fit becomes due for this part"
+    )
     idempotency_key: Key | None = Field(
-        default=None, description="needed for samples without a query: a repeat with the same key is harmless"
+        default=None,
+        description="needed for samples without a query, but not for logged ones: a repeat with it is harmless",
     )
 
 
@@ -145,7 +155,7 @@ class AddedSamples(Reply):
 
 class SampleView(Reply):
     id: int
-    purpose: Purpose
+    purpose: SamplePurpose
     query_id: int | None
     sampler: str
     attempt: int

@@ -19,10 +19,10 @@ class CreateSurrogate(Request):
 
 
 class PatchSurrogate(Request):
-    """What may change while the design runs; None leaves a field as it is."""
+    """What may change while the design runs; None leaves a field as it is. A budget of 0 asks for no real step."""
 
     paused: bool | None = None
-    budget: Annotated[int, Field(ge=2, le=100_000)] | None = None
+    budget: Annotated[int, Field(ge=0, le=100_000)] | None = None
     target: Annotated[float, Field(gt=0.5, lt=1)] | None = None
     tolerances: dict[str, Positive | None] | None = Field(
         default=None,
@@ -59,14 +59,16 @@ class Fidelity(Reply):
 
 
 class Ledger(Reply):
-    """Acknowledged real steps by purpose. ``total`` is what the design cost: initial + adaptive + manual; evaluation is
-    apart, and ``unresolved`` counts the steps that leases which ended without an answer may have taken, so the true
-    number of real steps lies between total and total + unresolved. ``failed`` of the unresolved ones were under leases
-    that a sampler gave back with an error; the rest ran out."""
+    """Acknowledged real steps by purpose. ``total`` is what the design cost: initial + adaptive + manual. Evaluation is
+    apart, and so are ``logged`` steps, which somebody recorded before: they cost no budget. ``unresolved`` counts the
+    steps that leases which ended without an answer may have taken, so the true number of real steps lies between total
+    and total + unresolved. ``failed`` of the unresolved ones were under leases that a sampler gave back with an error;
+    the rest ran out."""
 
     initial: int = 0
     adaptive: int = 0
     manual: int = 0
+    logged: int = 0
     total: int = 0
     evaluation: int = 0
     unresolved: int = 0

@@ -126,7 +126,7 @@ def _is_due(connection: Connection) -> sa.ColumnElement[bool]:
         surrogates.c.revision > surrogates.c.fitted_revision,
         free,
         sa.exists(OWN_SAMPLES),
-        ~OPEN_QUERY,
+        ~OPEN_QUERY | (surrogates.c.logged_revision > surrogates.c.fitted_revision),
     )
 
 

@@ -159,6 +159,12 @@ def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], 
         touch(connection, held)
 
 
+def is_unbegun(surrogate_id: int) -> sa.ColumnElement[bool]:
+    """Whether a row of queries is a pending one of this surrogate that no sampler has begun."""
+    begun = sa.select(leases.c.id).where(leases.c.query_id == queries.c.id, leases.c.outcome != "unbegun")
+    return (queries.c.surrogate_id == surrogate_id) & (queries.c.status == "pending") & ~sa.exists(begun)
+
+
 def requeue_set_aside(connection: Connection, held: Row[Any]) -> int:
     """Make the queries that were set aside pending, with as many attempts as a new one has; returns how many."""
     set_aside = (queries.c.surrogate_id == held.id) & (queries.c.status == "set_aside")

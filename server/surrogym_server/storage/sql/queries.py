@@ -21,7 +21,7 @@ from surrogym_server.storage.records import (
 )
 from surrogym_server.storage.sql import leases as leasing
 from surrogym_server.storage.sql.database import Database, clock
-from surrogym_server.storage.sql.rows import Span, find, hold, insert_queries, recall, remember, within
+from surrogym_server.storage.sql.rows import Span, append_event, find, hold, insert_queries, recall, remember, within
 from surrogym_server.storage.sql.tables import leases, queries, surrogates
 
 COLUMNS = [
@@ -100,6 +100,15 @@ class SqlQueries(port.Queries):
             elif lease.outcome != outcome:
                 raise _ended(query_id)
             return _read(connection, held.id, query_id)
+
+    def withdraw(self, name: str, query_ids: Sequence[int]) -> int:
+        with self._database.write() as connection:
+            held = hold(connection, name)
+            chosen = queries.c.id.in_(query_ids) & leasing.is_unbegun(held.id)
+            gone = len(connection.execute(sa.delete(queries).where(chosen).returning(queries.c.id)).all())
+            if gone:
+                append_event(connection, held, "queries", withdrawn=gone, round=held.round)
+            return gone
 
     def get(self, name: str, query_id: int) -> QueryRecord:
         with self._database.read() as connection:

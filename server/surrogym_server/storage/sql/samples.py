@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,9 @@ from surrogym_server.storage.records import (
 )
 from surrogym_server.storage.sql.answers import Answered, read_answered, settle
 from surrogym_server.storage.sql.database import Database
-from surrogym_server.storage.sql.rows import append_event, find, hold, recall, remember, touch
+from surrogym_server.storage.sql.logged import complete_log, store_logged
+from surrogym_server.storage.sql.rows import find, hold, recall, remember, touch
+from surrogym_server.storage.sql.sample_rows import body_of, insert_samples, row_of
 from surrogym_server.storage.sql.tables import queries, samples
 
 COLUMNS = [
@@ -43,15 +44,29 @@ class SqlSamples(port.Samples):
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def add(self, name: str, sampler: str, samples: Sequence[NewSample], *, key: str | None = None) -> AddedSamples:
-        body = fingerprint(sampler, [_body(sample) for sample in samples])
+    def add(
+        self,
+        name: str,
+        sampler: str,
+        samples: Sequence[NewSample],
+        *,
+        key: str | None = None,
+        logged: bool = False,
+        complete: bool = True,
+    ) -> AddedSamples:
+        body = fingerprint(sampler, [body_of(sample) for sample in samples], *(["logged"] if logged else []))
         with self._database.write() as connection:
             held = hold(connection, name)
             before: list[int] | None = recall(connection, held, "add_samples", key, body)
             if before is not None:
                 return AddedSamples(tuple(before), len(before))
-            answered = read_answered(connection, held, samples)
-            added = _store(connection, held, sampler, samples, answered)
+            if logged:
+                added = store_logged(connection, held, sampler, samples)
+                if complete:
+                    complete_log(connection, held)
+            else:
+                answered = read_answered(connection, held, samples)
+                added = _store(connection, held, sampler, samples, answered)
             remember(connection, held, "add_samples", key, body, added.ids)
             return added
 
@@ -59,14 +74,16 @@ class SqlSamples(port.Samples):
         with self._database.read() as connection:
             rows = connection.execute(_raw_arrays(find(connection, name))).all()
         if not rows:
-            return SampleArrays(no_rows(), no_rows(), no_rows(), np.zeros(0), np.zeros(0, dtype=bool))
-        q, u, q_next, reward, terminated = zip(*rows, strict=True)
+            none = np.zeros(0, dtype=np.bool_)
+            return SampleArrays(no_rows(), no_rows(), no_rows(), np.zeros(0), none, none)
+        q, u, q_next, reward, terminated, purpose = zip(*rows, strict=True)
         return SampleArrays(
             coordinates=_matrix(q),
             action=_matrix(u),
             next_coordinates=_matrix(q_next),
             reward=np.array(reward, dtype=np.float64),
             terminated=np.array(terminated, dtype=np.bool_),
+            logged=np.array([one == "logged" for one in purpose], dtype=np.bool_),
         )
 
     def page(self, name: str, after: int, limit: int) -> list[SampleRecord]:
@@ -103,12 +120,14 @@ def _store(
     prints: dict[Identity, str] = {identity: sample.fingerprint for identity, sample in known.items()}
     new: dict[Identity, dict[str, Any]] = {}
     for identity, sample, lease in zip(identities, batch, answered, strict=True):
-        row = _row(held, sampler, sample, lease)
+        row = row_of(held, sampler, sample, lease)
         if prints.setdefault(identity, row["fingerprint"]) != row["fingerprint"]:
             raise IdempotencyConflict(f"expected the sample first reported for query {sample.query_id}, got another")
         if identity not in ids:
             new.setdefault(identity, row)
-    ids |= dict(zip(new, _insert(connection, held, sampler, list(new.values())), strict=True))
+    ids |= dict(zip(new, insert_samples(connection, held, sampler, list(new.values())), strict=True))
+    if new:
+        touch(connection, held)
     settle(connection, [lease for lease in answered if lease and not lease.reported])
     return AddedSamples(tuple(ids[identity] for identity in identities), len(batch) - len(new))
 
@@ -118,50 +137,11 @@ def _identity(place: int, sample: NewSample, lease: Answered | None) -> Identity
     return (lease.lease_id, sample.step) if lease else (None, place)
 
 
-def _body(sample: NewSample) -> dict[str, Any]:
-    """What a repeat has to repeat. The step is known apart, and fingerprints are older than it."""
-    return {name: value for name, value in asdict(sample).items() if name != "step"}
-
-
-def _insert(connection: Connection, held: Row[Any], sampler: str, rows: list[dict[str, Any]]) -> list[int]:
-    if not rows:
-        return []
-    insert = sa.insert(samples).returning(samples.c.id, sort_by_parameter_order=True)
-    ids = [int(id) for id in connection.execute(insert, rows).scalars()]
-    late = sum(row["late"] for row in rows)
-    append_event(connection, held, "sample", sampler=sampler, ids=ids, late=late)
-    touch(connection, held)
-    return ids
-
-
-def _row(held: Row[Any], sampler: str, sample: NewSample, lease: Answered | None) -> dict[str, Any]:
-    return {
-        "surrogate_id": held.id,
-        "query_id": lease.query_id if lease else None,
-        "lease_id": lease.lease_id if lease else None,
-        "purpose": lease.purpose if lease else "manual",
-        "sampler": sampler,
-        "attempt": lease.attempt if lease else 0,
-        "step": sample.step,
-        "late": lease is not None and not lease.live,
-        "coordinates": sample.coordinates,
-        "action": sample.action,
-        "next_coordinates": sample.next_coordinates,
-        "reward": sample.reward,
-        "terminated": sample.terminated,
-        "truncated": sample.truncated,
-        "observation": sample.observation,
-        "next_observation": sample.next_observation,
-        "fingerprint": fingerprint(_body(sample)),
-        "created_at": held.now,
-    }
-
-
 def _raw_arrays(surrogate_id: int) -> sa.Select[Any]:
     """Rows of bytes, reward and flag: a bulk read makes no Python float of a coordinate."""
     vectors = (samples.c.coordinates, samples.c.action, samples.c.next_coordinates)
     raw: list[Any] = [sa.type_coerce(column, sa.LargeBinary()) for column in vectors]
-    wanted = sa.select(*raw, samples.c.reward, samples.c.terminated)
+    wanted = sa.select(*raw, samples.c.reward, samples.c.terminated, samples.c.purpose)
     return wanted.where(samples.c.surrogate_id == surrogate_id).order_by(samples.c.id)
 
 

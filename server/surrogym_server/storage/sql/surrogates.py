@@ -11,10 +11,10 @@ from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage import port
 from surrogym_server.storage.records import NewSurrogate, Phase, SurrogateRecord, SurrogateSummary
 from surrogym_server.storage.sql.database import Database, clock, conflict_insert
-from surrogym_server.storage.sql.leases import requeue_set_aside
+from surrogym_server.storage.sql.leases import is_unbegun, requeue_set_aside
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, touch, unknown_surrogate
 from surrogym_server.storage.sql.summaries import read_summaries
-from surrogym_server.storage.sql.tables import leases, queries, samples, surrogates
+from surrogym_server.storage.sql.tables import queries, samples, surrogates
 
 NO_RIGHT = {"fit_token": None, "fit_owner": None, "fit_expires": None, "fit_seconds": None}
 COLUMNS = [
@@ -157,8 +157,7 @@ def _withdraw_unbegun(
     """Withdraw what the design chose by what was asked of it before, as far as no sampler has begun it, and the right
     of a fit that is running. What was asked for beyond the design is asked for again, unless there is a smaller
     ``budget``, beyond which initial queries are withdrawn too. Gives the changes of the surrogate that follow."""
-    begun = sa.select(leases.c.id).where(leases.c.query_id == queries.c.id, leases.c.outcome != "unbegun")
-    unbegun = (queries.c.surrogate_id == held.id) & (queries.c.status == "pending") & ~sa.exists(begun)
+    unbegun = is_unbegun(held.id)
     chosen = sa.delete(queries).where(unbegun, queries.c.purpose == "adaptive")
     withdrawn = connection.execute(chosen.returning(queries.c.steps, queries.c.extra)).all()
     connection.execute(sa.update(surrogates).where(surrogates.c.id == held.id).values(**NO_RIGHT))
@@ -178,9 +177,9 @@ def _withdraw_unbegun(
 
 
 def spoken_for(connection: Connection, surrogate_id: int) -> int:
-    """Samples there are, and those that queries without an answer stand for: open ones, and those set aside, of which
-    steps may have been taken."""
-    taken = sa.select(sa.func.count()).where(samples.c.surrogate_id == surrogate_id)
+    """Samples that cost a real step, and those that queries without an answer stand for: open ones, and those set
+    aside, of which steps may have been taken."""
+    taken = sa.select(sa.func.count()).where(samples.c.surrogate_id == surrogate_id, samples.c.purpose != "logged")
     awaited = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0)).where(
         queries.c.surrogate_id == surrogate_id, queries.c.status != "answered"
     )

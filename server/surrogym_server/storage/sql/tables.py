@@ -13,7 +13,16 @@ import numpy as np
 import sqlalchemy as sa
 from sqlalchemy.engine import Dialect
 
-from surrogym_server.storage.records import Array, EventKind, Phase, Purpose, QueryKind, QueryStatus, Vector
+from surrogym_server.storage.records import (
+    Array,
+    EventKind,
+    Phase,
+    Purpose,
+    QueryKind,
+    QueryStatus,
+    SamplePurpose,
+    Vector,
+)
 from surrogym_server.storage.sql.damage import damaged
 
 metadata = sa.MetaData(
@@ -146,6 +155,7 @@ surrogates = sa.Table(
     sa.Column("checkpoint", sa.Text),
     sa.Column("revision", sa.BigInteger, nullable=False),  # grows with whatever the design has to look at
     sa.Column("fitted_revision", sa.BigInteger, nullable=False),  # what the last fit has seen
+    sa.Column("logged_revision", sa.BigInteger, nullable=False, server_default="0"),  # that has all of the last log
     sa.Column("fit_token", sa.Text),
     sa.Column("fit_owner", sa.Text),
     sa.Column("fit_expires", sa.Double),
@@ -206,7 +216,7 @@ samples = sa.Table(
     sa.Column("query_id", Id, sa.ForeignKey("queries.id", ondelete="CASCADE"), index=True),
     sa.Column("lease_id", Id, sa.ForeignKey("leases.id", ondelete="CASCADE")),
     sa.Column("step", sa.Integer, nullable=False, server_default="0"),
-    sa.Column("purpose", Word("samples.purpose", Purpose), nullable=False),
+    sa.Column("purpose", Word("samples.purpose", SamplePurpose), nullable=False),
     sa.Column("sampler", sa.Text, nullable=False),
     sa.Column("attempt", sa.Integer, nullable=False),
     sa.Column("late", sa.Boolean, nullable=False),
@@ -222,6 +232,7 @@ samples = sa.Table(
     sa.Column("created_at", sa.Double, nullable=False),
     sa.UniqueConstraint("lease_id", "step"),
     sa.Index(None, "surrogate_id", "id"),
+    sa.Index(None, "surrogate_id", "fingerprint"),
     sqlite_autoincrement=True,
 )
 

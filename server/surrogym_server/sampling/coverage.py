@@ -1,0 +1,51 @@
+"""What a log has covered of the queries that a design would begin with. Pure."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy  # its parts are loaded on first use
+from numpy.typing import NDArray
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+def covered(definition: EnvironmentDefinition, q: Array, u: Array, logged_q: Array, logged_u: Array) -> Bools:
+    """Which of m queries a log makes unnecessary: those that a logged step lies nearer to than half the way to the
+    nearest other one.
+
+    Distances are measured over states and actions, in widths of the sampling range, angles around the circle. Two
+    discrete actions are 1 apart. A single query counts as covered by any log.
+
+    Args:
+        definition: of the environment.
+        q, u: the queries, (m, C) and (m, F).
+        logged_q, logged_u: the logged steps, (n, C) and (n, F).
+    """
+    if not len(q) or not len(logged_q):
+        return np.zeros(len(q), dtype=np.bool_)
+    asked, logged = _places(definition, q, u), _places(definition, logged_q, logged_u)
+    tree = scipy.spatial.cKDTree(asked)
+    other = tree.query(asked, k=2)[0][:, 1]  # infinite where there is none
+    nearest: Array = scipy.spatial.cKDTree(logged).query(asked)[0]
+    result: Bools = nearest < 0.5 * other
+    return result
+
+
+def _places(definition: EnvironmentDefinition, q: Array, u: Array) -> Array:
+    """Points whose distances are those of ``covered``, (n, D)."""
+    columns: list[Array] = []
+    for index, coordinate in enumerate(definition.coordinates):
+        if coordinate.kind == "angle":
+            columns += [np.sin(q[:, index]) / 2, np.cos(q[:, index]) / 2]
+        else:
+            low, high = coordinate.sampling.low, coordinate.sampling.high
+            columns.append((q[:, index] - low) / ((high - low) or 1.0))
+    for entry, count in enumerate(definition.action.nvec):
+        columns += [np.where(u[:, entry] == value, np.sqrt(0.5), 0.0) for value in range(count)]
+    if not definition.action.nvec:
+        least, most = definition.action.limits
+        columns += list(((u - least) / (most - least)).T)
+    return np.stack(columns, 1)

@@ -1,0 +1,57 @@
+"""Samples as rows of their table."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection, Row
+
+from surrogym_server.storage.records import NewSample, SamplePurpose, fingerprint
+from surrogym_server.storage.sql.answers import Answered
+from surrogym_server.storage.sql.rows import append_event
+from surrogym_server.storage.sql.tables import samples
+
+
+def body_of(sample: NewSample) -> dict[str, Any]:
+    """What a repeat has to repeat. The step is known apart, and fingerprints are older than it."""
+    return {name: value for name, value in asdict(sample).items() if name != "step"}
+
+
+def insert_samples(connection: Connection, held: Row[Any], sampler: str, rows: list[dict[str, Any]]) -> list[int]:
+    """Insert rows of samples and append the event; returns their ids in order."""
+    if not rows:
+        return []
+    insert = sa.insert(samples).returning(samples.c.id, sort_by_parameter_order=True)
+    ids = [int(id) for id in connection.execute(insert, rows).scalars()]
+    late = sum(row["late"] for row in rows)
+    append_event(connection, held, "sample", sampler=sampler, ids=ids, late=late)
+    return ids
+
+
+def row_of(
+    held: Row[Any], sampler: str, sample: NewSample, lease: Answered | None = None, *, logged: bool = False
+) -> dict[str, Any]:
+    """A sample as a row of its table: of the lease that it answers, of a log, or by hand."""
+    purpose: SamplePurpose = "logged" if logged else "manual"
+    return {
+        "surrogate_id": held.id,
+        "query_id": lease.query_id if lease else None,
+        "lease_id": lease.lease_id if lease else None,
+        "purpose": lease.purpose if lease else purpose,
+        "sampler": sampler,
+        "attempt": lease.attempt if lease else 0,
+        "step": sample.step,
+        "late": lease is not None and not lease.live,
+        "coordinates": sample.coordinates,
+        "action": sample.action,
+        "next_coordinates": sample.next_coordinates,
+        "reward": sample.reward,
+        "terminated": sample.terminated,
+        "truncated": sample.truncated,
+        "observation": sample.observation,
+        "next_observation": sample.next_observation,
+        "fingerprint": fingerprint(body_of(sample)),
+        "created_at": held.now,
+    }

@@ -1,0 +1,117 @@
+"""A log that comes in: a model of it alone, real steps only where it has not been, rows refused by index and reason."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from support import pendulum
+from surrogym_server.engine.design_job import initial_queries, run_design_job
+from surrogym_server.engine.models import ModelCache
+from surrogym_server.errors import InvalidInput
+from surrogym_server.services.definitions import Definitions
+from surrogym_server.services.designer import Designer
+from surrogym_server.services.metrics import ProcessMetrics
+from surrogym_server.services.models import load_model
+from surrogym_server.services.notices import Notices
+from surrogym_server.services.samples import SampleService
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import LedgerRecord, NewSample, NewSurrogate
+
+NAME = "pendulum"
+
+
+class Here:
+    """Runs jobs in this process."""
+
+    async def run(self, job):
+        return run_design_job(job)
+
+
+@pytest.fixture
+def service(storage: Storage, definitions: Definitions) -> SampleService:
+    async def make() -> SampleService:  # notices belong to a running event loop
+        return SampleService(storage, definitions, Notices())
+
+    return asyncio.run(make())
+
+
+@pytest.fixture
+def fit(storage: Storage, definitions: Definitions):
+    """Fits whatever is due."""
+    cache = ModelCache(lambda id, version: load_model(storage, definitions, id, version), storage.models.newest)
+
+    def run() -> None:
+        async def once() -> None:
+            designer = Designer(
+                storage, definitions, Here(), cache, Notices(), ProcessMetrics(),
+                owner="here", threads=1, look_seconds=0.05, fit_seconds=3600,
+            )  # fmt: skip
+            await designer.fit_all_due()
+
+        asyncio.run(once())
+
+    return run
+
+
+def logged(count: int, speed: float = 8.0) -> list[NewSample]:
+    """Real steps of the pendulum from speeds up to this."""
+    rng = np.random.default_rng(0)
+    low, high = np.array([-np.pi, -speed, -2.0]), np.array([np.pi, speed, 2.0])
+    steps = [pendulum.real_step(list(row[:2]), list(row[2:])) for row in rng.uniform(low, high, (count, 3))]
+    return [NewSample(**{name: _tuple(value) for name, value in step.items()}) for step in steps]
+
+
+def _tuple(value):
+    return tuple(value) if isinstance(value, list) else value
+
+
+def alone(storage: Storage, definitions: Definitions) -> str:
+    """A surrogate that asks for no real step."""
+    spec = pendulum.spec(budget=0)
+    state, q, u, _ = initial_queries(definitions._define(spec), 0)
+    storage.surrogates.create(NewSurrogate("alone", spec, 0, 0.999, state, q, u))
+    return "alone"
+
+
+def test_a_log_alone_gives_a_model(storage: Storage, definitions: Definitions, service: SampleService, fit):
+    name = alone(storage, definitions)
+    service.add(name, "log", logged(30), None, logged=True)
+    fit()
+    record = storage.surrogates.get(name)
+    assert (record.phase, record.error) == ("from_log", None)
+    assert storage.models.get(name).samples == 30
+    assert storage.queries.list(name) == []
+
+
+def test_a_log_over_the_range_leaves_the_budget_to_adaptive_queries(storage: Storage, service: SampleService, fit):
+    service.add(NAME, "log", logged(60), None, logged=True)
+    assert storage.queries.list(NAME) == [], "all initial queries are covered"
+    fit()
+    assert storage.surrogates.get(NAME).phase == "sampling", "nobody chose the log to disprove the model"
+    assert {query.purpose for query in storage.queries.list(NAME)} == {"adaptive"}
+    assert storage.ledger.read(NAME) == LedgerRecord(logged=60)
+
+
+def test_a_log_of_a_corner_leaves_initial_queries(storage: Storage, service: SampleService):
+    service.add(NAME, "log", logged(60, speed=0.5), None, logged=True)
+    assert 0 < len(storage.queries.list(NAME, ("pending",))) < pendulum.INITIAL
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"action": (9.0,)}, r"samples\.2: action: expected entry 0 in \[-2, 2\], got 9$"),
+        ({"action": (0.0, 0.0)}, r"samples\.2: action: expected shape \(1, 1\)"),
+        ({"coordinates": (0.0,)}, r"samples\.2\.coordinates: expected \(n, 2\)"),
+    ],
+)
+def test_a_bad_row_is_named_by_index_and_reason(storage: Storage, service: SampleService, change, reason: str):
+    rows = logged(4)
+    rows[2] = replace(rows[2], **change)
+    with pytest.raises(InvalidInput, match=reason):
+        service.add(NAME, "log", rows, "key")
+    assert storage.samples.count(NAME) == 0
