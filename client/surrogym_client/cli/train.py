@@ -28,6 +28,7 @@ from surrogym_client.cli.options import (
 if TYPE_CHECKING:
     from surrogym_client.training import TrainProgress, TrainResult, TrainSettings
     from surrogym_client.training.closed_loop import LoopSettings
+    from surrogym_client.training.handover import AuditSettings, Handover
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
     from surrogym_shared.wire import SurrogateView
@@ -173,11 +174,25 @@ class LoopOptions:
         ),
     ] = 0
     rounds: Annotated[int, typer.Option(min=1, help="Rounds of --improve, at most.")] = 3
+    audit: Annotated[
+        bool,
+        typer.Option(
+            "--audit/--no-audit",
+            help="Compare the model with a few real steps on the policy's way, beyond the budget, before the policy is "
+            "handed over. A sampler has to be running; without one the card says that there was no audit.",
+        ),
+    ] = True
+    audit_steps: Annotated[int, typer.Option(min=2, max=256, help="Real steps of an audit.")] = 8
 
     def settings(self) -> LoopSettings | None:
         from surrogym_client.training.closed_loop import LoopSettings
 
         return LoopSettings(self.improve, self.rounds) if self.improve else None
+
+    def audited(self, seed: int) -> AuditSettings | None:
+        from surrogym_client.training.handover import AuditSettings
+
+        return AuditSettings(steps=self.audit_steps, seed=seed) if self.audit else None
 
 
 @dataclass(frozen=True)
@@ -233,10 +248,10 @@ def command(
     _import(search.algorithm, quiet=output.quiet)
     card = partial(_write_card, surrogate=surrogate, spec=spec, url=url, seed=search.seed)
     with _keeping(card, typed(context, without=("out", "start_from", "trust_policy", "token"))):
-        result = _train(url, token, surrogate, out, settings, loop.settings(), log.progress_file, quiet=output.quiet)
-    summary = card(result)
+        result, handover = _train(url, token, surrogate, out, settings, loop, log.progress_file, quiet=output.quiet)
+    summary = card(result, handover)
     named = service.server if given_here(context, "server") else None
-    output.give(summary, lambda: words_of_result(result, closed_loop=loop.improve > 0, server=named))
+    output.give(summary, lambda: words_of_result(result, handover, closed_loop=loop.improve > 0, server=named))
 
 
 def _settings(search: SearchOptions, session: SessionOptions, start: StartOptions, log: LogOptions) -> TrainSettings:
@@ -349,15 +364,13 @@ def _train(
     surrogate: str,
     out: Path,
     settings: TrainSettings,
-    rounds: LoopSettings | None,
+    loop: LoopOptions,
     progress_file: Path | None,
     *,
     quiet: bool,
-) -> TrainResult:
+) -> tuple[TrainResult, Handover]:
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.training import train
-    from surrogym_client.training.closed_loop import ClosedLoop
-    from surrogym_client.training.settings import chosen_for
+    from surrogym_client.training.audited import AuditedTraining
     from surrogym_client.transport import Api, HttpSurrogate
     from surrogym_shared.terminal import progress
 
@@ -368,9 +381,18 @@ def _train(
         _recording(progress_file, update) as record,
     ):
         try:
-            if rounds is None:
-                return train(port, out, chosen_for(api.surrogate(surrogate), settings), record)
-            return ClosedLoop(api, surrogate, port, out, settings, rounds, record, _waiting(update)).train()
+            training = AuditedTraining(
+                api,
+                surrogate,
+                port,
+                out,
+                settings,
+                rounds=loop.settings(),
+                audit=loop.audited(settings.seed),
+                progress=record,
+                waiting=_waiting(update),
+            )
+            return training.train()
         except ValueError as error:
             raise CommandError(str(error)) from error
 
@@ -382,7 +404,15 @@ def _waiting(update: Update) -> Callable[[SurrogateView], None]:
     return lambda view: update(None, f"waiting for a sampler (surrogym sample {view.name}): {words_of_design(view)}")
 
 
-def _write_card(result: TrainResult, surrogate: str, spec: EnvironmentSpec, url: str, seed: int) -> dict[str, Any]:
+def _write_card(
+    result: TrainResult,
+    handover: Handover | None = None,
+    *,
+    surrogate: str,
+    spec: EnvironmentSpec,
+    url: str,
+    seed: int,
+) -> dict[str, Any]:
     """Write the policy's card; gives back the result as JSON."""
     from surrogym_client.policies.card import NotedAddress, PolicyCard, write_card
     from surrogym_client.runtime.versions import versions
@@ -398,6 +428,7 @@ def _write_card(result: TrainResult, surrogate: str, spec: EnvironmentSpec, url:
         imagined_return=result.imagined_return,
         visited_confidence=result.visited_confidence,
         networks=result.networks,
+        **({} if handover is None else vars(handover)),
         settings=result.settings,
         versions=versions(),
     )

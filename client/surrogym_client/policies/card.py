@@ -8,6 +8,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, RootModel, ValidationError
 
 from surrogym_client.errors import SurrogymClientError
+from surrogym_client.policies.evidence import Audit, Promise
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import SurrogateName
 
@@ -43,6 +44,10 @@ class PolicyCard(BaseModel):
     seconds: float | None = None
     imagined_return: float | None = None
     visited_confidence: tuple[float | None, ...] = ()
+    promise: Promise | None = None
+    audit: Audit | None = None
+    trusted: bool | None = None  # None: nobody judged the promise
+    reason: str = ""  # why it is trusted, or not
     networks: int = 1  # that learned in the last training
     settings: dict[str, Any] = Field(default_factory=dict)
     versions: dict[str, str] = Field(default_factory=dict)

@@ -37,7 +37,7 @@ FIDELITY = {
     "within 1 deviation": "leave_one_out_within_one",
     "within 2": "leave_one_out_within_two",
 }
-LEDGER = ("initial", "adaptive", "manual", "total", "logged", "evaluation", "unresolved")
+LEDGER = ("initial", "adaptive", "manual", "total", "audit", "logged", "evaluation", "unresolved")
 
 
 def page(

@@ -12,7 +12,7 @@ from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
 from surrogym_shared.wire import NewSample, SurrogateView
 
 BATCH = 1_024  # samples in a request
-PURPOSES = ("initial", "adaptive", "manual", "logged", "evaluation")
+PURPOSES = ("initial", "adaptive", "manual", "audit", "logged", "evaluation")
 
 
 class NotImportable(SurrogymClientError):

@@ -11,6 +11,7 @@ from surrogym_client.transport.api import Api
 from surrogym_shared.wire import SurrogateView
 
 LOOK_SECONDS = 0.25
+FIRST_LEASE_SECONDS = 15.0  # a sampler that waits for queries begins within a second
 
 
 def share_of_design(view: SurrogateView) -> float:
@@ -28,6 +29,10 @@ def words_of_design(view: SurrogateView) -> str:
 
 class DesignUnfinished(SurrogymClientError):
     """The design has failed, or was not done in time; ``surrogym status`` says more."""
+
+
+class NobodyAnswers(SurrogymClientError):
+    """No sampler takes the queries that were asked."""
 
 
 def wait_for_surrogate(api: Api, name: str, seconds: float) -> SurrogateView:
@@ -80,6 +85,34 @@ def wait_for_design(
         if time.monotonic() >= deadline:
             phase = "unknown" if view is None else view.phase
             raise DesignUnfinished(f"the design of {name!r} was not done after {seconds:g} s: its phase is {phase}")
+        time.sleep(LOOK_SECONDS)
+
+
+def wait_for_answers(
+    api: Api, name: str, queries: set[int], seconds: float, progress: Callable[[SurrogateView], None] | None = None
+) -> None:
+    """Wait until samplers have answered these queries, or given up on them.
+
+    Raises:
+        NobodyAnswers: no sampler has begun any of them after ``FIRST_LEASE_SECONDS``.
+        DesignUnfinished: some were still open after ``seconds``.
+        UnknownSurrogate: there is none of this name.
+    """
+    started = time.monotonic()
+    deadline, begun = started + seconds, False
+    while True:
+        view = _look(api, name, deadline)
+        if view is not None:
+            if progress is not None:
+                progress(view)
+            wanted = [query for query in api.queries(name) if query.id in queries]
+            if all(query.status in ("answered", "set_aside") for query in wanted):
+                return
+            begun = begun or view.queries.leased > 0 or any(query.attempts for query in wanted)
+            if not begun and time.monotonic() >= started + FIRST_LEASE_SECONDS:
+                raise NobodyAnswers(f"no sampler has begun a query of {name!r} within {FIRST_LEASE_SECONDS:g} s")
+        if time.monotonic() >= deadline:
+            raise DesignUnfinished(f"{len(queries)} queries of {name!r} were not all answered after {seconds:g} s")
         time.sleep(LOOK_SECONDS)
 
 

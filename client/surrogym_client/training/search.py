@@ -69,6 +69,7 @@ class Found:
     lost_episodes: int = 0
     networks: int = 1
     gaining: bool = False
+    untrained: float | None = None  # imagined return of a network that has learned nothing; None: not measured
 
 
 class PolicySearch(ABC):

@@ -113,6 +113,7 @@ class TrainResult:
     episode_penalty: float | None = None  # what it takes off a training episode's return; mean of the last 100
     networks: int = 1  # that learned in the last training, one after another where one was given up
     gaining: bool = False  # the best policy was still getting better when the training ended
+    untrained: float | None = None  # imagined return of a network that has learned nothing; None: not measured
     visited_confidence: tuple[float | None, ...] = ()  # the confidence index where the policy went, of each round
 
 

@@ -69,4 +69,5 @@ def _result(found: Found, settings: TrainSettings, out: Path, seconds: float) ->
         episode_penalty=found.episode_penalty,
         networks=found.networks,
         gaining=found.gaining,
+        untrained=found.untrained,
     )

@@ -7,10 +7,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from surrogym_client.training.handover import Handover
     from surrogym_client.training.settings import TrainResult
 
 
-def words_of_result(result: TrainResult, *, closed_loop: bool = False, server: str | None = None) -> str:
+def words_of_result(
+    result: TrainResult, handover: Handover | None = None, *, closed_loop: bool = False, server: str | None = None
+) -> str:
     """What a training gave, and what is next; ``server`` is an address that the next command has to be given too."""
     on_server = "" if server is None else f" --server {shlex.quote(server)}"
     lost = result.lost_episodes
@@ -19,6 +22,17 @@ def words_of_result(result: TrainResult, *, closed_loop: bool = False, server: s
         f"{result.path}: {result.virtual_steps} virtual steps in {result.seconds:.1f} s"
         f"{_imagined(result.imagined_return)}{cut}{_loop(result.visited_confidence) if closed_loop else ''}"
         f"{_given_up(result.networks - 1)}{_gaining(result)}; next: surrogym evaluate {result.path}{on_server}"
+        f"{'' if handover is None else words_of_handover(handover)}"
+    )
+
+
+def words_of_handover(handover: Handover) -> str:
+    """The promise of a policy, and whether to trust it, on a line of its own."""
+    promise, trusted = handover.promise, "trusted" if handover.trusted else "not trusted"
+    return (
+        f"\npromise: mean return {promise.median:.4g}, "
+        f"between {promise.low:.4g} and {promise.high:.4g} with 90 % chance; "
+        f"{trusted}: {handover.reason}"
     )
 
 

@@ -222,17 +222,23 @@ class Api:
         action: Sequence[Sequence[float]] = (),
         *,
         rollouts: Sequence[Sequence[Sequence[float]]] = (),
+        audit: bool = False,
         idempotency_key: str | None = None,
     ) -> list[wire.QueryView]:
         """Put queries of one's own into the queue: coordinates (n, C) and action (n, F); or, where the original
-        environment can only be reset, action sequences, each (T, F)."""
-        body = wire.AddQueries(
+        environment can only be reset, action sequences, each (T, F). Those of an audit cost none of the budget."""
+        body = (wire.AuditModel if audit else wire.AddQueries)(
             coordinates=[list(row) for row in coordinates] or None,
             action=[list(row) for row in action] or None,
             rollouts=[[list(row) for row in actions] for actions in rollouts] or None,
             idempotency_key=idempotency_key or new_key(),
         )
-        return self._post(wire.QueryList, f"{routes.surrogate(name)}/queries", body).queries
+        return self._post(wire.QueryList, f"{routes.surrogate(name)}/{'audit' if audit else 'queries'}", body).queries
+
+    def withdraw_audit(self, name: str, query_ids: Sequence[int]) -> int:
+        """Take queries of an audit back that no sampler has begun; gives how many that were."""
+        body = wire.WithdrawQueries(query_ids=list(query_ids))
+        return self._post(wire.WithdrawnQueries, f"{routes.surrogate(name)}/audit:withdraw", body).withdrawn
 
     def queries(self, name: str) -> list[wire.QueryView]:
         """Every query ever asked, with its state, attempts and last error."""
@@ -312,6 +318,10 @@ class Api:
         return self._post(wire.ImprovedSurrogate, f"{routes.surrogate(name)}/improve", body)
 
     # Models
+
+    def session_coordinates(self, session: str) -> list[list[float]]:
+        """Where each lane of a session is, (N, C)."""
+        return self._get(wire.SessionCoordinates, f"{routes.session(session)}/coordinates").coordinates
 
     def query_uncertainty(
         self,

@@ -9,7 +9,7 @@ from fastapi.responses import Response
 
 from surrogym_server import convert
 from surrogym_server.api import examples
-from surrogym_server.api.auth import READ, SAMPLE
+from surrogym_server.api.auth import READ, SAMPLE, TRAIN
 from surrogym_server.api.body import example
 from surrogym_server.api.door import DoorRoute, json_up_to
 from surrogym_server.api.problems import documented
@@ -17,6 +17,7 @@ from surrogym_server.api.state import Use
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
     AddQueries,
+    AuditModel,
     ClaimedQueries,
     ClaimQueries,
     FailQuery,
@@ -24,6 +25,8 @@ from surrogym_shared.wire import (
     QueryStatus,
     QueryView,
     RenewLease,
+    WithdrawnQueries,
+    WithdrawQueries,
 )
 
 router = APIRouter(prefix="/v1/surrogates/{name}", tags=["queries"], route_class=DoorRoute)
@@ -87,6 +90,33 @@ def add_queries(name: str, body: Annotated[AddQueries, example(examples.ADD_QUER
     u = convert.numbers("action", body.action or ())
     rollouts = [convert.numbers("rollouts", actions) for actions in body.rollouts or ()]
     return convert.query_list(use.queries.add(name, q, u, body.idempotency_key, rollouts))
+
+
+@router.post(
+    "/audit",
+    status_code=201,
+    summary="Ask for the real steps of an audit",
+    dependencies=[TRAIN],
+    openapi_extra=json_up_to(128),
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.BEYOND_BUDGET, Code.INVALID_REQUEST),
+)
+def audit(name: str, body: Annotated[AuditModel, example(examples.ADD_QUERIES)], use: Use) -> QueryList:
+    """Where a policy goes, to hold the model against. They cost none of the budget; the model learns from them too."""
+    q = convert.numbers("coordinates", body.coordinates or ())
+    u = convert.numbers("action", body.action or ())
+    rollouts = [convert.numbers("rollouts", actions) for actions in body.rollouts or ()]
+    return convert.query_list(use.queries.add(name, q, u, body.idempotency_key, rollouts, purpose="audit"))
+
+
+@router.post(
+    "/audit:withdraw",
+    summary="Take audit queries back",
+    dependencies=[TRAIN],
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
+)
+def withdraw(name: str, body: Annotated[WithdrawQueries, example(examples.WITHDRAW)], use: Use) -> WithdrawnQueries:
+    """Those of an audit that no sampler has begun; others stay."""
+    return WithdrawnQueries(withdrawn=use.queries.withdraw_audit(name, body.query_ids))
 
 
 @router.get(

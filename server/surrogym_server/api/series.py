@@ -10,7 +10,7 @@ from surrogym_server.storage.records import SurrogateSummary
 
 Series = Iterable[tuple[str, float]]  # value of the label, and the number
 
-PURPOSES = ("initial", "adaptive", "manual", "logged", "evaluation")
+PURPOSES = ("initial", "adaptive", "manual", "audit", "logged", "evaluation")
 STATUSES = ("pending", "leased", "answered", "set_aside")
 
 

@@ -17,6 +17,7 @@ from surrogym_server.api.state import Use
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
     OpenSession,
+    SessionCoordinates,
     SessionList,
     SessionView,
     SubmitOccupancy,
@@ -65,6 +66,17 @@ async def list_sessions(name: str, use: Use) -> SessionList:
 async def get_session(id: str, use: Use) -> SessionView:
     """Its settings, the last seq answered, and the model version of each lane."""
     return convert.session_view(use.sessions.get(id), use.sessions.idle_seconds)
+
+
+@router.get(
+    "/sessions/{id}/coordinates",
+    summary="Where the lanes are",
+    dependencies=[TRAIN],
+    responses=documented(*SESSION_ERRORS),
+)
+async def session_coordinates(id: str, use: Use) -> SessionCoordinates:
+    """The coordinates of every lane, as the original environment can be set to them."""
+    return convert.session_coordinates(use.sessions.get(id))
 
 
 @router.delete(

@@ -104,7 +104,7 @@ def _design(spec: wire.EnvironmentSpec) -> core.DesignDefinition:
 
 def _learning(spec: wire.EnvironmentSpec) -> core.LearningDefinition:
     moves: Literal["observation", "coordinates"] = "observation" if spec.design.preset == "paper" else "coordinates"
-    return core.LearningDefinition(_model(spec.design), moves)
+    return core.LearningDefinition(_model(spec.design), moves, limits_rewards=spec.design.preset != "paper")
 
 
 def _model(design: wire.Design) -> Choice:

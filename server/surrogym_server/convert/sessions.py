@@ -34,6 +34,7 @@ def opening(request: replies.OpenSession) -> Opening:
         propagation=request.propagation,
         weighting=request.weighting,
         spread=request.spread,
+        functions=request.functions,
     )
     return Opening(
         settings=settings,
@@ -63,6 +64,10 @@ def session_view(session: Session, idle_seconds: float) -> replies.SessionView:
         outputs=list(session.definition.outputs),
         idle_seconds=idle_seconds,
     )
+
+
+def session_coordinates(session: Session) -> replies.SessionCoordinates:
+    return replies.SessionCoordinates(coordinates=session.lanes.q.tolist())
 
 
 def session_activity(activity: SessionActivity) -> replies.SessionActivity:

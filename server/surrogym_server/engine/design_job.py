@@ -56,6 +56,7 @@ class DesignJob:
     occupancy: Array | None = None  # (m, C) states that policies visited
     threads: int = 1
     logged: int = 0  # of the samples: they cost none of the budget
+    audited: int = 0  # of the samples: steps of audits, which cost none of it either
 
 
 @dataclass(frozen=True)
@@ -166,4 +167,5 @@ def _request(job: DesignJob) -> Request:
         extra=job.extra_queries,
         states=None if job.occupancy is None else torch.from_numpy(job.occupancy),
         logged=job.logged,
+        audited=job.audited,
     )

@@ -86,7 +86,7 @@ def _read(definition: EnvironmentDefinition, data: bytes, surrogate_id: int) -> 
         id=header["id"],
         surrogate=header["surrogate"],
         definition=definition,
-        settings=VirtualSettings(**header["settings"]),
+        settings=_settings(header["settings"]),
         seed=header["seed"],
         model=header["model"],
         lanes=to_device(LaneState.from_arrays(_unprefixed("lanes", arrays)), definition.device),
@@ -96,6 +96,11 @@ def _read(definition: EnvironmentDefinition, data: bytes, surrogate_id: int) -> 
         opened_by=None if opened_by is None else (opened_by[0], opened_by[1]),
         surrogate_id=surrogate_id,
     )
+
+
+def _settings(saved: dict[str, Any]) -> VirtualSettings:
+    limits = saved.get("reward_limits")
+    return VirtualSettings(**{**saved, "reward_limits": None if limits is None else (limits[0], limits[1])})
 
 
 def _answer(header: dict[str, Any], arrays: Arrays) -> Answer | None:

@@ -17,7 +17,7 @@ from surrogym_server.engine.occupancy import Reservoir
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import IdempotencyConflict, InvalidInput, SeqConflict
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.virtual import LaneState, LaneTransition, VirtualSettings, create, reset, step
+from surrogym_server.virtual import LaneState, LaneTransition, VirtualSettings, create, reset, step, within
 from surrogym_shared.port import ResetResult, StepResult, quick
 
 Bools = NDArray[np.bool_]
@@ -175,6 +175,7 @@ def step_session(
     """
     _check_mask(mask, session.settings.num_envs)
     lanes, transition = _step_versions(session, action, mask, deviations, model_of)
+    transition = within(session.settings.reward_limits, transition)
     versions = np.where(transition.reset_lanes, latest, session.versions)
     session = _visited(_with(session, lanes=lanes, versions=versions), mask)
     return session, _result(transition, versions)

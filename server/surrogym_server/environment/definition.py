@@ -80,10 +80,12 @@ class LearningDefinition:
         model: family of models, by its name in ``models.registry``, and its settings.
         moves: what the transition outputs are increments of; under ``observation`` the coordinates are read back from
             the observation, as the paper has it.
+        limits_rewards: whether virtual rewards are kept near those of the samples.
     """
 
     model: Choice
     moves: Literal["coordinates", "observation"]
+    limits_rewards: bool = True
 
 
 @dataclass(frozen=True)

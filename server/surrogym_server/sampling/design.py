@@ -64,7 +64,13 @@ class Request:
     extra: int = 0  # real steps to choose whatever the verdict
     states: Tensor | None = None  # (v, C) visited by policies
     pending_rollouts: tuple[Tensor, ...] = ()  # each (T, F)
-    logged: int = 0  # of the samples: they cost none of the budget
+    logged: int = 0  # of the samples, from a log
+    audited: int = 0  # of the samples, steps of audits
+
+    @property
+    def free(self) -> int:
+        """Samples that cost none of the budget."""
+        return self.logged + self.audited
 
 
 @dataclass(frozen=True)
@@ -179,7 +185,7 @@ def judge(
     """Whether to continue. A ``tested_confidence`` counts only when leave-one-out errors are known and agree, it is
     settled where episodes end, and adaptive queries, half as many as the initial design had, have tried to disprove
     it. Logged samples stand for initial queries, never for adaptive ones: nobody chose them to disprove anything."""
-    initial, spent = definition.design.initial, samples - request.logged
+    initial, spent = definition.design.initial, samples - request.free
     sure = all(c.confidence_index >= request.target for c in confidences)
     if definition.design.stopping == "tested_confidence":
         sure = sure and all(_agrees(c, t) for c, t in zip(confidences, tolerances, strict=True))
@@ -209,7 +215,7 @@ def _choose(
     """One query for each output below its target, least confident first; the first one of those reserved."""
     below = _below(confidences, request.target)
     if verdict == "continue":
-        wanted = below[: max(0, request.budget + request.logged - len(samples) - len(request.pending))]
+        wanted = below[: max(0, request.budget + request.free - len(samples) - len(request.pending))]
     else:
         wanted = [below[i % len(below)] for i in range(request.extra)]
     taken = Points.joined([Points(samples.q, samples.u), request.pending])
@@ -230,9 +236,8 @@ def _plan(
     is trusted with longer plans the more it has seen, and fits are few."""
     steps = request.extra
     if verdict == "continue":
-        room = (
-            request.budget + request.logged - len(samples) - sum(len(actions) for actions in request.pending_rollouts)
-        )
+        pending = sum(len(actions) for actions in request.pending_rollouts)
+        room = request.budget + request.free - len(samples) - pending
         steps = min(room, max(SHORTEST_ROUND, len(samples) // 4))
     longest = model.definition.max_rollout or 1
     ended = bool(samples.terminated.any())

@@ -29,6 +29,7 @@ from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import (
+    FREE,
     OPEN_STATUSES,
     FitLease,
     Granted,
@@ -260,8 +261,9 @@ class Designer:
         name = lease.surrogate
         record, samples = self._storage.surrogates.get(name), self._storage.samples.arrays(name)
         pending = self._storage.queries.list(name, (*OPEN_STATUSES, "set_aside"))
-        logged = int(samples.logged.sum())
-        spoken = len(samples.reward) - logged + sum(query.steps for query in pending)
+        pending = [query for query in pending if query.purpose not in FREE]
+        logged, audited = (samples.purpose.count(purpose) for purpose in ("logged", "audit"))
+        spoken = len(samples.reward) - logged - audited + sum(query.steps for query in pending)
         steps = [query for query in pending if query.kind == "step"]
         visited = None if lease.checkpoint is None else self._storage.occupancy.get(name, lease.checkpoint)
         return DesignJob(
@@ -281,6 +283,7 @@ class Designer:
             occupancy=None if visited is None else visited.states,
             threads=self._threads,
             logged=logged,
+            audited=audited,
         )
 
     def _commit(self, lease: FitLease, result: DesignResult) -> None:

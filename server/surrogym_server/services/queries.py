@@ -15,7 +15,7 @@ from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions, check_points, check_rollouts, check_settable
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.records import LeasedQuery, Phase, QueryRecord, QueryStatus
+from surrogym_server.storage.records import LeasedQuery, Phase, Purpose, QueryRecord, QueryStatus
 
 Array = NDArray[np.float64]
 
@@ -86,13 +86,21 @@ class QueryService:
         return record
 
     def add(
-        self, name: str, coordinates: Array, action: Array, key: str | None, rollouts: Sequence[Array] = ()
+        self,
+        name: str,
+        coordinates: Array,
+        action: Array,
+        key: str | None,
+        rollouts: Sequence[Array] = (),
+        *,
+        purpose: Purpose = "manual",
     ) -> list[QueryRecord]:
-        """Queue queries by hand: coordinates (m, C) and action (m, F), or action sequences, each (T, F).
+        """Queue queries by hand, or of an audit: coordinates (m, C) and action (m, F), or action sequences (T, F).
 
         Raises:
             InvalidInput: wrong shape, out of bounds, or of another kind than the original environment can answer.
             IdempotencyConflict: the same key with other queries.
+            BeyondBudget: all audits together would take more real steps than the design.
         """
         definition = self._definitions.get(name)
         if definition.max_rollout is None:
@@ -101,13 +109,24 @@ class QueryService:
                     "expected coordinates and action alone: the original environment can be set to any state"
                 )
             q, u = check_points(definition, check_settable(definition, coordinates), action)
-            ids = self._storage.queries.enqueue(name, q, u, key=key)
+            ids = self._storage.queries.enqueue(name, q, u, purpose=purpose, key=key)
         else:
             if len(coordinates) or len(action) or not len(rollouts):
                 raise InvalidInput("expected rollouts alone: the original environment can only be reset and act")
-            ids = self._storage.queries.enqueue(name, *NO_STEPS, check_rollouts(definition, rollouts), key=key)
+            ids = self._storage.queries.enqueue(
+                name, *NO_STEPS, check_rollouts(definition, rollouts), purpose=purpose, key=key
+            )
         self._notices.post(name)
         return [self._storage.queries.get(name, id) for id in ids]
+
+    def withdraw_audit(self, name: str, query_ids: Sequence[int]) -> int:
+        """Remove those of these queries that belong to an audit and that no sampler has begun; returns how many."""
+        pending = self._storage.queries.list(name, ("pending",))
+        audits = [query.id for query in pending if query.purpose == "audit" and query.id in set(query_ids)]
+        withdrawn = self._storage.queries.withdraw(name, audits) if audits else 0
+        if withdrawn:
+            self._notices.post(name)
+        return withdrawn
 
     def list(self, name: str, statuses: Sequence[QueryStatus]) -> list[QueryRecord]:
         """The queries of these statuses (none: all), oldest first."""

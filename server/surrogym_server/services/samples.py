@@ -73,7 +73,8 @@ class SampleService:
         if not pending:
             return
         taken = self._storage.samples.arrays(name)
-        q, u = taken.coordinates[taken.logged], taken.action[taken.logged]
+        logged = np.array([purpose == "logged" for purpose in taken.purpose], dtype=np.bool_)
+        q, u = taken.coordinates[logged], taken.action[logged]
         if definition.max_rollout is not None:
             steps = np.cumsum([query.steps for query in pending])
             chosen = steps <= len(q)

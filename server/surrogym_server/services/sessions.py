@@ -40,7 +40,7 @@ from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import SavedSession
 from surrogym_server.tensors import CPU
-from surrogym_server.virtual import VirtualSettings, expected_bytes
+from surrogym_server.virtual import VirtualSettings, expected_bytes, reward_limits
 from surrogym_server.virtual.paths import function_draws
 
 logger = logging.getLogger(__name__)
@@ -266,7 +266,7 @@ class SessionService:
             secrets.token_urlsafe(SESSION_ID_BYTES),
             surrogate,
             definition,
-            resolved(opening, definition),
+            self._limited(surrogate, resolved(opening, definition), definition),
             seed=secrets.randbits(63) if opening.seed is None else opening.seed,
             model=opening.model,
             version=version,
@@ -274,6 +274,11 @@ class SessionService:
             opened_by=None if opening.key is None else (opening.key, digest),
             surrogate_id=id,
         )
+
+    def _limited(self, surrogate: str, settings: VirtualSettings, definition: EnvironmentDefinition) -> VirtualSettings:
+        """Settings with limits of rewards from the samples. Preset ``paper`` has none."""
+        seen = self._storage.samples.reward_range(surrogate) if definition.learning.limits_rewards else None
+        return settings if seen is None else replace(settings, reward_limits=reward_limits(*seen))
 
     def _step(self, session: Session, u: Array, mask: Bools | None, deviations: bool) -> tuple[Session, Any]:
         try:

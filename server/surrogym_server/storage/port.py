@@ -34,6 +34,7 @@ from surrogym_server.storage.records import (
     NewSurrogate,
     OccupancyRecord,
     Phase,
+    Purpose,
     QueryCounts,
     QueryRecord,
     QueryStatus,
@@ -193,10 +194,15 @@ class Queries(ABC):
         action: Array,
         rollouts: Sequence[Array] = (),
         *,
+        purpose: Purpose = "manual",
         key: str | None = None,
     ) -> list[int]:
-        """Queue queries by hand, purpose ``manual``: steps from coordinates (m, C) under action (m, F), and rollouts
-        of action sequences, each (T, F); returns their ids."""
+        """Queue queries by hand, or of an audit: steps from coordinates (m, C) under action (m, F), and rollouts of
+        action sequences, each (T, F); returns their ids.
+
+        Raises:
+            BeyondBudget: all audits of the surrogate together would have more steps than its budget, and than 64.
+        """
 
     @abstractmethod
     def claim(self, name: str, sampler: str, limit: int, seconds: float) -> list[LeasedQuery]:
@@ -292,6 +298,10 @@ class Samples(ABC):
 
     @abstractmethod
     def count(self, name: str) -> int: ...
+
+    @abstractmethod
+    def reward_range(self, name: str) -> tuple[float, float] | None:
+        """The least and the largest reward; None without samples."""
 
 
 class Ledger(ABC):

@@ -18,8 +18,9 @@ Array = NDArray[np.float64]
 JSON = dict[str, Any]
 Vector = tuple[float, ...]
 Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "from_log", "failed"]
-Purpose = Literal["initial", "adaptive", "manual"]  # of queries
-SamplePurpose = Literal["initial", "adaptive", "manual", "logged"]
+Purpose = Literal["initial", "adaptive", "manual", "audit"]  # of queries
+SamplePurpose = Literal["initial", "adaptive", "manual", "audit", "logged"]
+FREE = ("audit", "logged")  # purposes of samples that cost none of the budget
 QueryStatus = Literal["pending", "leased", "answered", "set_aside"]
 QueryKind = Literal["step", "rollout"]
 Synchronous = Literal["full", "normal"]  # of a SQLite file: wait for the disk at every commit, or not always
@@ -236,7 +237,7 @@ class SampleArrays:
     next_coordinates: Array  # (n, C)
     reward: Array  # (n,)
     terminated: NDArray[np.bool_]  # (n,)
-    logged: NDArray[np.bool_]  # (n,) those that cost no budget
+    purpose: tuple[SamplePurpose, ...]  # (n,)
 
 
 # The rest
@@ -250,6 +251,7 @@ class LedgerRecord:
     initial: int = 0
     adaptive: int = 0
     manual: int = 0
+    audit: int = 0
     logged: int = 0
     evaluation: int = 0
     unresolved: int = 0
@@ -263,7 +265,7 @@ class LedgerRecord:
     @property
     def samples(self) -> int:
         """What the model learns from."""
-        return self.total + self.logged
+        return self.total + self.audit + self.logged
 
 
 @dataclass(frozen=True)

@@ -2,5 +2,16 @@
 
 from surrogym_server.virtual.environment import LaneTransition, VirtualSettings, create, expected_bytes, reset, step
 from surrogym_server.virtual.lanes import LaneState
+from surrogym_server.virtual.limits import reward_limits, within
 
-__all__ = ["LaneState", "LaneTransition", "VirtualSettings", "create", "expected_bytes", "reset", "step"]
+__all__ = [
+    "LaneState",
+    "LaneTransition",
+    "VirtualSettings",
+    "create",
+    "expected_bytes",
+    "reset",
+    "reward_limits",
+    "step",
+    "within",
+]

@@ -39,7 +39,9 @@ class VirtualSettings:
     propagation: Literal["mean", "sample"] = "sample"
     weighting: Weighting = "inverse_variance"
     spread: float = 0.01  # first deviation of particles, as a share of each coordinate's range
+    functions: int | None = None  # that lanes of variant pathwise share; None: each has its own
     process_noise: bool = False  # the learned noise moves the state, w of eq. 2
+    reward_limits: tuple[float, float] | None = None  # of mean rewards; None: none
     trust: float | None = None  # an episode ends where an output deviates by more, in its deviations over the samples
 
 
@@ -125,7 +127,7 @@ def step(
     moving, beginning = _divided(settings, lanes, _mask(mask, lanes))
     active = lanes.take(moving)
     if settings.variant == "pathwise":
-        active = with_paths(model, active)
+        active = with_paths(model, active, settings.functions)
     action = torch.from_numpy(u).to(definition.device)
     moved = _move(model, settings, active, action if isinstance(moving, slice) else action[moving], deviations)
     untrusted = _untrusted(model, settings, moved)

@@ -54,16 +54,18 @@ class ConstantErrors(FunctionDraws):
         )
 
 
-def with_paths(model: DynamicsModel, lanes: LaneState) -> LaneState:
+def with_paths(model: DynamicsModel, lanes: LaneState, functions: int | None = None) -> LaneState:
     """Lanes whose functions are drawn: those in the first step of their episode draw it now, under its model.
 
-    A draw is a pure function of model, seed, lane and episode. It is kept in the state all the same: solving for other
+    A draw is a pure function of model, seed, lane and episode; with a number of ``functions`` the lane counts modulo
+    that, so that lanes share functions. It is kept in the state all the same: solving for other
     lanes beside it could change its last bits.
     """
     fresh = lanes.elapsed == 0
     if not bool(fresh.any()):
         return lanes
     drawing, draws = lanes.take(fresh), function_draws(model)
-    noise = normal_noise(drawing, Purpose.PATH, 1, draws.path_size)[:, 0]
+    keyed = drawing if functions is None else replace(drawing, lane=drawing.lane % functions)
+    noise = normal_noise(keyed, Purpose.PATH, 1, draws.path_size)[:, 0]
     drawn = replace(drawing, path=draws.draw(noise))
     return drawn if len(drawn) == len(lanes) else lanes.put(fresh, drawn)

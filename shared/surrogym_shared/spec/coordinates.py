@@ -115,3 +115,12 @@ class Coordinate(Frozen):
                 f"[{self.bounds.low}, {self.bounds.high}]",
             )
         return self
+
+    @property
+    def settable(self) -> tuple[float, float]:
+        """What the original environment can be set to: its bounds, or the sampling range where it has none."""
+        low, high = limits(self.sampling)
+        if self.bounds is None:
+            return low, high
+        least, most = self.bounds.low, self.bounds.high
+        return low if least is None else least, high if most is None else most

@@ -47,6 +47,7 @@ from surrogym_shared.wire.queries import (
     AddedSamples,
     AddQueries,
     AddSamples,
+    AuditModel,
     ClaimedQueries,
     ClaimQueries,
     FailQuery,
@@ -62,6 +63,8 @@ from surrogym_shared.wire.queries import (
     SamplePage,
     SampleView,
     StepQuery,
+    WithdrawnQueries,
+    WithdrawQueries,
 )
 from surrogym_shared.wire.service import Access, Event, Health, Ready
 from surrogym_shared.wire.sessions import (
@@ -78,6 +81,7 @@ from surrogym_shared.wire.sessions import (
     RolloutReply,
     RolloutSession,
     SessionActivity,
+    SessionCoordinates,
     SessionList,
     SessionView,
     StepReply,
@@ -117,6 +121,7 @@ __all__ = [
     "AddQueries",
     "AddSamples",
     "AddedSamples",
+    "AuditModel",
     "AutoresetMode",
     "BoxSpace",
     "ClaimQueries",
@@ -172,6 +177,7 @@ __all__ = [
     "Seed",
     "Seq",
     "SessionActivity",
+    "SessionCoordinates",
     "SessionList",
     "SessionView",
     "StepQuery",
@@ -186,4 +192,6 @@ __all__ = [
     "Uncertainty",
     "Variant",
     "Vector",
+    "WithdrawQueries",
+    "WithdrawnQueries",
 ]

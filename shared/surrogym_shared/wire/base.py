@@ -20,8 +20,8 @@ MAX_DRAWS = 64
 MAX_MEASURED = 1e30  # beyond it variances overflow, and one such sample would leave no model to serve
 
 Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "from_log", "failed"]
-Purpose = Literal["initial", "adaptive", "manual"]
-SamplePurpose = Literal["initial", "adaptive", "manual", "logged"]
+Purpose = Literal["initial", "adaptive", "manual", "audit"]
+SamplePurpose = Literal["initial", "adaptive", "manual", "audit", "logged"]
 QueryKind = Literal["step", "rollout"]
 QueryStatus = Literal["pending", "leased", "answered", "set_aside"]
 Variant = Literal["deterministic", "probabilistic", "pathwise"]

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from surrogym_shared.spec import MAX_ROLLOUT_QUERY
 from surrogym_shared.wire.base import (
+    MAX_BATCH,
     MAX_CLAIM,
     Key,
     Matrix,
@@ -108,6 +109,19 @@ class AddQueries(Request):
     action: Matrix | None = None
     rollouts: Annotated[list[ActionSequence], Field(min_length=1, max_length=MAX_CLAIM)] | None = None
     idempotency_key: Key | None = None
+
+
+class AuditModel(AddQueries):
+    """Real steps that test a model where a policy goes. They cost none of the design's budget; all audits of a
+    surrogate together have as many steps as that, at most."""
+
+
+class WithdrawQueries(Request):
+    query_ids: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1, max_length=MAX_BATCH)]
+
+
+class WithdrawnQueries(Reply):
+    withdrawn: int = Field(description="how many were removed: those that were pending and that no sampler had begun")
 
 
 class NewSample(Request):

@@ -55,6 +55,11 @@ class OpenSession(Request):
     spread: Annotated[float, Field(ge=0, le=1)] = Field(
         default=0.01, description="initial deviation of particles, as a share of each coordinate's sampling range"
     )
+    functions: Annotated[int, Field(ge=1, le=MAX_LANES)] | None = Field(
+        default=None,
+        description="variant pathwise: lane i follows function i modulo so many, so that lanes share "
+        "functions from different starts; None: each lane its own",
+    )
     occupancy: bool = Field(default=False, description="collect visited coordinates, to be submitted at checkpoints")
     idempotency_key: Key | None = None
 
@@ -64,7 +69,13 @@ class OpenSession(Request):
         for name in () if self.variant == "probabilistic" else OF_PARTICLES:
             if getattr(self, name) != type(self).model_fields[name].default:
                 raise ValueError(f"{name}: expected with variant probabilistic alone, got with {self.variant}")
+        if self.functions is not None and self.variant != "pathwise":
+            raise ValueError(f"functions: expected with variant pathwise alone, got with {self.variant}")
         return self
+
+
+class SessionCoordinates(Reply):
+    coordinates: list[list[float]] = Field(description="(N, C) where each lane is now; of particles their mean")
 
 
 class BoxSpace(Reply):

@@ -68,6 +68,7 @@ class Ledger(Reply):
     initial: int = 0
     adaptive: int = 0
     manual: int = 0
+    audit: int = 0
     logged: int = 0
     total: int = 0
     evaluation: int = 0

@@ -26,7 +26,8 @@ ALLOWED = {
     "train": """
         POST /v1/surrogates/{name}/sessions, POST /v1/surrogates/{name}/improve, GET /v1/sessions/{id},
         DELETE /v1/sessions/{id}, POST /v1/sessions/{id}/occupancy, POST /v1/sessions/{id}/reset,
-        POST /v1/sessions/{id}/step, POST /v1/sessions/{id}/rollout""",
+        POST /v1/sessions/{id}/step, POST /v1/sessions/{id}/rollout, GET /v1/sessions/{id}/coordinates,
+        POST /v1/surrogates/{name}/audit, POST /v1/surrogates/{name}/audit:withdraw""",
     "sample": """
         POST /v1/surrogates/{name}/queries, POST /v1/surrogates/{name}/queries:claim,
         POST /v1/surrogates/{name}/queries/{query_id}:renew, POST /v1/surrogates/{name}/queries/{query_id}:fail,

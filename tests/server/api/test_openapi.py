@@ -18,6 +18,7 @@ EXAMPLES = {
     "RENEW": wire.RenewLease,
     "FAIL": wire.FailQuery,
     "ADD_QUERIES": wire.AddQueries,
+    "WITHDRAW": wire.WithdrawQueries,
     "ADD_SAMPLE": wire.AddSamples,
     "LEDGER": wire.ReportSteps,
     "IMPROVE": wire.Improve,

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 
 from support import pendulum
@@ -127,6 +128,34 @@ def test_no_occupancy_without_asking_for_it(client: httpx.Client, session: str, 
     assert send(client, session, "occupancy", checkpoint="c").json()["code"] == "invalid_request"
     asked = open_session(occupancy=True)["id"]
     assert send(client, asked, "occupancy", checkpoint="c").json()["code"] == "not_reset"
+
+
+def test_coordinates_of_the_lanes_are_what_observations_show(client: httpx.Client, session: str):
+    observation = send(client, session, "reset", seed=3).json()["observation"]
+    coordinates = client.get(f"/v1/sessions/{session}/coordinates").json()["coordinates"]
+    angles, speeds = np.array(coordinates).T
+    np.testing.assert_allclose(np.stack([np.cos(angles), np.sin(angles), speeds], 1), observation, rtol=1e-6)
+
+
+def test_rewards_keep_near_those_of_the_samples(client: httpx.Client, name: str, open_session: Open):
+    pendulum.teach(client, name, budget=5)
+    samples = client.get(f"/v1/surrogates/{name}/samples").json()["samples"]
+    rewards = [sample["reward"] for sample in samples]
+    room = max(max(rewards) - min(rewards), abs(min(rewards)), abs(max(rewards)))
+    opened = client.post(f"/v1/surrogates/{name}/sessions", json={"num_envs": 64, "seed": 0, "start_box": 1.0}).json()
+    send(client, opened["id"], "reset")
+    steps = send(client, opened["id"], "rollout", actions=[[[2.0]] * 64] * 20).json()["steps"]
+    imagined = np.array([step["reward"] for step in steps])
+    assert imagined.min() >= min(rewards) - room
+    assert imagined.max() <= max(rewards) + room
+
+
+@pytest.mark.parametrize("functions", [0, 2])
+def test_functions_are_of_variant_pathwise_alone(client: httpx.Client, taught: str, functions: int):
+    options = {"num_envs": 2, "functions": functions, "variant": "deterministic" if functions else "pathwise"}
+    refused = client.post(f"/v1/surrogates/{taught}/sessions", json=options)
+    assert refused.status_code == 422
+    assert "functions" in refused.json()["detail"]
 
 
 def test_closing_twice_is_harmless(client: httpx.Client, session: str):

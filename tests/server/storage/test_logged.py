@@ -22,14 +22,14 @@ def test_logged_samples_have_their_own_line_and_cost_no_budget(storage: Storage,
     assert (storage.ledger.read(name).total, storage.ledger.read(name).samples) == (0, 10)
     assert storage.designs.left(name) == 3
     assert {sample.purpose for sample in storage.samples.page(name, 0, 20)} == {"logged"}
-    assert storage.samples.arrays(name).logged.all()
+    assert set(storage.samples.arrays(name).purpose) == {"logged"}
 
 
 def test_arrays_tell_logged_samples_from_others(storage: Storage, make: Make, by_hand: Sample) -> None:
     name = make(queries=0)
     storage.samples.add(name, "log", [by_hand(reward=1.0)], logged=True)
     storage.samples.add(name, "hand", [by_hand(reward=1.0)], key="one")
-    assert storage.samples.arrays(name).logged.tolist() == [True, False]
+    assert storage.samples.arrays(name).purpose == ("logged", "manual")
     assert storage.ledger.read(name) == LedgerRecord(manual=1, logged=1)
 
 

@@ -54,6 +54,16 @@ def test_a_place_answers_alike_throughout_an_episode(model, started):
     assert not np.allclose(elsewhere, first)
 
 
+def test_lanes_share_so_many_functions_from_starts_of_their_own(model, started):
+    settings, lanes = started(model, 6, variant="pathwise", functions=2)
+    assert len(np.unique(lanes.q.numpy(), axis=0)) == 6
+    _, there = moved(model, settings, lanes, 2.0, -6.0)
+    assert len(np.unique(there[:, 1])) == 2
+    np.testing.assert_array_equal(there[:2], there[2:4])
+    _, own = moved(model, *started(model, 6, variant="pathwise"), 2.0, -6.0)
+    np.testing.assert_array_equal(own[:2], there[:2])
+
+
 def test_the_next_episode_follows_another_function(model, started):
     settings, lanes = started(model, 2, variant="pathwise", time_limit=1, autoreset_mode="same_step")
     lanes, _ = moved(model, settings, lanes, 2.0, -6.0)

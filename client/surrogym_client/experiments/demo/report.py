@@ -46,6 +46,10 @@ def metrics_of(
         "success_rate": real.success_rate,
         "mean_length": float(real.lengths.mean()),
         "imagined_return": card.imagined_return,
+        "promise": None if card.promise is None else card.promise.model_dump(),
+        "audit": None if card.audit is None else card.audit.model_dump(),
+        "trusted": card.trusted,
+        "reason": card.reason,
         "returns": real.returns.tolist(),
         "lengths": real.lengths.tolist(),
         "also": None if also is None else {**_returns(also), "success_rate": also.success_rate},
@@ -80,6 +84,7 @@ def table(metrics: dict[str, Any], folder: Path) -> str:
             ", ".join(f"{key} {_number(returns[key])}" for key in ("mean", "iqm", "min", "max")),
         ),
         ("imagined return", _number(metrics["imagined_return"])),
+        *_promise(metrics),
         ("success", _share(metrics["success_rate"])),
         *_also(metrics),
         ("target", f"{metrics['target']}: {'reached' if metrics['reached'] else 'not reached'}"),
@@ -105,6 +110,19 @@ def _also(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     if also is None or starts is None:
         return []
     return [(starts.words, f"mean {_number(also['mean'])}, success {_share(also['success_rate'])}")]
+
+
+def _promise(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """What the policy was handed over with; nothing where it was learned in the original environment."""
+    promise, audit = metrics["promise"], metrics["audit"]
+    if promise is None:
+        return []
+    low, median, high = (_number(promise[name]) for name in ("low", "median", "high"))
+    steps = 0 if audit is None else audit["steps"]
+    return [
+        ("promise", f"{median}, between {low} and {high} with 90 % chance; {steps} more real steps of audit"),
+        ("trusted", f"{'yes' if metrics['trusted'] else 'no'}: {metrics['reason']}"),
+    ]
 
 
 def _seconds(seconds: dict[str, float]) -> str:

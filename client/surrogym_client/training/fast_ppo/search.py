@@ -197,6 +197,7 @@ class _Training:
             lost_episodes=self._lost,
             networks=verdicts.networks,
             gaining=verdicts.gaining,
+            untrained=verdicts.floor,
         )
 
     def _by_reference(self) -> Found:

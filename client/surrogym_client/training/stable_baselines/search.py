@@ -132,6 +132,7 @@ class _Training:
             checks.lost,
             verdicts.networks,
             verdicts.gaining,
+            verdicts.floor,
         )
 
     def _learned(self, callbacks: Sequence[BaseCallback]) -> tuple[BaseAlgorithm, bool]:

@@ -16,7 +16,7 @@ from surrogym_server.storage.sql.rows import Span, append_event, find, hold, rec
 from surrogym_server.storage.sql.tables import evaluations, leases, queries, samples
 
 OPERATION = "report_steps"
-COUNTED = ("initial", "adaptive", "manual", "logged", "evaluation", "failed", "expired")
+COUNTED = ("initial", "adaptive", "manual", "audit", "logged", "evaluation", "failed", "expired")
 
 
 class SqlLedger(port.Ledger):

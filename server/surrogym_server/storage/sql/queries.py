@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.engine import Connection
+from sqlalchemy.engine import Connection, Row
 
-from surrogym_server.errors import LeaseExpired, UnknownSurrogate
+from surrogym_server.errors import BeyondBudget, LeaseExpired, UnknownSurrogate
 from surrogym_server.storage import port
 from surrogym_server.storage.records import (
     Array,
     LeasedQuery,
+    Purpose,
     QueryCounts,
     QueryRecord,
     QueryStatus,
@@ -33,6 +34,9 @@ COLUMNS = [
 ]
 
 
+LEAST_AUDITED = 64  # real steps of audits that every surrogate may take
+
+
 class SqlQueries(port.Queries):
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -44,15 +48,19 @@ class SqlQueries(port.Queries):
         action: Array,
         rollouts: Sequence[Array] = (),
         *,
+        purpose: Purpose = "manual",
         key: str | None = None,
     ) -> list[int]:
-        body = fingerprint(coordinates.tolist(), action.tolist(), *(actions.tolist() for actions in rollouts))
+        parts = [coordinates.tolist(), action.tolist(), *(actions.tolist() for actions in rollouts)]
+        body = fingerprint(*parts, *([] if purpose == "manual" else [purpose]))
         with self._database.write() as connection:
             held = hold(connection, name)
             before: list[int] | None = recall(connection, held, "enqueue", key, body)
             if before is not None:
                 return before
-            ids = insert_queries(connection, held, "manual", held.round, coordinates, action, rollouts)
+            if purpose == "audit":
+                _require_room(connection, held, len(coordinates) + sum(map(len, rollouts)))
+            ids = insert_queries(connection, held, purpose, held.round, coordinates, action, rollouts)
             remember(connection, held, "enqueue", key, body, ids)
             return ids
 
@@ -145,6 +153,20 @@ class SqlQueries(port.Queries):
                 return leasing.sweep(connection, hold(connection, name))
         except UnknownSurrogate:  # deleted meanwhile
             return 0
+
+
+def _require_room(connection: Connection, held: Row[Any], steps: int) -> None:
+    """Raise ``BeyondBudget`` where all audits together would take more than ``LEAST_AUDITED`` steps and the budget."""
+    asked = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0), sa.func.max(surrogates.c.budget))
+    own = (queries.c.surrogate_id == surrogates.c.id) & (queries.c.purpose == "audit")
+    joined = asked.select_from(surrogates.outerjoin(queries, own)).where(surrogates.c.id == held.id)
+    before, budget = connection.execute(joined).one()
+    limit = max(int(budget), LEAST_AUDITED)
+    if before + steps > limit:
+        raise BeyondBudget(
+            f"expected at most {max(0, limit - int(before))} more real steps of audits, got {steps}: together they "
+            f"take at most as many as the budget, or {LEAST_AUDITED}"
+        )
 
 
 def query_counts(connection: Connection, span: Span) -> dict[int, QueryCounts]:

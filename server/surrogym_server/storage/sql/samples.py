@@ -75,7 +75,7 @@ class SqlSamples(port.Samples):
             rows = connection.execute(_raw_arrays(find(connection, name))).all()
         if not rows:
             none = np.zeros(0, dtype=np.bool_)
-            return SampleArrays(no_rows(), no_rows(), no_rows(), np.zeros(0), none, none)
+            return SampleArrays(no_rows(), no_rows(), no_rows(), np.zeros(0), none, ())
         q, u, q_next, reward, terminated, purpose = zip(*rows, strict=True)
         return SampleArrays(
             coordinates=_matrix(q),
@@ -83,7 +83,7 @@ class SqlSamples(port.Samples):
             next_coordinates=_matrix(q_next),
             reward=np.array(reward, dtype=np.float64),
             terminated=np.array(terminated, dtype=np.bool_),
-            logged=np.array([one == "logged" for one in purpose], dtype=np.bool_),
+            purpose=tuple(purpose),
         )
 
     def page(self, name: str, after: int, limit: int) -> list[SampleRecord]:
@@ -104,6 +104,12 @@ class SqlSamples(port.Samples):
         with self._database.read() as connection:
             own = samples.c.surrogate_id == find(connection, name)
             return int(connection.execute(sa.select(sa.func.count()).where(own)).scalar_one())
+
+    def reward_range(self, name: str) -> tuple[float, float] | None:
+        with self._database.read() as connection:
+            extremes = sa.select(sa.func.min(samples.c.reward), sa.func.max(samples.c.reward))
+            low, high = connection.execute(extremes.where(samples.c.surrogate_id == find(connection, name))).one()
+            return None if low is None else (float(low), float(high))
 
 
 def _store(

@@ -9,7 +9,7 @@ from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage import port
-from surrogym_server.storage.records import NewSurrogate, Phase, SurrogateRecord, SurrogateSummary
+from surrogym_server.storage.records import FREE, NewSurrogate, Phase, SurrogateRecord, SurrogateSummary
 from surrogym_server.storage.sql.database import Database, clock, conflict_insert
 from surrogym_server.storage.sql.leases import is_unbegun, requeue_set_aside
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, touch, unknown_surrogate
@@ -179,9 +179,9 @@ def _withdraw_unbegun(
 def spoken_for(connection: Connection, surrogate_id: int) -> int:
     """Samples that cost a real step, and those that queries without an answer stand for: open ones, and those set
     aside, of which steps may have been taken."""
-    taken = sa.select(sa.func.count()).where(samples.c.surrogate_id == surrogate_id, samples.c.purpose != "logged")
+    taken = sa.select(sa.func.count()).where(samples.c.surrogate_id == surrogate_id, samples.c.purpose.not_in(FREE))
     awaited = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0)).where(
-        queries.c.surrogate_id == surrogate_id, queries.c.status != "answered"
+        queries.c.surrogate_id == surrogate_id, queries.c.status != "answered", queries.c.purpose.not_in(FREE)
     )
     return int(connection.execute(sa.select(taken.scalar_subquery() + awaited.scalar_subquery())).scalar_one())
 

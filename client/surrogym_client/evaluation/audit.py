@@ -1,0 +1,143 @@
+"""The audit of a policy: where on its imagined way to look, and what real steps there say of the model. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import sqrt
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.policies.evidence import Audit, Promise
+from surrogym_shared.spec import EnvironmentSpec
+
+AUDIT_STEPS = 8
+ALARM = 0.01  # chance that a right model is blamed for the errors of its outputs
+MISPLACED_ENDS = 2  # steps whose ending was predicted wrongly: from so many on the model is at fault
+SLACK = 0.1  # of what a policy earns beyond an untrained one: a promise that falls by less stands
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Real steps beside their predictions.
+
+    Attributes:
+        names: of the outputs, (O,).
+        errors: (n, O) real less predicted, in each output's unit.
+        deviations: (n, O) that the model predicted for the function's value.
+        expected: (O,) error that the model claims beside: its tolerance, or its leave-one-out error where that is
+            larger, which holds the noise.
+        misplaced: steps whose ending was predicted wrongly.
+    """
+
+    names: Sequence[str]
+    errors: Array
+    deviations: Array
+    expected: Array
+    misplaced: int = 0
+
+    @property
+    def claimed(self) -> Array:
+        """Deviation (n, O) of each error, as the model claims."""
+        scale: Array = np.sqrt(self.deviations**2 + self.expected**2)
+        return scale
+
+
+def judge(compared: Compared, before: Promise, after: Promise, floor: float | None) -> Audit:
+    """Hold real steps against the model, and the promise after them against the one before.
+
+    An output is at fault where the sum of squared errors, each over its claimed deviation, is larger than chance
+    explains: beyond the 1 % quantile of the chi-squared distribution, shared between the outputs. Errors within
+    the tolerance are never a fault.
+
+    Args:
+        compared: the real steps.
+        before: the promise before the audit.
+        after: that of the model that has learned from it.
+        floor: the return of an untrained policy; None where nobody measured it.
+    """
+    n, count = compared.errors.shape
+    sums = ((compared.errors / compared.claimed) ** 2).sum(0)
+    limit = chi_squared(n, ALARM / count)
+    actual, claimed = (np.sqrt((values**2).mean(0)) for values in (compared.errors, compared.claimed))
+    faults = [
+        f"{name}: errors of {actual[i]:.3g}, where the model expected {claimed[i]:.3g}"
+        for i, name in enumerate(compared.names)
+        if sums[i] > limit
+    ]
+    if compared.misplaced >= MISPLACED_ENDS:
+        faults.append(f"{compared.misplaced} of {n} steps ended, or did not end, against the prediction")
+    earned = abs(before.median - floor) if floor is not None else abs(before.median)
+    if after.median < before.low - SLACK * earned:
+        faults.append(f"the promise fell from {before.median:.4g} to {after.median:.4g} with the audit's steps learned")
+    return Audit(
+        steps=n,
+        passed=not faults,
+        faults=tuple(faults),
+        errors=dict(zip(compared.names, actual.tolist(), strict=True)),
+        expected=dict(zip(compared.names, claimed.tolist(), strict=True)),
+        before=before,
+        after=after,
+    )
+
+
+def chi_squared(degrees: int, above: float) -> float:
+    """The value that a chi-squared variable exceeds with chance ``above`` (Wilson and Hilferty 1931)."""
+    z, c = NormalDist().inv_cdf(1 - above), 2 / (9 * degrees)
+    return float(degrees * (1 - c + z * sqrt(c)) ** 3)
+
+
+def places(spec: EnvironmentSpec, q: Array, u: Array, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Which of the visited states q (m, C) with their actions u (m, F) to ask for, at most ``count``.
+
+    Half of them are drawn at random, so that they stand for the time that the policy spends. The others lie farthest
+    from all chosen before, so that they stand for its way; distances are in deviations over what was visited.
+    """
+    settable = np.flatnonzero(_settable(spec, q))
+    count = min(count, len(settable))
+    if not count:
+        return settable
+    at = _scaled(spec, q[settable], u[settable])
+    drawn = rng.choice(len(settable), size=(count + 1) // 2, replace=False)
+    chosen: list[int] = drawn.tolist()
+    nearest = np.min([np.linalg.norm(at - at[i], axis=1) for i in chosen], axis=0)
+    while len(chosen) < count:
+        farthest = int(np.argmax(nearest))
+        chosen.append(farthest)
+        nearest = np.minimum(nearest, np.linalg.norm(at - at[farthest], axis=1))
+    found: NDArray[np.intp] = settable[chosen]
+    return found
+
+
+def differences(spec: EnvironmentSpec, real: Array, predicted: Array) -> Array:
+    """Real less predicted coordinates, (n, C); angles by the shorter way."""
+    difference = real - predicted
+    for index, coordinate in enumerate(spec.coordinates):
+        if coordinate.kind == "angle":
+            difference[:, index] = (difference[:, index] + np.pi) % (2 * np.pi) - np.pi
+    return difference
+
+
+def _scaled(spec: EnvironmentSpec, q: Array, u: Array) -> Array:
+    columns = [u]
+    for index, coordinate in enumerate(spec.coordinates):
+        column = q[:, index : index + 1]
+        columns += [np.cos(column), np.sin(column)] if coordinate.kind == "angle" else [column]
+    at = np.concatenate(columns, 1)
+    spread = at.std(0)
+    scaled: Array = at / np.where(spread > 0, spread, 1.0)
+    return scaled
+
+
+def _settable(spec: EnvironmentSpec, q: Array) -> Bools:
+    """Which states (m,) the original environment can be set to."""
+    inside = np.ones(len(q), dtype=bool)
+    for index, coordinate in enumerate(spec.coordinates):
+        low, high = coordinate.settable
+        inside &= (q[:, index] >= low) & (q[:, index] <= high)
+    return inside

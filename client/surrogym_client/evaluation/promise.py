@@ -1,0 +1,79 @@
+"""The promise: what the surrogate says a policy will earn, as an interval."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from statistics import NormalDist
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.evaluation.imagined import imagine
+from surrogym_client.policies.evidence import Promise
+from surrogym_client.policies.predict import Predict
+from surrogym_shared.port import SurrogatePort
+from surrogym_shared.wire import OF_PARTICLES
+
+FUNCTIONS = 32  # drawn from the posterior
+STARTS = 8  # of each function
+EVALUATION_STARTS = 100  # the mean over so many real starts is what the interval is for
+LOW, HIGH = 0.05, 0.95
+NORMAL_POINTS = 201  # of a normal distribution, at equal probabilities
+
+Array = NDArray[np.float64]
+
+
+def promise_of(port: SurrogatePort, predict: Predict, seed: int, session: Mapping[str, Any] | None = None) -> Promise:
+    """Run a policy along functions drawn from the posterior, each from several starts, without any penalty.
+
+    Args:
+        port: the surrogate.
+        predict: the policy; observations (N, D) to actions.
+        seed: of functions and starts.
+        session: fields of ``OpenSession`` that the policy was trained with. Its variant, what belongs to that, and the
+            penalty are left out.
+    """
+    left_out = {"variant", "penalty", *OF_PARTICLES}
+    options = {name: value for name, value in (session or {}).items() if name not in left_out}
+    options |= {"variant": "pathwise", "functions": FUNCTIONS, "penalty": 0.0}
+    returns = imagine(port, predict, FUNCTIONS * STARTS, seed, **options).returns
+    return interval(returns.reshape(STARTS, FUNCTIONS))  # lane i follows function i modulo FUNCTIONS
+
+
+def interval(returns: Array) -> Promise:
+    """The promise of episodes' returns, (starts, functions).
+
+    Means of a few starts differ between functions by chance as well. They are drawn together until their variance is
+    what the functions alone explain (one-way analysis of variance); the chance of
+    100 real starts, and of the virtual ones, is added again.
+    """
+    parts = _parts(returns)
+    starts, functions = returns.shape
+    spread = parts.within * np.sqrt(1 / EVALUATION_STARTS + 1 / returns.size)
+    samples = parts.functions[:, None] + spread * _normal_points()
+    low, median, high = np.quantile(samples, [LOW, 0.5, HIGH]).tolist()
+    return Promise(median=median, low=low, high=high, functions=functions, episodes=starts * functions)
+
+
+class _Parts(NamedTuple):
+    functions: Array  # (functions,) mean returns, with the variance that the functions explain
+    within: float  # deviation of the returns of one function between starts
+
+
+def _parts(returns: Array) -> _Parts:
+    means = returns.mean(0)
+    within = float(returns.var(0, ddof=1).mean())
+    observed = float(means.var(ddof=1))
+    explained = max(observed - within / len(returns), 0.0)
+    scale = np.sqrt(explained / observed) if observed > 0 else 0.0
+    scale *= 1 + 1.5 / len(means)  # Student's t for one more function than were drawn, to first order
+    return _Parts(means.mean() + scale * (means - means.mean()), float(np.sqrt(within)))
+
+
+@cache
+def _normal_points() -> Array:
+    """Standard normal quantiles at equal probabilities."""
+    standard = NormalDist()
+    return np.array([standard.inv_cdf((i + 0.5) / NORMAL_POINTS) for i in range(NORMAL_POINTS)])

@@ -1,0 +1,128 @@
+"""A training whose policy is audited before it is handed over, and trained on where the audit fails."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from surrogym_client.evaluation.audit import AUDIT_STEPS
+from surrogym_client.policies.files import load_policy
+from surrogym_client.surrogates.waiting import wait_for_design
+from surrogym_client.training.closed_loop import ClosedLoop, LoopSettings, visit
+from surrogym_client.training.handover import AuditSettings, Handover, Subject, hand_over
+from surrogym_client.training.search import search_for
+from surrogym_client.training.settings import (
+    TrainingInterrupted,
+    TrainProgress,
+    TrainResult,
+    TrainSettings,
+    chosen_for,
+)
+from surrogym_client.training.trainer import train
+from surrogym_client.transport.api import Api
+from surrogym_shared.port import SurrogatePort
+from surrogym_shared.wire import SurrogateView
+
+MOST_AUDITS = 3  # of one training; each takes its own real steps
+
+
+@dataclass(frozen=True)
+class AuditedTraining:
+    """Train a policy and hand it over.
+
+    Where an audit fails and the budget has steps left, they are asked where the policy goes, the policy learns on, and
+    is audited again. Where none are left, the policy is handed over with the failed audit.
+
+    Attributes:
+        api: the server.
+        name: of the surrogate.
+        port: the surrogate.
+        out: where the policy goes.
+        settings: of each training.
+        rounds: of the closed loop; None: without one.
+        audit: how to audit; None: don't.
+        progress: called after every rollout.
+        waiting: called with every look at the surrogate, while a sampler answers queries.
+    """
+
+    api: Api
+    name: str
+    port: SurrogatePort
+    out: Path
+    settings: TrainSettings
+    rounds: LoopSettings | None = None
+    audit: AuditSettings | None = None
+    progress: Callable[[TrainProgress], None] | None = None
+    waiting: Callable[[SurrogateView], None] | None = None
+
+    def train(self) -> tuple[TrainResult, Handover]:
+        """Train, audit, and train on where that fails.
+
+        Raises:
+            DesignUnfinished: queries were not answered in time.
+            TrainingInterrupted: Ctrl-C came when there was a policy already.
+            ValueError, SurrogymClientError: as ``train``.
+        """
+        result = self._first()
+        try:
+            for number in range(1, MOST_AUDITS + 1):
+                taken = self.api.surrogate(self.name).ledger.total
+                handover = hand_over(self._subject(result), self.audit, self.waiting)
+                passed = handover.audit is None or handover.audit.passed
+                if passed or number == MOST_AUDITS or not self._asked_more(result, taken, number):
+                    break
+                result = self._train_on(result)
+        except TrainingInterrupted as interruption:
+            raise TrainingInterrupted(_joined(result, interruption.result)) from None
+        except KeyboardInterrupt:
+            raise TrainingInterrupted(result) from None
+        return result, handover
+
+    def _first(self) -> TrainResult:
+        if self.rounds is None:
+            return train(self.port, self.out, self._chosen, self.progress)
+        loop = ClosedLoop(
+            self.api, self.name, self.port, self.out, self.settings, self.rounds, self.progress, self.waiting
+        )
+        return loop.train()
+
+    @property
+    def _chosen(self) -> TrainSettings:
+        return chosen_for(self.api.surrogate(self.name), self.settings)
+
+    def _subject(self, result: TrainResult) -> Subject:
+        predict, settings = load_policy(result.path, result.algorithm), self.settings
+        session = dict(settings.session)
+        return Subject(self.api, self.name, self.port, predict, session, result.untrained, settings.seed)
+
+    def _asked_more(self, result: TrainResult, taken: int, number: int) -> bool:
+        """Spend what the budget has left where the policy goes. Whether real steps of the budget were taken since they
+        were ``taken``."""
+        view = self.api.surrogate(self.name)
+        wanted = min(self.rounds.queries if self.rounds else AUDIT_STEPS, view.budget_left)
+        if wanted > 0:
+            checkpoint = f"seed {self.settings.seed}, audit {number}, round {view.round}"
+            visit(self.port, result, self.settings, checkpoint)
+            self.api.improve(self.name, wanted, checkpoint=checkpoint)
+            patience = LoopSettings(wanted).patience_seconds
+            view = wait_for_design(self.api, self.name, patience, self.waiting, after_round=view.round)
+        return view.ledger.total > taken
+
+    def _train_on(self, result: TrainResult) -> TrainResult:
+        """Train in the model that has learned from the audit, from the policy that there is."""
+        now = self._chosen
+        if search_for(self.settings).resumable:
+            now = replace(now, start_from=self.out, trust_policy=False)
+        return _joined(result, train(self.port, self.out, now, self.progress))
+
+
+def _joined(before: TrainResult, after: TrainResult) -> TrainResult:
+    """The later result, with what both trainings took."""
+    return replace(
+        after,
+        virtual_steps=before.virtual_steps + after.virtual_steps,
+        seconds=before.seconds + after.seconds,
+        lost_episodes=before.lost_episodes + after.lost_episodes,
+        visited_confidence=before.visited_confidence,
+    )

@@ -1,0 +1,214 @@
+"""What a policy is handed over with: a promise, an audit by real steps, and whether the promise is to be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.environments.lanes import Lanes, session_request
+from surrogym_client.evaluation.audit import AUDIT_STEPS, Compared, differences, judge, places
+from surrogym_client.evaluation.imagined import WHOLE
+from surrogym_client.evaluation.promise import promise_of
+from surrogym_client.original.actions import decode_actions
+from surrogym_client.original.protocol import LONGEST_EPISODE
+from surrogym_client.policies.evidence import Audit, Promise
+from surrogym_client.policies.predict import Predict
+from surrogym_client.surrogates.phases import COMPLETED
+from surrogym_client.surrogates.waiting import NobodyAnswers, wait_for_answers, wait_for_design
+from surrogym_client.transport.api import Api
+from surrogym_shared.port import SurrogatePort
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import SampleView, SurrogateView
+
+WAY_LANES = 16  # episodes whose states an audit chooses from
+WIDE = 0.5  # of what a policy earns beyond an untrained one: a promise with a wider lower half is no promise
+NO_SAMPLER = "no sampler is connected"
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Handover:
+    """A policy's promise, and what speaks for it.
+
+    Attributes:
+        promise: of the latest model.
+        audit: real steps on the policy's way; None without one.
+        trusted: whether the promise is to be trusted.
+        reason: why, or why not, in one sentence.
+    """
+
+    promise: Promise
+    audit: Audit | None
+    trusted: bool
+    reason: str
+
+
+@dataclass(frozen=True)
+class AuditSettings:
+    """How to audit."""
+
+    steps: int = AUDIT_STEPS
+    patience_seconds: float = 3_600.0  # for a sampler to answer
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A policy to hand over, and what it was trained with."""
+
+    api: Api
+    name: str  # of the surrogate
+    port: SurrogatePort
+    predict: Predict
+    session: dict[str, Any] = field(default_factory=dict)  # fields of ``OpenSession``
+    floor: float | None = None  # the return of an untrained policy
+    seed: int = 0
+
+    def promise(self) -> Promise:
+        """What the latest model promises."""
+        return promise_of(self.port, self.predict, self.seed, self.session)
+
+
+def hand_over(
+    subject: Subject, audit: AuditSettings | None, progress: Callable[[SurrogateView], None] | None = None
+) -> Handover:
+    """Make the promise of a policy, audit it where a sampler is connected, and say whether it is to be trusted.
+
+    Args:
+        subject: the policy.
+        audit: how to audit; None: don't.
+        progress: called with every look at the surrogate while a sampler works.
+
+    Raises:
+        DesignUnfinished: the audit's queries were not answered in time.
+        SurrogymClientError: the server refused.
+    """
+    before = subject.promise()
+    if audit is None or (why := _not_possible(subject)) is not None:
+        view = subject.api.surrogate(subject.name)
+        return _without(view, before, subject.floor, "asked for none" if audit is None else str(why))
+    try:
+        found = take(subject, audit, before, progress)
+    except NobodyAnswers:
+        return _without(subject.api.surrogate(subject.name), before, subject.floor, NO_SAMPLER)
+    if found is None:
+        return _without(subject.api.surrogate(subject.name), before, subject.floor, "none of its queries was answered")
+    trusted, reason = _verdict(found, subject.floor)
+    return Handover(found.after, found, trusted, reason)
+
+
+def take(
+    subject: Subject, settings: AuditSettings, before: Promise, progress: Callable[[SurrogateView], None] | None
+) -> Audit | None:
+    """Take an audit's real steps, let the model learn from them, and judge; None where no step was taken."""
+    api, name, spec = subject.api, subject.name, subject.port.spec()
+    view = api.surrogate(name)
+    if spec.query == "rollout":
+        longest = min(settings.steps, spec.max_rollout or settings.steps)
+        _, actions = way_of(subject, 1, longest)
+        queries = api.add_queries(name, rollouts=[actions.tolist()], audit=True)
+    else:
+        q, u = way_of(subject, WAY_LANES, spec.time_limit or LONGEST_EPISODE)
+        chosen = places(spec, q, u, settings.steps, np.random.default_rng(settings.seed))
+        if not len(chosen):
+            return None
+        queries = api.add_queries(name, q[chosen].tolist(), u[chosen].tolist(), audit=True)
+    wanted = {query.id for query in queries}
+    try:
+        wait_for_answers(api, name, wanted, settings.patience_seconds, progress)
+    except BaseException:
+        api.withdraw_audit(name, sorted(wanted))
+        raise
+    samples = [sample for sample in api.samples(name) if sample.query_id in wanted]
+    if not samples:
+        return None
+    wait_for_design(api, name, settings.patience_seconds, progress, after_round=view.round)
+    return judge(compared(api, spec, view, samples), before, subject.promise(), subject.floor)
+
+
+def way_of(subject: Subject, episodes: int, steps: int) -> tuple[Array, Array]:
+    """States (m, C) that a policy visits in whole virtual episodes from the declared starts, each along a function of
+    its own, and the actions (m, F) that it takes there, in the original environment's units."""
+    spec = subject.port.spec()
+    options = {**subject.session, **WHOLE, "variant": "pathwise", "seed": subject.seed}
+    lanes = Lanes(subject.port, session_request(episodes, "same_step", options))
+    states, actions, running = [], [], np.ones(episodes, dtype=bool)
+    try:
+        observation = lanes.reset(subject.seed).observation
+        for _ in range(steps):
+            action = subject.predict(observation)
+            states.append(np.array(subject.api.session_coordinates(lanes.view.id))[running])
+            actions.append(decode_actions(spec, action, episodes)[running])
+            step = lanes.step(action)
+            if step.lost is not None:
+                return way_of(subject, episodes, steps)
+            observation = step.result.observation
+            running &= ~(step.result.terminated | step.result.truncated)
+            if not running.any():
+                break
+    finally:
+        lanes.close()
+    return np.concatenate(states), np.concatenate(actions)
+
+
+def compared(api: Api, spec: EnvironmentSpec, view: SurrogateView, samples: Sequence[SampleView]) -> Compared:
+    """Real steps beside what the model of ``view``, which had not seen them, predicts."""
+    q, u = [sample.coordinates for sample in samples], [sample.action for sample in samples]
+    predicted = api.predict(view.name, q, u, model=view.model_version)
+    uncertain = api.query_uncertainty(view.name, q, u, model=view.model_version)
+    moved = differences(
+        spec, np.array([sample.next_coordinates for sample in samples]), np.array(predicted.next_coordinates)
+    )
+    rewards = np.array([sample.reward for sample in samples]) - np.array(predicted.reward)
+    columns = {coordinate.name: moved[:, i] for i, coordinate in enumerate(spec.coordinates)} | {"reward": rewards}
+    assert view.fidelity is not None
+    claims = [output for output in view.fidelity.outputs if output.name in columns]
+    deviations = np.array(uncertain.deviation)[:, [uncertain.outputs.index(claim.name) for claim in claims]]
+    ended = np.array([sample.terminated for sample in samples])
+    return Compared(
+        names=[claim.name for claim in claims],
+        errors=np.stack([columns[claim.name] for claim in claims], 1),
+        deviations=deviations,
+        expected=np.array([max(claim.tolerance, claim.leave_one_out_error or 0.0) for claim in claims]),
+        misplaced=int((ended != np.array(predicted.terminated)).sum()),
+    )
+
+
+def _not_possible(subject: Subject) -> str | None:
+    """Why there can be no audit, or None."""
+    view = subject.api.surrogate(subject.name)
+    if view.spec.design.preset == "paper":
+        return "preset paper has none"
+    if not view.samplers:
+        return NO_SAMPLER
+    return "the design is paused" if view.paused else None
+
+
+def _verdict(audit: Audit, floor: float | None) -> tuple[bool, str]:
+    if not audit.passed:
+        return False, f"the audit failed: {audit.faults[0]}"
+    if (wide := _too_wide(audit.after, floor)) is not None:
+        return False, wide
+    return True, f"{audit.steps} real steps on the policy's way agree with the model"
+
+
+def _without(view: SurrogateView, promise: Promise, floor: float | None, why: str) -> Handover:
+    """A handover without an audit: trusted only where the design is ready."""
+    if (wide := _too_wide(promise, floor)) is not None:
+        return Handover(promise, None, False, wide)
+    if view.phase == "ready":
+        return Handover(promise, None, True, f"the design is ready; not audited: {why}")
+    state = "is not sure of its model" if view.phase in COMPLETED else "has not ended"
+    return Handover(promise, None, False, f"the design {state}, and there was no audit: {why}")
+
+
+def _too_wide(promise: Promise, floor: float | None) -> str | None:
+    """Why a promise is no promise, or None."""
+    if floor is None or promise.median - promise.low <= WIDE * abs(promise.median - floor):
+        return None
+    return f"the functions that the samples allow earn from {promise.low:.4g} to {promise.high:.4g}"

@@ -1,0 +1,78 @@
+"""The audit's judgement: right models pass, wrong ones fail, and errors within the tolerance are no fault."""
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from surrogym_client.evaluation.audit import Compared, chi_squared, differences, judge, places
+from surrogym_client.original.classic import pendulum
+from surrogym_client.policies.evidence import Promise
+
+PROMISE = Promise(median=-150.0, low=-160.0, high=-140.0, functions=32, episodes=256)
+UNTRAINED = -1_200.0
+
+
+def compared(errors: np.ndarray, deviation: float = 1.0, expected: float = 0.5, misplaced: int = 0) -> Compared:
+    names = [f"output {i}" for i in range(errors.shape[1])]
+    return Compared(names, errors, np.full(errors.shape, deviation), np.full(errors.shape[1], expected), misplaced)
+
+
+def test_at_most_one_in_fifty_right_models_fails():
+    rng = np.random.default_rng(0)
+    failed = sum(
+        not judge(compared(rng.normal(0, np.hypot(1.0, 0.5), (8, 3))), PROMISE, PROMISE, UNTRAINED).passed
+        for _ in range(1_000)
+    )
+    assert failed <= 20
+
+
+@pytest.mark.parametrize("factor", [3.0, 10.0])
+def test_errors_beyond_what_the_model_claims_fail(factor: float):
+    errors = factor * np.random.default_rng(0).normal(0, np.hypot(1.0, 0.5), (8, 2))
+    errors[:, 0] = 0.0
+    audit = judge(compared(errors), PROMISE, PROMISE, UNTRAINED)
+    assert not audit.passed
+    [fault] = audit.faults
+    assert fault.startswith("output 1: errors of")
+
+
+def test_errors_within_the_tolerance_are_never_a_fault():
+    errors = np.full((8, 2), 0.5)
+    assert judge(compared(errors, deviation=1e-9), PROMISE, PROMISE, UNTRAINED).passed
+
+
+@pytest.mark.parametrize(("after", "passed"), [(-155.0, True), (-250.0, True), (-300.0, False), (-100.0, True)])
+def test_a_promise_that_falls_by_a_tenth_of_what_was_learned_fails(after: float, passed: bool):
+    later = Promise(median=after, low=after - 10, high=after + 10, functions=32, episodes=256)
+    assert judge(compared(np.zeros((8, 1))), PROMISE, later, UNTRAINED).passed is passed
+
+
+@pytest.mark.parametrize(("misplaced", "passed"), [(0, True), (1, True), (2, False)])
+def test_endings_against_the_prediction_fail(misplaced: int, passed: bool):
+    assert judge(compared(np.zeros((8, 1)), misplaced=misplaced), PROMISE, PROMISE, UNTRAINED).passed is passed
+
+
+@pytest.mark.parametrize("degrees", [1, 2, 8, 64])
+def test_chi_squared_is_that_of_scipy(degrees: int):
+    for above in (0.05, 0.01, 0.001):
+        assert chi_squared(degrees, above) == pytest.approx(scipy.stats.chi2.isf(above, degrees), rel=0.06)
+
+
+def test_places_spread_over_the_way_and_keep_to_what_can_be_set():
+    rng = np.random.default_rng(0)
+    q = np.concatenate([rng.normal(0, 0.01, (500, 2)), [[3.0, 0.0], [-3.0, 7.0], [0.0, 7.5], [0.0, 80.0]]])
+    chosen = places(pendulum(), q, np.zeros((len(q), 1)), 8, rng)
+    assert len(set(chosen.tolist())) == 8
+    assert {501, 502} <= set(chosen.tolist()), "what lies far from the rest"
+    assert 503 not in chosen, "the environment can't be set there"
+
+
+def test_few_visited_states_give_as_many_places():
+    q = np.zeros((3, 2))
+    assert sorted(places(pendulum(), q, np.zeros((3, 1)), 8, np.random.default_rng(0))) == [0, 1, 2]
+    assert len(places(pendulum(), q + 1e3, np.zeros((3, 1)), 8, np.random.default_rng(0))) == 0
+
+
+def test_angles_differ_by_the_shorter_way():
+    difference = differences(pendulum(), np.array([[3.1, 1.0]]), np.array([[-3.1, 0.5]]))
+    assert difference[0].tolist() == pytest.approx([6.2 - 2 * np.pi, 0.5])

@@ -1,0 +1,57 @@
+"""The promise: an interval for the mean of 100 real starts, from episodes of several functions and starts."""
+
+import numpy as np
+import pytest
+
+from surrogym_client.evaluation.promise import EVALUATION_STARTS, FUNCTIONS, STARTS, interval, promise_of
+from surrogym_client.transport import HttpSurrogate
+
+Z = 1.6449  # of a standard normal's 95 % quantile
+
+
+def test_returns_that_differ_by_start_alone_give_the_spread_of_a_mean():
+    returns = np.repeat(np.random.default_rng(0).normal(-100, 20, (400, 1)), 32, axis=1)
+    promise = interval(returns)
+    spread = 20 * np.sqrt(1 / EVALUATION_STARTS + 1 / returns.size)
+    assert promise.median == pytest.approx(returns.mean())
+    assert promise.median - promise.low == pytest.approx(Z * spread, rel=0.1)
+    assert promise.high - promise.median == pytest.approx(Z * spread, rel=0.1)
+
+
+def test_functions_that_disagree_widen_the_interval():
+    returns = np.tile(np.random.default_rng(0).normal(0, 50, 32), (8, 1))
+    promise = interval(returns)
+    low, high = np.quantile(returns[0], [0.05, 0.95])
+    assert (promise.low, promise.high) == pytest.approx((low, high), abs=12)
+
+
+def test_chance_between_starts_is_not_taken_for_a_difference_of_functions():
+    rng = np.random.default_rng(1)
+    widths = []
+    for _ in range(50):
+        promise = interval(rng.normal(0, 10, (STARTS, FUNCTIONS)))
+        widths.append(promise.high - promise.low)
+    by_means = 2 * Z * 10 / np.sqrt(STARTS)
+    assert np.median(widths) < 0.6 * by_means, "means of eight starts alone would be taken for that"
+
+
+@pytest.mark.parametrize("between", [0.0, 5.0, 30.0])
+def test_the_interval_holds_the_mean_of_new_starts_nine_times_in_ten(between: float):
+    rng = np.random.default_rng(2)
+    inside = 0
+    for _ in range(2_000):
+        functions = rng.normal(0, between, FUNCTIONS + 1)
+        promise = interval(rng.normal(functions[1:], 10.0, (STARTS, FUNCTIONS)))
+        real = rng.normal(functions[0], 10.0, EVALUATION_STARTS).mean()
+        inside += promise.low <= real <= promise.high
+    assert 0.87 <= inside / 2_000 <= 0.985
+
+
+def test_a_promise_leaves_the_penalty_out_and_repeats(pendulum_server):
+    with HttpSurrogate(pendulum_server.url, "pendulum") as port:
+        still = lambda observation: np.zeros((len(observation), 1))  # noqa: E731
+        plain, penalised, again = (promise_of(port, still, 3, options) for options in ({}, {"penalty": 5.0}, {}))
+        other = promise_of(port, still, 4)
+    assert plain == penalised == again
+    assert plain != other
+    assert plain.low < plain.median < plain.high < 0

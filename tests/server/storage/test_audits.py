@@ -1,0 +1,49 @@
+"""Audit queries: apart from the budget, bounded, and taken back while nobody has begun them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from surrogym_server.errors import BeyondBudget
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import NewSample
+from surrogym_server.storage.sql.queries import LEAST_AUDITED
+
+Make = Callable[..., str]
+Q, U = np.zeros((4, 2)), np.zeros((4, 1))
+
+
+def test_audits_cost_none_of_the_budget(storage: Storage, make: Make, answer: Callable[..., NewSample]) -> None:
+    name = make(queries=0, budget=3)
+    storage.queries.enqueue(name, Q, U, purpose="audit")
+    assert storage.designs.left(name) == 3
+    leased = storage.queries.claim(name, "a", 4, 60.0)
+    storage.samples.add(name, "a", [answer(query) for query in leased])
+    ledger = storage.ledger.read(name)
+    assert (ledger.audit, ledger.total, ledger.samples) == (4, 0, 4)
+    assert storage.designs.left(name) == 3
+    assert set(storage.samples.arrays(name).purpose) == {"audit"}
+    assert storage.designs.due() == [name], "the model learns from them"
+
+
+def test_all_audits_together_are_bounded(storage: Storage, make: Make) -> None:
+    name = make(queries=0, budget=3)
+    many = np.zeros((LEAST_AUDITED, 2)), np.zeros((LEAST_AUDITED, 1))
+    ids = storage.queries.enqueue(name, *many, purpose="audit", key="k")
+    assert storage.queries.enqueue(name, *many, purpose="audit", key="k") == ids, "the same again asks for nothing"
+    with pytest.raises(BeyondBudget, match="at most 0 more real steps of audits, got 4"):
+        storage.queries.enqueue(name, Q, U, purpose="audit")
+    assert storage.queries.counts(name).pending == LEAST_AUDITED
+    storage.queries.enqueue(name, Q, U)
+
+
+def test_the_range_of_rewards_is_that_of_all_samples(
+    storage: Storage, make: Make, by_hand: Callable[..., NewSample]
+) -> None:
+    name = make(queries=0)
+    assert storage.samples.reward_range(name) is None
+    storage.samples.add(name, "a", [by_hand(reward=reward) for reward in (2.0, -1.5, 0.0)], key="k")
+    assert storage.samples.reward_range(name) == (-1.5, 2.0)

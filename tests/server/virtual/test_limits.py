@@ -1,0 +1,33 @@
+"""Limits of virtual rewards: what lies far beyond every sample is cut, before any penalty."""
+
+import numpy as np
+import pytest
+
+from surrogym_server.virtual import LaneTransition, reward_limits, within
+
+NONE = np.zeros(0)
+
+
+def transition(mean: list[float], penalty: float = 0.0) -> LaneTransition:
+    rewards, flags = np.array(mean), np.zeros(len(mean), dtype=bool)
+    return LaneTransition(NONE, rewards - penalty, flags, flags, NONE, NONE, flags, rewards, None, None)
+
+
+@pytest.mark.parametrize(
+    ("seen", "limits"),
+    [((-16.0, 0.0), (-32.0, 16.0)), ((1.0, 1.0), (0.0, 2.0)), ((0.0, 0.0), (0.0, 0.0)), ((5.0, 7.0), (-2.0, 14.0))],
+)
+def test_limits_leave_room_and_include_zero(seen: tuple[float, float], limits: tuple[float, float]):
+    assert reward_limits(*seen) == limits
+
+
+def test_a_penalty_comes_off_after_the_limit():
+    kept = within((-1.0, 2.0), transition([1e12, -1e12, 0.5], penalty=3.0))
+    assert kept.reward_mean.tolist() == [2.0, -1.0, 0.5]
+    assert kept.reward.tolist() == pytest.approx([-1.0, -4.0, -2.5], abs=1e-3)
+
+
+def test_rewards_within_the_limits_are_left_as_they_are():
+    same = transition([0.5, -0.5])
+    assert within((-1.0, 1.0), same) is same
+    assert within(None, same) is same

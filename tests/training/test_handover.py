@@ -1,0 +1,128 @@
+"""Handing a policy over: real steps on its way show a wrong model, and cost none of the budget."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from uuid import uuid4
+
+import numpy as np
+import pytest
+
+from support.moody import SPEC, Line
+from support.server import ServerProcess
+from surrogym_client.errors import UnknownSurrogate
+from surrogym_client.original import RealStep
+from surrogym_client.sampler import Sampler, SamplerSettings
+from surrogym_client.surrogates import waiting
+from surrogym_client.surrogates.waiting import wait_for_design
+from surrogym_client.training import TrainSettings
+from surrogym_client.training.audited import AuditedTraining
+from surrogym_client.training.handover import NO_SAMPLER, AuditSettings, Subject, hand_over, way_of
+from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_shared.spec import Design, EnvironmentSpec
+
+AUDIT = AuditSettings(patience_seconds=60.0)
+
+
+class Changed(Line):
+    """The line once somebody has changed it: what was paid on the left is not paid any more."""
+
+    changed = False
+
+    def step_from(self, coordinates: np.ndarray, action: np.ndarray) -> RealStep:
+        step = super().step_from(coordinates, action)
+        return replace(step, reward=step.reward - 3.0) if self.changed else step
+
+
+@dataclass
+class Place:
+    """A surrogate of a line, and the environment that a sampler has beside it."""
+
+    api: Api
+    port: HttpSurrogate
+    environment: Changed
+
+    @property
+    def name(self) -> str:
+        return self.port.surrogate
+
+    def subject(self) -> Subject:
+        return Subject(self.api, self.name, self.port, lambda o: -np.sign(o[:, :1]), floor=-10.0)
+
+
+@pytest.fixture
+def line(server_process: ServerProcess) -> Iterator[Place]:
+    name, environment, url = f"handed-{uuid4().hex[:8]}", Changed(), server_process.url
+    spec: EnvironmentSpec = SPEC.model_copy(update={"design": Design(initial=8, budget=16)})
+    settings = SamplerSettings(name="beside", wait_seconds=1.0, time_limit=120.0)
+    with Api(url) as api, Api(url) as own, HttpSurrogate(url, name) as port:
+        api.create_surrogate(name, spec)
+        thread = threading.Thread(target=_until_deleted, args=(Sampler(own, name, environment, settings),))
+        thread.start()
+        wait_for_design(api, name, 60)
+        yield Place(api, port, environment)
+        api.delete_surrogate(name)
+        thread.join(30)
+
+
+def _until_deleted(sampler: Sampler) -> None:
+    with suppress(UnknownSurrogate):
+        sampler.run()
+
+
+def test_a_right_model_passes_and_its_steps_stand_apart(line: Place) -> None:
+    before = line.api.surrogate(line.name)
+    handover = hand_over(line.subject(), AUDIT)
+    after = line.api.surrogate(line.name)
+    assert handover.trusted, handover.reason
+    assert handover.audit is not None
+    assert handover.audit.steps == 8
+    assert after.ledger.audit == 8
+    assert after.ledger.total == before.ledger.total, "an audit costs none of the budget"
+    assert after.budget_left == before.budget_left
+    assert after.samples == before.samples + 8, "the model learns from the audit"
+
+
+def test_a_machine_that_has_changed_fails_the_audit(line: Place) -> None:
+    line.environment.changed = True
+    handover = hand_over(line.subject(), AUDIT)
+    assert not handover.trusted
+    assert handover.audit is not None
+    assert handover.audit.faults[0].startswith("reward: errors of 3")
+    assert handover.promise.median < handover.audit.before.median - 10, "the model has learned what is paid now"
+
+
+def test_without_a_sampler_an_audit_is_given_up(
+    pendulum_server: ServerProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(waiting, "FIRST_LEASE_SECONDS", 1.0)
+    with Api(pendulum_server.url) as api, HttpSurrogate(pendulum_server.url, "pendulum") as port:
+        subject = Subject(api, "pendulum", port, lambda o: np.zeros((len(o), 1)))
+        before = api.surrogate("pendulum").queries
+        handover = hand_over(subject, AUDIT)
+        assert api.surrogate("pendulum").queries == before, "nothing is left in the queue"
+    assert handover.audit is None
+    assert handover.reason.endswith(NO_SAMPLER)
+
+
+def test_the_way_of_a_policy_is_what_it_visits(line: Place) -> None:
+    q, u = way_of(line.subject(), 4, 20)
+    assert q.shape == (80, 1)
+    assert np.abs(u).max() <= 1
+    moved = q[4:, 0] - q[:-4, 0]
+    assert moved == pytest.approx(0.1 * u[:-4, 0], abs=0.05)
+
+
+def test_a_failed_audit_is_on_the_result_of_a_training(line: Place, tmp_path: Path) -> None:
+    line.environment.changed = True
+    line.api.patch_surrogate(line.name, budget=line.api.surrogate(line.name).ledger.total)
+    settings = TrainSettings(algorithm="CMAES", total_steps=2_000)
+    training = AuditedTraining(line.api, line.name, line.port, tmp_path / "p.zip", settings, audit=AUDIT)
+    result, handover = training.train()
+    assert result.path.exists()
+    assert not handover.trusted
+    assert line.api.surrogate(line.name).ledger.audit == 8, "no budget is left to learn more"
