@@ -15,6 +15,7 @@ from uuid import uuid4
 import torch
 from fastapi import FastAPI
 from fastapi.responses import Response
+from threadpoolctl import threadpool_limits
 
 from surrogym_server import dashboard
 from surrogym_server.api import (
@@ -154,6 +155,7 @@ def say_goodbye(app: FastAPI) -> None:
 @asynccontextmanager
 async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: DesignPort) -> AsyncIterator[State]:
     torch.set_num_threads(settings.threads)
+    threadpool_limits(settings.threads, user_api="blas")  # of NumPy, in which policies act
     engine = _build_engine(settings, design)
     app.state.notices = engine.notices
     definitions = Definitions(storage, _stored_definition)
@@ -175,6 +177,7 @@ async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: 
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+        engine.live.stop()
         for threads in engine.threads:
             threads.shutdown()
         await asyncio.to_thread(engine.fits.close)

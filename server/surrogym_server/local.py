@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_server.convert import opening, session_view, stored_definition
+from surrogym_server.engine.rollouts import roll, roll_policy
 from surrogym_server.engine.session import (
     Session,
     check_opening,
@@ -24,7 +25,8 @@ from surrogym_server.errors import InvalidInput, NotReset, UnknownModel, Unknown
 from surrogym_server.models.files import from_bytes
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.services.sessions import resolved
-from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult
+from surrogym_shared.acting import ActingPolicy, NoiseKey, PolicyRun
+from surrogym_shared.port import Bools, Floats, Ints, PolicyRollout, ResetResult, StepResult
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import SurrogateFile
 from surrogym_shared.wire import OpenSession, SessionView, SubmittedOccupancy
@@ -121,13 +123,24 @@ class LocalSurrogate:
         return result
 
     def rollout(self, session: str, actions: Floats | Ints) -> list[StepResult]:
-        live, results = self._get(session), []
-        planned = [policy_actions(live.definition.action, row, live.settings.num_envs) for row in actions]
-        for u in planned:
-            live, result = step_session(live, u, None, False, self._version, VERSION)
-            results.append(result)
-        self._sessions[session] = live
-        return results
+        self._sessions[session], results = roll(self._get(session), np.asarray(actions), self._step)
+        return list(results)
+
+    def rollout_policy(
+        self,
+        session: str,
+        policy: ActingPolicy,
+        steps: int,
+        *,
+        noise: NoiseKey | None = None,
+        until: Bools | None = None,
+    ) -> PolicyRollout:
+        try:
+            run = PolicyRun(policy, steps, noise, None if until is None else np.asarray(until, dtype=bool))
+        except ValueError as error:
+            raise InvalidInput(str(error)) from error
+        self._sessions[session], result = roll_policy(self._get(session), run, self._step)
+        return result
 
     def submit_occupancy(self, session: str, checkpoint: str) -> SubmittedOccupancy:
         """There is no design here to weigh; says how many states there are, and keeps none."""
@@ -150,6 +163,9 @@ class LocalSurrogate:
         if session not in self._sessions:
             raise UnknownSession(f"no session {session!r}: open a new one")
         return self._sessions[session]
+
+    def _step(self, session: Session, u: NDArray[np.float64]) -> tuple[Session, StepResult]:
+        return step_session(session, u, None, False, self._version, VERSION)
 
     def _version(self, version: int) -> DynamicsModel:
         del version  # there is one

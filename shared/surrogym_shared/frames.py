@@ -15,6 +15,11 @@ final_lanes, final_observation            (K,) (K, D)  int64, float32
 model_version                             (N,)         int64
 deviation                                 (N, O)       float64
 ========================================  ===========  ==============================
+
+A rollout of a policy, ``op`` policy, carries the policy in its precision, float32 or float64: mean and deviation (D,),
+``parameters``, which are weights (I, O) and bias (O,) of each layer one after the other, and log_deviations (F,); and
+``until`` (N,) as bool. Its reply has the arrays above with T in front, action (T, N, F) and log_probability (T, N) as
+float64, and final_steps (K,) as int64 beside final_lanes.
 """
 
 from __future__ import annotations
@@ -22,14 +27,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Self, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_shared.acting import MAX_PARAMETERS, MAX_UNITS, ActingPolicy, NoiseKey, layers_of, parameters_of
 from surrogym_shared.codes import Code
-from surrogym_shared.port import ResetResult, StepResult, quick
+from surrogym_shared.network import MAX_LAYERS, Activation
+from surrogym_shared.port import PolicyRollout, ResetResult, StepResult, quick
 from surrogym_shared.wire import (
     MAX_ROLLOUT,
     ActionSpace,
@@ -49,6 +56,8 @@ BOOL = np.dtype("?")
 
 Seq = Annotated[int, msgspec.Meta(ge=1)]
 Seed = Annotated[int, msgspec.Meta(ge=0)]
+Word = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+Units = Annotated[int, msgspec.Meta(ge=1, le=MAX_UNITS)]
 
 
 class FrameError(ValueError):
@@ -96,6 +105,27 @@ class RolloutRequest(Frame, frozen=True, tag="rollout", kw_only=True):
     actions: memoryview
 
 
+class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    seed: Word
+    step: Word
+
+
+class PolicyRequest(Frame, frozen=True, tag="policy", kw_only=True):
+    """A rollout of a policy; ``units`` are the numbers that each layer gives."""
+
+    seq: Seq | None = None
+    steps: Annotated[int, msgspec.Meta(ge=1, le=MAX_ROLLOUT)]
+    mean: memoryview
+    deviation: memoryview
+    units: Annotated[list[Units], msgspec.Meta(min_length=1, max_length=MAX_LAYERS)]
+    parameters: memoryview
+    activation: Activation
+    precision: Literal["float32", "float64"]
+    log_deviations: memoryview | None = None
+    noise: Noise | None = None
+    until: memoryview | None = None
+
+
 class Step(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """One step of N lanes."""
 
@@ -127,6 +157,22 @@ class RolloutReply(Frame, frozen=True, tag="rollout"):
     steps: list[Step]
 
 
+class PolicyReply(Frame, frozen=True, tag="policy", kw_only=True):
+    seq: Seq
+    action: memoryview
+    log_probability: memoryview | None = None
+    observation: memoryview
+    reward: memoryview
+    terminated: memoryview
+    truncated: memoryview
+    model_version: memoryview
+    reward_mean: memoryview
+    final_steps: memoryview | None = None
+    final_lanes: memoryview | None = None
+    final_observation: memoryview | None = None
+    untrusted: memoryview | None = None
+
+
 class ProblemReply(Frame, frozen=True, tag="problem"):
     """A problem body (RFC 9457) on the stream; ``seq`` is that of the refused request, if it had one."""
 
@@ -138,8 +184,8 @@ class ProblemReply(Frame, frozen=True, tag="problem"):
     seq: int | None = None
 
 
-Request = ResetRequest | StepRequest | RolloutRequest
-Reply = ResetReply | StepReply | RolloutReply | ProblemReply
+Request = ResetRequest | StepRequest | RolloutRequest | PolicyRequest
+Reply = ResetReply | StepReply | RolloutReply | PolicyReply | ProblemReply
 T = TypeVar("T")
 
 _ENCODER = msgspec.msgpack.Encoder()
@@ -183,6 +229,26 @@ def rollout_request(seq: int | None, actions: Array) -> RolloutRequest:
     return RolloutRequest(seq=seq, actions=_flat(actions, FLOAT64))
 
 
+def policy_request(
+    seq: int | None, policy: ActingPolicy, steps: int, noise: NoiseKey | None, until: Bools | None
+) -> PolicyRequest:
+    """Lanes ``until`` (N,)."""
+    dtype = FLOAT32 if policy.dtype == np.float32 else FLOAT64
+    return PolicyRequest(
+        seq=seq,
+        steps=steps,
+        mean=_flat(policy.mean, dtype),
+        deviation=_flat(policy.deviation, dtype),
+        units=list(policy.units),
+        parameters=_flat(policy.vector, dtype),
+        activation=policy.activation,
+        precision="float32" if dtype is FLOAT32 else "float64",
+        log_deviations=None if policy.log_deviations is None else _flat(policy.log_deviations, dtype),
+        noise=None if noise is None else Noise(*noise),
+        until=None if until is None else _flat(until, BOOL),
+    )
+
+
 def seed_of(request: ResetRequest, shape: Shape) -> int | list[int] | None:
     """One seed, or those of the N lanes. Raises ``FrameError``."""
     if not isinstance(request.seed, memoryview):
@@ -210,6 +276,36 @@ def actions_of(request: RolloutRequest, shape: Shape) -> NDArray[np.float64]:
     return _array("actions", request.actions, FLOAT64, (steps, lanes, size))
 
 
+def policy_of(request: PolicyRequest, shape: Shape) -> ActingPolicy:
+    """The policy, as views of the frame. Raises ``FrameError``."""
+    dtype, size = FLOAT32 if request.precision == "float32" else FLOAT64, shape.observation
+    if (count := parameters_of(size, request.units)) > MAX_PARAMETERS:
+        raise FrameError(f"policy: expected at most {MAX_PARAMETERS} weights and biases, got {count}")
+    log = request.log_deviations
+    entries = 0 if log is None else log.nbytes // dtype.itemsize
+    try:
+        return ActingPolicy(
+            mean=_aligned("mean", request.mean, dtype, (size,)),
+            deviation=_aligned("deviation", request.deviation, dtype, (size,)),
+            layers=layers_of((size, *request.units), _aligned("parameters", request.parameters, dtype, (count,))),
+            activation=request.activation,
+            log_deviations=None if log is None else _aligned("log_deviations", log, dtype, (entries,)),
+        )
+    except FrameError:
+        raise
+    except ValueError as error:
+        raise FrameError(str(error)) from error
+
+
+def noise_of(request: PolicyRequest) -> NoiseKey | None:
+    return None if request.noise is None else NoiseKey(request.noise.seed, request.noise.step)
+
+
+def until_of(request: PolicyRequest, shape: Shape) -> Bools | None:
+    """The lanes (N,) whose ends are awaited. Raises ``FrameError``."""
+    return None if request.until is None else _array("until", _checked("until", request.until), BOOL, (shape.lanes,))
+
+
 # Replies
 
 
@@ -223,6 +319,51 @@ def step_reply(seq: int, result: StepResult) -> StepReply:
 
 def rollout_reply(seq: int, results: Sequence[StepResult]) -> RolloutReply:
     return RolloutReply(seq, [_step(result) for result in results])
+
+
+def policy_reply(seq: int, result: PolicyRollout) -> PolicyReply:
+    ended = len(result.final_lanes) > 0
+    log, untrusted = result.log_probability, result.untrusted
+    return PolicyReply(
+        seq=seq,
+        action=_flat(result.action, FLOAT64),
+        log_probability=None if log is None else _flat(log, FLOAT64),
+        observation=_flat(result.observation, FLOAT32),
+        reward=_flat(result.reward, FLOAT64),
+        terminated=_flat(result.terminated, BOOL),
+        truncated=_flat(result.truncated, BOOL),
+        model_version=_flat(result.model_version, INT64),
+        reward_mean=_flat(result.reward_mean, FLOAT64),
+        final_steps=_flat(result.final_steps, INT64) if ended else None,
+        final_lanes=_flat(result.final_lanes, INT64) if ended else None,
+        final_observation=_flat(result.final_observation, FLOAT32) if ended else None,
+        untrusted=None if untrusted is None else _flat(untrusted, BOOL),
+    )
+
+
+def policy_rollout(reply: PolicyReply, shape: Shape) -> PolicyRollout:
+    """Arrays of their own: aligned and writable, as a caller expects them. Raises ``FrameError``."""
+    steps, log, untrusted = (
+        reply.reward.nbytes // (shape.lanes * FLOAT64.itemsize),
+        reply.log_probability,
+        reply.untrusted,
+    )
+    each = (steps, shape.lanes)
+    final_lanes, final_observation = _final(reply, shape)
+    return PolicyRollout(
+        action=_own("action", reply.action, FLOAT64, (*each, shape.action)),
+        log_probability=None if log is None else _own("log_probability", log, FLOAT64, each),
+        observation=_own("observation", reply.observation, FLOAT32, (*each, shape.observation)),
+        reward=_own("reward", reply.reward, FLOAT64, each),
+        terminated=_own("terminated", _checked("terminated", reply.terminated), BOOL, each),
+        truncated=_own("truncated", _checked("truncated", reply.truncated), BOOL, each),
+        final_steps=_final_steps(reply, steps, len(final_lanes)),
+        final_lanes=final_lanes,
+        final_observation=final_observation,
+        model_version=_own("model_version", reply.model_version, INT64, each),
+        reward_mean=_own("reward_mean", reply.reward_mean, FLOAT64, each),
+        untrusted=None if untrusted is None else _own("untrusted", _checked("untrusted", untrusted), BOOL, each),
+    )
 
 
 def reset_result(reply: ResetReply, shape: Shape) -> ResetResult:
@@ -274,7 +415,15 @@ def _step(result: StepResult) -> Step:
     )
 
 
-def _final(step: Step, shape: Shape) -> tuple[Array, Array]:
+def _final_steps(reply: PolicyReply, steps: int, count: int) -> Array:
+    """The steps (K,) of the final lanes, in order."""
+    ended = _own("final_steps", memoryview(b"") if reply.final_steps is None else reply.final_steps, INT64, (count,))
+    if count and (ended[0] < 0 or ended[-1] >= steps or (np.diff(ended) < 0).any()):
+        raise FrameError(f"final_steps: expected some of 0..{steps - 1} in order, got {ended[:8].tolist()}")
+    return ended
+
+
+def _final(step: Step | PolicyReply, shape: Shape) -> tuple[Array, Array]:
     """final_lanes (K,) and final_observation (K, D); a frame without them has none."""
     if step.final_lanes is None or step.final_observation is None:
         if step.final_lanes is not step.final_observation:
@@ -315,6 +464,11 @@ def _own(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int, ..
     """An array with memory of its own."""
     _require_size(name, view, dtype, shape)
     return np.ndarray(shape, dtype, bytearray(view))
+
+
+def _aligned(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
+    """An array with memory of its own, which products read faster, and whose bits no address changes."""
+    return _array(name, view, dtype, shape).copy()
 
 
 def _require_size(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:

@@ -34,8 +34,8 @@ OUTSIDE = ("mean", "deviation", "low", "high")  # arrays of a policy beside its 
 class Layer(NamedTuple):
     """Inputs to outputs: x @ weights + bias."""
 
-    weights: Array  # (..., I, O)
-    bias: Array  # (..., O)
+    weights: NDArray[np.floating[Any]]  # (..., I, O)
+    bias: NDArray[np.floating[Any]]  # (..., O)
 
 
 class _Head(BaseModel):
@@ -96,23 +96,12 @@ class Network:
 
     def __call__(self, observation: NDArray[Any]) -> NDArray[Any]:
         """Actions (..., N, F) of observations (..., N, D); int64 (..., N) where there is one discrete choice."""
-        y = self.outputs(observation)
-        if not self.counts:
-            centre, reach = (self.low + self.high) / 2, (self.high - self.low) / 2
-            return np.asarray(centre + reach * np.tanh(y), dtype=np.float32)
-        groups = np.split(y, np.cumsum(self.counts)[:-1], axis=-1)
-        chosen = [group.argmax(-1) for group in groups]
-        return chosen[0] if len(chosen) == 1 else np.stack(chosen, -1)
+        return most_probable(self.outputs(observation), self.low, self.high, self.counts)
 
-    def outputs(self, observation: NDArray[Any]) -> Array:
+    def outputs(self, observation: NDArray[Any]) -> NDArray[np.floating[Any]]:
         """The last layer's (..., N, A), before the tanh of a continuous action: scores of discrete choices."""
         x = (np.asarray(observation, dtype=np.float64) - self.mean) / self.deviation
-        *hidden, last = self.layers
-        for weights, bias in hidden:
-            x = x @ weights + bias[..., None, :]
-            x = np.tanh(x) if self.activation == "tanh" else np.maximum(x, 0.0)
-        scores: Array = x @ last.weights + last.bias[..., None, :]
-        return scores
+        return forward(self.layers, self.activation, x)
 
     def save(self, path: Path) -> None:
         """Write one policy: a zip of arrays and a JSON head, nothing in it is code."""
@@ -146,6 +135,26 @@ class Network:
                 return HEAD in file.namelist()
         except zipfile.BadZipFile:
             return False
+
+
+def forward(layers: Sequence[Layer], activation: Activation, x: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """Outputs (..., N, A) of inputs (..., N, D)."""
+    *hidden, last = layers
+    for weights, bias in hidden:
+        x = x @ weights + bias[..., None, :]
+        x = np.tanh(x) if activation == "tanh" else np.maximum(x, 0)
+    scores: NDArray[np.floating[Any]] = x @ last.weights + last.bias[..., None, :]
+    return scores
+
+
+def most_probable(y: NDArray[np.floating[Any]], low: Array, high: Array, counts: tuple[int, ...]) -> NDArray[Any]:
+    """Actions (..., N, F) of outputs y (..., N, A); int64 (..., N) where there is one discrete choice."""
+    if not counts:
+        centre, reach = (low + high) / 2, (high - low) / 2
+        return np.asarray(centre + reach * np.tanh(y), dtype=np.float32)
+    groups = np.split(y, np.cumsum(counts)[:-1], axis=-1)
+    chosen = [group.argmax(-1) for group in groups]
+    return chosen[0] if len(chosen) == 1 else np.stack(chosen, -1)
 
 
 def counts_of(spec: EnvironmentSpec) -> tuple[int, ...]:

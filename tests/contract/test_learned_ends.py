@@ -1,17 +1,20 @@
-"""A declared reward and a learned termination, registered over HTTP, are the same on every transport and in process."""
+"""A declared reward and a learned termination, registered over HTTP, are the same on every transport and in process;
+so is what a policy of discrete choices does there."""
 
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
+from support.acting import assert_same_rollout, random_policy, stepped
 from support.teaching import teach
 from surrogym_client.original.classic import cartpole
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.models.files import from_bytes
-from surrogym_shared.port import SurrogatePort
+from surrogym_shared.acting import Actor, NoiseKey
+from surrogym_shared.port import PolicyPort
 from surrogym_shared.spec import DeclaredReward, Quantity, RewardTerm, Term
 from surrogym_shared.wire import OpenSession
 
@@ -26,7 +29,7 @@ SPEC = cartpole().model_copy(
 
 
 @pytest.fixture(scope="module")
-def ports(pendulum_server) -> Iterator[dict[str, SurrogatePort]]:
+def ports(pendulum_server) -> Iterator[dict[str, PolicyPort]]:
     with Api(pendulum_server.url) as api:
         teach(api, NAME, SPEC, queries=40)
         stored = api.surrogate(NAME).spec
@@ -56,3 +59,20 @@ def test_every_transport_ends_and_pays_alike(ports):
     for name in ("json", "binary", "stream"):
         np.testing.assert_array_equal(rewards[name], rewards["local"])
         np.testing.assert_array_equal(ends[name], ends["local"])
+
+
+@pytest.mark.parametrize("noise", [None, NoiseKey(5)], ids=["most probable", "noisy"])
+def test_every_transport_lets_a_policy_choose_as_step_by_step(ports, noise):
+    policy = random_policy((4, 12, 2), continuous=False)
+    actor = Actor(policy, 4, np.zeros(0), np.zeros(0), (2,), noisy=noise is not None)
+    opening = OpenSession(num_envs=6, seed=3, autoreset_mode="same_step")
+    single = ports["local"].open(opening).id
+    start = ports["local"].reset(single).observation
+    expected = stepped(ports["local"], single, actor, start, 40, noise)
+    assert len(expected.final_lanes), "poles fall"
+    assert noise is None or set(np.unique(expected.action)) == {0.0, 1.0}
+    for port in ports.values():
+        session = port.open(opening).id
+        port.reset(session)
+        assert_same_rollout(port.rollout_policy(session, policy, 40, noise=noise), expected)
+        port.close(session)

@@ -33,11 +33,13 @@ def post(http: httpx.Client) -> Post:
     return to_session
 
 
+POLICY = {"mean": [0, 0, 0], "deviation": [1, 1, 8], "layers": [{"weights": [[1.0], [0.5], [2]], "bias": [0.1]}]}
 REQUESTS = [
     ("step", {"seq": 2, "action": ACTION}),
     ("step", {"seq": 2, "action": ACTION, "mask": [True, False], "deviations": True}),
     ("reset", {"seq": 2, "seed": 4}),
     ("rollout", {"seq": 2, "actions": [ACTION] * 3}),
+    ("rollout", {"seq": 2, "policy": {**POLICY, "log_deviations": [-1.0]}, "steps": 3, "noise": {"seed": 4}}),
 ]
 
 

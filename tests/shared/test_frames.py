@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from support.acting import assert_same_rollout, random_policy
 from surrogym_shared import frames
+from surrogym_shared.acting import ActingPolicy, NoiseKey
 from surrogym_shared.codes import Code
 from surrogym_shared.frames import FrameError, Shape
-from surrogym_shared.port import ResetResult, StepResult
+from surrogym_shared.port import PolicyRollout, ResetResult, StepResult
 
 SEQ = st.integers(1, 2**63 - 1)
 SHAPES = st.builds(Shape, st.integers(1, 5), st.integers(1, 4), st.integers(1, 3), st.integers(1, 3))
@@ -95,6 +98,39 @@ def test_requests_come_back_bit_for_bit(data: st.DataObject, shape: Shape, seq: 
         assert frames.seed_of(reset, shape) == seed
 
 
+POLICIES = [random_policy((3, 4, 1)), random_policy((3, 2), np.float64, continuous=False)]
+
+
+@pytest.mark.parametrize("policy", POLICIES, ids=["float32", "float64"])
+@pytest.mark.parametrize("noise", [None, NoiseKey(2**63 - 1, 2**63 - 1)])
+def test_a_policy_comes_back_bit_for_bit(policy: ActingPolicy, noise: NoiseKey | None):
+    until = np.array([True, False])
+    request = frames.read_request(frames.encode(frames.policy_request(5, policy, 9, noise, until)))
+    assert isinstance(request, frames.PolicyRequest)
+    back = frames.policy_of(request, SMALL)
+    assert (request.seq, request.steps, frames.noise_of(request)) == (5, 9, noise)
+    np.testing.assert_array_equal(frames.until_of(request, SMALL), until)
+    assert (back.activation, back.units, back.dtype) == (policy.activation, policy.units, policy.dtype)
+    for name in ("mean", "deviation", "vector", "log_deviations"):
+        ours, theirs = getattr(back, name), getattr(policy, name)
+        np.testing.assert_array_equal(ours, theirs, strict=theirs is not None)
+
+
+@given(data=st.data(), shape=SHAPES)
+def test_what_a_policy_did_comes_back_bit_for_bit(data: st.DataObject, shape: Shape):
+    trusted = data.draw(st.booleans())
+    drawn = data.draw(st.lists(step_results(shape), min_size=1, max_size=3))
+    steps = [replace(one, deviation=None, untrusted=one.terminated if trusted else None) for one in drawn]
+    log = data.draw(st.none() | floats((len(steps), shape.lanes)))
+    result = PolicyRollout.of(steps, data.draw(floats((len(steps), shape.lanes, shape.action))), log)
+    reply = frames.read_reply(frames.encode(frames.policy_reply(3, result)))
+    assert isinstance(reply, frames.PolicyReply)
+    back = frames.policy_rollout(reply, shape)
+    assert_same_rollout(back, result)
+    for ours, theirs in zip(back.steps(), steps, strict=True):
+        assert_same(ours, theirs)
+
+
 def test_any_layout_of_an_array_is_sent_in_row_order():
     action = np.arange(6, dtype=np.float32).reshape(3, 2).T
     request = frames.step_request(1, action, None, False)
@@ -134,6 +170,15 @@ def example() -> StepResult:
     )
 
 
+def policy_example() -> PolicyRollout:
+    return PolicyRollout.of([replace(example(), deviation=None)] * 2, np.ones((2, 2, 1)), np.ones((2, 2)))
+
+
+def of_policy(**changes: Any) -> frames.PolicyRequest:
+    request = frames.policy_request(1, POLICIES[0], 2, None, None)
+    return msgspec.structs.replace(request, **changes)
+
+
 def read_whole_request(content: bytes) -> None:
     request = frames.read_request(content)
     match request:
@@ -145,6 +190,10 @@ def read_whole_request(content: bytes) -> None:
         case frames.ResetRequest():
             frames.seed_of(request, SMALL)
             frames.mask_of(request, SMALL)
+        case frames.PolicyRequest():
+            frames.policy_of(request, SMALL)
+            frames.noise_of(request)
+            frames.until_of(request, SMALL)
 
 
 def read_whole_reply(content: bytes) -> None:
@@ -156,6 +205,8 @@ def read_whole_reply(content: bytes) -> None:
             [frames.step_result(step, SMALL) for step in reply.steps]
         case frames.ResetReply():
             frames.reset_result(reply, SMALL)
+        case frames.PolicyReply():
+            frames.policy_rollout(reply, SMALL)
 
 
 MASK = np.array([True, False])
@@ -163,11 +214,15 @@ REQUESTS = [
     frames.reset_request(1, [3, 4], MASK),
     frames.step_request(1, np.ones((2, 1)), MASK, True),
     frames.rollout_request(1, np.ones((2, 2, 1))),
+    frames.policy_request(1, random_policy((3, 2, 1)), 4, NoiseKey(1, 2), MASK),
 ]
 REPLIES = [
     frames.reset_reply(1, ResetResult(np.ones((2, 3), dtype=np.float32), np.array([1, 2]))),
     frames.step_reply(1, example()),
     frames.rollout_reply(1, [example()] * 2),
+    frames.policy_reply(
+        1, PolicyRollout.of([replace(example(), deviation=None)] * 2, np.ones((2, 2, 1)), np.ones((2, 2)))
+    ),
     frames.ProblemReply(404, Code.UNKNOWN_SESSION, "unknown session", "no session"),
 ]
 CASES = [(read_whole_request, frames.encode(r)) for r in REQUESTS]
@@ -212,6 +267,17 @@ def test_every_cut_of_a_frame_is_an_error(read: Callable[[bytes], None], content
         (frames.reset_request(1, [1], None), "seed: expected 16 bytes"),
         (frames.reset_request(0, 1, None), "expected a frame"),
         (frames.reset_request(1, -1, None), "expected a frame"),
+        (of_policy(steps=0), "expected a frame"),
+        (of_policy(units=[1_025, 1]), "expected a frame"),
+        (of_policy(units=[1] * 9), "expected a frame"),
+        (of_policy(precision="float16"), "expected a frame"),
+        (of_policy(units=[1_024] * 2), "policy: expected at most 262144 weights and biases, got 1053696"),
+        (of_policy(units=[5, 1]), "parameters: expected 104 bytes"),
+        (of_policy(mean=np.ones(4).data), "mean: expected 12 bytes"),
+        (of_policy(deviation=np.zeros(3, dtype=np.float32).data), "expected a positive deviation, got 0"),
+        (of_policy(parameters=np.full(21, np.nan, dtype=np.float32).data), "finite numbers in layers"),
+        (of_policy(until=np.ones(3, dtype=bool).data), "until: expected 2 bytes"),
+        (of_policy(noise=frames.Noise(-1, 0)), "expected a frame"),
     ],
 )
 def test_a_request_that_does_not_fit_the_session_says_how(request_frame: frames.Request, message: str):
@@ -224,6 +290,13 @@ def test_an_unknown_field_is_refused():
     assert content[0] == 0x82, "a map of two"
     with pytest.raises(FrameError, match="unknown field `more`"):
         frames.read_request(b"\x83" + content[1:] + b"\xa4more\x01")
+
+
+def test_final_steps_are_steps_of_the_rollout_in_order():
+    reply = frames.policy_reply(1, policy_example())
+    for wrong in (np.array([0, 2]), np.array([-1, 0]), np.array([1, 0]), np.array([0])):
+        with pytest.raises(FrameError, match="final_steps: expected"):
+            read_whole_reply(frames.encode(msgspec.structs.replace(reply, final_steps=wrong.data)))
 
 
 def test_final_lanes_are_lanes_of_the_session():

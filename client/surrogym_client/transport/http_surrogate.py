@@ -11,15 +11,17 @@ from typing import Literal, Self, TypeVar, get_args
 
 import numpy as np
 
-from surrogym_client.errors import ProtocolMismatch, SessionLost
+from surrogym_client.errors import ProtocolMismatch, SessionLost, refused_here
 from surrogym_client.transport import routes
 from surrogym_client.transport.api import Api, check_protocol, new_key, parse
 from surrogym_client.transport.connection import Connection, Retries, Timeouts
 from surrogym_client.transport.step_codecs import UNREADABLE, BinaryForm, Form, JsonForm
 from surrogym_client.transport.stream import Stream, StreamLost, StreamUnavailable
 from surrogym_shared import wire
+from surrogym_shared.acting import ActingPolicy, NoiseKey, PolicyRun
+from surrogym_shared.codes import Code
 from surrogym_shared.frames import Shape
-from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult
+from surrogym_shared.port import Bools, Floats, Ints, PolicyRollout, ResetResult, StepResult
 from surrogym_shared.spec import EnvironmentSpec
 
 __all__ = ["Api", "HttpSurrogate", "Retries", "Timeouts", "Transport"]
@@ -146,6 +148,27 @@ class HttpSurrogate:
             "rollout",
             lambda seq, shape: self._form.rollout(seq, np.asarray(actions), shape),
             self._form.read_rollout,
+            self.connection.timeouts.rollout,
+        )
+
+    def rollout_policy(
+        self,
+        session: str,
+        policy: ActingPolicy,
+        steps: int,
+        *,
+        noise: NoiseKey | None = None,
+        until: Bools | None = None,
+    ) -> PolicyRollout:
+        try:
+            run = PolicyRun(policy, steps, noise, until)
+        except ValueError as error:
+            raise refused_here(Code.INVALID_REQUEST, str(error)) from error
+        return self._in_sequence(
+            session,
+            "rollout",
+            lambda seq, shape: self._form.policy(seq, run, shape),
+            self._form.read_policy,
             self.connection.timeouts.rollout,
         )
 

@@ -14,16 +14,17 @@ from numpy.typing import NDArray
 
 from surrogym_client.errors import error_from_problem, refused_here
 from surrogym_shared import frames
+from surrogym_shared.acting import PolicyRun
 from surrogym_shared.codes import Code, Problem
 from surrogym_shared.frames import FrameError, Shape
-from surrogym_shared.port import Bools, ResetResult, StepResult
+from surrogym_shared.port import Bools, PolicyRollout, ResetResult, StepResult
 
 Array = NDArray[Any]
 Seeds = int | Sequence[int] | None
 
 UNREADABLE = (msgspec.DecodeError, FrameError)  # what the readers raise for what is no reply
 
-R = TypeVar("R", frames.ResetReply, frames.StepReply, frames.RolloutReply)
+R = TypeVar("R", frames.ResetReply, frames.StepReply, frames.RolloutReply, frames.PolicyReply)
 
 
 class Form(Protocol):
@@ -37,11 +38,15 @@ class Form(Protocol):
 
     def rollout(self, seq: int, actions: Array, shape: Shape) -> bytes: ...
 
+    def policy(self, seq: int, run: PolicyRun, shape: Shape) -> bytes: ...
+
     def read_reset(self, content: bytes, shape: Shape) -> tuple[int, ResetResult]: ...
 
     def read_step(self, content: bytes, shape: Shape) -> tuple[int, StepResult]: ...
 
     def read_rollout(self, content: bytes, shape: Shape) -> tuple[int, list[StepResult]]: ...
+
+    def read_policy(self, content: bytes, shape: Shape) -> tuple[int, PolicyRollout]: ...
 
 
 class BinaryForm:
@@ -63,6 +68,10 @@ class BinaryForm:
         rows = _rows("actions", actions, (len(actions), shape.lanes, shape.action))
         return frames.encode(frames.rollout_request(seq, rows))
 
+    def policy(self, seq: int, run: PolicyRun, shape: Shape) -> bytes:
+        until = _mask(run.until, shape, "until")
+        return frames.encode(frames.policy_request(seq, run.policy, run.steps, run.noise, until))
+
     def read_reset(self, content: bytes, shape: Shape) -> tuple[int, ResetResult]:
         reply = _reply(content, frames.ResetReply)
         return reply.seq, frames.reset_result(reply, shape)
@@ -74,6 +83,10 @@ class BinaryForm:
     def read_rollout(self, content: bytes, shape: Shape) -> tuple[int, list[StepResult]]:
         reply = _reply(content, frames.RolloutReply)
         return reply.seq, [frames.step_result(step, shape) for step in reply.steps]
+
+    def read_policy(self, content: bytes, shape: Shape) -> tuple[int, PolicyRollout]:
+        reply = _reply(content, frames.PolicyReply)
+        return reply.seq, frames.policy_rollout(reply, shape)
 
 
 class _ResetBody(msgspec.Struct, forbid_unknown_fields=True):
@@ -103,6 +116,8 @@ class _StepBody(msgspec.Struct, forbid_unknown_fields=True):
 class _RolloutBody(msgspec.Struct, forbid_unknown_fields=True):
     seq: int
     steps: list[_StepBody]
+    action: list[list[list[float]]] | None = None
+    log_probability: list[list[float]] | None = None
 
 
 _ENCODER = msgspec.json.Encoder()
@@ -144,6 +159,29 @@ class JsonForm:
         body = _ROLLOUT.decode(content)
         return body.seq, [_step_result(step, shape) for step in body.steps]
 
+    def policy(self, seq: int, run: PolicyRun, shape: Shape) -> bytes:
+        del shape
+        policy = run.policy
+        arrays = {
+            "mean": policy.mean.tolist(),
+            "deviation": policy.deviation.tolist(),
+            "layers": [{name: part.tolist() for name, part in layer._asdict().items()} for layer in policy.layers],
+            "activation": policy.activation,
+            "precision": str(policy.dtype),
+            "log_deviations": None if policy.log_deviations is None else policy.log_deviations.tolist(),
+        }
+        noise = None if run.noise is None else run.noise._asdict()
+        body = {"seq": seq, "policy": arrays, "steps": run.steps, "noise": noise, "until": _listed(run.until)}
+        return _ENCODER.encode(body)
+
+    def read_policy(self, content: bytes, shape: Shape) -> tuple[int, PolicyRollout]:
+        body = _ROLLOUT.decode(content)
+        if not body.steps or body.action is None:
+            raise FrameError("expected steps and the policy's action, got a reply without")
+        log = None if body.log_probability is None else np.array(body.log_probability, dtype=np.float64)
+        steps = [_step_result(step, shape) for step in body.steps]
+        return body.seq, PolicyRollout.of(steps, np.array(body.action, dtype=np.float64), log)
+
 
 def _reply(content: bytes, kind: type[R]) -> R:
     """A frame of the kind that was asked for; raises the error that a problem frame stands for."""
@@ -168,9 +206,9 @@ def _rows(what: str, raw: Array, expected: tuple[int, ...]) -> Array:
     return array
 
 
-def _mask(mask: Bools | None, shape: Shape) -> Bools | None:
+def _mask(mask: Bools | None, shape: Shape, name: str = "mask") -> Bools | None:
     if mask is not None and np.shape(mask) != (shape.lanes,):
-        raise refused_here(Code.INVALID_REQUEST, f"mask: expected {shape.lanes} entries, got shape {np.shape(mask)}")
+        raise refused_here(Code.INVALID_REQUEST, f"{name}: expected {shape.lanes} entries, got shape {np.shape(mask)}")
     return mask
 
 

@@ -15,6 +15,7 @@ from surrogym_server.api.door import Door, door_of
 from surrogym_server.api.json_body import JSON
 from surrogym_shared import frames
 
+SCHEMAS = "#/components/schemas/{model}"
 BINARY: dict[str, Any] = {frames.MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}}
 
 
@@ -40,7 +41,8 @@ def _lean(door: Door, endpoint: Callable[..., Awaitable[Response]]) -> ASGIApp:
 
 def described(model: type[BaseModel], example: dict[str, Any]) -> dict[str, Any]:
     """OpenAPI of a body that comes as JSON or as a frame."""
-    content = {JSON: {"schema": model.model_json_schema(), "example": example}, **BINARY}
+    schema = model.model_json_schema(ref_template=SCHEMAS)
+    content = {JSON: {"schema": schema, "example": example}, **BINARY}
     return {"requestBody": {"required": True, "content": content}}
 
 

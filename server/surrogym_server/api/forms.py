@@ -9,7 +9,7 @@ import msgspec
 
 from surrogym_server import convert
 from surrogym_server.api.json_body import JSON, parse_as
-from surrogym_server.engine.session import Answer
+from surrogym_server.engine.session import Answer, steps_of
 from surrogym_server.services.sessions import SessionService
 from surrogym_shared import frames
 from surrogym_shared.wire import ResetSession, RolloutSession, StepSession
@@ -36,7 +36,10 @@ async def step_json(sessions: SessionService, id: str, content: bytes) -> bytes:
 
 async def rollout_json(sessions: SessionService, id: str, content: bytes) -> bytes:
     body = parse_as(RolloutSession, content)
-    answer = await sessions.rollout(id, body.seq, convert.numbers("actions", body.actions))
+    if body.actions is None:
+        answer = await sessions.rollout_policy(id, body.seq, convert.policy_run(body))
+    else:
+        answer = await sessions.rollout(id, body.seq, convert.numbers("actions", body.actions))
     return await _rollout_written(_rollout_in_json, answer)
 
 
@@ -53,28 +56,31 @@ async def carry_out(sessions: SessionService, id: str, shape: frames.Shape, requ
         case frames.RolloutRequest():
             answer = await sessions.rollout(id, request.seq, frames.actions_of(request, shape))
             return await _rollout_written(_rollout_in_frames, answer)
+        case frames.PolicyRequest():
+            answer = await sessions.rollout_policy(id, request.seq, convert.framed_policy_run(request, shape))
+            return await _rollout_written(_rollout_in_frames, answer)
 
 
 async def _rollout_written(write: Callable[[Answer], bytes], answer: Answer) -> bytes:
-    assert isinstance(answer.outcome, tuple)
-    return write(answer) if len(answer.outcome) <= SHORT_ROLLOUT else await asyncio.to_thread(write, answer)
+    return write(answer) if steps_of(answer.outcome) <= SHORT_ROLLOUT else await asyncio.to_thread(write, answer)
 
 
 def _rollout_in_json(answer: Answer) -> bytes:
     """Step by step: a thread that encodes lets no other one in."""
     steps = [msgspec.Raw(_JSON.encode(step)) for step in convert.rollout_steps(answer)]
-    return _JSON.encode({"seq": answer.seq, "steps": steps})
+    return _JSON.encode({"seq": answer.seq, "steps": steps, **convert.rollout_actions(answer)})
 
 
 def _rollout_in_frames(answer: Answer) -> bytes:
     return frames.encode(convert.rollout_frame(answer))
 
 
-def _framed(kind: type[frames.Request]) -> Carry:
+def _framed(*kinds: type[frames.Request]) -> Carry:
     async def carry(sessions: SessionService, id: str, content: bytes) -> bytes:
         request = frames.read_request(content)
-        if not isinstance(request, kind):
-            raise frames.FrameError(f"expected a {kind.__name__}, got a {type(request).__name__}")
+        if not isinstance(request, kinds):
+            expected = " or a ".join(kind.__name__ for kind in kinds)
+            raise frames.FrameError(f"expected a {expected}, got a {type(request).__name__}")
         return await carry_out(sessions, id, convert.session_shape(sessions.get(id)), request)
 
     return carry
@@ -82,4 +88,7 @@ def _framed(kind: type[frames.Request]) -> Carry:
 
 RESET: dict[str, Carry] = {JSON: reset_json, frames.MEDIA_TYPE: _framed(frames.ResetRequest)}
 STEP: dict[str, Carry] = {JSON: step_json, frames.MEDIA_TYPE: _framed(frames.StepRequest)}
-ROLLOUT: dict[str, Carry] = {JSON: rollout_json, frames.MEDIA_TYPE: _framed(frames.RolloutRequest)}
+ROLLOUT: dict[str, Carry] = {
+    JSON: rollout_json,
+    frames.MEDIA_TYPE: _framed(frames.RolloutRequest, frames.PolicyRequest),
+}

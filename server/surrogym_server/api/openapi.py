@@ -10,10 +10,11 @@ from fastapi.openapi.utils import get_openapi
 from fastapi.responses import Response
 from starlette.routing import compile_path
 
+from surrogym_server.api.body import SCHEMAS
+from surrogym_server.api.json_body import JSON
 from surrogym_server.api.problems import documented, problem_response
 from surrogym_shared.codes import Code, Problem
 
-SCHEMAS = "#/components/schemas/{model}"
 RESPONSES = "#/components/responses/{name}"
 
 ANY_REQUEST = documented(
@@ -58,6 +59,7 @@ def describe(app: FastAPI) -> dict[str, Any]:
         for methods in schema["paths"].values():
             for operation in methods.values():
                 _add_refusals(operation)
+                components["schemas"].update(_parts_of_body(operation))
         app.openapi_schema = schema
     return app.openapi_schema
 
@@ -66,6 +68,13 @@ def _add_refusals(operation: dict[str, Any]) -> None:
     """Those that the route has not described itself, because it has causes of its own."""
     for status in (*ANY_REQUEST, *(WITH_TOKEN if "security" in operation else ())):
         operation["responses"].setdefault(str(status), {"$ref": RESPONSES.format(name=status)})
+
+
+def _parts_of_body(operation: dict[str, Any]) -> dict[str, Any]:
+    """Take the schemas of nested models out of a body that FastAPI does not read, and so has no components of."""
+    schema = operation.get("requestBody", {}).get("content", {}).get(JSON, {}).get("schema", {})
+    parts: dict[str, Any] = schema.pop("$defs", {})
+    return parts
 
 
 def _name_operations(paths: dict[str, Any]) -> None:

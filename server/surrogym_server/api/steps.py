@@ -17,7 +17,7 @@ from surrogym_server.api import examples, forms
 from surrogym_server.api.auth import TRAIN
 from surrogym_server.api.body import BINARY, LeanRoute, described
 from surrogym_server.api.deadline import PARAMETER, seconds_left
-from surrogym_server.api.door import MEDIA_TYPE
+from surrogym_server.api.door import MEDIA_TYPE, json_up_to
 from surrogym_server.api.json_body import JSON, take_turn
 from surrogym_server.api.problems import answer_to, documented
 from surrogym_server.api.stream import StepStream
@@ -52,11 +52,11 @@ ERRORS = documented(
 )
 
 
-def _documented(body: type[BaseModel], example: dict[str, Any], reply: type[BaseModel]) -> dict[str, Any]:
+def _documented(body: type[BaseModel], example: dict[str, Any], reply: type[BaseModel], **extra: Any) -> dict[str, Any]:
     return {
         "response_model": reply,
         "dependencies": [TRAIN],
-        "openapi_extra": {**described(body, example), "parameters": [PARAMETER]},
+        "openapi_extra": {**described(body, example), "parameters": [PARAMETER], **extra},
         "responses": {200: {"content": BINARY}, **ERRORS},
     }
 
@@ -74,9 +74,13 @@ async def step(id: str, request: Request) -> Response:
     return await _carried(forms.STEP, id, request)
 
 
-@router.post("/rollout", summary="Step several times", **_documented(RolloutSession, examples.ROLLOUT, RolloutReply))
+@router.post(
+    "/rollout",
+    summary="Step several times",
+    **_documented(RolloutSession, examples.ROLLOUT, RolloutReply, **json_up_to(128)),
+)
 async def rollout(id: str, request: Request) -> Response:
-    """With given actions, in one request; all steps or none."""
+    """With given actions, or with those of a policy that is sent as arrays, in one request; all steps or none."""
     return await _carried(forms.ROLLOUT, id, request)
 
 

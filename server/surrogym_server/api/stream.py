@@ -72,7 +72,7 @@ def _at_once(
         request = frames.read_request(content)
     except frames.FrameError:
         return None
-    if isinstance(request, frames.RolloutRequest):
+    if isinstance(request, frames.RolloutRequest | frames.PolicyRequest):
         return None
     carried = _carried(sessions.within(limit), id, shape, request)
     try:

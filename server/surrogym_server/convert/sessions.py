@@ -10,14 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_server.convert.numbers import numbers
 from surrogym_server.engine.session import Answer, Session
 from surrogym_server.environment import definition as core
+from surrogym_server.errors import InvalidInput
 from surrogym_server.services.activity import SessionActivity
 from surrogym_server.services.sessions import Opening
 from surrogym_server.virtual import VirtualSettings
 from surrogym_shared import frames
 from surrogym_shared import wire as replies
-from surrogym_shared.port import ResetResult, StepResult
+from surrogym_shared.acting import ActingPolicy, NoiseKey, PolicyRun
+from surrogym_shared.network import Layer
+from surrogym_shared.port import PolicyRollout, ResetResult, StepResult
 
 
 def opening(request: replies.OpenSession) -> Opening:
@@ -127,8 +131,47 @@ def step_reply(answer: Answer) -> dict[str, Any]:
 
 def rollout_steps(answer: Answer) -> Iterator[dict[str, Any]]:
     """The fields of the steps of ``RolloutReply``, one by one; they all carry the one seq of the request."""
-    assert isinstance(answer.outcome, tuple)
-    return (_step_fields(answer.seq, step) for step in answer.outcome)
+    assert not isinstance(answer.outcome, ResetResult)
+    steps = answer.outcome.steps() if isinstance(answer.outcome, PolicyRollout) else answer.outcome
+    return (_step_fields(answer.seq, step) for step in steps)
+
+
+def rollout_actions(answer: Answer) -> dict[str, Any]:
+    """The fields of ``RolloutReply`` that say what a policy did; none where no policy acted."""
+    if not isinstance(answer.outcome, PolicyRollout):
+        return {}
+    log = answer.outcome.log_probability
+    return {"action": answer.outcome.action.tolist()} | ({} if log is None else {"log_probability": log.tolist()})
+
+
+def policy_run(request: replies.RolloutSession) -> PolicyRun:
+    """Raises ``InvalidInput``: arrays that don't fit together."""
+    assert request.policy is not None
+    assert request.steps is not None
+    given, dtype = request.policy, np.dtype(request.policy.precision)
+
+    def array(name: str, rows: Any) -> NDArray[Any]:
+        with np.errstate(over="ignore"):  # what float32 can't hold becomes infinite, and is refused as such
+            return numbers(name, rows).astype(dtype)
+
+    try:
+        policy = ActingPolicy(
+            array("mean", given.mean),
+            array("deviation", given.deviation),
+            tuple(Layer(array("weights", layer.weights), array("bias", layer.bias)) for layer in given.layers),
+            given.activation,
+            None if given.log_deviations is None else array("log_deviations", given.log_deviations),
+        )
+    except ValueError as error:
+        raise InvalidInput(str(error)) from error
+    noise = None if request.noise is None else NoiseKey(request.noise.seed, request.noise.step)
+    return PolicyRun(policy, request.steps, noise, lane_mask(request.until))
+
+
+def framed_policy_run(request: frames.PolicyRequest, shape: frames.Shape) -> PolicyRun:
+    """Raises ``FrameError``."""
+    policy, until = frames.policy_of(request, shape), frames.until_of(request, shape)
+    return PolicyRun(policy, request.steps, frames.noise_of(request), until)
 
 
 def session_shape(session: Session) -> frames.Shape:
@@ -152,8 +195,10 @@ def step_frame(answer: Answer) -> frames.StepReply:
     return frames.step_reply(answer.seq, answer.outcome[0])
 
 
-def rollout_frame(answer: Answer) -> frames.RolloutReply:
-    assert isinstance(answer.outcome, tuple)
+def rollout_frame(answer: Answer) -> frames.RolloutReply | frames.PolicyReply:
+    assert not isinstance(answer.outcome, ResetResult)
+    if isinstance(answer.outcome, PolicyRollout):
+        return frames.policy_reply(answer.seq, answer.outcome)
     return frames.rollout_reply(answer.seq, answer.outcome)
 
 

@@ -18,7 +18,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import Damaged, InvalidInput, UnknownSession
 from surrogym_server.tensors import to_device
 from surrogym_server.virtual import LaneState, VirtualSettings
-from surrogym_shared.port import ResetResult, StepResult
+from surrogym_shared.port import PolicyRollout, ResetResult, StepResult
 
 FORMAT, WITHOUT_PATHS = 2, 1  # the one that is written, and an older one that is read as well
 MALFORMED = (BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, ValueError, LookupError, TypeError)
@@ -106,8 +106,14 @@ def _settings(saved: dict[str, Any]) -> VirtualSettings:
 def _answer(header: dict[str, Any], arrays: Arrays) -> Answer | None:
     if (kept := header.get("answer")) is None:
         return None
-    reset = _unprefixed("reset", arrays)
-    outcome = ResetResult(**reset) if reset else _steps(_unprefixed("steps", arrays))
+    outcome: Outcome
+    if reset := _unprefixed("reset", arrays):
+        outcome = ResetResult(**reset)
+    elif policy := _unprefixed("policy", arrays):
+        known: dict[str, Any] = {"log_probability": None, **policy}
+        outcome = PolicyRollout(**known)
+    else:
+        outcome = _steps(_unprefixed("steps", arrays))
     return Answer(kept["seq"], Fingerprint(digest=kept["digest"]), outcome)
 
 
@@ -120,6 +126,8 @@ def _visited(header: dict[str, Any], arrays: Arrays) -> Reservoir | None:
 def _outcome_arrays(outcome: Outcome) -> Arrays:
     if isinstance(outcome, ResetResult):
         return _prefixed("reset", _fields(outcome))
+    if isinstance(outcome, PolicyRollout):
+        return _prefixed("policy", _fields(outcome))
     rows = [_fields(step) for step in outcome]
     arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0] if name not in RAGGED}
     arrays |= {name: np.concatenate([row[name] for row in rows]) for name in RAGGED}
@@ -135,7 +143,7 @@ def _steps(arrays: Arrays) -> tuple[StepResult, ...]:
     return tuple(StepResult(**{name: column[t] for name, column in columns.items()}) for t in range(count))
 
 
-def _fields(result: ResetResult | StepResult) -> Arrays:
+def _fields(result: ResetResult | StepResult | PolicyRollout) -> Arrays:
     values = {field.name: getattr(result, field.name) for field in fields(result)}
     return {name: value for name, value in values.items() if value is not None}
 

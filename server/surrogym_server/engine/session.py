@@ -18,7 +18,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import IdempotencyConflict, InvalidInput, SeqConflict
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual import LaneState, LaneTransition, VirtualSettings, create, reset, step, within
-from surrogym_shared.port import ResetResult, StepResult, quick
+from surrogym_shared.port import PolicyRollout, ResetResult, StepResult, quick
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
@@ -26,7 +26,7 @@ Versions = NDArray[np.int64]
 WantedVersion = Literal["latest"] | int
 ModelOf = Callable[[int], DynamicsModel]
 Seeds = int | Sequence[int] | None
-Outcome = ResetResult | tuple[StepResult, ...]
+Outcome = ResetResult | tuple[StepResult, ...] | PolicyRollout
 
 RESULT_BYTES = 2_048  # of one step's arrays, beside the numbers in them
 LANE_BYTES = 48  # of one lane in them, beside its observation and its action
@@ -89,7 +89,7 @@ class Session:
     def nbytes(self) -> int:
         """Bytes of its lanes and of its kept answer, roughly."""
         outcome = None if self.answer is None else self.answer.outcome
-        return self.lanes.nbytes + self.answer_bytes(len(outcome) if isinstance(outcome, tuple) else 1)
+        return self.lanes.nbytes + self.answer_bytes(1 if outcome is None else steps_of(outcome))
 
     def answer_bytes(self, steps: int) -> int:
         """Bytes that the answer to so many steps takes while it is kept, roughly."""
@@ -100,6 +100,11 @@ class Session:
     def seq(self) -> int:
         """The last seq that was answered."""
         return 0 if self.answer is None else self.answer.seq
+
+
+def steps_of(outcome: Outcome) -> int:
+    """How many steps an outcome is of; a reset counts for one."""
+    return 1 if isinstance(outcome, ResetResult) else len(outcome)
 
 
 def open_session(

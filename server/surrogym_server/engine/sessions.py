@@ -1,6 +1,6 @@
 """The live sessions of this process; everyone else knows only their ids.
 
-All methods belong to the event loop's thread.
+All methods but ``check_wanted`` belong to the event loop's thread.
 """
 
 from __future__ import annotations
@@ -12,8 +12,17 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 
-from surrogym_server.engine.session import Answer, Fingerprint, Outcome, Session, answered, check_opening, replay
-from surrogym_server.errors import DeadlineExceeded, Overloaded, SessionExpired, TooLarge, UnknownSession
+from surrogym_server.engine.session import (
+    Answer,
+    Fingerprint,
+    Outcome,
+    Session,
+    answered,
+    check_opening,
+    replay,
+)
+from surrogym_server.errors import DeadlineExceeded, Overloaded, SessionExpired, TooLarge, Unavailable, UnknownSession
+from surrogym_shared.port import PolicyRollout
 
 # Work below this is done in the event loop: a hop to a thread and back costs about 70 us idle and several times
 # that on a busy machine, and nobody else notices a wait of two milliseconds.
@@ -89,6 +98,7 @@ class LiveSessions:
         self._limits = limits
         self._requests = 0
         self._live: dict[str, _Live] = {}
+        self._stopping = False
         self._expired: OrderedDict[str, None] = OrderedDict()
 
     def __len__(self) -> int:
@@ -181,6 +191,22 @@ class LiveSessions:
             self._requests -= 1
             live.requests -= 1
 
+    def check_wanted(self, id: str) -> None:
+        """Let long work go on, between two of its steps. May be called from any thread.
+
+        Raises:
+            UnknownSession: the session was closed meanwhile.
+            Unavailable: this process stops.
+        """
+        if self._stopping:
+            raise Unavailable("the server stops, and the steps of this request were not taken: send it again")
+        if id not in self._live:
+            raise UnknownSession(f"session {id!r} was closed during this request")
+
+    def stop(self) -> None:
+        """Let long work end where it next asks ``check_wanted``."""
+        self._stopping = True
+
     def close(self, id: str) -> None:
         """End a session; harmless when it has ended."""
         self._live.pop(id, None)
@@ -227,8 +253,10 @@ class LiveSessions:
         else:
             threads = self._threads if steps == 1 else self._rollouts
             done, seconds = await self._in_thread(threads, live.session, work, expected, deadline)
-        known = live.seconds_per_step if live.seconds_per_step < float("inf") else seconds / steps
-        live.seconds_per_step = (1 - FORGETTING) * known + FORGETTING * seconds / steps
+        taken = len(done[1]) if isinstance(done[1], PolicyRollout) else steps  # which may have stopped early
+        each = seconds / taken
+        known = live.seconds_per_step if live.seconds_per_step < float("inf") else each
+        live.seconds_per_step = (1 - FORGETTING) * known + FORGETTING * each
         return done
 
     async def _in_thread(

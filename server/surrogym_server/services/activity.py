@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_server.engine.session import Answer, Session
-from surrogym_shared.port import StepResult
+from surrogym_shared.port import PolicyRollout, ResetResult, StepResult
 
 Clock = Callable[[], float]
 
@@ -54,7 +54,8 @@ class Tally:
         self._since = self._last = clock()
         self._decayed = 0.0
         self._seq = 0
-        self._pending: list[StepResult] = []
+        self._pending: list[StepResult | PolicyRollout] = []
+        self._unfolded = 0  # steps in them
         self._sums: NDArray[np.float64] | None = None  # (2, N) reward and penalty of the running episodes
         self._steps = 0
         self._episodes = 0
@@ -62,16 +63,17 @@ class Tally:
 
     def stepped(self, answer: Answer) -> None:
         """Take note of an answer; one that was given before counts once."""
-        if answer.seq <= self._seq or not isinstance(answer.outcome, tuple):
+        if answer.seq <= self._seq or isinstance(answer.outcome, ResetResult):
             return
         self._seq = answer.seq
-        now, lanes = self._clock(), len(answer.outcome[0].reward)
-        steps = len(answer.outcome) * lanes
-        self._steps += steps
-        self._decayed = self._decayed * math.exp((self._last - now) / RATE_SECONDS) + steps
+        results = (answer.outcome,) if isinstance(answer.outcome, PolicyRollout) else answer.outcome
+        now, taken, lanes = self._clock(), len(answer.outcome), results[0].reward.shape[-1]
+        self._steps += taken * lanes
+        self._decayed = self._decayed * math.exp((self._last - now) / RATE_SECONDS) + taken * lanes
         self._last = now
-        self._pending.extend(answer.outcome)
-        if len(self._pending) >= FOLD_STEPS or len(self._pending) * lanes >= FOLD_LANE_STEPS:
+        self._pending.extend(results)
+        self._unfolded += taken
+        if self._unfolded >= FOLD_STEPS or self._unfolded * lanes >= FOLD_LANE_STEPS:
             self._fold()
 
     def reset(self, mask: NDArray[np.bool_] | None) -> None:
@@ -97,10 +99,11 @@ class Tally:
     def _fold(self) -> None:
         if not self._pending:
             return
-        reward = np.stack([step.reward for step in self._pending])
-        penalty = np.stack([step.reward_mean for step in self._pending]) - reward
-        ended = np.stack([step.terminated | step.truncated for step in self._pending])
+        reward = np.concatenate([np.atleast_2d(result.reward) for result in self._pending])
+        penalty = np.concatenate([np.atleast_2d(result.reward_mean) for result in self._pending]) - reward
+        ended = np.concatenate([np.atleast_2d(result.terminated | result.truncated) for result in self._pending])
         self._pending.clear()
+        self._unfolded = 0
         gains = np.stack([reward, penalty], 1)  # (T, 2, N)
         sums = np.zeros(gains.shape[1:]) if self._sums is None else self._sums
         begin = 0

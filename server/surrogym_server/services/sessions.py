@@ -9,13 +9,13 @@ import secrets
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from surrogym_server.engine.models import ModelCache
+from surrogym_server.engine.rollouts import OneStep, parts_of, roll, roll_policy
 from surrogym_server.engine.saved import session_from_bytes, session_to_bytes
 from surrogym_server.engine.session import (
     Answer,
@@ -27,6 +27,7 @@ from surrogym_server.engine.session import (
     open_session,
     reset_session,
     step_session,
+    steps_of,
 )
 from surrogym_server.engine.sessions import LiveSessions, Work
 from surrogym_server.environment.actions import policy_actions
@@ -42,6 +43,8 @@ from surrogym_server.storage.records import SavedSession
 from surrogym_server.tensors import CPU
 from surrogym_server.virtual import VirtualSettings, expected_bytes, reward_limits
 from surrogym_server.virtual.paths import function_draws
+from surrogym_shared.acting import PolicyRun
+from surrogym_shared.port import StepResult
 
 logger = logging.getLogger(__name__)
 
@@ -51,7 +54,6 @@ Array = NDArray[np.float64]
 SESSION_ID_BYTES = 16
 MAX_PARTICLES = 4_000_000  # of all lanes of a session
 MAX_PATHWISE_LANES = 4_096  # the function of each is some thousand numbers
-MAX_ROLLOUT_STEPS = 1_000_000  # of all lanes in one request
 
 
 @dataclass(frozen=True)
@@ -166,17 +168,19 @@ class SessionService:
         """T steps with a policy's actions (T, N, F) or (T, N), all or none. Raises as ``step``."""
 
         def work(session: Session) -> tuple[Session, Outcome]:
-            lanes, results = session.settings.num_envs, []
-            if len(actions) * lanes > MAX_ROLLOUT_STEPS:
-                raise TooLarge(f"expected at most {MAX_ROLLOUT_STEPS} steps in all, got {len(actions)} x {lanes}")
-            planned = [policy_actions(session.definition.action, row, lanes) for row in actions]
-            for u in planned:
-                session, result = self._step(session, u, None, False)
-                results.append(result)
-            return session, tuple(results)
+            return roll(session, actions, self._stepper(id))
 
         request = Fingerprint("rollout", _columns(actions, 3))
         return await self._counted(id, seq, request, work, steps=len(actions))
+
+    async def rollout_policy(self, id: str, seq: int | None, run: PolicyRun) -> Answer:
+        """Let a policy act in all lanes, all steps or none. Raises as ``step``, and ``TooLarge``."""
+
+        def work(session: Session) -> tuple[Session, Outcome]:
+            return roll_policy(session, run, self._stepper(id))
+
+        request = Fingerprint(digest=digest_of("policy", *parts_of(run)))  # at once: its parts would keep the policy
+        return await self._counted(id, seq, request, work, run.steps)
 
     async def submit_occupancy(self, id: str, checkpoint: str) -> tuple[int, float]:
         """Store the states that a session visited under a name; returns how many, and the confidence index there.
@@ -238,7 +242,7 @@ class SessionService:
         answer = await self._live.advance(id, seq, request, work, steps, self._deadline)
         self._metrics.steps.observe(time.perf_counter() - started)
         self._tallies.of(id).stepped(answer)
-        self._metrics.lane_steps += steps * self._live.get(id).settings.num_envs
+        self._metrics.lane_steps += steps_of(answer.outcome) * self._live.get(id).settings.num_envs
         return answer
 
     def _check_size(self, settings: VirtualSettings) -> None:
@@ -280,7 +284,7 @@ class SessionService:
         seen = self._storage.samples.reward_range(surrogate) if definition.learning.limits_rewards else None
         return settings if seen is None else replace(settings, reward_limits=reward_limits(*seen))
 
-    def _step(self, session: Session, u: Array, mask: Bools | None, deviations: bool) -> tuple[Session, Any]:
+    def _step(self, session: Session, u: Array, mask: Bools | None, deviations: bool) -> tuple[Session, StepResult]:
         try:
             return step_session(
                 session,
@@ -294,6 +298,15 @@ class SessionService:
             raise
         except BaseException as error:  # of a family's code; written out, as ``plugin_calls`` costs each step more
             raise failure_of(session.definition, error) from error
+
+    def _stepper(self, id: str) -> OneStep:
+        """Steps of a rollout, which ends where nobody wants it any more."""
+
+        def step(session: Session, u: Array) -> tuple[Session, StepResult]:
+            self._live.check_wanted(id)
+            return self._step(session, u, None, False)
+
+        return step
 
     def _submit(self, session: Session, checkpoint: str, states: Array) -> float:
         """Store visited states; the confidence index there. By the id: the name may be another surrogate's by now."""

@@ -69,6 +69,7 @@ from surrogym_shared.wire.queries import (
 from surrogym_shared.wire.service import Access, Event, Health, Ready
 from surrogym_shared.wire.sessions import (
     OF_PARTICLES,
+    ActionNoise,
     ActionRow,
     Actions,
     ActionSpace,
@@ -76,6 +77,8 @@ from surrogym_shared.wire.sessions import (
     DiscreteSpace,
     MultiDiscreteSpace,
     OpenSession,
+    PolicyArrays,
+    PolicyLayer,
     ResetReply,
     ResetSession,
     RolloutReply,
@@ -115,6 +118,7 @@ __all__ = [
     "OF_PARTICLES",
     "PROTOCOL",
     "Access",
+    "ActionNoise",
     "ActionRow",
     "ActionSpace",
     "Actions",
@@ -152,6 +156,8 @@ __all__ = [
     "PatchSurrogate",
     "Phase",
     "Points",
+    "PolicyArrays",
+    "PolicyLayer",
     "Prediction",
     "Purpose",
     "Query",

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from surrogym_shared.acting import MAX_ROLLOUT as MAX_ROLLOUT  # for those who know the wire alone
 from surrogym_shared.bounded import FailFast
 from surrogym_shared.spec import MAX_DIMENSIONS, NAME_PATTERN
 
@@ -14,7 +15,6 @@ MAX_LANES = 65_536
 MAX_PARTICLES = 1_000_000
 MAX_CLAIM = 256
 MAX_BATCH = 65_536
-MAX_ROLLOUT = 100_000
 MAX_IMAGINED = 500  # steps of an imagined episode
 MAX_DRAWS = 64
 MAX_MEASURED = 1e30  # beyond it variances overflow, and one such sample would leave no model to serve

@@ -6,6 +6,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
+from surrogym_shared.acting import MAX_UNITS
+from surrogym_shared.network import MAX_LAYERS, Activation
 from surrogym_shared.spec import MAX_DIMENSIONS
 from surrogym_shared.wire.base import (
     MAX_LANES,
@@ -183,16 +185,76 @@ class StepReply(Reply):
     )
 
 
-class RolloutSession(Request):
-    seq: Seq | None = None
-    actions: Annotated[list[Actions], Field(min_length=1, max_length=MAX_ROLLOUT)] = Field(
-        description="(T, N, F): T steps in one request"
+Numbers = Annotated[list[FiniteFloat], Field(min_length=1, max_length=MAX_UNITS)]
+
+
+class PolicyLayer(Request):
+    """Inputs to outputs: x @ weights + bias."""
+
+    weights: Annotated[list[Numbers], Field(min_length=1, max_length=MAX_UNITS)] = Field(description="(I, O)")
+    bias: Numbers = Field(description="(O,)")
+
+
+class PolicyArrays(Request):
+    """A network that acts on standardised observations; the session's action space says what its outputs mean.
+
+    Continuous: the centre of the bounds plus half their width times tanh(y), plus noise, clipped to the bounds.
+    Discrete: scores of the choices of each entry. They are drawn by softmax with noise; the highest wins without.
+    """
+
+    mean: Numbers = Field(description="(D,) subtracted from an observation")
+    deviation: Numbers = Field(description="(D,) which divides the difference")
+    layers: Annotated[list[PolicyLayer], Field(min_length=1, max_length=MAX_LAYERS)]
+    activation: Activation = Field(default="tanh", description="of the hidden layers")
+    log_deviations: Numbers | None = Field(
+        default=None, description="(F,) logarithms of the deviations of continuous actions; needed for noise"
     )
+    precision: Literal["float32", "float64"] = Field(default="float32", description="that the network computes in")
+
+
+class ActionNoise(Request):
+    """The key of the noise of actions: the same key, lane and entry give the same number."""
+
+    seed: Seed
+    step: Seed = Field(default=0, description="number of the rollout's first step; the next has the next number")
+
+
+class RolloutSession(Request):
+    """Either ``actions``, or a ``policy`` and ``steps``."""
+
+    seq: Seq | None = None
+    actions: Annotated[list[Actions], Field(min_length=1, max_length=MAX_ROLLOUT)] | None = Field(
+        default=None, description="(T, N, F): T steps in one request"
+    )
+    policy: PolicyArrays | None = Field(default=None, description="acts in all lanes, on the server")
+    steps: Annotated[int, Field(ge=1, le=MAX_ROLLOUT)] | None = Field(
+        default=None, description="T with a policy, at most"
+    )
+    noise: ActionNoise | None = Field(default=None, description="of the policy's actions; None: the most probable ones")
+    until: Annotated[list[bool], Field(max_length=MAX_LANES)] | None = Field(
+        default=None,
+        description="(N,) lanes; a policy's rollout stops after the step by which an episode has ended in each of them",
+    )
+
+    @model_validator(mode="after")
+    def _actions_or_a_policy(self) -> Self:
+        if (self.actions is None) == (self.policy is None):
+            got = "neither" if self.actions is None else "both"
+            raise ValueError(f"expected either actions or a policy, got {got}")
+        if (self.policy is None) != (self.steps is None):
+            raise ValueError("expected steps with a policy, and only with one")
+        if self.policy is None and (self.noise or self.until is not None):
+            raise ValueError("expected noise and until with a policy alone, got them with actions")
+        return self
 
 
 class RolloutReply(Reply):
     seq: int
     steps: list[StepReply]
+    action: list[list[list[float]]] | None = Field(
+        default=None, description="(T, N, F) of the policy, before it is clipped to its bounds"
+    )
+    log_probability: list[list[float]] | None = Field(default=None, description="(T, N) of each action, with noise")
 
 
 class SubmitOccupancy(Request):

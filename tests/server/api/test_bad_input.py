@@ -311,6 +311,52 @@ def test_a_rollout_is_made_whole_or_not_at_all(client: httpx.Client, session: st
     assert client.get(f"/v1/sessions/{session}").json()["seq"] == 1
 
 
+POLICY = {"mean": [0, 0, 0], "deviation": [1, 1, 1], "layers": [{"weights": [[1], [1], [1]], "bias": [0]}]}
+ROLL = {"policy": POLICY, "steps": 2}
+
+
+def with_layers(count: int, units: int) -> dict[str, Any]:
+    middle = {"weights": [[0.1] * units] * units, "bias": [0.1] * units}
+    first = {"weights": [[0.1] * units] * 3, "bias": [0.1] * units}
+    return {**ROLL, "policy": {**POLICY, "layers": [first, *[middle] * (count - 1)]}}
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ({}, "expected either actions or a policy, got neither"),
+        ({**ROLL, "actions": [[[0.0], [0.0]]]}, "expected either actions or a policy, got both"),
+        ({"policy": POLICY}, "expected steps with a policy"),
+        ({"actions": [[[0.0], [0.0]]], "noise": {"seed": 0}}, "expected noise and until with a policy alone"),
+        ({**ROLL, "steps": 0}, "steps"),
+        ({**ROLL, "until": [True]}, "until: expected 2 entries, one a lane, got 1"),
+        ({**ROLL, "noise": {"seed": -1}}, "seed"),
+        ({**ROLL, "noise": {"seed": 0}}, "expected log_deviations for the noise"),
+        ({**ROLL, "noise": {"seed": 0}, "policy": {**POLICY, "log_deviations": [21]}}, "within +-20, got 21"),
+        ({**ROLL, "policy": {**POLICY, "mean": [0, 0]}}, "expected deviation of shape (2,), got (3,)"),
+        ({**ROLL, "policy": {**POLICY, "deviation": [1, 0, 1]}}, "expected a positive deviation, got 0"),
+        ({**ROLL, "policy": {**POLICY, "mean": [0, 0, 1e300]}}, "finite numbers in mean"),
+        ({**ROLL, "policy": {**POLICY, "mean": [0, 0, float("nan")]}}, "finite"),
+        ({**ROLL, "policy": {**POLICY, "layers": []}}, "layers"),
+        ({**ROLL, "policy": {**POLICY, "activation": "exec"}}, "activation"),
+        ({**ROLL, "policy": {**POLICY, "code": "1"}}, "code"),
+        ({**ROLL, "policy": {**POLICY, "layers": [{"weights": [[1], [1, 2], [1]], "bias": [0]}]}}, "one length"),
+        ({**ROLL, "policy": {**POLICY, "layers": [{"weights": [[1], [1]], "bias": [0]}]}}, "shape (3, 1), got (2, 1)"),
+        (with_layers(9, 1), "at most 8"),
+        (with_layers(1, 1_025), "1024"),
+    ],
+)
+def test_a_policy_that_cannot_act(client: httpx.Client, session: str, body: Any, said: str):
+    post(client, f"/v1/sessions/{session}/reset", {"seq": 1}).raise_for_status()
+    refused(post(client, f"/v1/sessions/{session}/rollout", {"seq": 2, **body}), Code.INVALID_REQUEST, said)
+    assert client.get(f"/v1/sessions/{session}").json()["seq"] == 1
+
+
+def test_a_policy_too_large_for_json_is_told_the_way_of_frames(client: httpx.Client, session: str):
+    reply = post(client, f"/v1/sessions/{session}/rollout", with_layers(8, 100))
+    refused(reply, Code.TOO_LARGE, "131072 bytes", "larger ones come as application/vnd.msgpack")
+
+
 @pytest.mark.parametrize(
     ("body", "code"),
     [

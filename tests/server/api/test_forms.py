@@ -10,12 +10,15 @@ import msgspec
 import numpy as np
 import pytest
 
+from support.acting import assert_same_rollout, random_policy
+from surrogym_client.transport.step_codecs import BinaryForm, JsonForm
 from surrogym_server import convert
 from surrogym_server.api import forms
 from surrogym_server.engine.session import Answer, Fingerprint
 from surrogym_server.services.sessions import SessionService
 from surrogym_shared import frames, wire
-from surrogym_shared.port import StepResult
+from surrogym_shared.acting import PolicyRun
+from surrogym_shared.port import PolicyRollout, StepResult
 
 SHAPE = frames.Shape(lanes=2, observation=3, action=1, outputs=3)
 
@@ -39,6 +42,10 @@ class Prepared:
 
     async def rollout(self, id: str, seq: int | None, actions: np.ndarray) -> Answer:
         return Answer(7, Fingerprint(digest=id), tuple(step(number) for number in range(len(actions))))
+
+    async def rollout_policy(self, id: str, seq: int | None, run: PolicyRun) -> Answer:
+        results = [step(number) for number in range(run.steps)]
+        return Answer(7, Fingerprint(digest=id), PolicyRollout.of(results, np.ones((run.steps, 2, 1)), None))
 
 
 @pytest.fixture
@@ -67,3 +74,16 @@ def test_a_long_reply_is_written_beside_the_event_loop(steps: int, writers: set[
     assert [frames.step_result(one, SHAPE).reward.tolist() for one in frame.steps] == [
         one.reward for one in reply.steps
     ]
+
+
+@pytest.mark.parametrize("steps", [1, forms.SHORT_ROLLOUT + 1])
+def test_a_reply_to_a_policy_says_the_same_in_both_forms(steps: int, writers: set[threading.Thread]):
+    sessions, run = cast(SessionService, Prepared()), PolicyRun(random_policy((3, 4, 1)), steps)
+    as_json = asyncio.run(forms.rollout_json(sessions, "abc", JsonForm().policy(1, run, SHAPE)))
+    request = frames.policy_request(None, run.policy, steps, None, None)
+    as_frame = asyncio.run(forms.carry_out(sessions, "abc", SHAPE, request))
+    assert (threading.main_thread() in writers) == (steps <= forms.SHORT_ROLLOUT)
+    assert wire.RolloutReply.model_validate_json(as_json).action == [[[1.0], [1.0]]] * steps
+    (seq, ours), (_, theirs) = JsonForm().read_policy(as_json, SHAPE), BinaryForm().read_policy(as_frame, SHAPE)
+    assert seq == 7
+    assert_same_rollout(ours, theirs)

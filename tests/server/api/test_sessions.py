@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -31,6 +32,51 @@ def test_replies_are_what_the_api_says(client: httpx.Client, session: str):
     assert (rollout.seq, len(rollout.steps)) == (3, 3)
 
 
+POLICY = {"mean": [0, 0, 0], "deviation": [1, 1, 8], "layers": [{"weights": [[1], [0.5], [2]], "bias": [0.1]}]}
+
+
+def test_a_policy_by_hand(client: httpx.Client, session: str):
+    send(client, session, "reset")
+    noisy = {"policy": {**POLICY, "log_deviations": [-1]}, "noise": {"seed": 4}}
+    for body, spoken in (({"policy": POLICY}, False), (noisy, True)):
+        reply = send(client, session, "rollout", **body, steps=3).raise_for_status()
+        rollout = wire.RolloutReply.model_validate_json(reply.content)
+        assert (len(rollout.steps), len(rollout.action), len(rollout.action[0])) == (3, 3, 2)
+        assert (rollout.log_probability is not None) == spoken
+
+
+def test_a_rollout_ends_with_its_session(client: httpx.Client, open_session: Open):
+    """Long before its steps could have been taken."""
+    steps, share = 50_000, 100
+    session = open_session(num_envs=2)["id"]
+    send(client, session, "reset")
+    begun = time.perf_counter()
+    send(client, session, "rollout", policy=POLICY, steps=steps // share).raise_for_status()
+    whole = share * (time.perf_counter() - begun)
+    with ThreadPoolExecutor(1) as threads:
+        begun = time.perf_counter()
+        rollout = threads.submit(send, client, session, "rollout", policy=POLICY, steps=steps)
+        while "surrogym_session_requests 1.0" not in client.get("/metrics").text:
+            assert not rollout.done()
+        client.delete(f"/v1/sessions/{session}").raise_for_status()
+        assert rollout.result().json()["code"] == "unknown_session"
+    assert time.perf_counter() - begun < whole / 2
+
+
+def test_steps_are_answered_while_a_policy_acts_elsewhere(client: httpx.Client, open_session: Open):
+    planner, trainer = open_session(num_envs=2)["id"], open_session(num_envs=2)["id"]
+    for session in (planner, trainer):
+        send(client, session, "reset")
+    with ThreadPoolExecutor(1) as threads:
+        rollout = threads.submit(send, client, planner, "rollout", policy=POLICY, steps=20_000)
+        while "surrogym_session_requests 1.0" not in client.get("/metrics").text:
+            assert not rollout.done()
+        for _ in range(5):
+            send(client, trainer, "step", action=ACTIONS).raise_for_status()
+        assert not rollout.done()
+        client.delete(f"/v1/sessions/{planner}")
+
+
 def test_an_action_of_one_number_may_come_flat(client: httpx.Client, open_session: Open):
     sessions = [open_session(num_envs=2)["id"] for _ in range(2)]
     replies = []
@@ -43,6 +89,7 @@ def test_an_action_of_one_number_may_come_flat(client: httpx.Client, open_sessio
 def test_a_repeated_request_gets_the_same_reply_bit_for_bit(client: httpx.Client, session: str):
     bodies = [("reset", {"seq": 1, "seed": 5}), ("step", {"seq": 2, "action": ACTIONS})]
     bodies.append(("rollout", {"seq": 3, "actions": [ACTIONS] * 2}))
+    bodies.append(("rollout", {"seq": 4, "policy": POLICY, "steps": 2}))
     for what, body in bodies:
         first, again = (send(client, session, what, **body) for _ in range(2))
         assert (first.status_code, again.content) == (200, first.content)

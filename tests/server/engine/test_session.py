@@ -10,6 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from support.acting import assert_same_rollout, random_policy
+from surrogym_server.engine.rollouts import roll_policy
 from surrogym_server.engine.saved import session_from_bytes, session_to_bytes
 from surrogym_server.engine.session import (
     Fingerprint,
@@ -23,6 +25,7 @@ from surrogym_server.engine.session import (
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import Damaged, InvalidInput, SeqConflict
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
+from surrogym_shared.acting import NoiseKey, PolicyRun
 from surrogym_shared.port import StepResult
 
 Open = Callable[..., Session]
@@ -159,6 +162,19 @@ def test_the_answer_of_a_reset_is_saved_too(opened: Open, definition: Environmen
     np.testing.assert_array_equal(
         replay(back, 1, Fingerprint("digest")).outcome.observation, result.observation, strict=True
     )
+
+
+@pytest.mark.parametrize("noise", [None, NoiseKey(3)])
+def test_the_answer_to_a_policy_is_saved_too(opened: Open, fitted: Fitted, definition: EnvironmentDefinition, noise):
+    session, _ = reset_session(opened(trust=100.0, autoreset_mode="same_step", time_limit=2), 5, None, 1)
+
+    def step(session: Session, u: np.ndarray) -> tuple[Session, StepResult]:
+        return step_session(session, u, None, False, lambda version: fitted(VERSIONS[version]), 1)
+
+    session, rollout = roll_policy(session, PolicyRun(random_policy((3, 4, 1)), 5, noise), step)
+    session, _ = answered(session, Fingerprint("digest"), rollout)
+    back = session_from_bytes(definition, session_to_bytes(session))
+    assert_same_rollout(replay(back, 1, Fingerprint("digest")).outcome, rollout)
 
 
 def test_only_the_next_seq_and_a_repeat_of_the_last_are_taken(opened: Open):

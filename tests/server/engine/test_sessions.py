@@ -18,6 +18,7 @@ from surrogym_server.errors import (
     SeqConflict,
     SessionExpired,
     TooLarge,
+    Unavailable,
     UnknownSession,
 )
 
@@ -109,6 +110,29 @@ def test_a_step_does_not_queue_behind_rollouts(opened: Open):
             await rollout
 
         asyncio.run(both())
+
+
+@pytest.mark.parametrize(("end", "error"), [("close", UnknownSession), ("stop", Unavailable)])
+def test_long_work_ends_when_its_session_or_the_server_does(opened: Open, end: str, error: type[Exception]):
+    begun = threading.Event()
+    with ThreadPoolExecutor(1) as steps, ThreadPoolExecutor(1) as rollouts:
+        live = LiveSessions(Threads(steps, 1), Threads(rollouts, 1), limits=LIMITS, idle_seconds=10)
+        live.add(opened("planner"))
+
+        def endless(session: Session) -> tuple[Session, Outcome]:
+            while True:
+                begun.set()
+                live.check_wanted("planner")
+
+        async def run() -> None:
+            rollout = asyncio.create_task(live.advance("planner", 1, Fingerprint("d"), endless, steps=2))
+            while not begun.is_set() and not rollout.done():
+                await asyncio.sleep(0.001)
+            live.close("planner") if end == "close" else live.stop()
+            with pytest.raises(error):
+                await rollout
+
+        asyncio.run(run())
 
 
 def test_work_that_fails_changes_nothing(live: LiveSessions, opened: Open):

@@ -8,7 +8,7 @@ import pytest
 from surrogym_server.engine.session import Answer
 from surrogym_server.services import activity
 from surrogym_server.services.activity import Samplers, Tally
-from surrogym_shared.port import StepResult
+from surrogym_shared.port import PolicyRollout, StepResult
 
 
 class Clock:
@@ -50,6 +50,16 @@ def test_returns_are_sums_between_ends(gathered: int, monkeypatch: pytest.Monkey
     assert (read.steps, read.episodes) == (8, 3)
     assert [episode.reward for episode in read.recent] == [3, 70, 12]
     assert [episode.penalty for episode in read.recent] == [1.0, 1.5, 1.0]
+
+
+def test_the_steps_of_a_policy_count_as_single_steps():
+    several, one = Tally(Clock()), Tally(Clock())
+    steps = [result([1, 10], [False, False]), result([2, 20], [True, False]), result([4, 40], [False, True])]
+    one.stepped(answer(2, *steps))
+    several.stepped(Answer(2, "", PolicyRollout.of(steps, np.zeros((3, 2, 1)), None)))
+    for tally in (several, one):
+        tally.stepped(answer(3, result([8, 80], [True, False])))
+    assert several.read(None) == one.read(None)  # type: ignore[arg-type]
 
 
 def test_a_reset_drops_what_did_not_end():

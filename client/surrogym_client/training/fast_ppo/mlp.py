@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_shared.acting import layers_of
 from surrogym_shared.network import Activation
 
 Array = NDArray[np.floating[Any]]  # float32
@@ -81,16 +82,6 @@ class Mlp:
         if key not in self._made:
             self._made[key] = np.empty((rows, columns), dtype=np.float32)
         return self._made[key]
-
-
-def layers_of(sizes: Sequence[int], vector: Array) -> list[tuple[Array, Array]]:
-    """Weights (I, O) and bias (O,) of each layer, as views of a vector."""
-    layers, begin = [], 0
-    for inputs, outputs in pairwise(sizes):
-        middle, end = begin + inputs * outputs, begin + (inputs + 1) * outputs
-        layers.append((vector[begin:middle].reshape(inputs, outputs), vector[middle:end]))
-        begin = end
-    return layers
 
 
 def orthogonal(rng: np.random.Generator, inputs: int, outputs: int, gain: float) -> Array:

@@ -1,0 +1,111 @@
+"""Rollouts: several steps of one session in one request, with given actions or with those of a policy.
+
+Shapes: N lanes, D observation entries, F action entries, T steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from surrogym_server.engine.session import Session
+from surrogym_server.environment.actions import policy_actions
+from surrogym_server.environment.definition import ActionDefinition
+from surrogym_server.errors import InvalidInput, TooLarge
+from surrogym_shared.acting import Acted, Actor, NoiseKey, PolicyRun
+from surrogym_shared.port import PolicyRollout, StepResult
+
+MAX_STEPS = 1_000_000  # of all lanes in one request
+MAX_ACTIVATIONS = 2**24  # of all lanes in the widest layer of a policy: 128 MiB
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+OneStep = Callable[[Session, Floats], tuple[Session, StepResult]]  # by the model's actions (N, F)
+
+
+def parts_of(run: PolicyRun) -> tuple[object, ...]:
+    """What the fingerprint of a request is made of."""
+    policy = run.policy
+    arrays = (policy.mean, policy.deviation, policy.vector, policy.log_deviations, run.until)
+    return (run.steps, policy.units, policy.activation, run.noise, *arrays)
+
+
+def roll(session: Session, actions: NDArray[np.float64], step: OneStep) -> tuple[Session, tuple[StepResult, ...]]:
+    """Step with a policy's actions (T, N, F) or (T, N), all or none.
+
+    Raises:
+        InvalidInput: wrong shape, not finite, out of bounds; found before the first step.
+        TooLarge: too many steps in all lanes.
+    """
+    lanes, results = session.settings.num_envs, []
+    _check_steps(len(actions), lanes)
+    for u in [policy_actions(session.definition.action, row, lanes) for row in actions]:
+        session, result = step(session, u)
+        results.append(result)
+    return session, tuple(results)
+
+
+def roll_policy(session: Session, run: PolicyRun, step: OneStep) -> tuple[Session, PolicyRollout]:
+    """Let a policy act, all steps or none.
+
+    Raises:
+        InvalidInput: a policy of other observations or actions, ``until`` of another length, actions that are not
+            finite.
+        TooLarge: too many steps in all lanes, or a layer too wide for so many lanes.
+    """
+    definition, lanes = session.definition, session.settings.num_envs
+    _check_steps(run.steps, lanes)
+    if (wide := lanes * max(run.policy.units)) > MAX_ACTIVATIONS:
+        raise TooLarge(f"expected at most {MAX_ACTIVATIONS} units of a layer in all lanes, got {wide}")
+    actor = _actor(len(definition.observation_names), definition.action, run)
+    waiting = _awaited(run, lanes)
+    observation = definition.observe(session.lanes.q).to(torch.float32).cpu().numpy()
+    results, actions, logs = [], [], []
+    for number in range(run.steps):
+        acted = _act(actor, observation, None if run.noise is None else run.noise.later(number))
+        session, result = step(session, policy_actions(definition.action, acted.sent, lanes))
+        results.append(result)
+        actions.append(acted.action)
+        logs.append(acted.log_probability)
+        observation = result.observation
+        waiting &= ~(result.terminated | result.truncated)
+        if run.until is not None and not waiting.any():
+            break
+    return session, PolicyRollout.of(results, _stacked(actions), None if run.noise is None else _stacked(logs))
+
+
+def _check_steps(steps: int, lanes: int) -> None:
+    if steps * lanes > MAX_STEPS:
+        raise TooLarge(f"expected at most {MAX_STEPS} steps in all, got {steps} x {lanes}")
+
+
+def _actor(observation: int, action: ActionDefinition, run: PolicyRun) -> Actor:
+    low, high = action.limits
+    try:
+        return Actor(run.policy, observation, low, high, action.policy_counts, noisy=run.noise is not None)
+    except ValueError as error:
+        raise InvalidInput(str(error)) from error
+
+
+def _awaited(run: PolicyRun, lanes: int) -> Bools:
+    if run.until is None:
+        return np.ones(lanes, dtype=bool)
+    if run.until.shape != (lanes,):
+        raise InvalidInput(f"until: expected {lanes} entries, one a lane, got {len(run.until)}")
+    return run.until.copy()
+
+
+def _act(actor: Actor, observation: NDArray[np.float32], noise: NoiseKey | None) -> Acted:
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return actor.act(observation, noise)
+    except ValueError as error:
+        raise InvalidInput(str(error)) from error
+
+
+def _stacked(rows: Iterable[NDArray[Any] | None]) -> Floats:
+    return np.stack([row for row in rows if row is not None]).astype(np.float64)

@@ -1,0 +1,218 @@
+"""A policy as plain arrays, and how it acts: the same NumPy code wherever the lanes are stepped.
+
+Shapes: N lanes, D observation entries, A outputs of the network, F action entries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_shared.distributions import Bounded, Choices, Sampled, middle_and_reach
+from surrogym_shared.network import MAX_LAYERS, Activation, Layer, Network, forward, most_probable
+
+MAX_UNITS = 1_024  # of a layer
+MAX_PARAMETERS = 262_144  # of all layers
+MAX_ROLLOUT = 100_000  # steps of one request
+MAX_LOG_DEVIATION = 20
+STEP_WORD = 128  # the counter's third word of 64 bits; the two below count what one step draws
+
+Array = NDArray[np.floating[Any]]
+
+
+class NoiseKey(NamedTuple):
+    """Which noise actions have: a seed, and the number of the first step, from which a rollout counts on."""
+
+    seed: int
+    step: int = 0
+
+    def later(self, steps: int) -> NoiseKey:
+        """The key of the noise that begins ``steps`` later."""
+        return NoiseKey(self.seed, self.step + steps)
+
+    def generator(self) -> np.random.Generator:
+        """The generator of one step. Lane i reads behind lane i - 1, so no lane depends on how many follow it."""
+        return np.random.Generator(np.random.Philox(key=self.seed, counter=self.step << STEP_WORD))
+
+
+@dataclass(frozen=True)
+class ActingPolicy:
+    """A network that acts; what its outputs mean is the action space's.
+
+    All arrays are float32 or all are float64, and the network computes in that.
+
+    Raises:
+        ValueError: arrays that don't fit together, that are too large, or that hold NaN or infinity.
+    """
+
+    mean: Array  # (D,) subtracted from an observation
+    deviation: Array  # (D,) which divides the difference
+    layers: tuple[Layer, ...]
+    activation: Activation = "tanh"  # of the hidden layers
+    log_deviations: Array | None = None  # (F,) of continuous actions with noise
+
+    def __post_init__(self) -> None:
+        named = self._named()
+        if not 1 <= len(self.layers) <= MAX_LAYERS:
+            raise ValueError(f"policy: expected 1 to {MAX_LAYERS} layers, got {len(self.layers)}")
+        for name, array in named.items():
+            if array.dtype not in (np.float32, np.float64) or array.dtype != self.mean.dtype:
+                raise ValueError(f"policy: expected {name} as {_allowed(self.mean.dtype)}, got {array.dtype}")
+        self._check_shapes()
+        for name, array in named.items():
+            if not np.isfinite(array).all():
+                raise ValueError(f"policy: expected finite numbers in {name}, got NaN or infinity")
+        if self.log_deviations is not None and np.abs(self.log_deviations).max() > MAX_LOG_DEVIATION:
+            most = np.abs(self.log_deviations).max()
+            raise ValueError(f"policy: expected log_deviations within +-{MAX_LOG_DEVIATION}, got {most:g}")
+        if not (self.deviation > 0).all():
+            raise ValueError(f"policy: expected a positive deviation, got {self.deviation.min():g}")
+
+    @classmethod
+    def of(cls, network: Network) -> Self:
+        """The most probable actions of a network."""
+        return cls(network.mean, network.deviation, network.layers, network.activation)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        return self.mean.dtype
+
+    @property
+    def units(self) -> tuple[int, ...]:
+        """How many numbers each layer gives; the last is A."""
+        return tuple(len(layer.bias) for layer in self.layers)
+
+    @property
+    def vector(self) -> Array:
+        """Weights and bias of each layer, one after the other."""
+        return np.concatenate([part.ravel() for layer in self.layers for part in layer])
+
+    def _named(self) -> dict[str, Array]:
+        named = {"mean": self.mean, "deviation": self.deviation}
+        for i, layer in enumerate(self.layers):
+            named |= {f"layers[{i}].weights": layer.weights, f"layers[{i}].bias": layer.bias}
+        return named if self.log_deviations is None else named | {"log_deviations": self.log_deviations}
+
+    def _check_shapes(self) -> None:
+        size = self.mean.size
+        shapes: dict[str, tuple[int, ...]] = {"mean": (size,), "deviation": (size,)}
+        for i, layer in enumerate(self.layers):
+            after = layer.bias.size
+            if not 1 <= after <= MAX_UNITS:
+                raise ValueError(f"policy: expected 1 to {MAX_UNITS} units in layers[{i}], got {after}")
+            shapes |= {f"layers[{i}].weights": (size, after), f"layers[{i}].bias": (after,)}
+            size = after
+        if self.log_deviations is not None:
+            shapes["log_deviations"] = (max(self.log_deviations.size, 1),)
+        for name, array in self._named().items():
+            if array.shape != shapes[name]:
+                raise ValueError(f"policy: expected {name} of shape {shapes[name]}, got {array.shape}")
+        if (count := parameters_of(self.mean.size, self.units)) > MAX_PARAMETERS:
+            raise ValueError(f"policy: expected at most {MAX_PARAMETERS} weights and biases, got {count}")
+
+
+@dataclass(frozen=True)
+class PolicyRun:
+    """A policy that is to act for T steps; see ``surrogym_shared.port.PolicyPort.rollout_policy``.
+
+    Raises:
+        ValueError: steps or a key outside what a request can hold.
+    """
+
+    policy: ActingPolicy
+    steps: int
+    noise: NoiseKey | None = None
+    until: NDArray[np.bool_] | None = None  # (N,)
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.steps <= MAX_ROLLOUT:
+            raise ValueError(f"steps: expected 1 to {MAX_ROLLOUT}, got {self.steps}")
+        if self.noise is not None and not all(0 <= word < 2**63 for word in self.noise):
+            raise ValueError(f"noise: expected a seed and a step of 0 to 2^63 - 1, got {tuple(self.noise)}")
+
+
+class Acted(NamedTuple):
+    """What a policy did in one step."""
+
+    action: Array  # (N, F) before it is clipped to its bounds
+    log_probability: Array | None  # (N,) of it; None without noise
+    sent: NDArray[Any]  # the action as a surrogate takes it
+
+
+@dataclass(frozen=True)
+class Actor:
+    """A policy in an action space.
+
+    Raises:
+        ValueError: a policy of other observations or of another action space.
+    """
+
+    policy: ActingPolicy
+    observation: int  # D
+    low: NDArray[np.float64]  # (F,) of continuous actions
+    high: NDArray[np.float64]  # (F,)
+    counts: tuple[int, ...] = ()  # choices of each entry of a discrete action
+    noisy: bool = False
+
+    def __post_init__(self) -> None:
+        policy, log = self.policy, self.policy.log_deviations
+        if policy.mean.size != self.observation:
+            raise ValueError(f"policy: expected a mean of {self.observation} entries, got {policy.mean.size}")
+        if policy.units[-1] != self._distribution.outputs:
+            expected = self._distribution.outputs
+            raise ValueError(f"policy: expected {expected} units in the last layer, got {policy.units[-1]}")
+        if self.counts and log is not None:
+            raise ValueError("policy: expected no log_deviations with discrete actions, got some")
+        if self.noisy and not self.counts and log is None:
+            raise ValueError("policy: expected log_deviations for the noise of continuous actions, got none")
+        if log is not None and log.size != len(self.low):
+            raise ValueError(f"policy: expected log_deviations of {len(self.low)} entries, got {log.size}")
+
+    def act(self, observation: NDArray[Any], noise: NoiseKey | None) -> Acted:
+        """The actions for observations (N, D) in one step, with the noise of a key or the most probable ones.
+
+        Raises:
+            ValueError: the network's outputs are not finite.
+        """
+        policy = self.policy
+        x = ((observation - policy.mean) / policy.deviation).astype(policy.dtype, copy=False)
+        y = forward(policy.layers, policy.activation, x)
+        if not np.isfinite(y).all():
+            raise ValueError("policy: expected finite outputs of the network, got NaN or infinity")
+        if noise is None:
+            sent = most_probable(y, self.low, self.high, self.counts)
+            return Acted(sent.reshape(len(y), -1).astype(np.float64), None, sent)
+        further = np.zeros(0, dtype=policy.dtype) if policy.log_deviations is None else policy.log_deviations
+        action, log = self._distribution.sample(y, further, noise.generator())
+        return Acted(action, log, self._distribution.sent(action))
+
+    @cached_property
+    def _distribution(self) -> Sampled:
+        if self.counts:
+            return Choices(self.counts)
+        return Bounded(*middle_and_reach(self.low, self.high, self.policy.dtype))
+
+
+def layers_of(sizes: Sequence[int], vector: Array) -> tuple[Layer, ...]:
+    """The layers in a vector, as views of it; ``sizes`` are the numbers that enter, pass between them, and leave."""
+    layers, begin = [], 0
+    for inputs, outputs in pairwise(sizes):
+        middle, end = begin + inputs * outputs, begin + (inputs + 1) * outputs
+        layers.append(Layer(vector[begin:middle].reshape(inputs, outputs), vector[middle:end]))
+        begin = end
+    return tuple(layers)
+
+
+def parameters_of(observation: int, units: Sequence[int]) -> int:
+    """How many weights and biases layers of so many units have."""
+    return sum((inputs + 1) * outputs for inputs, outputs in pairwise((observation, *units)))
+
+
+def _allowed(dtype: np.dtype[Any]) -> str:
+    return str(dtype) if dtype in (np.float32, np.float64) else "float32 or float64"

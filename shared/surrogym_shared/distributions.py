@@ -1,0 +1,109 @@
+"""What the outputs of an actor mean: a normal distribution within bounds, or a choice for each entry of an action.
+
+Shapes: B rows, A outputs of the actor, F action entries, K further parameters, which no network gives.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+HALF_LOG_TAU = 0.5 * float(np.log(2 * np.pi))
+
+Array = NDArray[np.floating[Any]]  # float32 in a training
+
+
+class Sampled(Protocol):
+    """A distribution of actions (B, F), given the outputs of an actor (B, A) and further parameters (K,)."""
+
+    @property
+    def outputs(self) -> int:
+        """How many numbers an actor gives, A."""
+        ...
+
+    def sample(self, outputs: Array, further: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Draw actions (B, F) as a policy learns from them, and give their log probabilities (B,)."""
+        ...
+
+    def sent(self, actions: Array) -> NDArray[Any]:
+        """These actions as a surrogate takes them."""
+        ...
+
+    def log_probability(self, outputs: Array, further: Array, actions: Array) -> Array:
+        """Log probabilities (B,) of actions (B, F)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Bounded:
+    """Continuous actions: normal around centre + reach tanh(y). The further parameters are log deviations (F,)."""
+
+    centre: Array  # (F,)
+    reach: Array  # (F,)
+
+    @property
+    def outputs(self) -> int:
+        return len(self.reach)
+
+    def sample(self, outputs: Array, further: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+        z = rng.standard_normal(outputs.shape, dtype=_kind(outputs))
+        actions = self.centre + self.reach * np.tanh(outputs) + np.exp(further) * z
+        return actions, (-0.5 * z * z - further - HALF_LOG_TAU).sum(1)
+
+    def sent(self, actions: Array) -> NDArray[Any]:
+        low, high = self.centre - self.reach, self.centre + self.reach
+        return np.clip(actions, low, high)
+
+    def log_probability(self, outputs: Array, further: Array, actions: Array) -> Array:
+        z = (actions - self.centre - self.reach * np.tanh(outputs)) * np.exp(-further)
+        log: Array = (-0.5 * z * z - further - HALF_LOG_TAU).sum(1)
+        return log
+
+
+@dataclass(frozen=True)
+class Choices:
+    """Discrete actions: one choice for each entry, independent of one another. There are no further parameters."""
+
+    counts: tuple[int, ...]
+
+    @property
+    def outputs(self) -> int:
+        return sum(self.counts)
+
+    def sample(self, outputs: Array, further: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+        gumbel = -np.log(rng.standard_exponential(outputs.shape, dtype=_kind(outputs)))
+        chosen = [part.argmax(1) for part in self.parts(outputs + gumbel)]  # Gumbel's maximum draws by softmax
+        actions = np.stack(chosen, 1).astype(np.float32)
+        return actions, self.log_probability(outputs, further, actions)
+
+    def sent(self, actions: Array) -> NDArray[Any]:
+        chosen = actions.astype(np.int64)
+        return chosen[:, 0] if len(self.counts) == 1 else chosen
+
+    def log_probability(self, outputs: Array, further: Array, actions: Array) -> Array:  # noqa: ARG002
+        logs = [log_softmax(part) for part in self.parts(outputs)]
+        rows = np.arange(len(outputs))
+        log: Array = np.sum([part[rows, actions[:, i].astype(np.int64)] for i, part in enumerate(logs)], axis=0)
+        return log
+
+    def parts(self, outputs: Array) -> list[Array]:
+        """The outputs of each entry."""
+        return np.split(outputs, np.cumsum(self.counts)[:-1], axis=1)
+
+
+def middle_and_reach(low: NDArray[np.float64], high: NDArray[np.float64], dtype: np.dtype[Any]) -> tuple[Array, Array]:
+    """Centre and half width (F,) of bounds (F,)."""
+    return ((low + high) / 2).astype(dtype), ((high - low) / 2).astype(dtype)
+
+
+def log_softmax(scores: Array) -> Array:
+    shifted = scores - scores.max(1, keepdims=True)
+    log: Array = shifted - np.log(np.exp(shifted).sum(1, keepdims=True))
+    return log
+
+
+def _kind(outputs: Array) -> type[np.float32] | type[np.float64]:
+    return np.float32 if outputs.dtype == np.float32 else np.float64
