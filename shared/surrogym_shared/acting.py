@@ -20,8 +20,9 @@ from surrogym_shared.network import MAX_LAYERS, Activation, Layer, Network, forw
 MAX_UNITS = 1_024  # of a layer
 MAX_PARAMETERS = 262_144  # of all layers
 MAX_ROLLOUT = 100_000  # steps of one request
-MAX_LOG_DEVIATION = 20
-STEP_WORD = 128  # the counter's third word of 64 bits; the two below count what one step draws
+MAX_LANE_STEPS = 1_000_000  # steps of all lanes in one request
+MAX_ACTIVATIONS = 2**24  # of all lanes in the widest layer: 128 MiB
+MAX_LOG_DEVIATION = 80  # float32 holds its exponential
 
 Array = NDArray[np.floating[Any]]
 
@@ -36,9 +37,25 @@ class NoiseKey(NamedTuple):
         """The key of the noise that begins ``steps`` later."""
         return NoiseKey(self.seed, self.step + steps)
 
-    def generator(self) -> np.random.Generator:
+
+class KeyedGenerator:
+    """One generator that is set to the noise of a key: to make another for each step asks the system for entropy."""
+
+    def __init__(self) -> None:
+        self._bits = np.random.Philox(0)
+        self._generator = np.random.Generator(self._bits)
+
+    def at(self, key: NoiseKey) -> np.random.Generator:
         """The generator of one step. Lane i reads behind lane i - 1, so no lane depends on how many follow it."""
-        return np.random.Generator(np.random.Philox(key=self.seed, counter=self.step << STEP_WORD))
+        self._bits.state = {
+            "bit_generator": "Philox",
+            "state": {"counter": _words(0, 0, key.step, 0), "key": _words(key.seed, 0)},
+            "buffer": _words(0, 0, 0, 0),
+            "buffer_pos": 4,  # nothing is left of what was drawn before
+            "has_uint32": 0,
+            "uinteger": 0,
+        }
+        return self._generator
 
 
 @dataclass(frozen=True)
@@ -189,8 +206,12 @@ class Actor:
             sent = most_probable(y, self.low, self.high, self.counts)
             return Acted(sent.reshape(len(y), -1).astype(np.float64), None, sent)
         further = np.zeros(0, dtype=policy.dtype) if policy.log_deviations is None else policy.log_deviations
-        action, log = self._distribution.sample(y, further, noise.generator())
+        action, log = self._distribution.sample(y, further, self._keyed.at(noise))
         return Acted(action, log, self._distribution.sent(action))
+
+    @cached_property
+    def _keyed(self) -> KeyedGenerator:
+        return KeyedGenerator()
 
     @cached_property
     def _distribution(self) -> Sampled:
@@ -212,6 +233,10 @@ def layers_of(sizes: Sequence[int], vector: Array) -> tuple[Layer, ...]:
 def parameters_of(observation: int, units: Sequence[int]) -> int:
     """How many weights and biases layers of so many units have."""
     return sum((inputs + 1) * outputs for inputs, outputs in pairwise((observation, *units)))
+
+
+def _words(*words: int) -> NDArray[np.uint64]:
+    return np.array(words, dtype=np.uint64)
 
 
 def _allowed(dtype: np.dtype[Any]) -> str:

@@ -18,8 +18,10 @@ deviation                                 (N, O)       float64
 
 A rollout of a policy, ``op`` policy, carries the policy in its precision, float32 or float64: mean and deviation (D,),
 ``parameters``, which are weights (I, O) and bias (O,) of each layer one after the other, and log_deviations (F,); and
-``until`` (N,) as bool. Its reply has the arrays above with T in front, action (T, N, F) and log_probability (T, N) as
-float64, and final_steps (K,) as int64 beside final_lanes.
+``until`` (N,) as bool. Its reply has the arrays above with T in front, action (T, N, F) and log_probability (T, N), and
+final_steps (K,) as int64 beside final_lanes. It leaves out what follows from the rest, and loses no bit by that: action
+and log_probability are float32 where that holds them (``precision``), reward_mean comes where it is not the reward, and
+model_version is (N,) where it never changes.
 """
 
 from __future__ import annotations
@@ -159,6 +161,7 @@ class RolloutReply(Frame, frozen=True, tag="rollout"):
 
 class PolicyReply(Frame, frozen=True, tag="policy", kw_only=True):
     seq: Seq
+    precision: Literal["float32", "float64"]
     action: memoryview
     log_probability: memoryview | None = None
     observation: memoryview
@@ -166,7 +169,7 @@ class PolicyReply(Frame, frozen=True, tag="policy", kw_only=True):
     terminated: memoryview
     truncated: memoryview
     model_version: memoryview
-    reward_mean: memoryview
+    reward_mean: memoryview | None = None
     final_steps: memoryview | None = None
     final_lanes: memoryview | None = None
     final_observation: memoryview | None = None
@@ -323,17 +326,21 @@ def rollout_reply(seq: int, results: Sequence[StepResult]) -> RolloutReply:
 
 def policy_reply(seq: int, result: PolicyRollout) -> PolicyReply:
     ended = len(result.final_lanes) > 0
-    log, untrusted = result.log_probability, result.untrusted
+    log, versions, untrusted = result.log_probability, result.model_version, result.untrusted
+    with np.errstate(over="ignore"):
+        short = all(one is None or np.array_equal(one, one.astype(FLOAT32)) for one in (result.action, log))
+    dtype = FLOAT32 if short else FLOAT64
     return PolicyReply(
         seq=seq,
-        action=_flat(result.action, FLOAT64),
-        log_probability=None if log is None else _flat(log, FLOAT64),
+        precision="float32" if short else "float64",
+        action=_flat(result.action, dtype),
+        log_probability=None if log is None else _flat(log, dtype),
         observation=_flat(result.observation, FLOAT32),
         reward=_flat(result.reward, FLOAT64),
         terminated=_flat(result.terminated, BOOL),
         truncated=_flat(result.truncated, BOOL),
-        model_version=_flat(result.model_version, INT64),
-        reward_mean=_flat(result.reward_mean, FLOAT64),
+        model_version=_flat(versions[0] if (versions == versions[0]).all() else versions, INT64),
+        reward_mean=None if np.array_equal(result.reward_mean, result.reward) else _flat(result.reward_mean, FLOAT64),
         final_steps=_flat(result.final_steps, INT64) if ended else None,
         final_lanes=_flat(result.final_lanes, INT64) if ended else None,
         final_observation=_flat(result.final_observation, FLOAT32) if ended else None,
@@ -343,27 +350,33 @@ def policy_reply(seq: int, result: PolicyRollout) -> PolicyReply:
 
 def policy_rollout(reply: PolicyReply, shape: Shape) -> PolicyRollout:
     """Arrays of their own: aligned and writable, as a caller expects them. Raises ``FrameError``."""
-    steps, log, untrusted = (
-        reply.reward.nbytes // (shape.lanes * FLOAT64.itemsize),
-        reply.log_probability,
-        reply.untrusted,
-    )
-    each = (steps, shape.lanes)
+    steps, log, untrusted = reply.reward.nbytes // (8 * shape.lanes), reply.log_probability, reply.untrusted
+    each, dtype = (steps, shape.lanes), FLOAT32 if reply.precision == "float32" else FLOAT64
     final_lanes, final_observation = _final(reply, shape)
+    reward = _own("reward", reply.reward, FLOAT64, each)
+    mean = None if reply.reward_mean is None else _own("reward_mean", reply.reward_mean, FLOAT64, each)
     return PolicyRollout(
-        action=_own("action", reply.action, FLOAT64, (*each, shape.action)),
-        log_probability=None if log is None else _own("log_probability", log, FLOAT64, each),
+        action=_array("action", reply.action, dtype, (*each, shape.action)).astype(np.float64),
+        log_probability=None if log is None else _array("log_probability", log, dtype, each).astype(np.float64),
         observation=_own("observation", reply.observation, FLOAT32, (*each, shape.observation)),
-        reward=_own("reward", reply.reward, FLOAT64, each),
+        reward=reward,
         terminated=_own("terminated", _checked("terminated", reply.terminated), BOOL, each),
         truncated=_own("truncated", _checked("truncated", reply.truncated), BOOL, each),
         final_steps=_final_steps(reply, steps, len(final_lanes)),
         final_lanes=final_lanes,
         final_observation=final_observation,
-        model_version=_own("model_version", reply.model_version, INT64, each),
-        reward_mean=_own("reward_mean", reply.reward_mean, FLOAT64, each),
+        model_version=_versions(reply.model_version, each),
+        reward_mean=reward.copy() if mean is None else mean,
         untrusted=None if untrusted is None else _own("untrusted", _checked("untrusted", untrusted), BOOL, each),
     )
+
+
+def _versions(view: memoryview, each: tuple[int, int]) -> Array:
+    """Model versions (T, N), also where the frame has those of the lanes alone."""
+    one = each[1] * INT64.itemsize
+    if view.nbytes == one:
+        return np.repeat(_own("model_version", view, INT64, each[1:])[None], each[0], 0)
+    return _own("model_version", view, INT64, each)
 
 
 def reset_result(reply: ResetReply, shape: Shape) -> ResetResult:

@@ -79,7 +79,7 @@ class PolicyRollout:
             final_observation=np.concatenate([step.final_observation for step in steps]),
             model_version=np.stack([step.model_version for step in steps]),
             reward_mean=np.stack([step.reward_mean for step in steps]),
-            untrusted=np.stack(untrusted) if untrusted else None,
+            untrusted=np.stack(untrusted) if len(untrusted) == len(steps) else None,
         )
 
     def steps(self) -> list[StepResult]:

@@ -14,7 +14,20 @@ from common import machine, parser
 
 import report
 
-PARTS = ("step", "cold", "peers", "train", "search", "fit", "growth", "predict", "evidence", "lists", "attacks")
+PARTS = (
+    "step",
+    "cold",
+    "peers",
+    "train",
+    "rollout",
+    "search",
+    "fit",
+    "growth",
+    "predict",
+    "evidence",
+    "lists",
+    "attacks",
+)
 
 
 def main() -> None:

@@ -65,6 +65,19 @@ def train(found: dict[str, Any]) -> Iterator[Line]:
     yield "PPO, 16 lanes, remote beside in process", "1.10 x", reached, found["ratio"] <= 1.1
 
 
+def rollout(found: dict[str, Any]) -> Iterator[Line]:
+    for lanes, measured in found["lanes"].items():
+        share = measured["share, by rollout"]
+        reached = f"{share:.0%}; by step {measured['share, by step']:.0%}"
+        reached += f", given actions {measured['share, given actions']:.0%}"
+        yield f"a policy's rollout over the stream beside in process, N = {lanes}", "85 %", reached, share >= 0.85
+    whole = found["trainings"]
+    reached = (
+        f"{whole['ratio']:.3f} x ({len(whole['pairs'])} pairs, {whole['pairs'][0]:.3f} to {whole['pairs'][-1]:.3f})"
+    )
+    yield "FASTPPO, remote beside in process", "1.05 x", reached, whole["ratio"] <= 1.05
+
+
 def search(found: dict[str, Any]) -> Iterator[Line]:
     whole, one = found["trainings"], found["updates"]
     runs = {name: [run["imagined"] for run in each] for name, each in whole["runs"].items()}
@@ -164,6 +177,7 @@ PARTS = {
     "step": step,
     "peers": peers,
     "train": train,
+    "rollout": rollout,
     "search": search,
     "fit": fit,
     "predict": predict,

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from support.acting import assert_same_rollout, random_policy, stepped
+from support.acting import Stepwise, assert_same_rollout, random_policy, stepped
+from surrogym_client.evaluation.imagined import imagine
+from surrogym_client.training import TrainSettings, train
+from surrogym_client.training.fast_ppo.learner import restored
 from surrogym_shared.acting import ActingPolicy, Actor, NoiseKey
-from surrogym_shared.network import Layer
+from surrogym_shared.network import Layer, Network
 from surrogym_shared.port import PolicyPort
 from surrogym_shared.wire import OpenSession
 
@@ -165,3 +169,31 @@ def test_a_layer_too_wide_for_so_many_lanes_is_refused(port: PolicyPort, opened:
     port.reset(session)
     with pytest.raises(harness.errors.TooLarge, match="units of a layer"):
         port.rollout_policy(session, random_policy((3, 1_000, 1)), 1)
+
+
+@pytest.mark.parametrize("episodes", [1, 7])
+def test_an_imagined_return_is_the_same_by_rollouts_and_by_steps(port: PolicyPort, episodes: int):
+    arrays = random_policy(SIZES, np.float64)
+    network = Network(arrays.mean, arrays.deviation, arrays.layers, np.array([-2.0]), np.array([2.0]))
+    ours = imagine(port, network, episodes, 3, penalty=1.0)
+    theirs = imagine(port, lambda observation: network(observation), episodes, 3, penalty=1.0)
+    np.testing.assert_array_equal(ours.returns, theirs.returns)
+    assert ours.episode_penalty == theirs.episode_penalty > 0
+    assert ours.penalty_share == pytest.approx(theirs.penalty_share)
+
+
+def test_fastppo_learns_the_same_policy_wherever_it_acts(port: PolicyPort, local_harness, tmp_path: Path):
+    """By rollouts over each transport, and by single steps in process: the same parameters, bit for bit."""
+    settings = TrainSettings(
+        algorithm="fastppo",
+        total_steps=1_024,
+        num_envs=16,
+        hyperparameters={"n_steps": 16, "batch_size": 64, "n_epochs": 2},
+        session={"time_limit": 12},
+        prolong=False,
+    )
+    policies = []
+    for number, one in enumerate((port, Stepwise(local_harness.port))):
+        path = train(one, tmp_path / f"{number}.zip", settings).path
+        policies.append(restored(path, one.spec(), (64, 64)).parameters)
+    np.testing.assert_array_equal(*policies)

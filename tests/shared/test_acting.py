@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from support.acting import random_policy
-from surrogym_shared.acting import ActingPolicy, Actor, NoiseKey
+from surrogym_shared.acting import ActingPolicy, Actor, KeyedGenerator, NoiseKey
 from surrogym_shared.network import Layer, Network
 
 LOW, HIGH = np.array([-2.0, 0.0]), np.array([2.0, 1.0])
@@ -43,6 +43,14 @@ def test_noise_depends_on_seed_step_and_lane_alone(counts: tuple[int, ...]):
     for other in (NoiseKey(6, 70), NoiseKey(5, 71)):
         assert not np.array_equal(actor(counts).act(observations(900), other).action, many.action)
     assert NoiseKey(5, 60).later(10) == NoiseKey(5, 70)
+
+
+def test_noise_is_numpys_philox_with_the_step_in_the_third_word():
+    keyed = KeyedGenerator()
+    keyed.at(NoiseKey(9, 9)).standard_normal(3, dtype=np.float32)
+    drawn = keyed.at(NoiseKey(2**63 - 1, 5)).standard_normal(7)
+    made = np.random.Generator(np.random.Philox(key=2**63 - 1, counter=5 << 128))
+    np.testing.assert_array_equal(drawn, made.standard_normal(7))
 
 
 def test_log_probabilities_are_those_of_the_actions():

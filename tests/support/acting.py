@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from surrogym_client.errors import refused_here
 from surrogym_shared.acting import ActingPolicy, Actor, NoiseKey
+from surrogym_shared.codes import Code
 from surrogym_shared.network import Layer
-from surrogym_shared.port import PolicyRollout, SurrogatePort
+from surrogym_shared.port import PolicyPort, PolicyRollout, SurrogatePort
 
 
 def random_policy(
@@ -58,3 +60,26 @@ def assert_same_rollout(ours: PolicyRollout, theirs: PolicyRollout) -> None:
     for field in fields(ours):
         our, their = getattr(ours, field.name), getattr(theirs, field.name)
         np.testing.assert_array_equal(our, their, err_msg=field.name, strict=our is not None)
+
+
+class Stepwise:
+    """A surrogate that offers no rollouts of policies."""
+
+    def __init__(self, port: SurrogatePort) -> None:
+        self.spec, self.open, self.reset, self.step = port.spec, port.open, port.reset, port.step
+        self.rollout, self.close, self.submit_occupancy = port.rollout, port.close, port.submit_occupancy
+
+
+class Forgetful(Stepwise):
+    """A surrogate that loses the session at one of its rollouts of a policy."""
+
+    def __init__(self, port: PolicyPort, at: int) -> None:
+        super().__init__(port)
+        self._port, self._left = port, at
+
+    def rollout_policy(self, session: str, *arguments: Any, **options: Any) -> PolicyRollout:
+        self._left -= 1
+        if self._left == 0:
+            self.close(session)
+            raise refused_here(Code.UNKNOWN_SESSION, "lost")
+        return self._port.rollout_policy(session, *arguments, **options)

@@ -39,7 +39,7 @@ def batch_of(learner: Learner, rng: np.random.Generator) -> tuple[Mapping[str, n
     """One batch as a rollout buffer holds it, and as a learner takes it. Some ratios are outside the clip range."""
     seen = rng.normal(size=(ROWS, len(learner.mean))).astype(np.float32)
     x = learner.standardised(seen)
-    actions, logs = learner.act(x, rng)
+    actions, logs = learner.distribution.sample(learner.actor.forward(x), learner.further, rng)
     logs = logs + rng.normal(0, 0.3, ROWS).astype(np.float32)
     values, advantages, returns = (rng.normal(size=ROWS).astype(np.float32) for _ in range(3))
     given = {"observations": seen, "actions": actions, "log_probs": logs}

@@ -13,9 +13,12 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 
+from support.acting import Forgetful
 from support.models import learn
 from support.ppo import RATE, batch_of, layers, linear, reference
 from support.real_steps import random_steps
+from surrogym_client.environments.lanes import Lanes, session_request
+from surrogym_client.evaluation import imagined_returns
 from surrogym_client.original.classic import cartpole, mountain_car_continuous, pendulum
 from surrogym_client.policies import UnusablePolicy, load_policy
 from surrogym_client.training import TrainingInterrupted, TrainSettings, train
@@ -95,6 +98,32 @@ def test_advantages_are_those_of_a_rollout_buffer():
     np.testing.assert_allclose(
         collector._advantages(rewards, ended, values, last), buffer.advantages, rtol=1e-4, atol=1e-5
     )
+
+
+def test_a_session_that_is_lost_cuts_its_episodes_and_collecting_goes_on(surrogate):
+    """One step of the rollout ends them where they stood; the others are taken in a new session."""
+    spec, lanes = surrogate.spec(), 6
+    learner = Learner(spec, np.zeros(3), np.ones(3), (8,), np.random.default_rng(0))
+    whole, cut = (
+        Collector(Lanes(port, session_request(lanes, "same_step", {"seed": 3})), 0.95, 0.95, seed=0)
+        for port in (surrogate, Forgetful(surrogate, at=2))
+    )
+    first, same = whole.collect(learner, 10), cut.collect(learner, 10)
+    np.testing.assert_array_equal(same.observations, first.observations)
+    following, lost = whole.collect(learner, 10), cut.collect(learner, 10)
+    assert (first.lost, following.lost, lost.lost) == (0, 0, lanes)
+    np.testing.assert_array_equal(lost.observations[:lanes], following.observations[:lanes])
+    np.testing.assert_array_equal(lost.actions[:lanes], following.actions[:lanes])
+    assert not np.array_equal(lost.observations[lanes:], following.observations[lanes:])
+    assert lost.observations.shape == following.observations.shape
+    assert len(lost.earned) == 0, "episodes of twenty steps, none of which ended by itself"
+    assert len(following.earned) == lanes
+
+
+def test_imagined_episodes_begin_anew_where_the_session_is_lost(surrogate):
+    network = Learner(surrogate.spec(), np.zeros(3), np.ones(3), (8,), np.random.default_rng(0)).policy()
+    returns = [imagined_returns(port, network, 4, 0) for port in (surrogate, Forgetful(surrogate, at=1))]
+    np.testing.assert_array_equal(*returns)
 
 
 def test_choices_are_drawn_by_their_probabilities():

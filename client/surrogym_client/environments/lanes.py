@@ -17,7 +17,17 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from surrogym_client.errors import SessionLost, SurrogymClientError
-from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult, SurrogatePort
+from surrogym_shared.acting import ActingPolicy, NoiseKey
+from surrogym_shared.port import (
+    Bools,
+    Floats,
+    Ints,
+    PolicyPort,
+    PolicyRollout,
+    ResetResult,
+    StepResult,
+    SurrogatePort,
+)
 from surrogym_shared.wire import AutoresetMode, OpenSession
 
 REOPENINGS = 3
@@ -78,6 +88,7 @@ class Lanes:
         self.view = port.open(request)
         self._request = request
         self._deviations = deviations
+        self._rolls = request.autoreset_mode == "same_step" and isinstance(port, PolicyPort)
         self._seed = self.view.seed
         self._losses = 0
         self._reason = ""
@@ -135,6 +146,29 @@ class Lanes:
         over = result.terminated | result.truncated
         self._running = np.where(chosen, ~over | (self.mode == "same_step"), self._running)
         return step
+
+    @property
+    def rolls_policies(self) -> bool:
+        """Whether ``rollout`` is possible: the port can, and lanes that end begin anew in the same step."""
+        return self._rolls
+
+    def rollout(
+        self, policy: ActingPolicy, steps: int, noise: NoiseKey | None = None, until: Bools | None = None
+    ) -> PolicyRollout | None:
+        """Let a policy act in all lanes, in one request; see ``PolicyPort.rollout_policy``.
+
+        Gives None where the session was lost. No step was taken then, and the next ``step`` ends the episodes.
+        """
+        assert isinstance(self.port, PolicyPort)
+        if not self._cut.any():
+            try:
+                rollout = self.port.rollout_policy(self.view.id, policy, steps, noise=noise, until=until)
+            except SessionLost as error:
+                self._reopen(error)
+            else:
+                self._observation, self._version = rollout.observation[-1], rollout.model_version[-1]
+                return rollout
+        return None
 
     def close(self) -> None:
         """End the session. A server that is gone has ended it already."""

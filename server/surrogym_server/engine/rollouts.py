@@ -16,11 +16,8 @@ from surrogym_server.engine.session import Session
 from surrogym_server.environment.actions import policy_actions
 from surrogym_server.environment.definition import ActionDefinition
 from surrogym_server.errors import InvalidInput, TooLarge
-from surrogym_shared.acting import Acted, Actor, NoiseKey, PolicyRun
+from surrogym_shared.acting import MAX_ACTIVATIONS, MAX_LANE_STEPS, Acted, Actor, NoiseKey, PolicyRun
 from surrogym_shared.port import PolicyRollout, StepResult
-
-MAX_STEPS = 1_000_000  # of all lanes in one request
-MAX_ACTIVATIONS = 2**24  # of all lanes in the widest layer of a policy: 128 MiB
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -79,8 +76,8 @@ def roll_policy(session: Session, run: PolicyRun, step: OneStep) -> tuple[Sessio
 
 
 def _check_steps(steps: int, lanes: int) -> None:
-    if steps * lanes > MAX_STEPS:
-        raise TooLarge(f"expected at most {MAX_STEPS} steps in all, got {steps} x {lanes}")
+    if steps * lanes > MAX_LANE_STEPS:
+        raise TooLarge(f"expected at most {MAX_LANE_STEPS} steps in all, got {steps} x {lanes}")
 
 
 def _actor(observation: int, action: ActionDefinition, run: PolicyRun) -> Actor:

@@ -332,7 +332,7 @@ def with_layers(count: int, units: int) -> dict[str, Any]:
         ({**ROLL, "until": [True]}, "until: expected 2 entries, one a lane, got 1"),
         ({**ROLL, "noise": {"seed": -1}}, "seed"),
         ({**ROLL, "noise": {"seed": 0}}, "expected log_deviations for the noise"),
-        ({**ROLL, "noise": {"seed": 0}, "policy": {**POLICY, "log_deviations": [21]}}, "within +-20, got 21"),
+        ({**ROLL, "noise": {"seed": 0}, "policy": {**POLICY, "log_deviations": [81]}}, "within +-80, got 81"),
         ({**ROLL, "policy": {**POLICY, "mean": [0, 0]}}, "expected deviation of shape (2,), got (3,)"),
         ({**ROLL, "policy": {**POLICY, "deviation": [1, 0, 1]}}, "expected a positive deviation, got 0"),
         ({**ROLL, "policy": {**POLICY, "mean": [0, 0, 1e300]}}, "finite numbers in mean"),

@@ -25,6 +25,7 @@ from surrogym_client.policies.defaults import CRITIC
 from surrogym_client.policies.predict import Predict
 from surrogym_client.training.fast_ppo.actions import distribution_of
 from surrogym_client.training.fast_ppo.mlp import Array, Mlp, orthogonal
+from surrogym_shared.acting import ActingPolicy
 from surrogym_shared.archives import Header, read_arrays, read_entries
 from surrogym_shared.network import MAX_BYTES, Layer, Network, bounds_of, counts_of
 from surrogym_shared.spec import EnvironmentSpec
@@ -86,9 +87,11 @@ class Learner:
         x: Array = ((observation - self.mean) / self.deviation).astype(np.float32, copy=False)
         return x
 
-    def act(self, x: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Actions of standardised observations x (B, D) with noise, and their log probabilities."""
-        return self.distribution.sample(self.actor.forward(x), self.further, rng)
+    def acting(self) -> ActingPolicy:
+        """The actor and its noise as arrays, which are views of the parameters."""
+        layers = tuple(Layer(*layer) for layer in self.actor.layers)
+        log_deviations = self.further if len(self.further) else None
+        return ActingPolicy(self.mean, self.deviation, layers, self.distribution.activation, log_deviations)
 
     def values(self, x: Array) -> Array:
         """Of standardised observations (B, D), (B,)."""

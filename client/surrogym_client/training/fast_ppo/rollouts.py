@@ -9,9 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_client.environments.lanes import Lanes, LaneStep
+from surrogym_client.environments.acting import ActingLanes
+from surrogym_client.environments.lanes import Lanes
 from surrogym_client.training.fast_ppo.learner import Learner
 from surrogym_client.training.fast_ppo.mlp import Array
+from surrogym_shared.acting import NoiseKey
+from surrogym_shared.port import PolicyRollout
 
 LARGEST_REWARD = 10.0  # after scaling
 LATEST_EPISODES = 100
@@ -38,12 +41,13 @@ class Collector:
         lanes: of an open session with autoreset in the same step.
         gamma: discount.
         gae_lambda: lambda of the generalised advantage estimate (Schulman et al. 2016).
-        rng: of the actions' noise.
+        seed: of the actions' noise.
     """
 
-    def __init__(self, lanes: Lanes, gamma: float, gae_lambda: float, rng: np.random.Generator) -> None:
-        self._lanes, self._gamma, self._lambda, self._rng = lanes, gamma, gae_lambda, rng
-        self._observation = lanes.reset().observation
+    def __init__(self, lanes: Lanes, gamma: float, gae_lambda: float, seed: int) -> None:
+        self._gamma, self._lambda, self._noise = gamma, gae_lambda, NoiseKey(seed)
+        self._lanes, self._penalised = ActingLanes(lanes), lanes.view.penalty > 0
+        self._lanes.reset()
         self._scale = RewardScale(lanes.num_envs, gamma)
         self._earned = np.zeros(lanes.num_envs)  # by the running episodes
         self._penalty = np.zeros(lanes.num_envs)  # taken off them
@@ -56,66 +60,53 @@ class Collector:
 
     def collect(self, learner: Learner, steps: int) -> Rollout:
         """Take ``steps`` steps with every lane; the policy acts with its noise."""
-        n = self._lanes.num_envs
-        observations, actions, logs = [], [], []
-        rewards, ended = np.empty((steps, n), dtype=np.float32), np.empty((steps, n), dtype=bool)
-        cut: list[tuple[int, NDArray[Any], NDArray[Any]]] = []  # step, lanes, and what they saw last
-        earned: list[float] = []
-        size = taken = 0.0
-        lost = 0
+        taken = self._lanes.take(learner.acting(), steps, self._noise)
+        self._noise = self._noise.later(steps)
+        rollout = taken.rollout
+        assert rollout.log_probability is not None
+        ended = rollout.terminated | rollout.truncated
+        penalty = rollout.reward_mean - rollout.reward
+        rewards, earned = np.empty(ended.shape, dtype=np.float32), []
         for t in range(steps):
-            x = learner.standardised(self._observation)
-            action, log = learner.act(x, self._rng)
-            observations.append(x)
-            actions.append(action)
-            logs.append(log)
-            step = self._lanes.step(learner.distribution.sent(action))
-            result = step.result
-            ended[t] = result.terminated | result.truncated
-            rewards[t] = self._scale(result.reward, ended[t])
-            penalty = result.reward_mean - result.reward
-            self._earned += result.reward
-            self._penalty += penalty
+            rewards[t] = self._scale(rollout.reward[t], ended[t])
+            self._earned += rollout.reward[t]
+            self._penalty += penalty[t]
             if ended[t].any():
-                cut.append((t, *_truncated(step)))
-                earned += self._end(ended[t], step.cut)
-            size += float(np.abs(result.reward_mean).sum())
-            taken += float(np.abs(penalty).sum())
-            lost += int(step.cut.sum())
-            self._observation = result.observation
-        seen = np.concatenate(observations)
-        values = learner.values(seen).reshape(steps, n)
-        self._bootstrap(learner, rewards, cut)
-        last = learner.values(learner.standardised(self._observation))
+                earned += self._end(ended[t], taken.cut[t])
+        seen = learner.standardised(taken.seen.reshape(rewards.size, -1))
+        values = learner.values(seen).reshape(rewards.shape)
+        self._bootstrap(learner, rewards, rollout)
+        last = learner.values(learner.standardised(rollout.observation[-1]))
         advantages = self._advantages(rewards, ended, values, last)
+        size = float(np.abs(rollout.reward_mean).sum())
         return Rollout(
             seen,
-            np.concatenate(actions),
-            np.concatenate(logs),
+            rollout.action.reshape(rewards.size, -1).astype(np.float32),
+            rollout.log_probability.ravel().astype(np.float32),
             advantages.ravel(),
             (advantages + values).ravel(),
             earned,
-            taken / size if size else 0.0,
-            lost,
+            float(np.abs(penalty).sum()) / size if size else 0.0,
+            int(taken.cut.sum()),
         )
 
     def _end(self, ended: NDArray[np.bool_], lost: NDArray[np.bool_]) -> list[float]:
         """End the episodes of these lanes (N,); what they earned, but for those that were lost."""
         earned: list[float] = self._earned[ended & ~lost].tolist()
-        if self._lanes.view.penalty > 0:
+        if self._penalised:
             self._penalties.extend(self._penalty[ended].tolist())
         self._earned[ended] = 0.0
         self._penalty[ended] = 0.0
         return earned
 
-    def _bootstrap(self, learner: Learner, rewards: Array, cut: list[tuple[int, Any, Any]]) -> None:
+    def _bootstrap(self, learner: Learner, rewards: Array, rollout: PolicyRollout) -> None:
         """Add to the last reward of a truncated episode what the critic expects beyond it."""
-        counts = [len(lanes) for _, lanes, _ in cut]
-        if not sum(counts):
+        at = rollout.final_steps, rollout.final_lanes
+        short = (rollout.truncated & ~rollout.terminated)[at]
+        if not short.any():
             return
-        beyond = learner.values(learner.standardised(np.concatenate([seen for _, _, seen in cut])))
-        at = np.repeat([t for t, _, _ in cut], counts), np.concatenate([lanes for _, lanes, _ in cut])
-        rewards[at] += np.float32(self._gamma) * beyond
+        beyond = learner.values(learner.standardised(rollout.final_observation[short]))
+        rewards[at[0][short], at[1][short]] += np.float32(self._gamma) * beyond
 
     def _advantages(self, rewards: Array, ended: NDArray[np.bool_], values: Array, last: Array) -> Array:
         """Generalised advantage estimates (T, N)."""
@@ -151,10 +142,3 @@ class RewardScale:
         between = delta**2 * self._count * n / count
         self._variance = (self._variance * self._count + float(new.var()) * n + between) / count
         self._mean, self._count = self._mean + delta * n / count, count
-
-
-def _truncated(step: LaneStep) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Lanes whose episode was cut short in this step, and what they saw last."""
-    result = step.result
-    short = (result.truncated & ~result.terminated)[result.final_lanes]
-    return result.final_lanes[short], result.final_observation[short]

@@ -102,7 +102,7 @@ class _Training:
         proof = self._imagined(self._saved) if self._saved is not None and settings.anew else None
         self._verdicts = Verdicts(planned, self._imagined(self._new), proof)
         self._kept: LearnedNetwork | None = None
-        self._collector = Collector(lanes, self._gamma, search.gae_lambda, self._rng)
+        self._collector = Collector(lanes, self._gamma, search.gae_lambda, settings.seed)
 
     def run(self) -> Found:
         """Learn until a network comes to the end of its steps, or a person interrupts."""
