@@ -25,6 +25,7 @@ from surrogym_server.errors import InvalidInput, NotReset, UnknownModel, Unknown
 from surrogym_server.models.files import from_bytes
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.services.sessions import resolved
+from surrogym_server.virtual import in_fastest_form
 from surrogym_shared.acting import ActingPolicy, NoiseKey, PolicyRun
 from surrogym_shared.port import Bools, Floats, Ints, PolicyRollout, ResetResult, StepResult
 from surrogym_shared.spec import EnvironmentSpec
@@ -100,7 +101,7 @@ class LocalSurrogate:
             secrets.token_urlsafe(8),
             "local",
             definition,
-            resolved(asked, definition),
+            in_fastest_form(resolved(asked, definition), self._model),
             seed=secrets.randbits(63) if asked.seed is None else asked.seed,
             model=asked.model,
             version=VERSION,

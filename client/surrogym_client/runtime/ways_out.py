@@ -4,7 +4,7 @@ from __future__ import annotations
 
 EXTRAS = {  # their packages
     "server": (
-        *("alembic", "fastapi", "jiter", "prometheus_client", "psycopg", "safetensors", "scipy", "sqlalchemy"),
+        *("alembic", "fastapi", "jiter", "numba", "prometheus_client", "psycopg", "safetensors", "scipy", "sqlalchemy"),
         *("starlette", "threadpoolctl", "uvicorn"),
     ),
     "train": ("cmaes", "matplotlib", "stable_baselines3", "tensorboard", "torch"),

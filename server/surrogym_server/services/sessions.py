@@ -41,7 +41,7 @@ from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import SavedSession
 from surrogym_server.tensors import CPU
-from surrogym_server.virtual import VirtualSettings, expected_bytes, reward_limits
+from surrogym_server.virtual import VirtualSettings, expected_bytes, in_fastest_form, reward_limits
 from surrogym_server.virtual.paths import function_draws
 from surrogym_shared.acting import PolicyRun
 from surrogym_shared.port import StepResult
@@ -265,12 +265,12 @@ class SessionService:
         id = self._storage.surrogates.get(surrogate).id
         latest = self._models.refresh(id)
         version = latest if opening.model == "latest" else opening.model
-        self._models.get(id, version)
+        model = self._models.get(id, version, self._device)
         return open_session(
             secrets.token_urlsafe(SESSION_ID_BYTES),
             surrogate,
             definition,
-            self._limited(surrogate, resolved(opening, definition), definition),
+            in_fastest_form(self._limited(surrogate, resolved(opening, definition), definition), model),
             seed=secrets.randbits(63) if opening.seed is None else opening.seed,
             model=opening.model,
             version=version,

@@ -1,8 +1,9 @@
 """The virtual environment: N lanes at once, frozen state in, new state out; noise is a pure function of its key."""
 
-from surrogym_server.virtual.environment import LaneTransition, VirtualSettings, create, expected_bytes, reset, step
+from surrogym_server.virtual.environment import LaneTransition, VirtualSettings, create, expected_bytes, reset
 from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.limits import reward_limits, within
+from surrogym_server.virtual.step import in_fastest_form, step
 
 __all__ = [
     "LaneState",
@@ -10,6 +11,7 @@ __all__ = [
     "VirtualSettings",
     "create",
     "expected_bytes",
+    "in_fastest_form",
     "reset",
     "reward_limits",
     "step",

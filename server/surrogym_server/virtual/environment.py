@@ -43,6 +43,7 @@ class VirtualSettings:
     process_noise: bool = False  # the learned noise moves the state, w of eq. 2
     reward_limits: tuple[float, float] | None = None  # of mean rewards; None: none
     trust: float | None = None  # an episode ends where an output deviates by more, in its deviations over the samples
+    compiled: bool = False  # steps by compiled code where the model offers it; chosen when the session opens
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def reset(
     Raises:
         InvalidInput: mask or list of seeds of another length, or a seed that is negative or too large.
     """
-    chosen = _mask(mask, lanes)
+    chosen = chosen_lanes(mask, lanes)
     if seed is not None:
         lanes = _seeded(lanes, seed, chosen)
     lanes = _begin(definition, settings, lanes, chosen)
@@ -124,7 +125,7 @@ def step(
         NotReset: a lane that was never reset, or that ended under autoreset disabled.
     """
     definition = model.definition
-    moving, beginning = _divided(settings, lanes, _mask(mask, lanes))
+    moving, beginning = divided(settings, lanes, chosen_lanes(mask, lanes))
     active = lanes.take(moving)
     if settings.variant == "pathwise":
         active = with_paths(model, active, settings.functions)
@@ -159,7 +160,7 @@ def step(
     )
 
 
-def _divided(settings: VirtualSettings, lanes: LaneState, chosen: Chosen) -> tuple[Chosen, Tensor | None]:
+def divided(settings: VirtualSettings, lanes: LaneState, chosen: Chosen) -> tuple[Chosen, Tensor | None]:
     """Which of the chosen lanes this step moves, and which (N,) it resets instead, None where that is nobody."""
     running = lanes.phase == RUNNING
     if bool(running.all()):
@@ -257,7 +258,8 @@ def _array(values: Tensor) -> NDArray[Any]:
     return array
 
 
-def _mask(mask: Bools | None, lanes: LaneState) -> Chosen:
+def chosen_lanes(mask: Bools | None, lanes: LaneState) -> Chosen:
+    """The lanes of a mask (N,), or all."""
     if mask is None:
         return EVERY
     if len(mask) != len(lanes):

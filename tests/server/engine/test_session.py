@@ -84,13 +84,13 @@ def test_only_stepped_lanes_count_as_visits(opened: Open, fitted: Fitted):
     np.testing.assert_array_equal(session.visited.states[4], session.lanes.q[0])
 
 
+@pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize("variant", ["deterministic", "probabilistic", "pathwise"])
 def test_what_was_saved_goes_on_bit_for_bit(
-    opened: Open, fitted: Fitted, definition: EnvironmentDefinition, variant: str
+    opened: Open, fitted: Fitted, definition: EnvironmentDefinition, variant: str, compiled: bool
 ):
-    session, _ = reset_session(
-        opened(variant=variant, particles=8, occupancy=True, trust=2.0, process_noise=True), 11, None, 1
-    )
+    chosen = {"variant": variant, "particles": 8, "trust": 2.0, "process_noise": True, "compiled": compiled}
+    session, _ = reset_session(opened(occupancy=True, **chosen), 11, None, 1)
     results = []
     for _ in range(2):
         session, result = stepped(fitted, session)
@@ -115,7 +115,9 @@ def test_a_session_saved_before_there_were_functions_comes_back(
     with np.load(io.BytesIO(session_to_bytes(session))) as file:
         arrays = {name: file[name] for name in file.files if name != "lanes/path"}
     header = json.loads(arrays["header"].tobytes())
-    settings = {key: value for key, value in header["settings"].items() if key not in ("trust", "process_noise")}
+    settings = {
+        key: value for key, value in header["settings"].items() if key not in ("trust", "process_noise", "compiled")
+    }
     older = json.dumps({**header, "format": 1, "settings": settings}).encode()
     buffer = io.BytesIO()
     np.savez(buffer, **{**arrays, "header": np.frombuffer(older, dtype=np.uint8)})

@@ -86,6 +86,6 @@ def test_nothing_of_a_step_is_made_on_the_cpu(model, variant, differences, monke
         lanes, _ = reset(there.definition, settings, create(there.definition, settings, 0), seed=1)
         if settings.variant == "pathwise":
             lanes = replace(lanes, path=there.draw(lanes.q.new_zeros(LANES, there.path_size)))
-        plain = step.__wrapped__  # pretending does not go together with inference mode
+        plain = environment.step.__wrapped__  # pretending does not go together with inference mode
         plain(there, settings, lanes, np.zeros((LANES, model.definition.action.size)))
     assert {values.device.type for values in arrived} == {"meta"}

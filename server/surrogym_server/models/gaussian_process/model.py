@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from surrogym_server import compiled
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.step_rules import paid
 from surrogym_server.models.abilities import (
+    ArraySteps,
+    CompiledSteps,
     Differentiable,
     FunctionDraws,
     LeaveOneOut,
@@ -35,11 +39,13 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 from surrogym_server.models.gaussian_process.prediction.predictor import Predictor
 from surrogym_server.models.gaussian_process.prediction.regions import Jump, Region
 from surrogym_server.models.port import DynamicsModel, Transition
-from surrogym_server.tensors import cached
+from surrogym_server.tensors import CPU, cached
 
 
 @dataclass(frozen=True)
-class GaussianProcessModel(DynamicsModel, FunctionDraws, LeaveOneOut, Lookahead, RewardEdges, Differentiable):
+class GaussianProcessModel(
+    DynamicsModel, FunctionDraws, LeaveOneOut, Lookahead, RewardEdges, CompiledSteps, Differentiable
+):
     """One process for each output; regions for what ends an episode, and for where the reward jumps."""
 
     definition: EnvironmentDefinition
@@ -152,11 +158,22 @@ class GaussianProcessModel(DynamicsModel, FunctionDraws, LeaveOneOut, Lookahead,
             inside = jump.region.probability(state)
             yield inside.minimum(1 - inside)
 
+    def compiled(self) -> ArraySteps | None:
+        return self._compiled
+
     def _learns(self, column: int, q_next: Tensor) -> Tensor:
         """Which samples that end at q_next (m, C) an output would learn from, (m,) bool."""
         if column == len(self.transitions):
             return ~self.terminated(q_next)
         return usable(self.definition, column, q_next, self.transitions[column].feature_map)
+
+    @cached_property
+    def _compiled(self) -> ArraySteps | None:
+        if self.definition.device != CPU or not compiled.available():
+            return None
+        from surrogym_server.models.gaussian_process.prediction.compiled.step import StepsOfModel
+
+        return StepsOfModel.of(self._predictor, self.ending)
 
     @cached
     def _predictor(self) -> Predictor:

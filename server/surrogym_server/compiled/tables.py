@@ -1,0 +1,49 @@
+"""Many matrices in one array, so that a compiled function takes two arguments for all that it reads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from surrogym_server.compiled.jit import compiled
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Tables = tuple[Floats, Ints]  # numbers (K,), and begin, rows and columns of each matrix in them (S, 3)
+
+
+class TablesBuilder:
+    """Collects matrices. A vector is a matrix of one row; whole numbers are kept as float64."""
+
+    def __init__(self) -> None:
+        self._matrices: list[NDArray[Any]] = []
+
+    def add(self, *matrices: ArrayLike) -> int:
+        """Put matrices one after the other; gives the place of the first."""
+        first = len(self._matrices)
+        self._matrices += [np.atleast_2d(np.asarray(matrix, dtype=np.float64)) for matrix in matrices]
+        return first
+
+    def reserve(self) -> int:
+        """A place that ``fill`` fills later."""
+        return self.add(np.zeros((1, 0)))
+
+    def fill(self, place: int, matrix: ArrayLike) -> None:
+        self._matrices[place] = np.atleast_2d(np.asarray(matrix, dtype=np.float64))
+
+    def build(self) -> Tables:
+        sizes = [matrix.size for matrix in self._matrices]
+        begins = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+        shapes = [(int(begin), *matrix.shape) for begin, matrix in zip(begins, self._matrices, strict=True)]
+        flat: Sequence[NDArray[Any]] = [matrix.reshape(-1) for matrix in self._matrices]
+        return np.concatenate(flat), np.array(shapes, dtype=np.int64)
+
+
+@compiled
+def matrix(numbers: Floats, places: Ints, place: int) -> Floats:
+    """The matrix at a place, (rows, columns), not copied."""
+    begin, rows, columns = places[place, 0], places[place, 1], places[place, 2]
+    return numbers[begin : begin + rows * columns].reshape((rows, columns))

@@ -1,0 +1,77 @@
+"""Features of coordinates and action, as ``environment.features.Encoder`` gives them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_server.compiled.elementary import sine_and_cosine, wrapped
+from surrogym_server.compiled.jit import compiled
+from surrogym_server.compiled.tables import TablesBuilder, matrix
+from surrogym_server.environment.compiled.terms import evaluate
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.features import Encoder
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+ROWS, WEIGHTS = range(2)  # function, entry, centre and scale of each feature; weights of the coordinates
+CODES = {"affine": 0, "cos": 1, "sin": 2, "turned_cos": 3, "turned_sin": 4, "wrapped": 5, "equal": 6, "observed": 7}
+AFFINE, COS, SIN, TURNED_COS, TURNED_SIN, WRAPPED, EQUAL, OBSERVED = CODES.values()
+UNIT_ANGLE = math.sqrt(3) / math.pi
+
+
+def add_features(tables: TablesBuilder, definition: EnvironmentDefinition, encoder: Encoder) -> int:
+    """Put an encoder's features; gives their place. Those of the lead read it behind coordinates and action."""
+    size = len(definition.coordinates)
+    rows, weights = np.zeros((len(encoder.columns), 4)), np.zeros((len(encoder.columns), size))
+    for feature, column in encoder.columns.items():
+        beyond = size + definition.action.size if feature.function == "lead" else 0
+        code = CODES["affine" if feature.function == "lead" else feature.function]
+        rows[column] = code, beyond + feature.entry, feature.centre, feature.scale
+        if feature.weights:
+            weights[column] = feature.weights
+    return tables.add(rows, weights)
+
+
+@compiled
+def encode(
+    numbers: Floats, places: Ints, at: int, observe: int, raw: Floats, size: int, x: Floats, begin: int, end: int
+) -> None:
+    """Features ``begin`` to ``end`` of coordinates, action and lead, raw (C + F + L, B), into the same rows of
+    x (d, B); ``size`` is C, ``observe`` the place of the observation's terms."""
+    rows, weights = matrix(numbers, places, at + ROWS), matrix(numbers, places, at + WEIGHTS)
+    lanes = raw.shape[1]
+    other, phase = np.empty(lanes), np.empty(lanes)
+    shown, observed = raw, False
+    for f in range(begin, end):
+        code, entry, centre, scale = int(rows[f, 0]), int(rows[f, 1]), rows[f, 2], rows[f, 3]
+        if code == AFFINE:
+            for b in range(lanes):
+                x[f, b] = (raw[entry, b] - centre) / scale
+        elif code == COS:
+            sine_and_cosine(raw[entry], other, x[f])
+        elif code == SIN:
+            sine_and_cosine(raw[entry], x[f], other)
+        elif code in (TURNED_COS, TURNED_SIN):
+            phase[:] = 0.0
+            for c in range(size):
+                for b in range(lanes):
+                    phase[b] += weights[f, c] * raw[c, b]
+            if code == TURNED_COS:
+                sine_and_cosine(phase, other, x[f])
+            else:
+                sine_and_cosine(phase, x[f], other)
+        elif code == WRAPPED:
+            for b in range(lanes):
+                x[f, b] = wrapped(raw[entry, b]) * UNIT_ANGLE
+        elif code == EQUAL:
+            for b in range(lanes):
+                x[f, b] = 1.0 if raw[entry, b] == centre else 0.0
+        else:
+            if not observed:
+                shown, observed = evaluate(numbers, places, observe, raw[:size]), True
+            for b in range(lanes):
+                x[f, b] = (shown[entry, b] - centre) / scale

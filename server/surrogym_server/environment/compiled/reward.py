@@ -1,0 +1,63 @@
+"""A declared reward."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_server.compiled.elementary import exponential
+from surrogym_server.compiled.jit import inlined
+from surrogym_server.compiled.tables import TablesBuilder, matrix
+from surrogym_server.environment.compiled.terms import add_conditions, add_terms, evaluate, holding
+from surrogym_server.environment.declared_reward import DeclaredReward
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+SHAPES = {"one": 0, "linear": 1, "absolute": 2, "square": 3, "bump": 4}
+ONE, LINEAR, ABSOLUTE, SQUARE, BUMP = SHAPES.values()
+HEAD, WEIGHTS, TERMS = range(3)  # places of terms and conditions; action weights (F, X); weight, shape, quantities
+
+
+def add_reward(tables: TablesBuilder, reward: DeclaredReward) -> int:
+    """Put a declared reward; gives its place."""
+    values, weights, conditions = reward._compiled
+    head = [add_terms(tables, values), add_conditions(tables, conditions)]
+    terms = [(term.weight, SHAPES[term.shape], len(term.of)) for term in reward.terms]
+    return tables.add(head, weights, np.array(terms).reshape(-1, 3))
+
+
+@inlined
+def add_declared(numbers: Floats, places: Ints, at: int, q: Floats, u: Floats, total: Floats) -> None:
+    """Add the reward of states q (C, B) and actions u (F, B) to ``total`` (B,)."""
+    head, weights = matrix(numbers, places, at + HEAD), matrix(numbers, places, at + WEIGHTS)
+    terms = matrix(numbers, places, at + TERMS)
+    lanes = q.shape[1]
+    x = evaluate(numbers, places, int(head[0, 0]), q)
+    for f in range(len(weights)):
+        for i in range(len(x)):
+            if weights[f, i] != 0:
+                for b in range(lanes):
+                    x[i, b] += weights[f, i] * u[f, b]
+    holds = holding(numbers, places, int(head[0, 1]), q)
+    begin, shaped = 0, np.empty(lanes)
+    for t in range(len(terms)):
+        weight, shape, count = terms[t, 0], int(terms[t, 1]), int(terms[t, 2])
+        shaped[:] = 1.0 if shape == ONE else 0.0
+        for i in range(begin, begin + count):
+            for b in range(lanes):
+                v = x[i, b]
+                if shape == LINEAR:
+                    shaped[b] += v
+                elif shape == ABSOLUTE:
+                    shaped[b] += abs(v)
+                elif shape in (SQUARE, BUMP):
+                    shaped[b] += v * v
+        if shape == BUMP:
+            for b in range(lanes):
+                shaped[b] *= -0.5
+            exponential(shaped)
+        begin += count
+        for b in range(lanes):
+            if holds[t, b]:
+                total[b] += weight * shaped[b]

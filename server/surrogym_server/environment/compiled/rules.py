@@ -1,0 +1,74 @@
+"""Rules of a step: limits, walls, wrapped angles, and coordinates read back from an observation."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_server.compiled.elementary import wrapped
+from surrogym_server.compiled.jit import compiled, inlined
+from surrogym_server.compiled.tables import TablesBuilder, matrix
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.observation_inverse import ObservationInverse
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# Of each coordinate: ends of its reach, its bounds, the coordinate that they stop or -1, and whether it is an angle.
+REACH_LOW, REACH_HIGH, LOW, HIGH, STOPS, ANGLE = range(6)
+
+
+def add_rules(tables: TablesBuilder, definition: EnvironmentDefinition) -> int:
+    """Put what ``settle`` reads; gives its place."""
+    low, high = (end.tolist() for end in definition.reach)
+    return tables.add(
+        [
+            (low[i], high[i], c.low, c.high, -1 if c.stops is None else c.stops, c.kind == "angle")
+            for i, c in enumerate(definition.coordinates)
+        ]
+    )
+
+
+def add_inverse(tables: TablesBuilder, inverse: ObservationInverse | None) -> int:
+    """Put where moving coordinates are read from, coordinate and entries, -1 for none; gives its place."""
+    sources = () if inverse is None else inverse.sources
+    rows = [(index, *entries, *[-1] * (2 - len(entries))) for index, entries in sources]
+    return tables.add(np.array(rows).reshape(-1, 3))
+
+
+@compiled
+def clipped(rules: Floats, c: int, value: float) -> float:
+    """A value of coordinate c within its reach."""
+    low, high = rules[c, REACH_LOW], rules[c, REACH_HIGH]
+    return low if value < low else (high if value > high else value)
+
+
+@inlined
+def settle(rules: Floats, q: Floats) -> None:
+    """Leave coordinates q (C, B) as the environment does."""
+    size, lanes = q.shape
+    for c in range(size):
+        for b in range(lanes):
+            q[c, b] = clipped(rules, c, q[c, b])
+    for c in range(size):
+        stopped = int(rules[c, STOPS])
+        if stopped >= 0:
+            for b in range(lanes):
+                speed = q[stopped, b]
+                if (q[c, b] <= rules[c, LOW] and speed < 0) or (q[c, b] >= rules[c, HIGH] and speed > 0):
+                    q[stopped, b] = 0.0
+        if rules[c, ANGLE]:
+            for b in range(lanes):
+                q[c, b] = wrapped(q[c, b])
+
+
+@inlined
+def recover(numbers: Floats, places: Ints, at: int, o: Floats, q: Floats) -> None:
+    """Read moving coordinates back from observations o (D, B), into q (C, B)."""
+    sources = matrix(numbers, places, at)
+    for s in range(len(sources)):
+        c, first, second = int(sources[s, 0]), int(sources[s, 1]), int(sources[s, 2])
+        for b in range(q.shape[1]):
+            q[c, b] = o[first, b] if second < 0 else math.atan2(o[second, b], o[first, b])

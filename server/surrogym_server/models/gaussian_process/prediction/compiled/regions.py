@@ -1,0 +1,134 @@
+"""Learned regions and jumps of the reward."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_server.compiled.jit import compiled, inlined
+from surrogym_server.compiled.tables import TablesBuilder, matrix
+from surrogym_server.environment.compiled.features import add_features, encode
+from surrogym_server.environment.compiled.terms import add_terms, evaluate
+from surrogym_server.environment.features import Encoder
+from surrogym_server.gp.compiled import add_process, predict
+from surrogym_server.models.gaussian_process.prediction.regions import Classifier, Jump, Region, Thresholds
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# Of each form: its weight, whether it is a classifier, and the places of what it reads: axes, cuts and rules and
+# whether it is a complement, or features, process and number of features (a process of -1 is a constant).
+WEIGHT, CLASSIFIES, FIRST, SECOND, THIRD = range(5)
+LEAST_DEVIATION = 1e-9
+
+
+def add_region(tables: TablesBuilder, region: Region) -> int:
+    """Put a region; gives its place."""
+    return tables.add([(weight, *_add_form(tables, form)) for weight, form in region.forms])
+
+
+def add_jumps(tables: TablesBuilder, jumps: Sequence[Jump]) -> int:
+    """Put jumps, size and region of each; gives their place."""
+    return tables.add(np.array([(jump.size, add_region(tables, jump.region)) for jump in jumps]).reshape(-1, 2))
+
+
+def _add_form(tables: TablesBuilder, form: Thresholds | Classifier) -> tuple[float, ...]:
+    if isinstance(form, Thresholds):
+        columns, outside, width, membership = form._compiled
+        cuts = tables.add(np.stack([columns, outside, width], 1), membership)
+        return False, add_terms(tables, form._axes.terms), cuts, form.complement
+    encoder = Encoder.of(form.definition, (form.process.feature_map,))
+    features, process = add_features(tables, form.definition, encoder), form.process
+    place = tables.add([process.centre])
+    if process.posterior is not None:
+        inputs = encoder.inputs(process.feature_map)
+        place = add_process(tables, process.posterior, inputs, process.centre, process.scale)
+    return True, features, place if process.posterior is not None else -place - 1, encoder.width(lead=True)
+
+
+@inlined
+def _within(numbers: Floats, places: Ints, axes: int, at: int, complement: int, q: Floats) -> Floats:
+    cuts, membership = matrix(numbers, places, at), matrix(numbers, places, at + 1)
+    values = evaluate(numbers, places, axes, q)
+    terms, lanes = values.shape
+    outside = np.ones(lanes)
+    for r in range(membership.shape[1]):
+        rule = np.zeros(lanes)
+        for k in range(len(cuts)):
+            if membership[k, r] == 0:
+                continue
+            term, side = int(cuts[k, 0]) % terms, int(cuts[k, 0]) // terms
+            for b in range(lanes):
+                v = values[term, b]
+                v = v if side == 0 else (-v if side == 1 else abs(v))
+                rule[b] += membership[k, r] * min(max((v - cuts[k, 1]) / cuts[k, 2], 0.0), 1.0)
+        for b in range(lanes):
+            outside[b] *= min(max(1.0 - rule[b], 0.0), 1.0)
+    if not complement:
+        for b in range(lanes):
+            outside[b] = 1.0 - outside[b]
+    return outside
+
+
+@inlined
+def _classified(
+    numbers: Floats, places: Ints, features: int, process: int, width: int, observe: int, q: Floats, actions: int
+) -> Floats:
+    size, lanes = q.shape
+    raw = np.zeros((size + actions, lanes))
+    for c in range(size):
+        for b in range(lanes):
+            raw[c, b] = q[c, b]
+    x = np.empty((width, lanes))
+    encode(numbers, places, features, observe, raw, size, x, 0, width)
+    mean, deviation = np.zeros(lanes), np.zeros(lanes)
+    if process >= 0:
+        predict(numbers, places, process, x, True, mean, deviation)
+    else:
+        mean[:] = matrix(numbers, places, -process - 1)[0, 0]
+    for b in range(lanes):
+        z = mean[b] / max(deviation[b], LEAST_DEVIATION)
+        mean[b] = 0.5 * math.erfc(-z / math.sqrt(2.0))
+    return mean
+
+
+@compiled
+def probability(numbers: Floats, places: Ints, at: int, observe: int, q: Floats, actions: int) -> Floats:
+    """Probability that q (C, B) lies inside the region, (B,)."""
+    forms = matrix(numbers, places, at)
+    total = np.zeros(q.shape[1])
+    for f in range(len(forms)):
+        weight, first, second, third = (
+            forms[f, WEIGHT],
+            int(forms[f, FIRST]),
+            int(forms[f, SECOND]),
+            int(forms[f, THIRD]),
+        )
+        if forms[f, CLASSIFIES]:
+            inside = _classified(numbers, places, first, second, third, observe, q, actions)
+        else:
+            inside = _within(numbers, places, first, second, third, q)
+        for b in range(len(total)):
+            total[b] += weight * inside[b]
+    return total
+
+
+@inlined
+def add_jumped(
+    numbers: Floats, places: Ints, at: int, observe: int, q: Floats, actions: int, reward: Floats, variance: Floats
+) -> None:
+    """Add what jumps add to the reward of states q (C, B) and to its variance, (B,) each."""
+    jumps = matrix(numbers, places, at)
+    free = np.ones(q.shape[1], dtype=np.bool_)
+    for j in range(len(jumps)):
+        size = jumps[j, 0]
+        inside = probability(numbers, places, int(jumps[j, 1]), observe, q, actions)
+        for b in range(len(free)):
+            if free[b]:
+                variance[b] += size * size * inside[b] * (1.0 - inside[b])
+                if inside[b] > 0.5:
+                    reward[b] += size
+                free[b] = inside[b] <= 0.5

@@ -1,0 +1,188 @@
+"""A step of N lanes by compiled functions; ``virtual.environment.step`` is the reference.
+
+Arrays here share memory with the tensors of a lane state. What a step changes is copied first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from surrogym_server.compiled.tables import Tables
+from surrogym_server.environment.compiled.terms import tables_of
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.models.abilities import ArraySteps, ArrayTransition
+from surrogym_server.models.port import DynamicsModel
+from surrogym_server.virtual.compiled.outcome import conclude, observe
+from surrogym_server.virtual.environment import LaneTransition, VirtualSettings, chosen_lanes, divided
+from surrogym_server.virtual.lanes import RUNNING, LaneState
+from surrogym_server.virtual.noise import Purpose, normal_noise
+from surrogym_server.virtual.start import start_coordinates
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+MODELS = 64  # whose tables are kept
+NO_LANES = np.zeros(0, dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class _Changed:
+    """Copies of what a step changes of N lanes, changed in place, and what it gives."""
+
+    q: Floats  # (N, C)
+    episode: Ints  # (N,)
+    elapsed: Ints  # (N,)
+    phase: NDArray[np.int8]  # (N,)
+    rewards: Floats  # (2, N) penalised, and mean
+    ends: Bools  # (4, N) terminated, truncated, untrusted, any of them
+
+    @classmethod
+    def of(cls, lanes: LaneState) -> _Changed:
+        q, episode, elapsed, phase = (t.numpy().copy() for t in (lanes.q, lanes.episode, lanes.elapsed, lanes.phase))
+        ends = np.empty((4, len(phase)), dtype=np.bool_)
+        return cls(q, episode, elapsed, phase, np.empty((2, len(phase))), ends)
+
+    def lanes(self, before: LaneState) -> LaneState:
+        q, episode, elapsed, phase = (torch.from_numpy(a) for a in (self.q, self.episode, self.elapsed, self.phase))
+        return LaneState(before.seed, before.lane, episode, elapsed, phase, q, before.particles, before.path)
+
+
+def compiled_step(
+    model: DynamicsModel,
+    move: ArraySteps,
+    settings: VirtualSettings,
+    lanes: LaneState,
+    u: NDArray[np.floating[Any]],
+    mask: Bools | None,
+    deviations: bool,
+) -> tuple[LaneState, LaneTransition]:
+    """As ``virtual.environment.step``, where ``move`` are the model's compiled steps."""
+    definition, changed = model.definition, _Changed.of(lanes)
+    moving, beginning = _divided(settings, lanes, changed.phase, mask)
+    moved = _moved(model, move, settings, lanes, u, moving, deviations)
+    ended = _concluded(model, settings, moving, moved, changed)
+    final_lanes = NO_LANES
+    if settings.autoreset_mode == "same_step":
+        beginning = changed.ends[3]
+        final_lanes = beginning.nonzero()[0] if ended else NO_LANES
+    final_observation = _observed(move, changed.q[final_lanes])
+    if beginning is not None and beginning.any():
+        _begin(definition, settings, lanes, beginning, changed)
+    return changed.lanes(lanes), LaneTransition(
+        observation=_observed(move, changed.q),
+        reward=changed.rewards[0],
+        terminated=changed.ends[0],
+        truncated=changed.ends[1],
+        final_lanes=final_lanes,
+        final_observation=final_observation,
+        reset_lanes=np.zeros(len(changed.phase), dtype=bool) if beginning is None else beginning,
+        reward_mean=changed.rewards[1],
+        deviation=_scattered(moving, moved.deviation) if deviations else None,
+        untrusted=None if settings.trust is None else changed.ends[2],
+    )
+
+
+def _divided(
+    settings: VirtualSettings, lanes: LaneState, phase: NDArray[np.int8], mask: Bools | None
+) -> tuple[Bools, Bools | None]:
+    """Which lanes (N,) this step moves, and which it resets instead, None where that is nobody."""
+    running = phase == RUNNING
+    if mask is None and running.all():
+        return running, None
+    moving, waiting = divided(settings, lanes, chosen_lanes(mask, lanes))
+    return (
+        running if isinstance(moving, slice) else moving.numpy(),
+        None if waiting is None else waiting.numpy(),
+    )
+
+
+def _moved(
+    model: DynamicsModel,
+    move: ArraySteps,
+    settings: VirtualSettings,
+    lanes: LaneState,
+    u: NDArray[np.floating[Any]],
+    moving: Bools,
+    deviations: bool,
+) -> ArrayTransition:
+    """The move of the moving lanes, in their order."""
+    q, process = lanes.q.numpy(), None
+    if settings.process_noise:
+        process = normal_noise(lanes, Purpose.PROCESS, 1, len(model.definition.outputs) - 1)[:, 0].numpy()
+    if not moving.all():
+        q, u, process = q[moving], u[moving], None if process is None else process[moving]
+    wanted = deviations or settings.trust is not None
+    return move(
+        np.ascontiguousarray(q),
+        np.ascontiguousarray(u),
+        None if process is None else np.ascontiguousarray(process),
+        deviations=wanted,
+        reward_deviation=wanted or settings.penalty > 0,
+    )
+
+
+def _concluded(
+    model: DynamicsModel, settings: VirtualSettings, moving: Bools, moved: ArrayTransition, changed: _Changed
+) -> int:
+    """Take the moving lanes on; how many of them ended."""
+    trust, limit = settings.trust, settings.time_limit
+    scales = np.zeros(0) if trust is None else model.scales.numpy()
+    return conclude(
+        moving,
+        moved.q_next,
+        moved.reward,
+        moved.deviation,
+        moved.terminated,
+        scales,
+        model.terminal_reward,
+        settings.penalty,
+        np.inf if trust is None else trust,
+        -1 if limit is None else limit,
+        changed.q,
+        changed.elapsed,
+        changed.phase,
+        changed.rewards,
+        changed.ends,
+    )
+
+
+def _begin(
+    definition: EnvironmentDefinition, settings: VirtualSettings, lanes: LaneState, chosen: Bools, changed: _Changed
+) -> None:
+    """New episodes in the chosen lanes."""
+    at = torch.from_numpy(chosen)
+    fresh = lanes.take(at)
+    fresh = replace(fresh, episode=fresh.episode + 1, elapsed=torch.zeros_like(fresh.elapsed))
+    changed.q[chosen] = start_coordinates(definition, fresh, settings.start_box).numpy()
+    changed.episode[chosen] += 1
+    changed.elapsed[chosen] = 0
+    changed.phase[chosen] = RUNNING
+
+
+def _observed(steps: ArraySteps, q: Floats) -> Singles:
+    observation = np.empty((len(q), len(steps.definition.observation_names)), dtype=np.float32)
+    if len(q):
+        observe(*_observation_tables(steps), q, observation)
+    return observation
+
+
+@lru_cache(maxsize=MODELS)
+def _observation_tables(steps: ArraySteps) -> Tables:
+    return tables_of(steps.definition.observe)
+
+
+def _scattered(moving: Bools, values: Floats) -> Floats:
+    """Values of the moving lanes among all N, zero elsewhere."""
+    if moving.all():
+        return values
+    full: Floats = np.zeros((len(moving), *values.shape[1:]))
+    full[moving] = values
+    return full

@@ -1,0 +1,54 @@
+"""A step of N lanes, in the form that the session chose when it was opened."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+from surrogym_server.models.abilities import ArraySteps, CompiledSteps, offers
+from surrogym_server.models.port import DynamicsModel
+from surrogym_server.virtual import environment
+from surrogym_server.virtual.environment import Bools, Floats, LaneTransition, VirtualSettings
+from surrogym_server.virtual.lanes import LaneState
+
+logger = logging.getLogger(__name__)
+
+COMPILED_VARIANTS = ("deterministic",)
+
+
+def in_fastest_form(settings: VirtualSettings, model: DynamicsModel) -> VirtualSettings:
+    """Settings of a session that opens: its steps are compiled wherever they can be."""
+    try:
+        return replace(settings, compiled=_array_steps(model, replace(settings, compiled=True)) is not None)
+    except Exception:  # of numba or of its compiler, on a platform where they don't work
+        logger.warning("steps can't be compiled here, so they are computed by torch", exc_info=True)
+        return settings
+
+
+def step(
+    model: DynamicsModel,
+    settings: VirtualSettings,
+    lanes: LaneState,
+    u: Floats,
+    mask: Bools | None = None,
+    deviations: bool = False,
+) -> tuple[LaneState, LaneTransition]:
+    """Step all lanes, or those of the mask (N,), under u (N, F), the model's actions.
+
+    Raises:
+        InvalidInput: a mask of another length.
+        NotReset: a lane that was never reset, or that ended under autoreset disabled.
+    """
+    move = _array_steps(model, settings)
+    if move is None:
+        return environment.step(model, settings, lanes, u, mask, deviations)
+    from surrogym_server.virtual.compiled.step import compiled_step
+
+    return compiled_step(model, move, settings, lanes, u, mask, deviations)
+
+
+def _array_steps(model: DynamicsModel, settings: VirtualSettings) -> ArraySteps | None:
+    if not settings.compiled or settings.variant not in COMPILED_VARIANTS:
+        return None
+    able = offers(model, CompiledSteps)
+    return None if able is None else able.compiled()

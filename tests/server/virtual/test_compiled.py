@@ -1,0 +1,143 @@
+"""Compiled steps agree with those of torch, on every kind of environment and settings, and torch steps where there are
+none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from support.models import gaussian_processes
+from support.real_steps import random_steps
+from surrogym_client.original.classic import acrobot, cartpole, pendulum
+from surrogym_client.original.swingup import swing_up
+from surrogym_server import compiled
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.errors import NotReset
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
+from surrogym_server.testing.cases import model_cases
+from surrogym_server.virtual import LaneState, LaneTransition, VirtualSettings, create, in_fastest_form, reset, step
+from surrogym_shared.spec import EnvironmentSpec
+
+needs_numba = pytest.mark.skipif(not compiled.available(), reason="numba is not installed, or switched off")
+LANES, STEPS = 7, 5
+CHOICES: dict[str, dict[str, Any]] = {
+    "mean": {},
+    "penalty, same step": {"penalty": 3.0, "autoreset_mode": "same_step", "time_limit": 3},
+    "noise, trust, box": {"process_noise": True, "trust": 0.05, "start_box": 0.5, "time_limit": 2},
+}
+
+
+def paper(spec: EnvironmentSpec) -> EnvironmentSpec:
+    return spec.model_copy(update={"design": spec.design.model_copy(update={"preset": "paper"})})
+
+
+ENVIRONMENTS: dict[str, Callable[[], EnvironmentSpec]] = {
+    "cart-pole": cartpole,
+    "acrobot": acrobot,
+    "swing-up": swing_up,
+    "paper": lambda: paper(pendulum()),
+    "learned ending": lambda: cartpole().model_copy(update={"termination": "learned"}),
+}
+CASES = {f"case: {case}": case for case in model_cases("gaussian_process")}
+
+
+@pytest.fixture(scope="module", params=[*CASES, *ENVIRONMENTS])
+def model(request: pytest.FixtureRequest) -> GaussianProcessModel:
+    if request.param in CASES:
+        case = CASES[request.param]
+        return gaussian_processes(case.definition, case.samples)
+    spec = ENVIRONMENTS[request.param]()
+    return gaussian_processes(definition_from_spec(spec), random_steps(spec, 20, seed=0))
+
+
+def compiled_settings(model: GaussianProcessModel, **chosen: Any) -> VirtualSettings:
+    settings = in_fastest_form(VirtualSettings(LANES, **chosen), model)
+    assert settings.compiled
+    return settings
+
+
+def actions(model: GaussianProcessModel, rng: np.random.Generator) -> np.ndarray:
+    action = model.definition.action
+    if action.nvec:
+        return rng.integers(action.nvec, size=(LANES, action.size)).astype(float)
+    return rng.uniform(*action.limits, (LANES, action.size))
+
+
+def require_agreement(one: tuple[LaneState, LaneTransition], other: tuple[LaneState, LaneTransition]) -> None:
+    """Flags and counts are the same, numbers to 1e-8 of the largest; variances near 0 lose half of their digits."""
+    for ours, theirs in zip(one, other, strict=True):
+        for field in fields(ours):
+            a, b = getattr(ours, field.name), getattr(theirs, field.name)
+            assert (a is None) == (b is None), field.name
+            if a is None:
+                continue
+            a, b = np.asarray(a), np.asarray(b)
+            assert (a.dtype, a.shape) == (b.dtype, b.shape), field.name
+            tolerance = 2e-6 if field.name == "deviation" or a.dtype == np.float32 else 1e-8
+            np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance, err_msg=field.name)
+
+
+@needs_numba
+@pytest.mark.parametrize("choice", CHOICES)
+def test_compiled_steps_agree_with_torch(model, choice):
+    settings, rng = compiled_settings(model, **CHOICES[choice]), np.random.default_rng(0)
+    lanes, _ = reset(model.definition, settings, create(model.definition, settings, 0))
+    for count in range(STEPS):
+        u = actions(model, rng)
+        made = step(model, settings, lanes, u, deviations=count % 2 == 1)
+        require_agreement(made, step(model, replace(settings, compiled=False), lanes, u, deviations=count % 2 == 1))
+        lanes = made[0]
+
+
+@needs_numba
+def test_compiled_steps_of_masked_lanes_agree_with_torch(model):
+    settings, rng = compiled_settings(model, time_limit=2), np.random.default_rng(0)
+    lanes, _ = reset(model.definition, settings, create(model.definition, settings, 0))
+    for _ in range(STEPS):
+        u, mask = actions(model, rng), rng.random(LANES) < 0.6
+        made = step(model, settings, lanes, u, mask)
+        require_agreement(made, step(model, replace(settings, compiled=False), lanes, u, mask))
+        lanes = made[0]
+
+
+@needs_numba
+def test_compiled_steps_refuse_lanes_that_were_never_reset(model):
+    settings = compiled_settings(model)
+    with pytest.raises(NotReset):
+        step(model, settings, create(model.definition, settings, 0), actions(model, np.random.default_rng(0)))
+
+
+@needs_numba
+def test_compiled_steps_change_no_state_that_was_given(model):
+    settings = compiled_settings(model, autoreset_mode="same_step", time_limit=1)
+    lanes, _ = reset(model.definition, settings, create(model.definition, settings, 0))
+    before = {name: array.copy() for name, array in lanes.to_arrays().items()}
+    after, _ = step(model, settings, lanes, actions(model, np.random.default_rng(0)))
+    for name, array in lanes.to_arrays().items():
+        np.testing.assert_array_equal(array, before[name])
+    assert (after.episode == lanes.episode + 1).all()
+
+
+def test_session_without_numba_steps_by_torch(model, monkeypatch):
+    monkeypatch.setattr(compiled, "available", lambda: False)
+    fresh = replace(model)  # what it has compiled is not kept
+    settings = VirtualSettings(LANES)
+    assert in_fastest_form(settings, fresh) == settings
+    lanes, _ = reset(model.definition, settings, create(model.definition, settings, 0))
+    u = actions(model, np.random.default_rng(0))
+    ours, theirs = (step(fresh, chosen, lanes, u) for chosen in (replace(settings, compiled=True), settings))
+    for field in fields(LaneTransition):
+        np.testing.assert_array_equal(getattr(ours[1], field.name), getattr(theirs[1], field.name))
+
+
+def test_session_whose_model_fails_to_compile_steps_by_torch(model, monkeypatch, caplog):
+    def fails(_: GaussianProcessModel) -> None:
+        raise RuntimeError("no code for this processor")
+
+    monkeypatch.setattr(GaussianProcessModel, "compiled", fails)
+    assert not in_fastest_form(VirtualSettings(LANES), model).compiled
+    assert "computed by torch" in caplog.text
