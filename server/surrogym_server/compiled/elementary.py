@@ -8,11 +8,14 @@ compiled code would call for each entry, take five to ten times as long.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
+from numba import types
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from surrogym_server.compiled.jit import compiled
+from surrogym_server.compiled.jit import compiled, summing
 
 Floats = NDArray[np.float64]
 
@@ -26,49 +29,57 @@ RIGHT_ANGLE = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624
 LARGEST_ANGLE = 1e5  # beyond, the C library reduces the argument
 
 
+def _keep_bits(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return builder.bitcast(arguments[0], context.get_value_type(signature.return_type))
+
+
+def _bits_of(_: Any, _number: Any) -> Any:
+    return types.int64(types.float64), _keep_bits
+
+
+def _float_of(_: Any, _bits: Any) -> Any:
+    return types.float64(types.int64), _keep_bits
+
+
+bits_of: Any = intrinsic(_bits_of)  # of a float64, as an int64
+float_of: Any = intrinsic(_float_of)  # of 64 bits
+
+
 @compiled
 def exponential(x: Floats) -> None:
     """e^x in the place of x (n,), for x <= 709; below -708 it is about 1e-308."""
-    shifted = np.empty_like(x)
     for i in range(x.size):
         v = x[i] if x[i] > LEAST_EXPONENT else LEAST_EXPONENT
         t = v * PER_LOG2 + ROUNDING
-        shifted[i] = t
         k = t - ROUNDING
         r = (v - k * LOG2_HIGH) - k * LOG2_LOW
-        p = 1.6059043836821613e-10
-        p = p * r + 2.08767569878681e-09
-        p = p * r + 2.505210838544172e-08
-        p = p * r + 2.755731922398589e-07
-        p = p * r + 2.7557319223985893e-06
-        p = p * r + 2.48015873015873e-05
-        p = p * r + 1.984126984126984e-04
-        p = p * r + 1.388888888888889e-03
-        p = p * r + 8.333333333333333e-03
-        p = p * r + 4.1666666666666664e-02
-        p = p * r + 1.6666666666666666e-01
-        p = p * r + 0.5
+        # (e^r - 1 - r) / r^2 of |r| <= log(2) / 2, interpolated at Chebyshev nodes, to 1e-17
+        p = 2.510038549551032e-08
+        p = p * r + 2.7620088445409746e-07
+        p = p * r + 2.7557268459997064e-06
+        p = p * r + 2.4801521295954376e-05
+        p = p * r + 0.00019841269863053618
+        p = p * r + 0.0013888888917213717
+        p = p * r + 0.008333333333330062
+        p = p * r + 0.04166666666662413
+        p = p * r + 0.16666666666666669
+        p = p * r + 0.5000000000000001
         p = p * r + 1.0
-        x[i] = p * r + 1.0
-    bits, steps = x.view(np.int64), shifted.view(np.int64)
-    for i in range(x.size):
-        bits[i] += steps[i] << 52  # times 2^k
+        x[i] = float_of(bits_of(p * r + 1.0) + (bits_of(t) << 52))  # times 2^k
 
 
 @compiled
 def sine_and_cosine(x: Floats, sine: Floats, cosine: Floats) -> None:
     """sin x and cos x of x (n,), into arrays of the same size."""
-    shifted = np.empty_like(x)
-    largest = 0.0
+    large = False
     for i in range(x.size):
-        largest = max(largest, abs(x[i]))
-    if not largest < LARGEST_ANGLE:
+        large |= not abs(x[i]) < LARGEST_ANGLE
+    if large:
         for i in range(x.size):
             sine[i], cosine[i] = math.sin(x[i]), math.cos(x[i])
         return
     for i in range(x.size):
         t = x[i] * PER_RIGHT_ANGLE + ROUNDING
-        shifted[i] = t
         k = t - ROUNDING
         r = ((x[i] - k * RIGHT_ANGLE[0]) - k * RIGHT_ANGLE[1]) - k * RIGHT_ANGLE[2]
         z = r * r
@@ -84,14 +95,9 @@ def sine_and_cosine(x: Floats, sine: Floats, cosine: Floats) -> None:
         c = c * z + 2.48015872894767294178e-05
         c = c * z - 1.38888888888741095749e-03
         c = c * z + 4.16666666666666019037e-02
-        sine[i] = r + r * z * s
-        cosine[i] = 1.0 - (0.5 * z - z * z * c)
-    turns = shifted.view(np.int64)
-    for i in range(x.size):
-        quarter = turns[i]
-        s, c = sine[i], cosine[i]
-        odd = quarter & 1
-        first, second = (c if odd else s), (s if odd else c)
+        s, c = r + r * z * s, 1.0 - (0.5 * z - z * z * c)
+        quarter = bits_of(t)
+        first, second = (c, s) if quarter & 1 else (s, c)
         sine[i] = -first if quarter & 2 else first
         cosine[i] = -second if (quarter + 1) & 2 else second
 
@@ -103,3 +109,12 @@ def wrapped(angle: float) -> float:
     if not 0.0 <= turned < 2 * math.pi:
         turned %= 2 * math.pi
     return turned - math.pi
+
+
+@summing
+def dot(a: Floats, b: Floats) -> float:
+    """Sum of a_i b_i, (n,) each, in any order."""
+    total = 0.0
+    for i in range(len(a)):
+        total += a[i] * b[i]
+    return total

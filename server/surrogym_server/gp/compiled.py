@@ -9,10 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from surrogym_server.compiled.elementary import exponential
-from surrogym_server.compiled.jit import compiled, inlined
+from surrogym_server.compiled.elementary import dot, exponential, sine_and_cosine
+from surrogym_server.compiled.jit import inlined
 from surrogym_server.compiled.tables import TablesBuilder, matrix
 from surrogym_server.gp.kernel import to_mirror
+from surrogym_server.gp.pathwise import frequencies
 from surrogym_server.gp.posterior import Posterior
 
 Floats = NDArray[np.float64]
@@ -21,10 +22,13 @@ Ints = NDArray[np.int64]
 # Places of a process' matrices: its numbers (below); columns of x and inverse length scales (2, d); points in length
 # scales (n, d), then their mirror images; weights of them (1, S); coefficients of x, x^2 and of the prior variance's
 # x^2, x^4, of the mirror's exponent, and of the polynomial covariances with points (5 + 2 n, d); L (n, n).
-HEAD, INPUTS, POINTS, WEIGHTS, POLYNOMIALS, FACTOR = range(6)
+# The frequencies of drawn functions (d, S), of inputs in their own unit, of those that a reflection leaves and of those
+# that it turns.
+HEAD, INPUTS, POINTS, WEIGHTS, POLYNOMIALS, FACTOR, KEPT, TURNED = range(8)
 # Scale, constants of mean and prior variance, parity of a reflection or 0, signal variance, constant of the polynomial
-# covariance, whether there is any, and the number of points.
-SCALE, CENTRE, PRIOR, PARITY, SIGNAL, CONSTANT, POLYNOMIAL, COUNT = range(8)
+# covariance, whether there is any, the number of points, whether there is a linear and a quadratic part, and whether a
+# reflection turns every input.
+SCALE, CENTRE, PRIOR, PARITY, SIGNAL, CONSTANT, POLYNOMIAL, COUNT, LINES, SQUARES, TURNS_ALL = range(11)
 OF_MEAN, OF_PRIOR, OF_MIRROR, OF_POINTS = 0, 2, 4, 5  # rows of POLYNOMIALS
 
 
@@ -49,6 +53,9 @@ def add_process(
         polynomial.constant,
         hyper.has_polynomial,
         len(x),
+        hyper.linear_variance > 0,
+        hyper.quadratic_variance > 0,
+        reflection is not None and bool((reflection.signs < 0).all()),
     )
     rows = [
         scale * (posterior.weights @ linear),
@@ -57,6 +64,8 @@ def add_process(
         polynomial.quadratic,
         mirror,
     ]
+    turns = torch.zeros_like(hyper.lengthscale) if reflection is None else (1 - reflection.signs) / 2
+    waves = frequencies(x.shape[1], x.device) / hyper.lengthscale[:, None]
     return tables.add(
         head,
         [inputs, (1 / hyper.lengthscale).tolist()],
@@ -64,6 +73,8 @@ def add_process(
         scale * hyper.signal_variance * weights,
         torch.cat([torch.stack(rows), linear, squares]),
         posterior.factor,
+        waves * (1 - turns)[:, None],
+        waves * turns[:, None],
     )
 
 
@@ -78,15 +89,17 @@ def _smooth(own: Floats, inverse: Floats, points: Floats) -> Floats:
     smooth = np.zeros((len(points), lanes))
     for i in range(len(points)):
         j = 0
-        while j + 1 < size:
+        while j + 3 < size:
             for b in range(lanes):
-                one, other = scaled[j, b] - points[i, j], scaled[j + 1, b] - points[i, j + 1]
-                smooth[i, b] -= 0.5 * (one * one + other * other)
-            j += 2
-        if j < size:
+                first, second = scaled[j, b] - points[i, j], scaled[j + 1, b] - points[i, j + 1]
+                third, fourth = scaled[j + 2, b] - points[i, j + 2], scaled[j + 3, b] - points[i, j + 3]
+                smooth[i, b] -= 0.5 * (first * first + second * second + third * third + fourth * fourth)
+            j += 4
+        while j < size:
             for b in range(lanes):
-                one = scaled[j, b] - points[i, j]
-                smooth[i, b] -= 0.5 * one * one
+                difference = scaled[j, b] - points[i, j]
+                smooth[i, b] -= 0.5 * difference * difference
+            j += 1
     exponential(smooth.reshape(smooth.size))
     return smooth
 
@@ -119,14 +132,15 @@ def _explain(factor: Floats, k: Floats) -> None:
     lanes = k.shape[1]
     for i in range(len(factor)):
         j = 0
-        while j + 1 < i:
-            one, other = factor[i, j], factor[i, j + 1]
+        while j + 3 < i:
+            first, second, third, fourth = factor[i, j], factor[i, j + 1], factor[i, j + 2], factor[i, j + 3]
             for b in range(lanes):
-                k[i, b] -= one * k[j, b] + other * k[j + 1, b]
-            j += 2
-        if j < i:
+                k[i, b] -= first * k[j, b] + second * k[j + 1, b] + third * k[j + 2, b] + fourth * k[j + 3, b]
+            j += 4
+        while j < i:
             for b in range(lanes):
                 k[i, b] -= factor[i, j] * k[j, b]
+            j += 1
         pivot = 1 / factor[i, i]
         for b in range(lanes):
             k[i, b] *= pivot
@@ -157,9 +171,58 @@ def _deviation(head: Floats, rows: Floats, own: Floats, explained: Floats, devia
         deviation[b] = head[0, SCALE] * np.sqrt(max(deviation[b], 0.0))
 
 
-@compiled
-def predict(numbers: Floats, places: Ints, at: int, x: Floats, wanted: bool, mean: Floats, deviation: Floats) -> None:
-    """Mean and, if wanted, latent deviation at inputs x (d, B), in the output's unit: into (B,) each."""
+@inlined
+def _add_residuals(
+    head: Floats, rows: Floats, kept: Floats, turned: Floats, own: Floats, k: Floats, paths: Floats, mean: Floats
+) -> None:
+    """Add to the mean (B,) how far drawn functions, the first columns of paths (B, W), are from it."""
+    (size, count), parity, scale = kept.shape, head[0, PARITY], head[0, SCALE]
+    straight, mirrored = np.empty(count), np.empty(count)
+    sine, cosine = np.empty(count), np.empty(count)
+    for b in range(len(mean)):
+        for s in range(count):
+            straight[s] = mirrored[s] = 0.0
+        for j in range(size):
+            for s in range(count):
+                straight[s] += own[j, b] * kept[j, s]
+                mirrored[s] += own[j, b] * turned[j, s]
+        for s in range(count):
+            stays, changes = straight[s], mirrored[s]
+            straight[s], mirrored[s] = stays + changes, stays - changes
+        sine_and_cosine(straight, sine, cosine)
+        amplitude = np.sqrt(head[0, SIGNAL] / count)
+        total = dot(cosine, paths[b, :count]) + dot(sine, paths[b, count : 2 * count])
+        if parity != 0:
+            if head[0, TURNS_ALL]:  # cos(-a) = cos(a), sin(-a) = -sin(a)
+                total += parity * (dot(cosine, paths[b, :count]) - dot(sine, paths[b, count : 2 * count]))
+            else:
+                sine_and_cosine(mirrored, sine, cosine)
+                total += parity * (dot(cosine, paths[b, :count]) + dot(sine, paths[b, count : 2 * count]))
+            amplitude /= np.sqrt(2.0)
+        total *= amplitude
+        at = 2 * count
+        if head[0, LINES]:
+            total += np.sqrt(head[0, CONSTANT]) * paths[b, at]
+            for j in range(size):
+                total += np.sqrt(rows[OF_PRIOR, j]) * own[j, b] * paths[b, at + 1 + j]
+            at += 1 + size
+        if head[0, SQUARES]:
+            for j in range(size):
+                total += np.sqrt(rows[OF_PRIOR + 1, j]) * own[j, b] * own[j, b] * paths[b, at + j]
+            at += size
+        for i in range(len(k)):
+            total += k[i, b] * paths[b, at + i]
+        mean[b] += scale * total
+
+
+@inlined
+def predict(
+    numbers: Floats, places: Ints, at: int, x: Floats, wanted: bool, paths: Floats, mean: Floats, deviation: Floats
+) -> None:
+    """Mean and, if wanted, latent deviation at inputs x (d, B), in the output's unit: into (B,) each.
+
+    With ``paths`` (B, W) the value of a drawn function, one a column of x, takes the place of the mean.
+    """
     head, inputs = matrix(numbers, places, at + HEAD), matrix(numbers, places, at + INPUTS)
     points, weights = matrix(numbers, places, at + POINTS), matrix(numbers, places, at + WEIGHTS)
     rows = matrix(numbers, places, at + POLYNOMIALS)
@@ -177,7 +240,12 @@ def predict(numbers: Floats, places: Ints, at: int, x: Floats, wanted: bool, mea
     for i in range(len(points)):
         for b in range(lanes):
             mean[b] += weights[0, i] * smooth[i, b]
+    if not wanted and not len(paths):
+        return
+    k = _covariances(head, rows, own, smooth)
+    if len(paths):
+        kept, turned = matrix(numbers, places, at + KEPT), matrix(numbers, places, at + TURNED)
+        _add_residuals(head, rows, kept, turned, own, k, paths, mean)
     if wanted:
-        k = _covariances(head, rows, own, smooth)
         _explain(matrix(numbers, places, at + FACTOR), k)
         _deviation(head, rows, own, k, deviation)

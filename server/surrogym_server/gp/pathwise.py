@@ -88,13 +88,13 @@ class Pathwise:
     def _waves(self, x: Tensor) -> Tensor:
         """Random Fourier features of the squared exponential at x (m, d), (m, 2 S)."""
         hyper = self.posterior.hyper
-        phase = (x / hyper.lengthscale) @ _frequencies(x.shape[1], x.device)
+        phase = (x / hyper.lengthscale) @ frequencies(x.shape[1], x.device)
         return math.sqrt(hyper.signal_variance / FREQUENCIES) * torch.cat([phase.cos(), phase.sin()], 1)
 
 
 @cache
 @torch.inference_mode(False)
-def _frequencies(d: int, device: torch.device) -> Tensor:
+def frequencies(d: int, device: torch.device) -> Tensor:
     """Frequencies (d, S) of the squared exponential in length scales: standard normal, the same for ever."""
     drawn = np.random.Generator(np.random.Philox(key=d)).standard_normal((d, FREQUENCIES))
     return torch.from_numpy(drawn).to(device)

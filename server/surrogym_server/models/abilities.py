@@ -183,9 +183,17 @@ class ArraySteps(ABC):
 
     @abstractmethod
     def __call__(
-        self, q: Floats, u: Floats, process: Floats | None, *, deviations: bool, reward_deviation: bool
+        self,
+        q: Floats,
+        u: Floats,
+        *,
+        process: Floats | None,
+        paths: Floats | None,
+        deviations: bool,
+        reward_deviation: bool,
     ) -> ArrayTransition:
-        """The step from q (m, C) under u (m, F), both in rows; arguments as those of ``transition``."""
+        """The step from q (m, C) under u (m, F), in rows; arguments as those of ``transition``, and ``paths``
+        (m, W) as in ``transition_along``, for a family that draws functions."""
 
 
 class CompiledSteps(ABC):

@@ -5,15 +5,13 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
-from surrogym_server.models.abilities import ArraySteps, CompiledSteps, offers
+from surrogym_server.models.abilities import ArraySteps, CompiledSteps, FunctionDraws, offers
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual import environment
 from surrogym_server.virtual.environment import Bools, Floats, LaneTransition, VirtualSettings
 from surrogym_server.virtual.lanes import LaneState
 
 logger = logging.getLogger(__name__)
-
-COMPILED_VARIANTS = ("deterministic",)
 
 
 def in_fastest_form(settings: VirtualSettings, model: DynamicsModel) -> VirtualSettings:
@@ -48,7 +46,9 @@ def step(
 
 
 def _array_steps(model: DynamicsModel, settings: VirtualSettings) -> ArraySteps | None:
-    if not settings.compiled or settings.variant not in COMPILED_VARIANTS:
+    if not settings.compiled or settings.variant == "probabilistic":
+        return None
+    if settings.variant == "pathwise" and offers(model, FunctionDraws) is None:
         return None
     able = offers(model, CompiledSteps)
     return None if able is None else able.compiled()

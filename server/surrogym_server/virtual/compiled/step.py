@@ -22,6 +22,7 @@ from surrogym_server.virtual.compiled.outcome import conclude, observe
 from surrogym_server.virtual.environment import LaneTransition, VirtualSettings, chosen_lanes, divided
 from surrogym_server.virtual.lanes import RUNNING, LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
+from surrogym_server.virtual.paths import with_paths
 from surrogym_server.virtual.start import start_coordinates
 
 Floats = NDArray[np.float64]
@@ -67,6 +68,8 @@ def compiled_step(
     """As ``virtual.environment.step``, where ``move`` are the model's compiled steps."""
     definition, changed = model.definition, _Changed.of(lanes)
     moving, beginning = _divided(settings, lanes, changed.phase, mask)
+    if settings.variant == "pathwise":
+        lanes = _with_paths(model, lanes, moving)
     moved = _moved(model, move, settings, lanes, u, moving, deviations)
     ended = _concluded(model, settings, moving, moved, changed)
     final_lanes = NO_LANES
@@ -104,6 +107,13 @@ def _divided(
     )
 
 
+def _with_paths(model: DynamicsModel, lanes: LaneState, moving: Bools) -> LaneState:
+    if moving.all():
+        return with_paths(model, lanes)
+    at = torch.from_numpy(moving)
+    return lanes.put(at, with_paths(model, lanes.take(at)))
+
+
 def _moved(
     model: DynamicsModel,
     move: ArraySteps,
@@ -114,19 +124,21 @@ def _moved(
     deviations: bool,
 ) -> ArrayTransition:
     """The move of the moving lanes, in their order."""
-    q, process = lanes.q.numpy(), None
+    wanted, process = deviations or settings.trust is not None, None
     if settings.process_noise:
         process = normal_noise(lanes, Purpose.PROCESS, 1, len(model.definition.outputs) - 1)[:, 0].numpy()
-    if not moving.all():
-        q, u, process = q[moving], u[moving], None if process is None else process[moving]
-    wanted = deviations or settings.trust is not None
     return move(
-        np.ascontiguousarray(q),
-        np.ascontiguousarray(u),
-        None if process is None else np.ascontiguousarray(process),
+        _rows(moving, lanes.q.numpy()),
+        _rows(moving, u),
+        process=None if process is None else _rows(moving, process),
+        paths=_rows(moving, lanes.path.numpy()) if settings.variant == "pathwise" else None,
         deviations=wanted,
         reward_deviation=wanted or settings.penalty > 0,
     )
+
+
+def _rows(moving: Bools, values: NDArray[Any]) -> NDArray[Any]:
+    return np.ascontiguousarray(values if moving.all() else values[moving])
 
 
 def _concluded(

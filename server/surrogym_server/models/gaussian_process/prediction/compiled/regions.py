@@ -6,18 +6,29 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numba import types
 from numpy.typing import NDArray
 
-from surrogym_server.compiled.jit import compiled, inlined
+from surrogym_server.compiled.jit import compiled, entry, inlined
 from surrogym_server.compiled.tables import TablesBuilder, matrix
 from surrogym_server.environment.compiled.features import add_features, encode
 from surrogym_server.environment.compiled.terms import add_terms, evaluate
 from surrogym_server.environment.features import Encoder
 from surrogym_server.gp.compiled import add_process, predict
+from surrogym_server.models.gaussian_process.prediction.compiled.layout import (
+    BLOCK,
+    ENDING,
+    HEAD,
+    JUMPS,
+    NONE,
+    OBSERVE,
+    READS_AFTER,
+)
 from surrogym_server.models.gaussian_process.prediction.regions import Classifier, Jump, Region, Thresholds
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 # Of each form: its weight, whether it is a classifier, and the places of what it reads: axes, cuts and rules and
 # whether it is a complement, or features, process and number of features (a process of -1 is a constant).
@@ -86,7 +97,7 @@ def _classified(
     encode(numbers, places, features, observe, raw, size, x, 0, width)
     mean, deviation = np.zeros(lanes), np.zeros(lanes)
     if process >= 0:
-        predict(numbers, places, process, x, True, mean, deviation)
+        predict(numbers, places, process, x, True, np.empty((0, 0)), mean, deviation)
     else:
         mean[:] = matrix(numbers, places, -process - 1)[0, 0]
     for b in range(lanes):
@@ -132,3 +143,49 @@ def add_jumped(
                 if inside[b] > 0.5:
                     reward[b] += size
                 free[b] = inside[b] <= 0.5
+
+
+@entry(
+    types.float64[::1],
+    types.int64[:, ::1],
+    types.float64[:, ::1],
+    types.float64[:, ::1],
+    types.int64,
+    types.boolean,
+    types.float64[::1],
+    types.float64[:, ::1],
+    types.boolean[::1],
+)
+def judge(
+    numbers: Floats,
+    places: Ints,
+    q: Floats,
+    q_next: Floats,
+    actions: int,
+    reward_deviation: bool,
+    reward: Floats,
+    deviation: Floats,
+    terminated: Bools,
+) -> None:
+    """What learned regions add to steps from q to q_next (N, C): jumps to ``reward`` (N,) and to its deviation, the
+    last column of ``deviation`` (N, O), and learned ends to ``terminated`` (N,). ``actions`` is F."""
+    head = matrix(numbers, places, HEAD)
+    observe = int(head[0, OBSERVE])
+    for begin in range(0, len(q), BLOCK):
+        lanes, size = min(BLOCK, len(q) - begin), q.shape[1]
+        state, arrived = np.empty((size, lanes)), np.empty((size, lanes))
+        for b in range(lanes):
+            for c in range(size):
+                arrived[c, b] = q_next[begin + b, c]
+                state[c, b] = arrived[c, b] if head[0, READS_AFTER] else q[begin + b, c]
+        pay, variance = np.zeros(lanes), np.zeros(lanes)
+        add_jumped(numbers, places, int(head[0, JUMPS]), observe, state, actions, pay, variance)
+        for b in range(lanes):
+            reward[begin + b] += pay[b]
+            if reward_deviation:
+                known = deviation[begin + b, -1]
+                deviation[begin + b, -1] = np.sqrt(known * known + variance[b])
+        if head[0, ENDING] != NONE:
+            inside = probability(numbers, places, int(head[0, ENDING]), observe, arrived, actions)
+            for b in range(lanes):
+                terminated[begin + b] = inside[b] > 0.5

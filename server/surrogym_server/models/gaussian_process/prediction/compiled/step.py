@@ -10,7 +10,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from surrogym_server.compiled.jit import compiled, entry, inlined
+from surrogym_server.compiled.jit import entry, inlined
 from surrogym_server.compiled.tables import Tables, TablesBuilder, matrix
 from surrogym_server.environment.compiled.features import add_features, encode
 from surrogym_server.environment.compiled.reward import add_declared, add_reward
@@ -20,11 +20,30 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import leading
 from surrogym_server.gp.compiled import add_process, predict
 from surrogym_server.models.abilities import ArraySteps, ArrayTransition
-from surrogym_server.models.gaussian_process.prediction.compiled.regions import (
-    add_jumped,
-    add_jumps,
-    add_region,
-    probability,
+from surrogym_server.models.gaussian_process.prediction.compiled.layout import (
+    AFTER_FEATURES,
+    AFTER_WIDTH,
+    BLOCK,
+    CONDITIONS,
+    DECLARED,
+    ENDING,
+    ENTRIES,
+    FEATURES,
+    HAS_STAGE,
+    HEAD,
+    INVERSE,
+    JUMPS,
+    LEAD,
+    LEADS,
+    LED_WIDTH,
+    MOVES_OBSERVATION,
+    NONE,
+    OBSERVE,
+    OUTPUTS,
+    PROCESSES,
+    READS_AFTER,
+    RULES,
+    WIDTH,
 )
 from surrogym_server.models.gaussian_process.prediction.predictor import Predictor
 from surrogym_server.models.gaussian_process.prediction.regions import Region
@@ -33,38 +52,16 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-BLOCK = 32  # lanes computed at once: what is held of them stays in the first cache
-
-# Numbers of the head, and places of what is read: all in the matrix HEAD.
-HEAD = 0
-(
-    OBSERVE,
-    FEATURES,
-    WIDTH,
-    LED_WIDTH,
-    AFTER_FEATURES,
-    AFTER_WIDTH,
-    OUTPUTS,
-    PROCESSES,
-    LEAD,
-    RULES,
-    INVERSE,
-    MOVES_OBSERVATION,
-    READS_AFTER,
-    DECLARED,
-    JUMPS,
-    CONDITIONS,
-    ENDING,
-) = range(17)
-CENTRE, NOISE, STAGE = range(3)  # of each column of outputs: constant, deviation of its noise, and when it is predicted
-NONE = -1
+CENTRE, NOISE, STAGE = range(3)  # of each column of outputs: constant, deviation of its noise, and its stage
+FIRST, LED, AFTER = range(3)  # stages: what reads (q, u), what reads the lead too, what reads the next state
+STAGES = 3
 
 
 def tables_of(predictor: Predictor, ending: Region | None) -> Tables:
     """All that ``step`` reads of a model and its environment."""
     definition, tables = predictor.definition, TablesBuilder()
     place = tables.reserve()
-    head = dict.fromkeys(range(17), float(NONE))
+    head = dict.fromkeys(range(ENTRIES), float(NONE))
     first, second, after = predictor._groups
     head[OBSERVE] = add_terms(tables, definition.observe)
     head[FEATURES] = add_features(tables, definition, first.encoder)
@@ -74,25 +71,31 @@ def tables_of(predictor: Predictor, ending: Region | None) -> Tables:
         head[AFTER_FEATURES] = add_features(tables, definition, after.encoder)
         head[AFTER_WIDTH] = after.encoder.width(lead=False)
     head[OUTPUTS], head[PROCESSES] = _add_outputs(tables, predictor)
-    head[LEAD] = tables.add(leading(definition) if second is not None else ())
+    lead = leading(definition) if second is not None else ()
+    head[LEAD], head[LEADS] = tables.add(lead), len(lead)
+    for stage, group in enumerate((first, second, after)):
+        head[HAS_STAGE + stage] = group is not None
     head[RULES] = add_rules(tables, definition)
     head[INVERSE] = add_inverse(tables, predictor._inverse)
     head[MOVES_OBSERVATION] = definition.moves_observation
     head[READS_AFTER] = predictor.reward.feature_map.after
     if definition.declared_reward is not None:
         head[DECLARED] = add_reward(tables, definition.declared_reward)
-    head[JUMPS] = add_jumps(tables, predictor.jumps)
-    if ending is not None:
-        head[ENDING] = add_region(tables, ending)
-    elif definition.termination_groups:
+    if definition.termination_groups:
         head[CONDITIONS] = add_conditions(tables, definition._termination)
-    tables.fill(place, [head[i] for i in range(17)])
+    if ending is not None or predictor.jumps:
+        from surrogym_server.models.gaussian_process.prediction.compiled.regions import add_jumps, add_region
+
+        head[JUMPS] = add_jumps(tables, predictor.jumps)
+        head[ENDING] = NONE if ending is None else add_region(tables, ending)
+    tables.fill(place, [head[i] for i in range(ENTRIES)])
     return tables.build()
 
 
 def _add_outputs(tables: TablesBuilder, predictor: Predictor) -> tuple[int, int]:
     """Put columns of outputs, and processes by stage; gives their places."""
     rows, processes = np.zeros((predictor._reward_column + 1, 3)), []
+    begins = {one.column: one.span.start for group in predictor._groups if group for one in group.drawn}
     places = (*predictor._columns, predictor._reward_column)
     for number, output in enumerate((*predictor.transitions, predictor.reward)):
         stage = 2 if output.feature_map.after else int(output.feature_map.lead)
@@ -105,43 +108,38 @@ def _add_outputs(tables: TablesBuilder, predictor: Predictor) -> tuple[int, int]
         rows[column] = 0.0, output.scale * math.sqrt(posterior.hyper.noise_variance), stage
         inputs = group.encoder.inputs(output.feature_map)
         place = add_process(tables, posterior, inputs, output.centre, output.scale)
-        processes.append((stage, column, number, place))
-    return tables.add(rows), tables.add(np.array(processes).reshape(-1, 4))
+        processes.append((stage, column, number, place, begins[column]))
+    return tables.add(rows), tables.add(np.array(processes).reshape(-1, 5))
 
 
 @inlined
-def _predict_changes(
-    numbers: Floats,
-    places: Ints,
-    head: Floats,
-    raw: Floats,
-    size: int,
-    process: Floats,
-    deviations: bool,
-    reward_deviation: bool,
-    mean: Floats,
-    spread: Floats,
+def _encode_stage(
+    numbers: Floats, places: Ints, head: Floats, stage: int, raw: Floats, arrived: Floats, mean: Floats, x: Floats
 ) -> None:
-    """Changes, and a reward that reads the state before, (columns, B), and deviations (O, B); the lead is put behind
-    the actions of raw (C + F + L, B)."""
-    features, observe = int(head[0, FEATURES]), int(head[0, OBSERVE])
-    width, led_width = int(head[0, WIDTH]), int(head[0, LED_WIDTH])
-    x = np.empty((led_width, raw.shape[1]))
-    encode(numbers, places, features, observe, raw, size, x, 0, width)
-    _predict_stage(numbers, places, head, 0, x, process, deviations, reward_deviation, mean, spread)
-    if led_width == width:
-        return
-    lead, rules = matrix(numbers, places, int(head[0, LEAD])), matrix(numbers, places, int(head[0, RULES]))
-    first = len(raw) - lead.shape[1]
-    for i in range(lead.shape[1]):
-        c = int(lead[0, i])
-        for b in range(raw.shape[1]):
-            raw[first + i, b] = clipped(rules, c, raw[c, b] + mean[c, b])
-    encode(numbers, places, features, observe, raw, size, x, width, led_width)
-    _predict_stage(numbers, places, head, 1, x, process, deviations, reward_deviation, mean, spread)
+    """Put the features that a stage reads beyond those of the stage before into x (d, B).
+
+    The first reads coordinates and actions of raw (C + F + L, B), the second the lead too, which is put behind them,
+    the third where the step arrived (C, B), which takes the place of the coordinates.
+    """
+    size, lanes, observe = len(arrived), raw.shape[1], int(head[0, OBSERVE])
+    width, begin, end = int(head[0, WIDTH]), 0, int(head[0, WIDTH])
+    features = int(head[0, AFTER_FEATURES if stage == AFTER else FEATURES])
+    if stage == LED:
+        lead, rules = matrix(numbers, places, int(head[0, LEAD])), matrix(numbers, places, int(head[0, RULES]))
+        first, begin, end = len(raw) - lead.shape[1], width, int(head[0, LED_WIDTH])
+        for i in range(lead.shape[1]):
+            c = int(lead[0, i])
+            for b in range(lanes):
+                raw[first + i, b] = clipped(rules, c, raw[c, b] + mean[c, b])
+    elif stage == AFTER:
+        end = int(head[0, AFTER_WIDTH])
+        for c in range(size):
+            for b in range(lanes):
+                raw[c, b] = arrived[c, b]
+    encode(numbers, places, features, observe, raw, size, x, begin, end)
 
 
-@compiled
+@inlined
 def _predict_stage(
     numbers: Floats,
     places: Ints,
@@ -149,6 +147,7 @@ def _predict_stage(
     stage: int,
     x: Floats,
     process: Floats,
+    paths: Floats,
     deviations: bool,
     reward_deviation: bool,
     mean: Floats,
@@ -166,83 +165,38 @@ def _predict_stage(
             continue
         column, number = int(processes[p, 1]), int(processes[p, 2])
         wanted = reward_deviation if number == last else deviations
-        predict(numbers, places, int(processes[p, 3]), x, wanted, mean[column], spread[number])
+        drawn = paths[:, int(processes[p, 4]) :]
+        predict(numbers, places, int(processes[p, 3]), x, wanted, drawn, mean[column], spread[number])
         if number < last and len(process):
             for b in range(x.shape[1]):
                 mean[column, b] += columns[column, NOISE] * process[b, number]
 
 
 @inlined
-def _arrive(numbers: Floats, places: Ints, head: Floats, q: Floats, mean: Floats) -> Floats:
-    """Next coordinates of q (C, B) that change by mean (columns, B), (C, B)."""
-    arrived = np.empty_like(q)
-    for c in range(len(q)):
-        for b in range(q.shape[1]):
-            arrived[c, b] = q[c, b]
+def _arrive(numbers: Floats, places: Ints, head: Floats, raw: Floats, mean: Floats, arrived: Floats) -> None:
+    """Next coordinates (C, B) of those in raw, that change by mean (columns, B)."""
+    size, lanes = arrived.shape
+    for c in range(size):
+        for b in range(lanes):
+            arrived[c, b] = raw[c, b]
     if head[0, MOVES_OBSERVATION]:
-        observation = evaluate(numbers, places, int(head[0, OBSERVE]), q)
+        observation = evaluate(numbers, places, int(head[0, OBSERVE]), arrived)
         for d in range(len(observation)):
-            for b in range(q.shape[1]):
+            for b in range(lanes):
                 observation[d, b] += mean[d, b]
         recover(numbers, places, int(head[0, INVERSE]), observation, arrived)
     else:
-        for c in range(len(q)):
-            for b in range(q.shape[1]):
+        for c in range(size):
+            for b in range(lanes):
                 arrived[c, b] += mean[c, b]
     settle(matrix(numbers, places, int(head[0, RULES])), arrived)
-    return arrived
 
 
 @inlined
-def _pay(
-    numbers: Floats,
-    places: Ints,
-    head: Floats,
-    raw: Floats,
-    size: int,
-    actions: int,
-    arrived: Floats,
-    state: Floats,
-    reward_deviation: bool,
-    mean: Floats,
-    spread: Floats,
-) -> Floats:
-    """Rewards (B,); their deviation in the last row of ``spread`` is widened by doubtful edges."""
-    lanes = raw.shape[1]
-    observe, last = int(head[0, OBSERVE]), len(mean) - 1
-    none = np.empty((0, 0))
-    if head[0, READS_AFTER]:
-        after = np.empty((size + actions, lanes))
-        for b in range(lanes):
-            for c in range(size):
-                after[c, b] = arrived[c, b]
-            for f in range(size, size + actions):
-                after[f, b] = raw[f, b]
-        width = int(head[0, AFTER_WIDTH])
-        x = np.empty((width, lanes))
-        encode(numbers, places, int(head[0, AFTER_FEATURES]), observe, after, size, x, 0, width)
-        _predict_stage(numbers, places, head, 2, x, none, False, reward_deviation, mean, spread)
-    pay: Floats = mean[last]
-    if head[0, DECLARED] != NONE:
-        add_declared(numbers, places, int(head[0, DECLARED]), state, raw[size : size + actions], pay)
-    if len(matrix(numbers, places, int(head[0, JUMPS]))):
-        variance = np.zeros(lanes)
-        add_jumped(numbers, places, int(head[0, JUMPS]), observe, state, actions, pay, variance)
-        for b in range(lanes):
-            if reward_deviation:
-                spread[-1, b] = np.sqrt(spread[-1, b] * spread[-1, b] + variance[b])
-    return pay
-
-
-@inlined
-def _ended(numbers: Floats, places: Ints, head: Floats, arrived: Floats, actions: int) -> Bools:
-    """Whether episodes end at coordinates (C, B), (B,)."""
+def _ended(numbers: Floats, places: Ints, head: Floats, arrived: Floats) -> Bools:
+    """Whether episodes end at coordinates (C, B) as declared, (B,)."""
     over = np.zeros(arrived.shape[1], dtype=np.bool_)
-    if head[0, ENDING] != NONE:
-        inside = probability(numbers, places, int(head[0, ENDING]), int(head[0, OBSERVE]), arrived, actions)
-        for b in range(len(over)):
-            over[b] = inside[b] > 0.5
-    elif head[0, CONDITIONS] != NONE:
+    if head[0, CONDITIONS] != NONE:
         holds = holding(numbers, places, int(head[0, CONDITIONS]), arrived)
         for g in range(len(holds)):
             for b in range(len(over)):
@@ -253,6 +207,7 @@ def _ended(numbers: Floats, places: Ints, head: Floats, arrived: Floats, actions
 @entry(
     types.float64[::1],
     types.int64[:, ::1],
+    types.float64[:, ::1],
     types.float64[:, ::1],
     types.float64[:, ::1],
     types.float64[:, ::1],
@@ -269,6 +224,7 @@ def step(
     q: Floats,
     u: Floats,
     process: Floats,
+    paths: Floats,
     deviations: bool,
     reward_deviation: bool,
     q_next: Floats,
@@ -276,36 +232,46 @@ def step(
     deviation: Floats,
     terminated: Bools,
 ) -> None:
-    """Steps from q (N, C) under u (N, F), moved by ``process`` (N, M) deviations of the noise where it has rows, into
-    ``q_next`` (N, C), ``reward`` (N,), ``deviation`` (N, O) of what is asked for, and ``terminated`` (N,)."""
-    head = matrix(numbers, places, HEAD)
+    """Steps from q (N, C) under u (N, F).
+
+    They are moved by ``process`` (N, M) deviations of the noise, and follow the functions ``paths`` (N, W), where these
+    have rows. Results go into ``q_next`` (N, C), ``reward`` (N,), ``deviation`` (N, O), as far as it is asked for, and
+    ``terminated`` (N,).
+    """
+    head, size, actions = matrix(numbers, places, HEAD), q.shape[1], u.shape[1]
+    columns, leads = len(matrix(numbers, places, int(head[0, OUTPUTS]))), int(head[0, LEADS])
+    width = int(max(head[0, LED_WIDTH], head[0, AFTER_WIDTH]))
     for begin in range(0, len(q), BLOCK):
-        end = min(begin + BLOCK, len(q))
-        lanes, size, actions = end - begin, q.shape[1], u.shape[1]
-        lead = matrix(numbers, places, int(head[0, LEAD]))
-        raw = np.empty((size + actions + lead.shape[1], lanes))
+        lanes = min(BLOCK, len(q) - begin)
+        raw, arrived = np.empty((size + actions + leads, lanes)), np.empty((size, lanes))
         for b in range(lanes):
             for c in range(size):
                 raw[c, b] = q[begin + b, c]
             for f in range(actions):
                 raw[size + f, b] = u[begin + b, f]
-        columns = matrix(numbers, places, int(head[0, OUTPUTS]))
-        mean, spread = np.zeros((len(columns), lanes)), np.zeros((deviation.shape[1], lanes))
-        shake = process[begin:end] if len(process) else process
-        _predict_changes(numbers, places, head, raw, size, shake, deviations, reward_deviation, mean, spread)
-        arrived = _arrive(numbers, places, head, raw[:size], mean)
-        state = arrived if head[0, READS_AFTER] else raw[:size]
-        pay = _pay(numbers, places, head, raw, size, actions, arrived, state, reward_deviation, mean, spread)
-        over = _ended(numbers, places, head, arrived, actions)
+        mean, spread = np.zeros((columns, lanes)), np.zeros((deviation.shape[1], lanes))
+        x, shake, drawn = np.empty((width, lanes)), process[begin : begin + lanes], paths[begin : begin + lanes]
+        for stage in range(STAGES):
+            if stage == AFTER:
+                _arrive(numbers, places, head, raw, mean, arrived)
+            if head[0, HAS_STAGE + stage]:
+                _encode_stage(numbers, places, head, stage, raw, arrived, mean, x)
+                _predict_stage(
+                    numbers, places, head, stage, x, shake, drawn, deviations, reward_deviation, mean, spread
+                )
+        if head[0, DECLARED] != NONE:
+            state, pushed = raw[:size], raw[size : size + actions]
+            add_declared(numbers, places, int(head[0, DECLARED]), state, pushed, mean[columns - 1])
+        over = _ended(numbers, places, head, arrived)
         for b in range(lanes):
             for c in range(size):
                 q_next[begin + b, c] = arrived[c, b]
             for o in range(len(spread)):
                 deviation[begin + b, o] = spread[o, b]
-            reward[begin + b], terminated[begin + b] = pay[b], over[b]
+            reward[begin + b], terminated[begin + b] = mean[columns - 1, b], over[b]
 
 
-NO_PROCESS = np.zeros((0, 0))
+NO_ROWS = np.zeros((0, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,14 +281,23 @@ class StepsOfModel(ArraySteps):
     definition: EnvironmentDefinition
     tables: Tables
     outputs: int
+    has_regions: bool  # where episodes end or the reward jumps, learned
 
     @classmethod
     def of(cls, predictor: Predictor, ending: Region | None) -> Self:
         """``ending`` is where episodes end, if that is learned."""
-        return cls(predictor.definition, tables_of(predictor, ending), len(predictor.transitions) + 1)
+        regions = ending is not None or bool(predictor.jumps)
+        return cls(predictor.definition, tables_of(predictor, ending), len(predictor.transitions) + 1, regions)
 
     def __call__(
-        self, q: Floats, u: Floats, process: Floats | None, *, deviations: bool, reward_deviation: bool
+        self,
+        q: Floats,
+        u: Floats,
+        *,
+        process: Floats | None,
+        paths: Floats | None,
+        deviations: bool,
+        reward_deviation: bool,
     ) -> ArrayTransition:
         count = len(q)
         moved = ArrayTransition(
@@ -332,7 +307,8 @@ class StepsOfModel(ArraySteps):
             *self.tables,
             q,
             u,
-            NO_PROCESS if process is None else process,
+            NO_ROWS if process is None else process,
+            NO_ROWS if paths is None else paths,
             deviations,
             reward_deviation,
             moved.q_next,
@@ -340,4 +316,17 @@ class StepsOfModel(ArraySteps):
             moved.deviation,
             moved.terminated,
         )
+        if self.has_regions:
+            from surrogym_server.models.gaussian_process.prediction.compiled.regions import judge
+
+            judge(
+                *self.tables,
+                q,
+                moved.q_next,
+                u.shape[1],
+                reward_deviation,
+                moved.reward,
+                moved.deviation,
+                moved.terminated,
+            )
         return moved
