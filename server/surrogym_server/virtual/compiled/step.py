@@ -20,7 +20,7 @@ from surrogym_server.models.abilities import ArraySteps, ArrayTransition
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual.compiled.outcome import conclude, observe
 from surrogym_server.virtual.environment import LaneTransition, VirtualSettings, chosen_lanes, divided
-from surrogym_server.virtual.lanes import RUNNING, LaneState
+from surrogym_server.virtual.lanes import EVERY, RUNNING, Chosen, LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
 from surrogym_server.virtual.paths import with_paths
 from surrogym_server.virtual.start import start_coordinates
@@ -67,17 +67,17 @@ def compiled_step(
 ) -> tuple[LaneState, LaneTransition]:
     """As ``virtual.environment.step``, where ``move`` are the model's compiled steps."""
     definition, changed = model.definition, _Changed.of(lanes)
-    moving, beginning = _divided(settings, lanes, changed.phase, mask)
+    running, moving, beginning = _divided(settings, lanes, changed.phase, mask)
     if settings.variant == "pathwise":
-        lanes = _with_paths(model, lanes, moving)
+        lanes = lanes.put(moving, with_paths(model, lanes.take(moving)))
     moved = _moved(model, move, settings, lanes, u, moving, deviations)
-    ended = _concluded(model, settings, moving, moved, changed)
+    ended = _concluded(model, settings, running, moved, changed)
     final_lanes = NO_LANES
     if settings.autoreset_mode == "same_step":
         beginning = changed.ends[3]
         final_lanes = beginning.nonzero()[0] if ended else NO_LANES
-    final_observation = _observed(move, changed.q[final_lanes])
-    if beginning is not None and beginning.any():
+    final_observation = _observed(move, changed.q[final_lanes] if ended else changed.q[:0])
+    if beginning is not None and (ended or settings.autoreset_mode != "same_step"):
         _begin(definition, settings, lanes, beginning, changed)
     return changed.lanes(lanes), LaneTransition(
         observation=_observed(move, changed.q),
@@ -88,30 +88,21 @@ def compiled_step(
         final_observation=final_observation,
         reset_lanes=np.zeros(len(changed.phase), dtype=bool) if beginning is None else beginning,
         reward_mean=changed.rewards[1],
-        deviation=_scattered(moving, moved.deviation) if deviations else None,
+        deviation=_scattered(running, moved.deviation) if deviations else None,
         untrusted=None if settings.trust is None else changed.ends[2],
     )
 
 
 def _divided(
     settings: VirtualSettings, lanes: LaneState, phase: NDArray[np.int8], mask: Bools | None
-) -> tuple[Bools, Bools | None]:
-    """Which lanes (N,) this step moves, and which it resets instead, None where that is nobody."""
+) -> tuple[Bools, Chosen, Bools | None]:
+    """Which lanes (N,) this step moves, twice, and which it resets instead, None where that is nobody."""
     running = phase == RUNNING
     if mask is None and running.all():
-        return running, None
+        return running, EVERY, None
     moving, waiting = divided(settings, lanes, chosen_lanes(mask, lanes))
-    return (
-        running if isinstance(moving, slice) else moving.numpy(),
-        None if waiting is None else waiting.numpy(),
-    )
-
-
-def _with_paths(model: DynamicsModel, lanes: LaneState, moving: Bools) -> LaneState:
-    if moving.all():
-        return with_paths(model, lanes)
-    at = torch.from_numpy(moving)
-    return lanes.put(at, with_paths(model, lanes.take(at)))
+    moved = running if isinstance(moving, slice) else moving.numpy()
+    return moved, moving, None if waiting is None else waiting.numpy()
 
 
 def _moved(
@@ -120,7 +111,7 @@ def _moved(
     settings: VirtualSettings,
     lanes: LaneState,
     u: NDArray[np.floating[Any]],
-    moving: Bools,
+    moving: Chosen,
     deviations: bool,
 ) -> ArrayTransition:
     """The move of the moving lanes, in their order."""
@@ -137,8 +128,8 @@ def _moved(
     )
 
 
-def _rows(moving: Bools, values: NDArray[Any]) -> NDArray[Any]:
-    return np.ascontiguousarray(values if moving.all() else values[moving])
+def _rows(moving: Chosen, values: NDArray[Any]) -> NDArray[Any]:
+    return np.ascontiguousarray(values if isinstance(moving, slice) else values[moving.numpy()])
 
 
 def _concluded(
@@ -193,7 +184,7 @@ def _observation_tables(steps: ArraySteps) -> Tables:
 
 def _scattered(moving: Bools, values: Floats) -> Floats:
     """Values of the moving lanes among all N, zero elsewhere."""
-    if moving.all():
+    if len(values) == len(moving):
         return values
     full: Floats = np.zeros((len(moving), *values.shape[1:]))
     full[moving] = values
