@@ -39,6 +39,7 @@ from surrogym_server.api.state import Services
 from surrogym_server.api.turns import Turns
 from surrogym_server.convert import definition_from_spec, stored_definition
 from surrogym_server.convert.stored import read_stored
+from surrogym_server.engine.compiling import Compiling
 from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
 from surrogym_server.engine.fits import Fits
 from surrogym_server.engine.models import ModelCache
@@ -91,6 +92,7 @@ class State(TypedDict):
 @dataclass(frozen=True)
 class _Engine:
     fits: Fits
+    compiling: Compiling
     live: LiveSessions
     threads: tuple[ThreadPoolExecutor, ...]
     notices: Notices
@@ -165,11 +167,12 @@ async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: 
         for name, why in registry.broken.items():
             logger.warning("the %s %r is left out: %s", registry.kind, name, why)
     engine.fits.start()
+    compiling = asyncio.to_thread(engine.compiling.start)
     restored = services.sessions.restore()
     if restored:
         logger.info("sessions that came back: %d", restored)
     looking = asyncio.to_thread(_name_lacking, definitions)
-    tasks = [asyncio.create_task(work) for work in (services.designer.run(), sweeper.run(), looking)]
+    tasks = [asyncio.create_task(work) for work in (services.designer.run(), sweeper.run(), looking, compiling)]
     try:
         yield {"services": services}
     finally:
@@ -181,6 +184,7 @@ async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: 
         for threads in engine.threads:
             threads.shutdown()
         await asyncio.to_thread(engine.fits.close)
+        engine.compiling.close()
         logger.info("sessions saved: %d", services.sessions.save())
         storage.close()
 
@@ -194,7 +198,7 @@ def _build_engine(settings: Settings, design: DesignPort) -> _Engine:
         limits=Limits(settings.max_sessions, settings.max_sessions_mib * MEBIBYTE, settings.max_waiting),
         idle_seconds=settings.session_idle_seconds,
     )
-    return _Engine(Fits(design.run), live, (for_steps, for_rollouts), Notices())
+    return _Engine(Fits(design.run), Compiling(), live, (for_steps, for_rollouts), Notices())
 
 
 def _build_services(
@@ -230,7 +234,14 @@ def _build_services(
         samples=SampleService(storage, definitions, engine.notices, samplers),
         models=ModelService(storage, definitions, cache, engine.notices),
         sessions=SessionService(
-            storage, definitions, cache, engine.live, settings.max_lanes, metrics, torch.device(settings.device)
+            storage,
+            definitions,
+            cache,
+            engine.live,
+            settings.max_lanes,
+            metrics,
+            torch.device(settings.device),
+            engine.compiling.wait,
         ),
         designer=designer,
         events=EventService(storage, engine.notices),

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
-import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from numba import njit
 from numba.core import config
+from numba.core.errors import NumbaError
+
+from surrogym_server.compiled import kept
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -43,41 +43,18 @@ def entry(*arguments: Any) -> Callable[[F], F]:
 
     def compile_or_load(function: F) -> F:
         chosen: dict[str, Any] = {"fastmath": {"contract"}, **OPTIONS}
-        folder = _folder()
+        folder = kept.folder()
         if folder is not None:
             try:
                 with _kept_in(folder):
                     return cast(F, njit([arguments], cache=True, **chosen)(function))
+            except NumbaError:
+                raise  # it would fail again
             except Exception as error:  # numba reads its files with pickle, and writes them where it may
                 logger.warning("compiled steps can't be kept in %s, so they are compiled again: %s", folder, error)
         return cast(F, njit([arguments], **chosen)(function))
 
     return compile_or_load
-
-
-@cache
-def _folder() -> Path | None:
-    """Where compiled functions are kept, one folder for each version of their sources; None where nothing can be.
-
-    Numba reads its files with pickle, so the folder has to be the user's own.
-    """
-    chosen = settings.CACHE_DIR or os.environ.get("XDG_CACHE_HOME")
-    try:
-        folder = Path(chosen) if chosen else Path.home() / ".cache"
-        folder = folder / "surrogym" / _digest_of_sources()
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        state = folder.stat()
-        own = not hasattr(os, "getuid") or (state.st_uid == os.getuid() and not state.st_mode & 0o022)
-        return folder if own and os.access(folder, os.W_OK) else None
-    except (OSError, RuntimeError):  # no home, or a read-only one
-        return None
-
-
-def _digest_of_sources() -> str:
-    """Of all compiled files: numba looks at the file of the function that is called alone."""
-    root = Path(__file__).parents[1]
-    files = sorted({*root.glob("**/compiled/*.py"), *root.glob("**/compiled.py")})
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
 
 
 @contextmanager

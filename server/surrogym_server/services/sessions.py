@@ -7,7 +7,7 @@ import copy
 import logging
 import secrets
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -78,8 +78,13 @@ class SessionService:
         max_lanes: int,
         metrics: ProcessMetrics,
         device: torch.device = CPU,
+        compiled: Callable[[], None] = lambda: None,
     ) -> None:
-        """``device`` is where sessions are stepped; what comes in and goes out is not on it."""
+        """
+        Args:
+            device: where sessions are stepped; what comes in and goes out is not on it.
+            compiled: waits until steps that are being compiled are; called in a thread.
+        """
         self._storage = storage
         self._definitions = definitions
         self._models = models
@@ -87,6 +92,7 @@ class SessionService:
         self._max_lanes = max_lanes
         self._metrics = metrics
         self._device = device
+        self._compiled = compiled
         self._tallies = Tallies()
         self._opening = asyncio.Lock()
         self._deadline: float | None = None
@@ -266,6 +272,7 @@ class SessionService:
         latest = self._models.refresh(id)
         version = latest if opening.model == "latest" else opening.model
         model = self._models.get(id, version, self._device)
+        self._compiled()
         return open_session(
             secrets.token_urlsafe(SESSION_ID_BYTES),
             surrogate,

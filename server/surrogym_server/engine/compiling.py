@@ -1,0 +1,46 @@
+"""Steps are compiled before the first session asks, in another process: numba would hold up the threads of this one."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from contextlib import suppress
+
+from surrogym_server import compiled
+from surrogym_server.compiled import kept
+
+PROGRAM = """
+import os
+if hasattr(os, "nice"):
+    os.nice(10)
+import surrogym_server.models.gaussian_process.prediction.compiled.regions
+import surrogym_server.models.gaussian_process.prediction.compiled.step
+import surrogym_server.virtual.compiled.step
+"""
+LONGEST = 120.0  # seconds that a session waits for it; then it compiles for itself
+
+
+class Compiling:
+    """A process that compiles steps, while there is any."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Begin, where steps can be compiled and kept on disk, and an earlier process has not done so."""
+        if self._process is None and compiled.available() and kept.folder() is not None and not kept.has_any():
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", PROGRAM], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+            )
+
+    def wait(self) -> None:
+        """Until it has ended, well or not. In a thread."""
+        if self._process is not None:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(LONGEST)
+
+    def close(self) -> None:
+        """End it."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()

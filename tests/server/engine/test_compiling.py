@@ -1,0 +1,47 @@
+"""A server compiles steps ahead where nothing is kept yet, and only there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from surrogym_server import compiled
+from surrogym_server.compiled import kept
+from surrogym_server.engine import compiling
+from surrogym_server.engine.compiling import Compiling
+
+pytestmark = pytest.mark.skipif(not compiled.available(), reason="numba is not installed, or switched off")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder in the place of the user's."""
+    monkeypatch.setattr(kept, "folder", lambda: tmp_path)
+    return tmp_path
+
+
+def test_first_server_compiles_in_a_process_of_its_own(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    done = folder / "done"
+    monkeypatch.setattr(compiling, "PROGRAM", f"open({str(done)!r}, 'w').close()")
+    ahead = Compiling()
+    ahead.start()
+    ahead.wait()
+    assert done.exists()
+    ahead.close()
+
+
+def test_later_server_starts_no_process(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(compiling.subprocess, "Popen", lambda *_, **__: pytest.fail("nothing is left to compile"))
+    (folder / "step").mkdir()
+    (folder / "step" / "step.nbi").touch()
+    Compiling().start()
+
+
+def test_server_that_closes_ends_the_process(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(compiling, "PROGRAM", "import time; time.sleep(600)")
+    ahead = Compiling()
+    ahead.start()
+    ahead.close()
+    assert ahead._process is not None
+    assert ahead._process.poll() is not None
