@@ -19,6 +19,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
+import pytest
 from common import MICROSECONDS, Call, figures, parser, ratio, started, take_turns, timed, write
 from servers import TRIVIAL
 from websockets.sync.client import connect
@@ -29,6 +30,7 @@ from surrogym_client.transport import Api, HttpSurrogate, Transport
 from surrogym_client.transport.connection import Connection, Retries
 from surrogym_client.transport.step_codecs import BinaryForm, Form, JsonForm
 from surrogym_client.transport.stream import Stream
+from surrogym_server import local
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.models.files import from_bytes
@@ -107,9 +109,12 @@ def measure(subjects: dict[str, Call], beside: Callable[[str], str | None], quic
     return measured
 
 
-def stepping(port: SurrogatePort, lanes: int) -> Call:
-    """Steps of a new session."""
-    session = port.open(OpenSession(num_envs=lanes, seed=0)).id
+def stepping(port: SurrogatePort, lanes: int, *, compiled: bool = True, **chosen: Any) -> Call:
+    """Steps of a new session, by torch where they are not to be compiled."""
+    with pytest.MonkeyPatch.context() as patch:
+        if not compiled:
+            patch.setattr(local, "in_fastest_form", lambda settings, _: settings)
+        session = port.open(OpenSession(num_envs=lanes, seed=0, **chosen)).id
     port.reset(session)
     action = np.random.default_rng(0).uniform(-2, 2, (lanes, 1)).astype(np.float32)
     return lambda: port.step(session, action)
@@ -193,6 +198,22 @@ def throughput(url: str, lanes: int, quick: bool) -> Measured:
         return measure(subjects, lambda _: "in process", quick)
 
 
+FORMS: dict[str, dict[str, Any]] = {
+    "mean": {},
+    "penalty": {"penalty": 3.0},
+    "drawn": {"variant": "pathwise"},
+}
+
+
+def forms(url: str, lanes: int, quick: bool) -> Measured:
+    """Steps in this process: compiled, and by torch."""
+    port, subjects = in_process(url), {}
+    for name, chosen in FORMS.items():
+        subjects[f"{name}, torch"] = stepping(port, lanes, compiled=False, **chosen)
+        subjects[f"{name}, compiled"] = stepping(port, lanes, compiled=True, **chosen)
+    return measure(subjects, lambda name: name.replace("compiled", "torch"), quick)
+
+
 READY = "echo, WebSocket library"
 BESIDE = {"stream": "echo, WebSocket", "binary": "echo, HTTP", "json": "echo, HTTP JSON"}
 
@@ -209,11 +230,17 @@ def show_throughput(lanes: int, measured: Measured) -> None:
     print(f"{lanes:6} " + "".join(f"{name} {rate:12,.0f}   " for name, rate in per_second.items()) + f"{share:6.1%}")
 
 
+def show_forms(lanes: int, measured: Measured) -> None:
+    for name in FORMS:
+        ours, theirs = measured[f"{name}, compiled"], measured[f"{name}, torch"]
+        print(f"{lanes:6} {name:26}{theirs['p50']:10.0f}{ours['p50']:10.0f}{ours['ratio']:12.2f}")
+
+
 def main() -> None:
     made = parser(__doc__)
     made.add_argument("--lanes", type=int, nargs="*", choices=LANES, default=LANES)
     options = started(made)
-    report: dict[str, Any] = {"round_trip_us": {}, "step_us": {}}
+    report: dict[str, Any] = {"round_trip_us": {}, "step_us": {}, "forms_us": {}}
     with echo_server() as echo, surrogym_server() as url:
         print(f"{'N':>6} {'round trip':26}{'p50 us':>10}{'p99 us':>10}{'to echo':>12}{'to library':>12}")
         for lanes in options.lanes:
@@ -223,6 +250,10 @@ def main() -> None:
         for lanes in options.lanes:
             report["step_us"][lanes] = throughput(url, lanes, options.quick)
             show_throughput(lanes, report["step_us"][lanes])
+        print(f"\n{'N':>6} {'step in process, p50 us':26}{'torch':>10}{'compiled':>10}{'ratio':>12}")
+        for lanes in options.lanes:
+            report["forms_us"][lanes] = forms(url, lanes, options.quick)
+            show_forms(lanes, report["forms_us"][lanes])
     write(options.out, "step", report)
 
 

@@ -207,6 +207,10 @@ class CompiledSteps(ABC):
         """The model's compiled steps; None where this installation can't compile them, or the model is on another
         device. The first call in a process loads compiled code, the first on a machine compiles it."""
 
+    @abstractmethod
+    def compiled_pays(self, *, deviations: bool) -> bool:
+        """Whether compiled steps are faster, with deviations in every step or without."""
+
 
 class Differentiable:
     """Nothing to call: ``transition`` can be differentiated by autograd with respect to q and u.

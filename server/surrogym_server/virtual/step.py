@@ -15,7 +15,10 @@ logger = logging.getLogger(__name__)
 
 
 def in_fastest_form(settings: VirtualSettings, model: DynamicsModel) -> VirtualSettings:
-    """Settings of a session that opens: its steps are compiled wherever they can be."""
+    """Settings of a session that opens: its steps are compiled where they can be and where that is faster."""
+    able, deviations = offers(model, CompiledSteps), settings.penalty > 0 or settings.trust is not None
+    if able is None or not able.compiled_pays(deviations=deviations):
+        return settings
     try:
         return replace(settings, compiled=_array_steps(model, replace(settings, compiled=True)) is not None)
     except Exception:  # of numba or of its compiler, on a platform where they don't work

@@ -17,6 +17,7 @@ from surrogym_client.original.swingup import swing_up
 from surrogym_server import compiled
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import NotReset
+from surrogym_server.models.gaussian_process import model as gaussian_process_model
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.testing.cases import model_cases
 from surrogym_server.virtual import LaneState, LaneTransition, VirtualSettings, create, in_fastest_form, reset, step
@@ -142,3 +143,11 @@ def test_session_whose_model_fails_to_compile_steps_by_torch(model, monkeypatch,
     monkeypatch.setattr(GaussianProcessModel, "compiled", fails)
     assert not in_fastest_form(VirtualSettings(LANES), model).compiled
     assert "computed by torch" in caplog.text
+
+
+def test_deviations_of_many_points_are_left_to_torch(monkeypatch):
+    case = CASES["case: learned reward"]
+    model = gaussian_processes(case.definition, case.samples)
+    monkeypatch.setattr(gaussian_process_model, "COMPILED_SOLVES", len(case.samples.q) - 1)
+    assert not in_fastest_form(VirtualSettings(LANES, penalty=1.0), model).compiled
+    assert in_fastest_form(VirtualSettings(LANES), model).compiled == compiled.available()

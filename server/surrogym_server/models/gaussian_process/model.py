@@ -41,6 +41,8 @@ from surrogym_server.models.gaussian_process.prediction.regions import Jump, Reg
 from surrogym_server.models.port import DynamicsModel, Transition
 from surrogym_server.tensors import CPU, cached
 
+COMPILED_SOLVES = 300  # points; the triangular solves of more are faster in a library of linear algebra
+
 
 @dataclass(frozen=True)
 class GaussianProcessModel(
@@ -160,6 +162,10 @@ class GaussianProcessModel(
 
     def compiled(self) -> ArraySteps | None:
         return self._compiled
+
+    def compiled_pays(self, *, deviations: bool) -> bool:
+        points = max((len(o.posterior.x) for o in self.outputs if o.posterior is not None), default=0)
+        return not deviations or points <= COMPILED_SOLVES
 
     def _learns(self, column: int, q_next: Tensor) -> Tensor:
         """Which samples that end at q_next (m, C) an output would learn from, (m,) bool."""
