@@ -28,7 +28,13 @@ LANES, STEPS = 7, 5
 CHOICES: dict[str, dict[str, Any]] = {
     "mean": {},
     "penalty, same step": {"penalty": 3.0, "autoreset_mode": "same_step", "time_limit": 3},
-    "drawn functions": {"variant": "pathwise", "penalty": 1.0, "autoreset_mode": "same_step", "time_limit": 3},
+    "drawn functions": {
+        "variant": "pathwise",
+        "functions": 3,
+        "penalty": 1.0,
+        "autoreset_mode": "same_step",
+        "time_limit": 3,
+    },
     "noise, trust, box": {"process_noise": True, "trust": 0.05, "start_box": 0.5, "time_limit": 2},
 }
 

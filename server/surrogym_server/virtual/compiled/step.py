@@ -69,7 +69,7 @@ def compiled_step(
     definition, changed = model.definition, _Changed.of(lanes)
     running, moving, beginning = _divided(settings, lanes, changed.phase, mask)
     if settings.variant == "pathwise":
-        lanes = lanes.put(moving, with_paths(model, lanes.take(moving)))
+        lanes = lanes.put(moving, with_paths(model, lanes.take(moving), settings.functions))
     moved = _moved(model, move, settings, lanes, u, moving, deviations)
     ended = _concluded(model, settings, running, moved, changed)
     final_lanes = NO_LANES
