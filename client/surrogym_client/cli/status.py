@@ -21,7 +21,7 @@ Form = Literal["json", "short", "words"]
 
 FIDELITY = (
     *("output", "confidence", "as in the paper", "tolerance", "coverage"),
-    *("leave-one-out error", "within 1 deviation", "within 2"),
+    *("leave-one-out error", "within 1 deviation", "within 2", "noise"),
 )
 
 
@@ -160,5 +160,5 @@ def _hint(view: SurrogateView) -> str | None:
 def _judged(output: OutputFidelity) -> tuple[str | float | None, ...]:
     return (
         *(output.name, output.confidence_index, output.confidence_index_paper, output.tolerance, output.coverage),
-        *(output.leave_one_out_error, output.leave_one_out_within_one, output.leave_one_out_within_two),
+        *(output.leave_one_out_error, output.leave_one_out_within_one, output.leave_one_out_within_two, output.noise),
     )

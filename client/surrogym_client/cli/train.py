@@ -108,9 +108,14 @@ class SessionOptions:
     spread: Annotated[
         float | None, typer.Option(help="First deviation of particles, as a share of the range. [default: 0.01]")
     ] = None
-    process_noise: Annotated[bool, typer.Option("--process-noise", help="Let the learned noise move the state.")] = (
-        False
-    )
+    process_noise: Annotated[
+        bool,
+        typer.Option(
+            "--process-noise",
+            help="Let the learned noise move the state. [default: where repeated real steps confirm noise]",
+            show_default=False,
+        ),
+    ] = False
     trust: Annotated[
         float | None,
         typer.Option(

@@ -36,6 +36,7 @@ FIDELITY = {
     "leave-one-out error": "leave_one_out_error",
     "within 1 deviation": "leave_one_out_within_one",
     "within 2": "leave_one_out_within_two",
+    "noise": "noise",
 }
 LEDGER = ("initial", "adaptive", "manual", "total", "audit", "logged", "evaluation", "unresolved")
 

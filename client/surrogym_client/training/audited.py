@@ -89,12 +89,13 @@ class AuditedTraining:
 
     @property
     def _chosen(self) -> TrainSettings:
-        return chosen_for(self.api.surrogate(self.name), self.settings)
+        by_mean = search_for(self.settings).by_mean
+        return chosen_for(self.api.surrogate(self.name), self.settings, by_mean=by_mean)
 
     def _subject(self, result: TrainResult) -> Subject:
         predict, settings = load_policy(result.path, result.algorithm), self.settings
-        session = dict(settings.session)
-        return Subject(self.api, self.name, self.port, predict, session, result.untrained, settings.seed)
+        session = chosen_for(self.api.surrogate(self.name), settings).judging
+        return Subject(self.api, self.name, self.port, predict, dict(session), result.untrained, settings.seed)
 
     def _asked_more(self, result: TrainResult, taken: int, number: int) -> bool:
         """Spend what the budget has left where the policy goes. Whether real steps of the budget were taken since they

@@ -154,7 +154,7 @@ class ClosedLoop:
 def _for_use(view: SurrogateView, settings: TrainSettings, *, region_known: bool) -> TrainSettings:
     """Settings of the last training, whose policy is used. It goes on from the policy whose region is known; where none
     is, it begins anew by draws, as a network that has learned from wrong models stays with what these taught it."""
-    last = chosen_for(view, settings)
+    last = chosen_for(view, settings, by_mean=search_for(settings).by_mean)
     anew = last is not settings and settings.start_from is None and not region_known
     return replace(last, anew=anew)
 

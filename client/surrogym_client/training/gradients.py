@@ -39,6 +39,7 @@ class Gradients(PolicySearch):
 
     suggested_steps = 1_843_200  # 200 updates on Pendulum
     resumable = False
+    by_mean = True
 
     def search(self, task: SearchTask) -> Found:
         _require_plain(task)

@@ -91,6 +91,7 @@ class PolicySearch(ABC):
     most_steps: ClassVar[int | None] = MAX_STEPS  # None: no bound, as for a search whose steps are cheap
     prolongable: ClassVar[bool] = False  # heeds ``task.prolong``
     tracked: ClassVar[bool] = False  # logs its curves to ``settings.tracker``
+    by_mean: ClassVar[bool] = False  # it follows the mean without noise, whatever the session
     resumable: ClassVar[bool] = True  # can start from a policy, and so learn in rounds
 
     @abstractmethod

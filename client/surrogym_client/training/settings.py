@@ -62,15 +62,26 @@ class TrainSettings:
         return self.session if self.judge is None else self.judge
 
 
-def chosen_for(view: SurrogateView, settings: TrainSettings) -> TrainSettings:
+def chosen_for(view: SurrogateView, settings: TrainSettings, *, by_mean: bool = False) -> TrainSettings:
     """The settings for a policy that is to be used, by what its surrogate's design came to.
 
-    Where that is not ready the policy learns on draws, a state a lane (TS1 of Chua et al. 2018): what relies on the
-    mean where the model is unsure fails in the original environment. Policies are compared by functions of the
-    posterior: draws shake a lane out of a state in which the policy would leave it for good. Who names a variant keeps
-    it, and preset ``paper`` has AUR-D.
+    Where repeated steps have shown that the original environment is noisy, the learned noise moves the lanes. Where the
+    design is not ready the policy learns on draws, a state a lane (TS1 of Chua et al. 2018): what relies on the mean
+    where the model is unsure fails in the original environment. Policies are compared by functions of the posterior:
+    draws shake a lane out of a state in which the policy would leave it for good. Who names a variant keeps it, and
+    preset ``paper`` has AUR-D.
+
+    Args:
+        view: the surrogate.
+        settings: what was asked for.
+        by_mean: the search follows the mean without noise, whatever the session.
     """
-    if "variant" in settings.session or view.phase == "ready" or view.spec.design.preset == "paper":
+    if view.spec.design.preset == "paper":
+        return settings
+    noisy = view.fidelity is not None and any(output.noise > 0 for output in view.fidelity.outputs)
+    if noisy and not by_mean:
+        settings = replace(settings, session={"process_noise": True, **settings.session})
+    if "variant" in settings.session or view.phase == "ready":
         return settings
     other = {name: value for name, value in settings.session.items() if name not in OF_PARTICLES}
     return replace(settings, session=DRAWS | settings.session, judge=FUNCTIONS | other)

@@ -81,6 +81,18 @@ class LeaveOneOut(ABC):
         """Of each output, (O,). One that never varied makes no error."""
 
 
+class LearnedNoise(ABC):
+    """The noise of a single step that the model has learned beside the function.
+
+    Fallback of ``sampling``: there is none, and no step is taken twice.
+    """
+
+    @property
+    @abstractmethod
+    def noise_deviations(self) -> tuple[float, ...]:
+        """Its deviation for each output, in the output's unit, (O,)."""
+
+
 class OutputOutlook(ABC):
     """One output at m candidates, in its own unit, as if some queries had been answered."""
 

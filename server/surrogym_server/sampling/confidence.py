@@ -27,6 +27,7 @@ class OutputConfidence:
     leave_one_out_error: float | None  # root mean square, in the output's unit; None where the family can't tell
     leave_one_out_within_one: float | None  # share of the samples within one predictive deviation
     leave_one_out_within_two: float | None
+    noise: float = 0.0  # established by repeated steps, in the output's unit
 
 
 def deviations(model: DynamicsModel, q: Tensor, u: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -23,6 +23,7 @@ from surrogym_server.sampling.candidates import Candidates, candidates_of
 from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
 from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
+from surrogym_server.sampling.noise import SLACK, established_noise, to_repeat, widened
 from surrogym_server.sampling.rollouts import Aim, first_rollouts, plan_round
 
 Verdict = Literal["continue", "ready", "over_budget", "from_log"]
@@ -117,7 +118,9 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     candidates, reserved = judged.candidates, judged.reserved
     chosen, rollouts = candidates.points[:0], tuple[Tensor, ...]()
     if definition.max_rollout is None:
-        chosen = _choose(learned.model, samples, candidates, confidences, tolerances, verdict, request, reserved)
+        chosen = _repeated(learned.model, samples, usual, verdict, request)
+        if not len(chosen):
+            chosen = _choose(learned.model, samples, candidates, confidences, tolerances, verdict, request, reserved)
     else:
         rng = _rng(definition, f"rollouts {state.round}")
         rollouts = _plan(learned.model, samples, confidences, tolerances, verdict, request, rng, reserved is not None)
@@ -143,12 +146,15 @@ def judge_model(
 ) -> Judged:
     """Judge a model by the ``usual`` tolerances (O,), over which those of its definition go. Raises PluginFailed."""
     definition = model.definition
-    tolerances = definition.tolerances_over(usual)
+    with plugin_calls(definition):
+        noise = established_noise(model, samples, definition.tolerances_over(usual))
+    tolerances = widened(definition.tolerances_over(usual), noise)
     points = Points(*monte_carlo(definition))
     with plugin_calls(definition):
         deviation = deviations(model, points.q, points.u)
         require_deviations(model, deviation)
-        confidences = tuple(confidences_of(model, deviation, tolerances))
+        judged = confidences_of(model, deviation, tolerances)
+    confidences = tuple(replace(c, noise=float(w)) for c, w in zip(judged, noise, strict=True))
     candidates = candidates_of(model, points, request.states, _rng(definition, f"visited {round_}"))
     reserved = ending(model, samples, candidates.points)
     settled = reserved is None or not definition.learns_termination
@@ -199,7 +205,24 @@ def judge(
 
 
 def _agrees(confidence: OutputConfidence, tolerance: float) -> bool:
-    return confidence.leave_one_out_error is not None and confidence.leave_one_out_error <= tolerance
+    limit = SLACK * tolerance if confidence.noise else tolerance
+    return confidence.leave_one_out_error is not None and confidence.leave_one_out_error <= limit
+
+
+def _repeated(
+    model: DynamicsModel, samples: Samples, usual: Sequence[float], verdict: Verdict, request: Request
+) -> Points:
+    """Steps to take again, to tell noise from misfit: in the second half of a budget, where the model is not sure."""
+    none = Points(samples.q[:0], samples.u[:0])
+    design, spent = model.definition.design, len(samples) - request.free
+    if verdict != "continue" or design.stopping != "tested_confidence":
+        return none
+    if spent < max(request.budget / 2, 1.5 * design.initial):
+        return none
+    with plugin_calls(model.definition):
+        again = to_repeat(model, samples, model.definition.tolerances_over(usual))
+    room = max(0, request.budget - spent - len(request.pending))
+    return none if again is None else again[:room]
 
 
 def _choose(

@@ -11,6 +11,7 @@ from surrogym_server.environment.points import Points
 from surrogym_server.models.abilities import (
     Differentiable,
     FunctionDraws,
+    LearnedNoise,
     LeaveOneOut,
     Lookahead,
     PredictedSteps,
@@ -64,6 +65,13 @@ def leave_one_out_errors_are_there_for_every_output(case: ModelCase) -> None:
             assert math.isfinite(one.error)
             assert one.error >= 0
             assert 0 <= one.within_one <= one.within_two <= 1
+
+
+def learned_noise_is_there_for_every_output(case: ModelCase) -> None:
+    if (able := offers(case.model, LearnedNoise)) is not None:
+        deviations = able.noise_deviations
+        assert len(deviations) == len(case.definition.outputs)
+        assert all(math.isfinite(one) and one >= 0 for one in deviations)
 
 
 def an_outlook_begins_with_the_deviations_and_an_answer_lowers_them(case: ModelCase) -> None:
@@ -154,6 +162,7 @@ LAWS_OF_ABILITIES: tuple[Callable[[ModelCase], None], ...] = (
     drawn_functions_scatter_as_the_deviations_say,
     a_drawn_function_may_have_columns_beyond_its_own,
     leave_one_out_errors_are_there_for_every_output,
+    learned_noise_is_there_for_every_output,
     an_outlook_begins_with_the_deviations_and_an_answer_lowers_them,
     what_is_assumed_is_as_what_is_observed,
     paths_tell_more_the_longer_they_are,

@@ -48,6 +48,10 @@ class OutputFidelity(Reply):
         "where the deviations tell the truth; None where the error is, and for a model fitted before this was counted",
     )
     leave_one_out_within_two: float | None = Field(default=None, description="the same within two deviations: 0.95")
+    noise: float = Field(
+        default=0.0,
+        description="deviation of the noise of a single step that repeated steps confirm; it widens the tolerance",
+    )
 
 
 class Fidelity(Reply):

@@ -19,6 +19,7 @@ from surrogym_server.models.abilities import (
     CompiledSteps,
     Differentiable,
     FunctionDraws,
+    LearnedNoise,
     LeaveOneOut,
     LeaveOneOutErrors,
     Lookahead,
@@ -46,7 +47,7 @@ COMPILED_SOLVES = 300  # points; the triangular solves of more are faster in a l
 
 @dataclass(frozen=True)
 class GaussianProcessModel(
-    DynamicsModel, FunctionDraws, LeaveOneOut, Lookahead, RewardEdges, CompiledSteps, Differentiable
+    DynamicsModel, FunctionDraws, LeaveOneOut, LearnedNoise, Lookahead, RewardEdges, Differentiable, CompiledSteps
 ):
     """One process for each output; regions for what ends an episode, and for where the reward jumps."""
 
@@ -122,6 +123,10 @@ class GaussianProcessModel(
         reward_deviation: bool = False,
     ) -> Transition:
         return self._predictor.transition(q, u, None, process, paths, deviations, reward_deviation)
+
+    @property
+    def noise_deviations(self) -> tuple[float, ...]:
+        return tuple(output.noise_deviation for output in self.outputs)
 
     def leave_one_out(self) -> tuple[LeaveOneOutErrors, ...]:
         return tuple(output.leave_one_out() for output in self.outputs)

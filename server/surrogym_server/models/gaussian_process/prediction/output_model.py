@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -38,6 +39,11 @@ class OutputModel:
             return x.new_full(x.shape[:-1], self.centre), x.new_zeros(x.shape[:-1])
         mean, variance = self.posterior.mean_and_variance(x)
         return self.centre + self.scale * mean, self.scale * variance.sqrt()
+
+    @property
+    def noise_deviation(self) -> float:
+        """Deviation of the learned noise, in the output's unit."""
+        return 0.0 if self.posterior is None else self.scale * math.sqrt(self.posterior.hyper.noise_variance)
 
     def leave_one_out(self) -> LeaveOneOutErrors:
         """How the process without each sample in turn foretells it. One that never varied makes no error."""

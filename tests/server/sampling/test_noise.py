@@ -1,0 +1,117 @@
+"""Noise told from misfit: only a step that is taken again and differs shows that the environment is noisy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+
+from support.exact_models import ExactModel, exact_pendulum
+from surrogym_server.environment.points import Points
+from surrogym_server.environment.samples import Samples
+from surrogym_server.models.abilities import LearnedNoise
+from surrogym_server.sampling.design import DesignState, Request, advance
+from surrogym_server.sampling.noise import ENOUGH, established_noise, repeats, to_repeat, widened
+
+TOLERANCES = (0.01, 0.01, 0.01)
+
+
+@dataclass(frozen=True)
+class ClaimsNoise(ExactModel, LearnedNoise):
+    """It takes what it can't explain for noise."""
+
+    noise: tuple[float, ...] = (0.2, 0.0, 0.0)
+
+    @property
+    def noise_deviations(self) -> tuple[float, ...]:
+        return self.noise
+
+
+@pytest.fixture(scope="module")
+def model() -> ClaimsNoise:
+    exact = exact_pendulum()
+    return ClaimsNoise(exact.definition, exact.move, exact.pay)
+
+
+def samples(model: ExactModel, again: int, noise: float = 0.0, count: int = 8) -> Samples:
+    """Steps from random states, the first of which was taken ``again`` times more."""
+    rng = np.random.default_rng(0)
+    which = [*range(count), *([0] * again)]
+    q, u = torch.tensor(rng.uniform(-1, 1, (count, 2)))[which], torch.tensor(rng.uniform(-1, 1, (count, 1)))[which]
+    q_next = model.move(q, u)
+    q_next[:, 0] += noise * torch.tensor(rng.normal(size=len(q)))
+    return Samples(q, u, q_next, model.pay(q, u), torch.zeros(len(q), dtype=torch.bool))
+
+
+def test_deviations_of_repeated_steps_are_pooled(model: ClaimsNoise):
+    taken = samples(model, again=400, noise=0.3)
+    found = repeats(model, taken)
+    assert found.degrees == 400
+    assert found.deviation.tolist() == pytest.approx([0.3, 0.0, 0.0], abs=0.03)
+    assert repeats(model, samples(model, again=0)).degrees == 0
+
+
+def test_noise_counts_once_repeats_confirm_it(model: ClaimsNoise):
+    assert established_noise(model, samples(model, again=ENOUGH - 1, noise=0.2), TOLERANCES).tolist() == [0, 0, 0]
+    assert established_noise(model, samples(model, again=8, noise=0.2), TOLERANCES).tolist() == [0.2, 0, 0]
+
+
+def test_misfit_of_a_deterministic_environment_is_no_noise(model: ClaimsNoise):
+    assert established_noise(model, samples(model, again=8), TOLERANCES).tolist() == [0, 0, 0]
+
+
+def test_noise_that_repeats_do_not_explain_is_bounded(model: ClaimsNoise):
+    louder = replace(model, noise=(50.0, 0.0, 0.0))
+    found = float(established_noise(louder, samples(model, again=50, noise=0.2), TOLERANCES)[0])
+    assert found == pytest.approx(0.6, rel=0.3)
+
+
+def test_one_repeat_comes_first_and_more_only_where_it_differs(model: ClaimsNoise):
+    first = to_repeat(model, samples(model, again=0), TOLERANCES)
+    assert first is not None
+    assert len(first) == 1
+    assert to_repeat(model, samples(model, again=1), TOLERANCES) is None, "the environment is deterministic"
+    more = to_repeat(model, samples(model, again=1, noise=0.2), TOLERANCES)
+    assert more is not None
+    assert len(more) == ENOUGH - 1
+    assert to_repeat(model, samples(model, again=ENOUGH, noise=0.2), TOLERANCES) is None
+
+
+def test_noise_below_the_tolerance_is_nobodys_concern(model: ClaimsNoise):
+    quiet = replace(model, noise=(0.005, 0.0, 0.0))
+    assert to_repeat(quiet, samples(model, again=0), TOLERANCES) is None
+    assert established_noise(quiet, samples(model, again=9, noise=0.005), TOLERANCES).tolist() == [0, 0, 0]
+
+
+def test_a_family_that_learns_no_noise_repeats_nothing(model: ClaimsNoise):
+    plain = exact_pendulum()
+    assert to_repeat(plain, samples(model, again=0), TOLERANCES) is None
+    assert established_noise(plain, samples(model, again=9, noise=0.2), TOLERANCES).tolist() == [0, 0, 0]
+
+
+def test_tolerances_without_noise_stay_to_the_last_bit():
+    assert widened((0.1, 0.3), torch.tensor([0.0, 0.4], dtype=torch.float64)) == (0.1, 0.5)
+
+
+def test_a_noisy_design_repeats_steps_and_comes_to_be_ready(model: ClaimsNoise):
+    rng, spread = np.random.default_rng(1), torch.tensor([0.0628, 0.16], dtype=torch.float64)  # 1 % of the ranges
+
+    def real(points: Points) -> Samples:
+        moved = model.move(points.q, points.u) + spread * torch.tensor(rng.normal(size=(len(points), 2)))
+        return Samples(points.q, points.u, moved, model.pay(points.q, points.u), torch.zeros(len(points)).bool())
+
+    low, high = torch.tensor([[-np.pi, -8.0, -2.0], [np.pi, 8.0, 2.0]])
+    points = low + (high - low) * torch.tensor(rng.random((24, 3)))
+    taken, state = real(Points(points[:, :2], points[:, 2:])), DesignState()
+    request = Request(budget=48, target=0.99, pending=Points(taken.q[:0], taken.u[:0]))
+    while (decision := advance(model.definition, taken, state, request)).verdict == "continue":
+        state, more = decision.state, real(Points(decision.q, decision.u))
+        fields = ("q", "u", "q_next", "reward", "terminated")
+        taken = Samples(*(torch.cat([getattr(taken, name), getattr(more, name)]) for name in fields))
+    assert decision.verdict == "ready"
+    assert repeats(model, taken).degrees == ENOUGH
+    theta, speed, reward = (output.noise for output in decision.confidences)
+    assert (theta, speed) == pytest.approx(spread.tolist(), rel=0.6)
+    assert reward == 0.0
