@@ -1,14 +1,50 @@
-"""``surrogym import``: a surrogate from its file."""
+"""``surrogym import``: a surrogate from its file, or from a log of real steps."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from surrogym_client.cli.groups import Output, Service, add
-from surrogym_client.cli.options import connect
+from surrogym_client.cli.options import SpecFile, Wait, connect, read_spec
+
+if TYPE_CHECKING:
+    from surrogym_client.logs import Imported
+    from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.wire import SurrogateView
+
+SHOWN = 5  # rejected rows and reasons in words; the file has all of them
+
+
+@dataclass(frozen=True)
+class OfLogs:
+    """What is asked of a log."""
+
+    register: Annotated[
+        str | None,
+        typer.Option("--register", help="Of a log: register a surrogate of this name with what was drafted."),
+    ] = None
+    to: Annotated[
+        str | None,
+        typer.Option("--to", help="Of a log: the surrogate to add it to, by whose specification it is read."),
+    ] = None
+    mapping: Annotated[
+        Path | None, typer.Option("--map", help="Of a log: JSON or TOML file that says what its columns are.")
+    ] = None
+    spec: SpecFile = None
+    draft: Annotated[
+        Path | None, typer.Option("--draft", help="Of a log: write the drafted specification to this file, to edit it.")
+    ] = None
+    budget: Annotated[
+        int, typer.Option(min=0, help="Of a log: real steps that may be asked for beyond it; 0 if there is no machine.")
+    ] = 0
+    rejected: Annotated[
+        Path | None,
+        typer.Option("--rejected", help="Of a log: file for the rows that can't be used. [default: beside the log]"),
+    ] = None
 
 
 def register(app: typer.Typer) -> None:
@@ -18,19 +54,52 @@ def register(app: typer.Typer) -> None:
 
 def command(
     context: typer.Context,
-    file: Annotated[Path, typer.Argument(help="What surrogym export wrote with the ending .surrogate.")],
-    name: Annotated[str | None, typer.Option(help="Name of the surrogate. [default: as in the file]")] = None,
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="What surrogym export wrote with the ending .surrogate; or a log as CSV, NPZ or Parquet, or the name "
+            "of a Minari data set."
+        ),
+    ],
+    name: Annotated[
+        str | None, typer.Option(help="Name of the surrogate, of a .surrogate file. [default: as in the file]")
+    ] = None,
     *,
+    log: OfLogs,
+    wait: Wait = 0.0,
     service: Service,
     output: Output,
 ) -> None:
-    """Make a surrogate of a file. It serves the same model at once, judged by the same tolerances, its design paused.
+    """Make a surrogate of an exported file, or of a log.
 
-    Its real samples are stored as manual ones. surrogym change NAME --resume lets the design go on, with its initial
-    queries first.
+    An exported surrogate serves the same model at once, judged by the same tolerances, its design paused. Its real
+    samples are stored as manual ones. surrogym change NAME --resume lets the design go on, with its initial queries
+    first.
 
-    Example: surrogym import pendulum.surrogate --name pendulum-2
+    A log is checked row by row. Rows that can't be used go to LOG.rejected.csv, with line and reason, and a
+    specification is drafted and shown. With --register or --to all other rows are stored, at no cost to the budget,
+    and a model is fitted to them. The same log twice changes nothing.
+
+    Example: surrogym import reactor.csv --register reactor --wait 120
     """
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.logs.reading import format_of
+
+    if format_of(file) == "surrogate":
+        if given := [f"--{name}" for name, value in vars(log).items() if value]:
+            raise CommandError(f"{file} is a surrogate's file: {given[0].replace('mapping', 'map')} is for logs")
+        _import_surrogate(context, file, name, service, output)
+        return
+    if name is not None:
+        raise CommandError(f"{file} is a log: give --register NAME or --to NAME, not --name")
+    if log.register and log.to:
+        raise CommandError("expected --register or --to, got both")
+    if log.to and log.spec:
+        raise CommandError("expected --spec without --to, whose surrogate has a specification, got both")
+    _import_log(context, file, log, wait, service, output)
+
+
+def _import_surrogate(context: typer.Context, file: Path, name: str | None, service: Service, output: Output) -> None:
     from surrogym_client.surrogates.transfer import import_surrogate
     from surrogym_shared.surrogate_file import SurrogateFile
     from surrogym_shared.terminal import on_interrupt, progress
@@ -50,6 +119,99 @@ def command(
         f"samples{_origin(read.ledger)}, design paused; next: surrogym train {view.name}"
     )
     output.give(view.model_dump(mode="json"), lambda: words)
+
+
+def _import_log(context: typer.Context, file: Path, log: OfLogs, wait: float, service: Service, output: Output) -> None:
+    from surrogym_client.logs import import_log
+    from surrogym_shared.terminal import on_interrupt, progress
+
+    token = service.token_for(context) if log.register or log.to else None
+    stays = "interrupted; the steps that were stored stay, and the same command stores the others"
+    with on_interrupt(lambda: stays), progress("import", quiet=output.quiet) as update:
+        imported = import_log(
+            file,
+            register=log.register,
+            to=log.to,
+            mapping=log.mapping,
+            spec=read_spec(log.spec),
+            budget=log.budget,
+            rejected=log.rejected,
+            url=service.server,
+            token=token,
+            progress=update,
+        )
+    if log.draft is not None:
+        log.draft.write_text(imported.log.spec.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    view = None
+    if imported.surrogate is not None and wait > 0:
+        view = _await_model(imported.surrogate, wait, service.server, token, quiet=output.quiet)
+    output.give(_as_json(imported, view), lambda: "\n".join(_words(file, imported, view)))
+
+
+def _await_model(name: str, wait: float, server: str | None, token: str | None, *, quiet: bool) -> SurrogateView:
+    """The surrogate once it has a model of the log. Raises ``DesignUnfinished``."""
+    from surrogym_client.surrogates.waiting import wait_for_model, words_of_design
+    from surrogym_shared.terminal import on_interrupt, progress
+
+    stays = f"interrupted while the server fits the model; surrogym status {name} shows it"
+    with (
+        on_interrupt(lambda: stays),
+        progress("fit", quiet=quiet) as update,
+        connect(server, token) as api,
+    ):
+        return wait_for_model(api, name, wait, lambda view: update(None, words_of_design(view)))
+
+
+def _as_json(imported: Imported, view: SurrogateView | None) -> dict[str, Any]:
+    log = imported.log
+    return {
+        "surrogate": imported.surrogate,
+        "rows": len(log.table),
+        "steps": len(log.steps),
+        "sent": imported.sent,
+        "duplicates": imported.duplicates,
+        "without_next_state": log.steps.ends,
+        "rejected": [{"line": line, "reason": reason} for line, reason in log.rejected],
+        "rejected_file": None if imported.rejected_file is None else str(imported.rejected_file),
+        "data_hash": log.steps.digest,
+        "notes": list(log.notes),
+        "spec": log.spec.model_dump(mode="json"),
+        "view": None if view is None else view.model_dump(mode="json"),
+    }
+
+
+def _words(file: Path, imported: Imported, view: SurrogateView | None) -> list[str]:
+    log = imported.log
+    lines = [f"{file}: {len(log.table)} rows, {len(log.steps)} steps"]
+    if log.steps.ends:
+        lines.append(f"{log.steps.ends} rows have no next state: they end an episode, or stand before a gap")
+    lines += [*_rejected(imported), *_specified(log.spec, log.notes)]
+    name = imported.surrogate
+    if name is None:
+        return [*lines, f"nothing was stored; next: surrogym import {file} --register NAME"]
+    there = f", {imported.duplicates} were there before" if imported.duplicates else ""
+    lines.append(f"{name}: {imported.taken} new logged steps{there}")
+    if view is not None and view.fidelity is not None:
+        index = view.fidelity.confidence_index
+        lines.append(f"model {view.model_version} of {view.samples} steps: confidence index {index:.4f}")
+    after = f"surrogym train {name}" if view is not None else f"surrogym status {name}"
+    return [*lines, f"next: {after}"]
+
+
+def _rejected(imported: Imported) -> list[str]:
+    rejected = imported.log.rejected
+    if not rejected:
+        return []
+    lines = [f"{len(rejected)} rows can't be used, see {imported.rejected_file}:"]
+    lines += [f"  line {line}: {reason}" for line, reason in rejected[:SHOWN]]
+    return [*lines, f"  and {len(rejected) - SHOWN} more"] if len(rejected) > SHOWN else lines
+
+
+def _specified(spec: EnvironmentSpec, notes: tuple[str, ...]) -> list[str]:
+    from surrogym_client.logs.drafting import limited
+
+    lines = [f"  {name}: {words}" for name, words in limited(spec).items()]
+    return ["specification:", *lines, *(f"  {note}" for note in notes)]
 
 
 def _origin(ledger: dict[str, int]) -> str:

@@ -23,8 +23,11 @@ def words_of_design(view: SurrogateView) -> str:
     """One look at a design."""
     ledger = view.ledger
     fidelity = "" if view.fidelity is None else f", confidence index {view.fidelity.confidence_index:.4f}"
-    logged = f", {ledger.logged} logged" if ledger.logged else ""
-    return f"{ledger.total} of {view.budget} real steps ({ledger.adaptive} adaptive){logged}{fidelity}"
+    taken = f"{ledger.total} of {view.budget} real steps ({ledger.adaptive} adaptive)"
+    logged = f"{ledger.logged} logged steps"
+    if not ledger.logged:
+        return f"{taken}{fidelity}"
+    return f"{taken}, {logged}{fidelity}" if view.budget else f"{logged}{fidelity}"
 
 
 class DesignUnfinished(SurrogymClientError):
@@ -113,6 +116,26 @@ def wait_for_answers(
                 raise NobodyAnswers(f"no sampler has begun a query of {name!r} within {FIRST_LEASE_SECONDS:g} s")
         if time.monotonic() >= deadline:
             raise DesignUnfinished(f"{len(queries)} queries of {name!r} were not all answered after {seconds:g} s")
+        time.sleep(LOOK_SECONDS)
+
+
+def wait_for_model(
+    api: Api, name: str, seconds: float, progress: Callable[[SurrogateView], None] | None = None
+) -> SurrogateView:
+    """The surrogate, once it has a model of all its samples. Arguments and errors as of ``wait_for_design``."""
+    deadline = time.monotonic() + seconds
+    while True:
+        view = _look(api, name, deadline)
+        if view is not None:
+            if progress is not None:
+                progress(view)
+            if view.fidelity is not None and view.fidelity.samples >= view.samples:
+                return view
+            if view.phase == "failed":
+                raise DesignUnfinished(f"the fit of {name!r} failed: {view.error}")
+        if time.monotonic() >= deadline:
+            phase = "unknown" if view is None else view.phase
+            raise DesignUnfinished(f"there was no model of {name!r} after {seconds:g} s: its phase is {phase}")
         time.sleep(LOOK_SECONDS)
 
 

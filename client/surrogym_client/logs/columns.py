@@ -1,0 +1,181 @@
+"""Which column of a log is what: by name, or by a mapping file."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from surrogym_client.logs.errors import UnusableLog
+
+SINGLE = {
+    "reward": ("reward", "rewards", "r"),
+    "terminated": ("terminated", "terminations", "terminal", "terminals", "done"),
+    "truncated": ("truncated", "truncations", "timeout", "timeouts"),
+    "episode": ("episode", "episode_id", "trajectory", "run"),
+    "time": ("time", "t", "timestamp", "seconds"),
+}
+ACTION = re.compile(r"^(?:actions?|act|u)(?:[._](.+)|\[(\d+)\])?$", re.IGNORECASE)
+STATE = re.compile(r"^(?:q|states?|obs|observations?|coordinates?)(?:[._](.+)|\[(\d+)\])$", re.IGNORECASE)
+NEXT = re.compile(r"^next[._](.+)$|^(.+)[._]next$", re.IGNORECASE)
+
+Limits = Annotated[list[float | None], Field(min_length=2, max_length=2)]
+
+
+@dataclass(frozen=True)
+class Roles:
+    """What the columns of a log are.
+
+    Attributes:
+        state: column of each coordinate, by the coordinate's name, in order.
+        action: column of each action entry, by its name.
+        following: column of the next state, of all coordinates or of none.
+        reward, terminated, truncated, episode, time: columns; None where the log has none.
+        limits: declared ends (low, high) of coordinates and action entries, by name.
+        angles, constants: coordinates declared as such.
+        discrete: whether the action is declared as the number of a discrete one; None leaves it to the data.
+        ignored: columns that are none of these.
+    """
+
+    state: Mapping[str, str]
+    action: Mapping[str, str]
+    following: Mapping[str, str] = field(default_factory=dict)
+    reward: str | None = None
+    terminated: str | None = None
+    truncated: str | None = None
+    episode: str | None = None
+    time: str | None = None
+    limits: Mapping[str, tuple[float | None, float | None]] = field(default_factory=dict)
+    angles: frozenset[str] = frozenset()
+    constants: frozenset[str] = frozenset()
+    discrete: bool | None = None
+    ignored: tuple[str, ...] = ()
+
+
+class Mapped(BaseModel):
+    """A mapping file. A list of columns names coordinates by their columns, a table gives names of one's own."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    state: dict[str, str] | list[str]
+    action: dict[str, str] | list[str]
+    next: dict[str, str] = {}
+    reward: str | None = None
+    terminated: str | None = None
+    truncated: str | None = None
+    episode: str | None = None
+    time: str | None = None
+    limits: dict[str, Limits] = {}
+    angles: list[str] = []
+    constants: list[str] = []
+    discrete: bool | None = None
+
+
+def roles_by_name(names: Sequence[str]) -> Roles:
+    """What the columns are by their names; see the how-to page on logs.
+
+    Raises:
+        UnusableLog: no column is an action, or none a state.
+    """
+    single: dict[str, Any] = {role: _first(names, known) for role, known in SINGLE.items()}
+    left = [name for name in names if name not in single.values()]
+    action = {_part(ACTION.match(name)) or "0": name for name in left if ACTION.match(name)}
+    left = [name for name in left if name not in action.values()]
+    marked = {_part(match): name for name in left if (match := STATE.match(name))}
+    following = {_part(match): name for name in left if (match := NEXT.match(name))}
+    plain = {name: name for name in left if name not in following.values()}
+    state = marked or plain
+    following = {_part(STATE.match(name)) or name: column for name, column in following.items()}
+    _require(names, state, action)
+    used = {*state.values(), *action.values(), *following.values(), *single.values()}
+    return _checked(
+        Roles(state, action, following, **single, ignored=tuple(name for name in names if name not in used))
+    )
+
+
+def roles_by_file(path: Path, names: Sequence[str]) -> Roles:
+    """What the columns are by a mapping file, JSON or TOML.
+
+    Raises:
+        OSError: it can't be read.
+        UnusableLog: it is no mapping, or names a column that the log lacks.
+    """
+    text = path.read_text(encoding="utf-8")
+    try:
+        content = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
+    except ValueError as error:
+        raise UnusableLog(f"expected JSON or TOML in {path}: {error}") from error
+    return roles_by_map(content, names, str(path))
+
+
+def roles_by_map(content: Mapping[str, Any], names: Sequence[str], where: str = "the mapping") -> Roles:
+    """What the columns are by a mapping. Raises ``UnusableLog`` as ``roles_by_file``."""
+    try:
+        mapped = Mapped.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise UnusableLog(f"{where} is no mapping of columns: {place}: {first['msg']}") from error
+    fields: dict[str, Any] = {role: getattr(mapped, role) or None for role in SINGLE}
+    state, action = _by_name(mapped.state), _by_name(mapped.action)
+    wanted = [*state.values(), *action.values(), *mapped.next.values(), *filter(None, fields.values())]
+    if missing := [column for column in wanted if column not in names]:
+        raise UnusableLog(f"{where} names the column {missing[0]!r}: expected one of {list(names)}")
+    _require(names, state, action)
+    declared = {*mapped.limits, *mapped.angles, *mapped.constants}
+    if unknown := sorted(declared - {*state, *action}):
+        raise UnusableLog(f"{where} names {unknown[0]!r}: expected one of {[*state, *action]}")
+    return _checked(
+        Roles(
+            state,
+            action,
+            mapped.next,
+            **fields,
+            limits={name: (ends[0], ends[1]) for name, ends in mapped.limits.items()},
+            angles=frozenset(mapped.angles),
+            constants=frozenset(mapped.constants),
+            discrete=mapped.discrete,
+            ignored=tuple(name for name in names if name not in wanted),
+        )
+    )
+
+
+def _checked(roles: Roles) -> Roles:
+    """The roles, if there is a next state for every coordinate or for none."""
+    if roles.following and set(roles.following) != set(roles.state):
+        odd = sorted(set(roles.following) ^ set(roles.state))[0]
+        raise UnusableLog(
+            f"expected next states of all of {list(roles.state)} or of none, got {list(roles.following)} "
+            f"({odd!r} differs): name the columns in a mapping file (--map)"
+        )
+    return roles
+
+
+def _require(names: Iterable[str], state: Mapping[str, str], action: Mapping[str, str]) -> None:
+    for what, found, example in (("action", action, "action_valve"), ("state", state, "state_temperature")):
+        if not found:
+            raise UnusableLog(
+                f"expected a column of the {what}, such as {example}, got {list(names)}: rename it, or name the "
+                "columns in a mapping file (--map)"
+            )
+
+
+def _first(names: Iterable[str], known: Sequence[str]) -> str | None:
+    """The first known name; a single letter has to be the letter itself: t is a time, and T a temperature."""
+    written = {name.lower() if len(name) > 1 else name: name for name in reversed(list(names))}
+    return next((written[name] for name in known if name in written), None)
+
+
+def _part(match: re.Match[str] | None) -> str:
+    """What the name has beside its prefix or its ending."""
+    return "" if match is None else next((part for part in match.groups() if part), "")
+
+
+def _by_name(given: dict[str, str] | list[str]) -> dict[str, str]:
+    return given if isinstance(given, dict) else {name: name for name in given}

@@ -1,0 +1,248 @@
+"""A specification drafted from a log: what the data show, and a note for each thing that was concluded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from surrogym_client.logs.columns import Roles
+from surrogym_client.logs.errors import UnusableLog
+from surrogym_client.logs.table import Bools, Floats
+from surrogym_client.logs.transitions import Transitions
+from surrogym_shared.spec import (
+    Bounds,
+    BoxAction,
+    Coordinate,
+    DeclaredReward,
+    Design,
+    DiscreteAction,
+    EnvironmentSpec,
+    Fixed,
+    ObservationEntry,
+    Reward,
+    RewardTerm,
+    Term,
+    Uniform,
+)
+
+MARGIN = 0.05  # of the width of the data, on each side of a sampling range
+SATURATED_ROWS = 5  # at an extreme, exactly: below, it is one like any other
+SATURATED_SHARE = 0.002
+MOST_DISCRETE = 16  # values of an action that is the number of a discrete one
+FULL_TURN = (0.9 * 2 * math.pi, 1.1 * 2 * math.pi)  # sizes of a jump that is a turn around the circle
+FEW_EPISODES = 2
+USUAL_LIMIT = 200  # steps of a virtual episode, where the log is a single one
+FAR = 8.0  # widths of the middle half of the data, from its middle: a remark, no fault
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A specification, and what it was concluded from."""
+
+    spec: EnvironmentSpec
+    notes: tuple[str, ...]
+
+
+def draft(roles: Roles, steps: Transitions, name: str, budget: int = 0) -> Draft:
+    """Draft the specification of the environment that a log is of.
+
+    Args:
+        roles: what the columns are, and what of it was declared.
+        steps: its usable transitions.
+        name: what the environment is called.
+        budget: real steps that a design may ask for.
+
+    Raises:
+        UnusableLog: no step can be used, or no state ever moves.
+    """
+    if len(steps) < 2:
+        raise UnusableLog(f"expected two usable steps at least, got {len(steps)}; see the rejected rows")
+    notes: list[str] = []
+    coordinates = [
+        found
+        for index, one in enumerate(roles.state)
+        if (found := _coordinate(roles, steps, one, index, notes)) is not None
+    ]
+    if not any(c.kind != "constant" for c in coordinates):
+        raise UnusableLog(f"expected a state that moves from row to row, got {list(roles.state)}, which never do")
+    kept = [index for index, one in enumerate(roles.state) if one in {c.name for c in coordinates}]
+    starts = {c.name: _start(c, steps, index) for c, index in zip(coordinates, kept, strict=True)}
+    spec = EnvironmentSpec(
+        environment=name,
+        coordinates=tuple(coordinates),
+        observation=tuple(entry for c in coordinates for entry in _observed(c)),
+        action=_action(roles, steps, notes),
+        start=starts,
+        termination="learned" if bool(steps.terminated.any()) else (),
+        time_limit=_time_limit(steps, notes),
+        reward=_reward(steps, notes),
+        design=Design(budget=budget),
+    )
+    notes += _about(roles, steps)
+    return Draft(spec, tuple(notes))
+
+
+def _coordinate(roles: Roles, steps: Transitions, name: str, index: int, notes: list[str]) -> Coordinate | None:
+    before, after = steps.q[:, index], steps.q_next[:, index]
+    low, high = float(min(before.min(), after.min())), float(max(before.max(), after.max()))
+    if low == high:
+        notes.append(f"{name}: always {low:g}, left out")
+        return None
+    if name in roles.angles or _turns(before, after):
+        notes.append(f"{name}: an angle in radians, as it {_why(name in roles.angles, 'jumps by a full turn')}")
+        return Coordinate(name=name, kind="angle", sampling=Uniform(low=-math.pi, high=math.pi))
+    if _turns(np.deg2rad(before), np.deg2rad(after)):
+        notes.append(f"{name}: jumps by 360, as an angle in degrees does: give it in radians")
+    margin = MARGIN * (high - low)
+    if name in roles.constants or bool((before == after).all()):
+        notes.append(f"{name}: a constant of each episode, as it {_why(name in roles.constants, 'never moves in one')}")
+        return Coordinate(name=name, kind="constant", sampling=Uniform(low=low, high=high))
+    bounds = _bounds(roles, name, after, (low, high), notes)
+    ends = (-math.inf, math.inf) if bounds is None else (bounds.low, bounds.high)
+    least, most = (-math.inf if ends[0] is None else ends[0]), (math.inf if ends[1] is None else ends[1])
+    sampling = Uniform(low=max(low - margin, least), high=min(high + margin, most))
+    notes += [f"{name}: {remark}" for remark in _remarks(after)]
+    return Coordinate(name=name, sampling=sampling, bounds=bounds)
+
+
+def _why(declared: bool, shown: str) -> str:
+    return "is declared" if declared else shown
+
+
+def _turns(before: Floats, after: Floats) -> bool:
+    """Whether the values stay within a circle and jump around it, where other steps are less than half a turn."""
+    change = np.abs(after - before)
+    jumps = change > math.pi
+    width = max(before.max(), after.max()) - min(before.min(), after.min())
+    around = (change[jumps] > FULL_TURN[0] / 1.5) & (change[jumps] < FULL_TURN[1])
+    return bool(jumps.any() and width <= 2 * math.pi + 1e-3 and around.all() and np.median(change) < math.pi / 2)
+
+
+def _bounds(roles: Roles, name: str, after: Floats, ends: tuple[float, float], notes: list[str]) -> Bounds | None:
+    """Declared limits, and extremes at which the data stay exactly."""
+    low, high = roles.limits.get(name, (None, None))
+    shown = [end if _stays_at(after, end, ends) else None for end in ends]
+    for side, end, declared in (("low", shown[0], low), ("high", shown[1], high)):
+        if end is not None and declared is None:
+            rows = int((after == end).sum())
+            notes.append(f"{name}: saturates at {end:g} ({side}), where {rows} steps end exactly")
+    low, high = shown[0] if low is None else low, shown[1] if high is None else high
+    return None if low is None and high is None else Bounds(low=low, high=high)
+
+
+def _stays_at(after: Floats, end: float, ends: tuple[float, float]) -> bool:
+    """Whether so many steps end exactly at an extreme that something stops them there."""
+    rows = int((after == end).sum())
+    others = np.unique(after[(after != ends[0]) & (after != ends[1])], return_counts=True)[1]
+    often = rows >= max(SATURATED_ROWS, SATURATED_SHARE * len(after))
+    return bool(often and len(others) and rows > 3 * others.max())
+
+
+def _start(coordinate: Coordinate, steps: Transitions, index: int) -> Uniform | Fixed:
+    """Where episodes of the log begin; a log of a single episode begins anywhere that it has been."""
+    begins = steps.q[steps.first, index]
+    values = begins if len(begins) >= FEW_EPISODES else steps.q[:, index]
+    if coordinate.kind == "angle":
+        values = wrapped(values)
+    low, high = float(values.min()), float(values.max())
+    return Fixed(value=low) if low == high else Uniform(low=low, high=high)
+
+
+def wrapped(angles: Floats) -> Floats:
+    """Angles in [-pi, pi)."""
+    return np.remainder(angles + np.pi, 2 * np.pi) - np.pi
+
+
+def _observed(coordinate: Coordinate) -> Iterator[ObservationEntry]:
+    name = coordinate.name
+    if coordinate.kind != "angle":
+        yield ObservationEntry(name=name, term=Term.linear(**{name: 1}))
+    else:
+        yield ObservationEntry(name=f"cos({name})", term=Term.cos(**{name: 1}), low=-1, high=1)
+        yield ObservationEntry(name=f"sin({name})", term=Term.sin(**{name: 1}), low=-1, high=1)
+
+
+def _action(roles: Roles, steps: Transitions, notes: list[str]) -> BoxAction | DiscreteAction:
+    values = steps.u
+    highest = int(values.max()) if values.size else 0
+    whole = bool((values == np.floor(values)).all() and values.min() >= 0 and 1 <= highest < MOST_DISCRETE)
+    named = len(np.unique(values)) == highest + 1
+    if values.shape[1] == 1 and (roles.discrete or (roles.discrete is None and whole and named)):
+        if not whole:
+            raise UnusableLog(
+                f"expected whole numbers from 0 of a discrete action, got {np.unique(values)[:5].tolist()}"
+            )
+        notes.append(f"action: one of {highest + 1}, as all values are whole numbers from 0 to {highest}")
+        return DiscreteAction(n=highest + 1)
+    low, high = [], []
+    for index, name in enumerate(roles.action):
+        ends = roles.limits.get(name, (None, None))
+        least = float(values[:, index].min()) if ends[0] is None else ends[0]
+        most = float(values[:, index].max()) if ends[1] is None else ends[1]
+        if least == most:
+            raise UnusableLog(
+                f"expected an action {name!r} that varies, got {least:g} in every row: nothing can be learned of it; "
+                "leave it out by a mapping file (--map)"
+            )
+        low.append(least)
+        high.append(most)
+    return BoxAction(low=tuple(low), high=tuple(high))
+
+
+def _time_limit(steps: Transitions, notes: list[str]) -> int:
+    if len(steps.episodes) >= FEW_EPISODES:
+        return max(steps.episodes)
+    notes.append(f"time limit: {USUAL_LIMIT} steps of a virtual episode, as the log is a single one")
+    return USUAL_LIMIT
+
+
+def _reward(steps: Transitions, notes: list[str]) -> Reward | DeclaredReward:
+    if steps.reward is None:
+        notes.append("reward: no column, so it is declared as 0; declare it in the drafted file before a training")
+        return DeclaredReward(kind="declared", terms=(RewardTerm(weight=0, shape="one"),))
+    return Reward(timing="auto")
+
+
+def _about(roles: Roles, steps: Transitions) -> list[str]:
+    notes = []
+    if steps.interval is not None:
+        notes.append(
+            f"sampling interval: {steps.interval:g}, in the unit of {roles.time}; a virtual step takes as long"
+        )
+    if roles.ignored:
+        notes.append(f"ignored columns: {', '.join(roles.ignored)}")
+    return notes
+
+
+def _remarks(values: Floats) -> list[str]:
+    """That something lies far from everything else."""
+    quarter, middle, three = np.quantile(values, [0.25, 0.5, 0.75])
+    far: Bools = np.abs(values - middle) > FAR * (three - quarter) if three > quarter else np.zeros(0, dtype=np.bool_)
+    if not far.any():
+        return []
+    worst = values[np.abs(values - middle).argmax()]
+    return [f"{int(far.sum())} steps end far from the others, up to {worst:g}; declare limits if these are faults"]
+
+
+def limited(spec: EnvironmentSpec) -> Mapping[str, str]:
+    """A line for each coordinate and the action, for a person."""
+    lines = {}
+    for c in spec.coordinates:
+        low, high = (c.sampling.low, c.sampling.high) if isinstance(c.sampling, Uniform) else c.sampling.limits
+        bounds = "" if c.bounds is None else f", saturates at [{_end(c.bounds.low)}, {_end(c.bounds.high)}]"
+        lines[c.name] = f"{c.kind}, {low:.6g} to {high:.6g}{bounds}"
+    match spec.action:
+        case BoxAction() as box:
+            lines["action"] = ", ".join(f"{a:.6g} to {b:.6g}" for a, b in zip(box.low, box.high, strict=True))
+        case DiscreteAction(n=n):
+            lines["action"] = f"one of {n}"
+        case _:
+            lines["action"] = f"several of {list(spec.action.nvec)}"
+    return lines
+
+
+def _end(value: float | None) -> str:
+    return "none" if value is None else f"{value:.6g}"

@@ -1,0 +1,9 @@
+"""What can go wrong with a whole log; what is wrong with one row sets that row aside."""
+
+from __future__ import annotations
+
+from surrogym_client.errors import SurrogymClientError
+
+
+class UnusableLog(SurrogymClientError):
+    """The log, its mapping or its columns can't be used; says what was expected and what came."""

@@ -1,0 +1,190 @@
+"""Files to tables: CSV, NPZ, Parquet, Minari. What a file is, is decided by what is in it."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from surrogym_client.logs.errors import UnusableLog
+from surrogym_client.logs.table import Cells, Table
+from surrogym_shared.archives import read_arrays
+
+Format = Literal["csv", "npz", "parquet", "minari", "surrogate"]
+
+MOST_BYTES = 4 * 1024**3  # of the arrays in an NPZ file
+SURROGATE = ".surrogate"
+DELIMITERS = ",;\t"
+STATES = ("coordinates", "observations", "observation", "states", "state", "obs", "q")
+ACTIONS = ("actions", "action", "u")
+NEXT = ("next_coordinates", "next_observations", "next_observation", "next_states", "next_state", "next_obs", "next_q")
+
+
+def format_of(path: Path) -> Format:
+    """What a log is, or that it is a surrogate's own file.
+
+    Raises:
+        OSError: there is no such file, and no Minari data set of this name.
+    """
+    if path.suffix == SURROGATE:
+        return "surrogate"
+    if path.is_dir():
+        return "minari"
+    try:
+        with path.open("rb") as file:
+            head = file.read(9)
+    except FileNotFoundError:
+        if _minari_has(path):
+            return "minari"
+        raise
+    if head[:4] == b"PAR1":
+        return "parquet"
+    if head[:2] == b"PK":
+        return "npz"
+    is_header = len(head) == 9 and head[8:] == b"{" and int.from_bytes(head[:8], "little") < 2**40
+    return "surrogate" if is_header else "csv"
+
+
+def read(path: Path) -> Table:
+    """The log at a path. Raises ``UnusableLog`` where it is none, or has no rows."""
+    kind = format_of(path)
+    if kind == "surrogate":
+        raise UnusableLog(f"expected a log, got a surrogate's file: surrogym import {path} without options for logs")
+    table = {"csv": read_csv, "npz": read_npz, "parquet": read_parquet, "minari": read_minari}[kind](path)
+    if not len(table):
+        raise UnusableLog(f"expected a surrogate's file, or a log with a heading and rows, got neither in {path}")
+    return table
+
+
+def read_csv(path: Path) -> Table:
+    """A table of text with a heading; separated by commas, semicolons or tabs."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise UnusableLog(f"expected text, NPZ, Parquet or a surrogate's file, got other bytes in {path}") from error
+    heading = text.partition("\n")[0]
+    delimiter = max(DELIMITERS, key=heading.count)
+    reader = csv.reader(io.StringIO(text), delimiter=delimiter)
+    names = [name.strip() for name in next(reader, [])]
+    _require_names(path, names)
+    rows: list[list[str]] = []
+    lines: list[int] = []
+    faults: dict[int, str] = {}
+    for row in reader:
+        if not row:
+            continue
+        if len(row) != len(names):
+            faults[len(rows)] = f"expected {len(names)} columns, got {len(row)}"
+        rows.append(row)
+        lines.append(reader.line_num)
+    padded = [row if len(row) == len(names) else [*row, *([""] * len(names))][: len(names)] for row in rows]
+    columns = {name: np.array([row[i] for row in padded], dtype=np.str_) for i, name in enumerate(names)}
+    return Table(columns, np.array(lines, dtype=np.int64), faults, rows)
+
+
+def read_npz(path: Path) -> Table:
+    """Arrays by name: (n,) each, or (n, k) of states, actions and next states. Nothing is unpickled."""
+    try:
+        arrays = read_arrays(path.read_bytes(), MOST_BYTES)
+    except ValueError as error:
+        raise UnusableLog(f"{path}: {error}") from error
+    named = [str(name) for name in arrays.pop("coordinate_names", ())]
+    columns = _columns(arrays, named)
+    return _of_columns(path, columns)
+
+
+def read_parquet(path: Path) -> Table:
+    """The columns of a Parquet file; lists of one length become columns of their own."""
+    try:
+        from pyarrow import parquet
+    except ModuleNotFoundError as error:
+        raise UnusableLog("a log in Parquet needs the package pyarrow: pip install 'surrogym[logs]'") from error
+    read_table = parquet.read_table(path)
+    arrays: dict[str, Any] = {}
+    for name, column in zip(read_table.column_names, read_table.columns, strict=True):
+        cells = column.to_numpy()
+        if cells.dtype == object and len(cells) and isinstance(cells[0], np.ndarray):
+            cells = np.stack(cells)
+        elif cells.dtype == object:
+            cells = np.array(["" if cell is None else str(cell) for cell in cells])
+        arrays[name] = cells
+    return _of_columns(path, _columns(arrays, []))
+
+
+def read_minari(path: Path) -> Table:
+    """All episodes of a Minari data set, by its name or its folder. Observations and actions have to be vectors."""
+    minari = _minari()
+    data = minari.MinariDataset(path / "data") if path.is_dir() else minari.load_dataset(str(path))
+    episodes = list(data.iterate_episodes())
+    if not all(isinstance(e.observations, np.ndarray) and isinstance(e.actions, np.ndarray) for e in episodes):
+        raise UnusableLog(f"expected observations and actions that are vectors in {path}, got dictionaries or tuples")
+    columns = _columns(
+        {
+            "observations": np.concatenate([_rows(e.observations[:-1]) for e in episodes]),
+            "actions": np.concatenate([_rows(e.actions) for e in episodes]),
+            "next_observations": np.concatenate([_rows(e.observations[1:]) for e in episodes]),
+            "reward": np.concatenate([e.rewards for e in episodes]),
+            "terminated": np.concatenate([e.terminations for e in episodes]),
+            "truncated": np.concatenate([e.truncations for e in episodes]),
+            "episode": np.concatenate([np.full(len(e.rewards), e.id) for e in episodes]),
+        },
+        [],
+    )
+    return _of_columns(path, columns)
+
+
+def _rows(array: Cells) -> Cells:
+    return array[:, None] if array.ndim == 1 else array
+
+
+def _columns(arrays: dict[str, Any], names: Sequence[str]) -> dict[str, Cells]:
+    """Arrays (n,) as they are, those (n, k) as k columns: ``q.s0`` or ``q.<name>``, ``action.0``, ``next.s0``."""
+    columns: dict[str, Cells] = {}
+    for name, array in arrays.items():
+        if array.ndim < 2:
+            columns[name] = np.atleast_1d(array)
+            continue
+        flat = array.reshape(len(array), -1)
+        if name in ACTIONS:
+            columns |= {f"action.{i}": flat[:, i] for i in range(flat.shape[1])}
+        elif name in (*STATES, *NEXT):
+            own = names if len(names) == flat.shape[1] else [f"s{i}" for i in range(flat.shape[1])]
+            columns |= {f"{'q' if name in STATES else 'next'}.{one}": flat[:, i] for i, one in enumerate(own)}
+        else:
+            columns |= {f"{name}.{i}": flat[:, i] for i in range(flat.shape[1])}
+    return columns
+
+
+def _of_columns(path: Path, columns: dict[str, Cells]) -> Table:
+    _require_names(path, list(columns))
+    lengths = {name: len(column) for name, column in columns.items()}
+    if len(set(lengths.values())) > 1:
+        raise UnusableLog(f"expected columns of one length in {path}, got {lengths}")
+    return Table(columns, np.arange(1, 1 + next(iter(lengths.values()))))
+
+
+def _require_names(path: Path, names: Sequence[str]) -> None:
+    if not any(names):
+        raise UnusableLog(f"expected a log with a heading that names its columns, got none in {path}")
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise UnusableLog(f"expected each column once in {path}, got {twice[0]!r} {names.count(twice[0])} times")
+
+
+def _minari() -> Any:
+    try:
+        import minari
+    except ModuleNotFoundError as error:
+        raise UnusableLog("a Minari data set needs the package minari: pip install 'minari[hdf5]'") from error
+    return minari
+
+
+def _minari_has(path: Path) -> bool:
+    """Whether there is a Minari data set of this name here; the package is asked only for what looks like one."""
+    if path.suffix or path.is_absolute() or "-v" not in path.name:
+        return False
+    return str(path) in _minari().list_local_datasets()

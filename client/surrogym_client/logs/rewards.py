@@ -1,0 +1,41 @@
+"""A declared reward, evaluated on the steps of a log that has no column of it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from surrogym_client.logs.table import Bools, Floats
+from surrogym_client.original.terms import evaluate, holds
+from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, RewardTerm
+
+
+def declared_reward(spec: EnvironmentSpec, q: Floats, u: Floats, q_next: Floats, terminated: Bools) -> Floats:
+    """What a declared reward pays for n steps, (n,). Raises TypeError where the reward is learned."""
+    reward = spec.reward
+    if not isinstance(reward, DeclaredReward):
+        raise TypeError(f"expected a declared reward, got a {reward.kind} one")
+    read = q_next if reward.timing == "after" else q
+    paid = np.sum([_paid(spec, term, read, u) for term in reward.terms], axis=0)
+    return np.asarray(paid + reward.terminal * terminated, dtype=np.float64)
+
+
+def _paid(spec: EnvironmentSpec, term: RewardTerm, q: Floats, u: Floats) -> Floats:
+    """weight * shape(of) where every inequality holds, else 0."""
+    of = [
+        (0.0 if one.term is None else evaluate(spec, one.term, q)) + (u @ np.array(one.action) if one.action else 0.0)
+        for one in term.of
+    ]
+    x = np.stack([np.broadcast_to(np.asarray(one), len(q)) for one in of]) if of else np.zeros((0, len(q)))
+    match term.shape:
+        case "one":
+            shaped = np.ones(len(q))
+        case "linear":
+            shaped = x.sum(0)
+        case "absolute":
+            shaped = np.abs(x).sum(0)
+        case "square":
+            shaped = (x**2).sum(0)
+        case "bump":
+            shaped = np.exp(-0.5 * (x**2).sum(0))
+    paying = np.all([holds(spec, one, q) for one in term.when], axis=0) if term.when else np.ones(len(q), dtype=bool)
+    return np.asarray(term.weight * shaped * paying, dtype=np.float64)

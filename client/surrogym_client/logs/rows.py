@@ -1,0 +1,128 @@
+"""Rows of a log as numbers, and what is wrong with each row by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from surrogym_client.logs.columns import Roles
+from surrogym_client.logs.table import Bools, Floats, Ints, Table, flags, groups, numbers, times
+from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
+
+SLACK = 1e-6  # of a range: what a number in single precision may be off
+Ends = Mapping[str, tuple[float | None, float | None]]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """n rows of a log with C coordinates and F action entries.
+
+    Attributes:
+        q: states, (n, C).
+        u: actions, (n, F).
+        following: next states, (n, C), where the log has columns of them.
+        reward: (n,), where it has a column.
+        terminated, truncated: (n,).
+        episode: a number for each episode, (n,), where it has a column.
+        time: (n,), where it has a column.
+        faults: the reason for each row that can't be used by itself.
+        sound: rows whose state can be used, (n,): as the next state of the row before, if for nothing else.
+    """
+
+    roles: Roles
+    lines: Ints
+    q: Floats
+    u: Floats
+    following: Floats | None
+    reward: Floats | None
+    terminated: Bools
+    truncated: Bools
+    episode: Ints | None
+    time: Floats | None
+    faults: dict[int, str]
+    sound: Bools
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+
+def rows_of(table: Table, roles: Roles, spec: EnvironmentSpec | None = None) -> Rows:
+    """The rows as numbers. Limits are those of the specification, and without one those of the mapping."""
+    faults: dict[int, list[str]] = {row: [reason] for row, reason in table.faults.items()}
+    whole = np.ones(len(table), dtype=np.bool_)
+    whole[list(table.faults)] = False
+    q, state_faults = _matrix(table, roles.state, _state_limits(roles, spec))
+    u, action_faults = _matrix(table, roles.action, _action_limits(roles, spec))
+    sound = whole.copy()
+    sound[list(state_faults)] = False
+    found = [state_faults, action_faults]
+    following = reward = time = None
+    if roles.following:
+        columns = {name: roles.following[name] for name in roles.state}
+        following, faulty = _matrix(table, columns, _state_limits(roles, spec))
+        found.append(faulty)
+    if roles.reward is not None:
+        reward, faulty = numbers(roles.reward, table.columns[roles.reward])
+        found.append(faulty)
+    if roles.time is not None:
+        time, faulty = times(roles.time, table.columns[roles.time])
+        found.append(faulty)
+    terminated, truncated = (np.zeros(len(table), dtype=np.bool_) for _ in range(2))
+    if roles.terminated is not None:
+        terminated, faulty = flags(roles.terminated, table.columns[roles.terminated])
+        found.append(faulty)
+    if roles.truncated is not None:
+        truncated, faulty = flags(roles.truncated, table.columns[roles.truncated])
+        found.append(faulty)
+    for one in found:
+        for row, reason in one.items():
+            if whole[row]:
+                faults.setdefault(row, []).append(reason)
+    episode = None if roles.episode is None else groups(table.columns[roles.episode])
+    reasons = {row: "; ".join(faults[row]) for row in sorted(faults)}
+    return Rows(
+        roles, table.lines, q, u, following, reward, terminated, truncated, episode, time, reasons, sound
+    )  # fmt: skip
+
+
+def _matrix(table: Table, columns: Mapping[str, str], ends: Ends) -> tuple[Floats, dict[int, str]]:
+    """Columns as numbers (n, k), and the first thing that is wrong in each row."""
+    values, faults = [], dict[int, str]()
+    for name, column in columns.items():
+        cells, faulty = numbers(column, table.columns[column])
+        values.append(cells)
+        for row, reason in (_beyond(column, cells, *ends.get(name, (None, None))) | faulty).items():
+            faults.setdefault(row, reason)
+    return np.stack(values, 1), faults
+
+
+def _beyond(column: str, cells: Floats, low: float | None, high: float | None) -> dict[int, str]:
+    """The reason for each cell that leaves its ends."""
+    least, most = -np.inf if low is None else low, np.inf if high is None else high
+    ends = [end for end in (least, most) if np.isfinite(end)]
+    width = most - least if len(ends) == 2 else max([1.0, *map(abs, ends)])
+    beyond = (cells < least - SLACK * width) | (cells > most + SLACK * width)
+    words = f"expected a value in [{least:g}, {most:g}]"
+    return {int(row): f"{column}: {words}, got {cells[row]:g}" for row in np.flatnonzero(beyond)}
+
+
+def _state_limits(roles: Roles, spec: EnvironmentSpec | None) -> Ends:
+    if spec is None:
+        return roles.limits
+    bounded = {c.name: c.bounds for c in spec.coordinates if c.bounds is not None}
+    return {name: (bounds.low, bounds.high) for name, bounds in bounded.items()}
+
+
+def _action_limits(roles: Roles, spec: EnvironmentSpec | None) -> Ends:
+    if spec is None:
+        return roles.limits
+    match spec.action:
+        case BoxAction(low=low, high=high):
+            ends = list(zip(low, high, strict=True))
+        case DiscreteAction(n=n):
+            ends = [(0.0, n - 1.0)]
+        case _:
+            ends = [(0.0, count - 1.0) for count in spec.action.nvec]
+    return dict(zip(roles.action, ends, strict=True))

@@ -1,0 +1,185 @@
+"""Rows to transitions: which row follows which, and which rows contradict the others."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from surrogym_client.logs.rows import Rows
+from surrogym_client.logs.table import Bools, Floats, Ints
+
+ONE_INTERVAL = 0.5  # a step's time may differ from the sampling interval by this share of it
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """m steps that can be used, in the order of the log.
+
+    Attributes:
+        row: their rows in the log, (m,).
+        q, u, q_next: (m, C), (m, F), (m, C).
+        reward: (m,); None where the log has none.
+        terminated, truncated: (m,).
+        first: whether an episode of the log begins with it, (m,).
+        episodes: rows of each episode.
+        rejected: the reason for each row that was set aside, by row.
+        ends: rows that only end an episode or stand before a gap: they have no next state.
+        interval: between two rows, in the unit of the time column; None without one.
+    """
+
+    row: Ints
+    q: Floats
+    u: Floats
+    q_next: Floats
+    reward: Floats | None
+    terminated: Bools
+    truncated: Bools
+    first: Bools
+    episodes: tuple[int, ...]
+    rejected: dict[int, str]
+    ends: int
+    interval: float | None
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    @property
+    def digest(self) -> str:
+        """Hash of the numbers: equal for equal transitions, whatever file they came in."""
+        sha = hashlib.sha256()
+        for array in (self.q, self.u, self.q_next, self.reward, self.terminated, self.truncated):
+            sha.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+        return sha.hexdigest()
+
+
+def transitions_of(rows: Rows) -> Transitions:
+    """The transitions of a log, each row that can't be used with its reason."""
+    rejected = dict(rows.faults)
+    _reject(rejected, _duplicates(rows, rejected))
+    episode = _episodes(rows)
+    order = [row for row in np.argsort(episode, kind="stable").tolist() if rows.faults.get(row) or row not in rejected]
+    out_of_order = _backwards(rows, episode, order, rejected)
+    _reject(rejected, out_of_order)
+    order = [row for row in order if row not in out_of_order]  # the row before goes on with the one behind
+    follower = {a: b for a, b in pairwise(order) if episode[a] == episode[b]}
+    if rows.episode is not None:
+        _reject(rejected, _going_on(rows, follower, rejected))
+    interval = _interval(rows, follower, rejected)
+    paired = _paired(rows, follower, rejected, interval)
+    usable = np.array([row for row in sorted(paired) if row not in rejected], dtype=np.int64)
+    after = np.array([paired[row] for row in usable.tolist()], dtype=np.int64)
+    begins = {first for first, row in _firsts(episode, order) if row}
+    return Transitions(
+        row=usable,
+        q=rows.q[usable],
+        u=rows.u[usable],
+        q_next=rows.q[after] if rows.following is None else rows.following[usable],
+        reward=None if rows.reward is None else rows.reward[usable],
+        terminated=rows.terminated[usable],
+        truncated=rows.truncated[usable],
+        first=np.array([row in begins for row in usable.tolist()], dtype=np.bool_),
+        episodes=tuple(np.unique(episode, return_counts=True)[1].tolist()),
+        rejected=dict(sorted(rejected.items())),
+        ends=len(rows) - len(usable) - len(rejected),
+        interval=interval,
+    )
+
+
+def _reject(rejected: dict[int, str], found: dict[int, str]) -> None:
+    for row, reason in found.items():
+        rejected.setdefault(row, reason)
+
+
+def _duplicates(rows: Rows, rejected: dict[int, str]) -> dict[int, str]:
+    """Rows that repeat an earlier one in every number, its time and episode included."""
+    parts: list[Floats | Ints | Bools | None] = [rows.q, rows.u, rows.following, rows.reward, rows.time, rows.episode]
+    columns = [part.reshape(len(rows), -1).astype(np.float64) for part in parts if part is not None]
+    whole = np.ascontiguousarray(np.concatenate([*columns, rows.terminated[:, None]], 1))
+    seen: dict[bytes, int] = {}
+    found = {}
+    for row in range(len(rows)):
+        before = row if row in rejected else seen.setdefault(whole[row].tobytes(), row)
+        if before != row:
+            found[row] = f"repeats line {rows.lines[before]}"
+    return found
+
+
+def _episodes(rows: Rows) -> Ints:
+    """The number of each row's episode, (n,): its column's, or a new one after an end and where the clock restarts."""
+    if rows.episode is not None:
+        return rows.episode
+    begins = np.zeros(len(rows), dtype=np.int64)
+    ended = rows.terminated | rows.truncated
+    begins[1:] = ended[:-1]
+    if rows.time is not None and len(rows) > 2:
+        time = rows.time
+        restarts = (time[1:-1] < time[:-2]) & (time[2:] > time[1:-1]) & (time[2:] <= time[:-2])
+        begins[1:-1] |= restarts
+    return np.cumsum(begins)
+
+
+def _backwards(rows: Rows, episode: Ints, order: Iterable[int], rejected: dict[int, str]) -> dict[int, str]:
+    """Rows whose time does not come after that of the row before in their episode."""
+    if rows.time is None:
+        return {}
+    latest: dict[int, int] = {}
+    found = {}
+    for row in order:
+        if not np.isfinite(rows.time[row]):
+            continue
+        before = latest.get(int(episode[row]))
+        if before is not None and rows.time[row] <= rows.time[before] and row not in rejected:
+            found[row] = (
+                f"{rows.roles.time}: expected a time after {rows.time[before]:g} of line {rows.lines[before]}, "
+                f"got {rows.time[row]:g}"
+            )
+        elif row not in rejected:
+            latest[int(episode[row])] = row
+    return found
+
+
+def _going_on(rows: Rows, follower: dict[int, int], rejected: dict[int, str]) -> dict[int, str]:
+    """Rows that say their episode ended while another row of it follows."""
+    return {
+        row: f"{rows.roles.terminated}: expected 0, as line {rows.lines[after]} goes on with the episode, got 1"
+        for row, after in follower.items()
+        if rows.terminated[row] and row not in rejected
+    }
+
+
+def _interval(rows: Rows, follower: dict[int, int], rejected: dict[int, str]) -> float | None:
+    """The median time between rows that follow each other."""
+    if rows.time is None or not follower:
+        return None
+    pairs = [(a, b) for a, b in follower.items() if a not in rejected and b not in rejected]
+    steps = [float(rows.time[b] - rows.time[a]) for a, b in pairs]
+    return float(np.median(steps)) if steps else None
+
+
+def _paired(rows: Rows, follower: dict[int, int], rejected: dict[int, str], interval: float | None) -> dict[int, int]:
+    """For each row that has a next state, the row that has it: itself where the log has columns of next states."""
+    if rows.following is not None:
+        return {row: row for row in range(len(rows)) if row not in rejected}
+    paired = {}
+    for row, after in follower.items():
+        if not rows.sound[after] or rows.terminated[row] or rows.truncated[row]:
+            continue
+        if interval and rows.time is not None:
+            step = rows.time[after] - rows.time[row]
+            if not abs(step - interval) <= ONE_INTERVAL * interval:
+                continue
+        paired[row] = after
+    return paired
+
+
+def _firsts(episode: Ints, order: list[int]) -> Iterable[tuple[int, bool]]:
+    """Rows of the order, and whether each is the first of its episode."""
+    seen: set[int] = set()
+    for row in order:
+        number = int(episode[row])
+        yield row, number not in seen
+        seen.add(number)

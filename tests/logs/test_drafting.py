@@ -1,0 +1,151 @@
+"""What a drafted specification concludes from the data, and what it leaves to a person."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support import reactor
+from surrogym_client.logs import ReadLog, UnusableLog, read_log
+from surrogym_client.logs.importing import Options
+from surrogym_client.original import make
+from surrogym_shared.spec import Bounds, BoxAction, DeclaredReward, DiscreteAction, Fixed, Uniform
+
+RNG = np.random.default_rng(0)
+
+
+def drafted(folder: Path, **columns) -> ReadLog:
+    np.savez(folder / "log.npz", **columns)
+    return read_log(folder / "log.npz")
+
+
+def rows(count: int = 50, **changes) -> dict[str, np.ndarray]:
+    """A walk x under an action that varies."""
+    u = RNG.uniform(-1, 1, count)
+    x = 1 + np.cumsum(0.1 * u)
+    return {"x": x, "next_x": x + 0.1 * u, "action": u, "reward": -(x**2)} | changes
+
+
+def test_the_reactors_log_gives_its_specification(tmp_path: Path):
+    module = reactor.example()
+    module.write(str(tmp_path / "log.csv"), list(module.operate()))
+    spec = read_log(tmp_path / "log.csv").spec
+    concentration, temperature = spec.coordinates
+    assert (concentration.kind, concentration.bounds) == ("linear", None)
+    assert temperature.bounds == Bounds(high=400), "the relief valve shows in the data"
+    assert spec.action == BoxAction(low=(280,), high=(320,))
+    assert (spec.time_limit, spec.termination, spec.design.budget) == (100, (), 0)
+
+
+def test_pendulums_angle_wraps_and_its_speed_saturates(tmp_path: Path):
+    machine = make("Pendulum-v1")
+    steps = []
+    for _ in range(60):
+        q = RNG.uniform([-math.pi, -8], [math.pi, 8])
+        for _ in range(40):
+            action = RNG.uniform(-2, 2, 1)
+            step = machine.step_from(q, action)
+            after = np.array(step.next_coordinates)
+            after[0] = math.remainder(after[0], 2 * math.pi)
+            steps.append((*q, *action, step.reward, *after))
+            q = after
+    theta, speed, action, reward, next_theta, next_speed = np.array(steps).T
+    log = drafted(
+        tmp_path, theta=theta, speed=speed, action=action, reward=reward, next_theta=next_theta, next_speed=next_speed
+    )
+    assert [c.kind for c in log.spec.coordinates] == ["angle", "linear"]
+    assert log.spec.coordinates[1].bounds == Bounds(low=-8, high=8)
+    assert log.spec.observation_names == ("cos(theta)", "sin(theta)", "speed")
+
+
+def test_an_angle_from_0_to_a_full_turn_is_wrapped(tmp_path: Path):
+    turned = np.arange(200) * 0.3
+    u = RNG.uniform(-1, 1, 200)
+    two_pi = 2 * math.pi
+    log = drafted(tmp_path, a=turned % two_pi, next_a=(turned + 0.3) % two_pi, action=u, reward=u)
+    assert log.spec.coordinates[0].kind == "angle"
+    assert log.steps.q.min() < -3
+    assert log.steps.q.max() < math.pi
+
+
+def test_what_never_changes_is_left_out_and_said(tmp_path: Path):
+    log = drafted(tmp_path, **rows(p=np.full(50, 3.0), next_p=np.full(50, 3.0)))
+    assert log.spec.coordinate_names == ("x",)
+    assert "p: always 3, left out" in log.notes
+
+
+def test_what_never_moves_in_an_episode_is_a_constant(tmp_path: Path):
+    goal = np.repeat(RNG.uniform(-1, 1, 5), 10)
+    log = drafted(tmp_path, **rows(goal=goal, next_goal=goal))
+    assert {c.name: c.kind for c in log.spec.coordinates} == {"x": "linear", "goal": "constant"}
+
+
+def test_a_range_has_a_margin_and_actions_have_none(tmp_path: Path):
+    columns = rows()
+    spec = drafted(tmp_path, **columns).spec
+    low, high = (f(f(columns["x"]), f(columns["next_x"])) for f in (min, max))
+    margin = 0.05 * (high - low)
+    assert spec.coordinates[0].sampling == Uniform(low=low - margin, high=high + margin)
+    assert spec.action == BoxAction(low=(columns["action"].min(),), high=(columns["action"].max(),))
+
+
+def test_whole_numbers_are_a_discrete_action(tmp_path: Path):
+    spec = drafted(tmp_path, **rows(action=np.arange(50) % 3)).spec
+    assert spec.action == DiscreteAction(n=3)
+
+
+def test_no_column_of_the_reward_declares_it_as_nothing(tmp_path: Path):
+    columns = rows()
+    del columns["reward"]
+    log = drafted(tmp_path, **columns)
+    assert isinstance(log.spec.reward, DeclaredReward)
+    assert any(note.startswith("reward: no column") for note in log.notes)
+
+
+def test_an_episode_that_ended_has_its_end_learned(tmp_path: Path):
+    ended = np.arange(50) % 10 == 9
+    assert drafted(tmp_path, **rows(terminated=ended)).spec.termination == "learned"
+
+
+def test_episodes_that_begin_at_one_place_start_there(tmp_path: Path):
+    columns = rows(episode=np.arange(50) // 10)
+    columns["x"][::10] = 1.0
+    spec = drafted(tmp_path, **columns).spec
+    assert (spec.start["x"], spec.time_limit) == (Fixed(value=1.0), 10)
+
+
+def test_a_value_far_from_all_others_is_pointed_out(tmp_path: Path):
+    columns = rows()
+    columns["next_x"][7] = 500.0
+    assert any("end far from the others, up to 500" in note for note in drafted(tmp_path, **columns).notes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"action": np.ones(50)}, "expected an action '0' that varies, got 1 in every row"),
+        ({"x": np.ones(50), "next_x": np.ones(50)}, "expected a state that moves"),
+    ],
+)
+def test_a_log_that_shows_nothing_is_refused(tmp_path: Path, changes, says: str):
+    with pytest.raises(UnusableLog, match=says):
+        drafted(tmp_path, **rows(**changes))
+
+
+def test_a_specification_sets_contradicting_rows_aside(tmp_path: Path):
+    from surrogym_shared.spec import EnvironmentSpec, Inequality, Term
+
+    columns = rows(terminated=np.zeros(50))
+    spec = drafted(tmp_path, **columns).spec
+    ends = ((Inequality(term=Term.linear(x=1), relation=">", value=2.0),),)
+    fields = spec.model_dump() | {"termination": ends}
+    columns["next_x"][:3], columns["terminated"][:2] = (3.0, 0.0, 3.0), 1
+    np.savez(tmp_path / "log.npz", **columns)
+    log = read_log(tmp_path / "log.npz", Options(spec=EnvironmentSpec.model_validate(fields)))
+    told = dict(log.rejected)
+    assert told[2] == "terminated: expected 0, as no declared termination holds at the next state, got 1"
+    assert told[3] == "terminated: expected 1, as a declared termination holds at the next state, got 0"
+    assert 1 not in told

@@ -1,0 +1,156 @@
+"""A log on a server: all usable rows at no cost, nothing twice, and a model of them at once."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from support import reactor
+from support.server import ServerProcess
+from surrogym_client.errors import ServerUnreachable, UnknownSurrogate
+from surrogym_client.logs import import_log, importing
+from surrogym_client.surrogates.waiting import wait_for_model
+from surrogym_client.transport import Api
+
+ROWS = 60
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return reactor.log(runs=3, length=20).write(tmp_path / "log.csv")
+
+
+@pytest.fixture
+def name(request: pytest.FixtureRequest) -> str:
+    return request.node.name[:60].replace("[", "-").rstrip("]")
+
+
+def test_a_log_gives_a_model_without_a_sampler(server_process: ServerProcess, log: Path, name: str):
+    imported = import_log(log, register=name, url=server_process.url)
+    assert (imported.sent, imported.taken, imported.rejected_file) == (ROWS, ROWS, None)
+    with Api(server_process.url) as api:
+        view = wait_for_model(api, name, 120)
+        kinds = {sample.purpose for sample in api.samples(name)}
+    assert (view.phase, view.ledger.logged, view.ledger.total, view.budget) == ("from_log", ROWS, 0, 0)
+    assert (view.queries.pending, view.samples, kinds) == (0, ROWS, {"logged"})
+
+
+def test_the_same_log_twice_changes_nothing(server_process: ServerProcess, log: Path, name: str):
+    import_log(log, register=name, url=server_process.url)
+    with Api(server_process.url) as api:
+        first = wait_for_model(api, name, 120)
+        again = import_log(log, register=name, url=server_process.url)
+        assert (again.sent, again.duplicates, again.taken) == (ROWS, ROWS, 0)
+        second = api.surrogate(name)
+    assert (second.round, second.samples, second.phase) == (first.round, first.samples, "from_log")
+
+
+def test_an_interrupted_import_is_taken_up(
+    server_process: ServerProcess, log: Path, name: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(importing, "BATCH", 25)
+
+    def stop(share: float, words: str) -> None:
+        if "25 of 60" in words:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        import_log(log, register=name, url=server_process.url, progress=stop)
+    with Api(server_process.url) as api:
+        assert (api.surrogate(name).samples, api.surrogate(name).phase) == (25, "collecting"), "no fit of half a log"
+    imported = import_log(log, to=name, url=server_process.url)
+    assert (imported.duplicates, imported.taken) == (25, 35)
+    with Api(server_process.url) as api:
+        assert wait_for_model(api, name, 120).samples == ROWS
+
+
+def test_a_log_that_has_grown_brings_what_is_new(server_process: ServerProcess, tmp_path: Path, name: str):
+    whole = reactor.log(runs=3, length=20)
+    early = reactor.Log(whole.heading, whole.rows[:40]).write(tmp_path / "early.csv")
+    late = whole.write(tmp_path / "late.csv")
+    spec = import_log(late).log.spec  # the ranges of all of it
+    import_log(early, register=name, spec=spec, url=server_process.url)
+    assert import_log(late, to=name, url=server_process.url).taken == 20
+
+
+def test_a_real_environment_goes_on_from_its_log(server_process: ServerProcess, log: Path, name: str):
+    spec = reactor.example().Reactor().spec()
+    with Api(server_process.url) as api:
+        before = api.create_surrogate(name, spec)
+        import_log(log, to=name, url=server_process.url)
+        view = wait_for_model(api, name, 120)
+        asked = {query.purpose for query in api.queries(name)}
+    assert view.budget_left + view.queries.pending == view.budget, "the log cost nothing"
+    assert "adaptive" in asked
+    assert view.queries.pending < before.queries.pending + 3, "initial queries that the log covers are withdrawn"
+
+
+def test_rows_beyond_the_surrogates_ranges_are_set_aside(server_process: ServerProcess, tmp_path: Path, name: str):
+    with Api(server_process.url) as api:
+        api.create_surrogate(name, reactor.example().Reactor().spec())
+    damaged = reactor.log(runs=3, length=20).at(7, "action_coolant", "321").at(9, "temperature", "401")
+    imported = import_log(damaged.write(tmp_path / "log.csv"), to=name, url=server_process.url)
+    assert [line for line, _ in imported.log.rejected] == [9, 11]
+    assert imported.sent == ROWS - 2
+
+
+def test_nothing_is_sent_without_a_name(log: Path):
+    imported = import_log(log, url="http://127.0.0.1:9")
+    assert (imported.surrogate, imported.sent, len(imported.log.steps)) == (None, 0, ROWS)
+
+
+def test_an_unknown_surrogate_and_a_server_that_is_away_are_named(server_process: ServerProcess, log: Path):
+    with pytest.raises(UnknownSurrogate):
+        import_log(log, to="nobody", url=server_process.url)
+    with pytest.raises(ValueError, match="one of register and to"):
+        import_log(log, register="a", to="b")
+
+
+def test_the_command_drafts_registers_and_waits(
+    server_process: ServerProcess, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+):
+    from surrogym_client.cli import main
+
+    path = reactor.log(runs=3, length=20).at(4, "temperature", "nan").write(tmp_path / "log.csv")
+    common = ["import", str(path), "--register", name, "--draft", str(tmp_path / "spec.json"), "--wait", "120"]
+    with pytest.raises(SystemExit) as ended:
+        main([*common, "--json", "--quiet", "--server", server_process.url])
+    assert not ended.value.code
+    told = json.loads(capsys.readouterr().out)
+    assert (told["rows"], told["sent"], told["view"]["phase"]) == (ROWS, ROWS - 1, "from_log")
+    assert told["rejected"] == [{"line": 6, "reason": "temperature: not a number: nan"}]
+    assert json.loads((tmp_path / "spec.json").read_text()) == told["spec"]
+    with pytest.raises(SystemExit):
+        main(["import", str(path), "--to", name, "--server", server_process.url])
+    said = capsys.readouterr().out
+    assert "1 rows can't be used" in said
+    assert f"{name}: 0 new logged steps, {ROWS - 1} were there before" in said
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--name", "x"], "is a log: give --register NAME or --to NAME, not --name"),
+        (["--register", "a", "--to", "b"], "expected --register or --to, got both"),
+        (["--map", "nothing.toml"], "nothing.toml: No such file"),
+    ],
+)
+def test_wrong_options_of_a_log_are_refused(
+    log: Path, capsys: pytest.CaptureFixture[str], options: list[str], says: str
+):
+    from surrogym_client.cli import main
+
+    with pytest.raises(SystemExit) as ended:
+        main(["import", str(log), *options])
+    assert ended.value.code == 1
+    assert says in capsys.readouterr().err
+
+
+def test_a_server_that_is_away_is_said_before_anything_is_lost(log: Path, monkeypatch: pytest.MonkeyPatch):
+    from surrogym_client.transport.connection import Retries
+
+    monkeypatch.setattr("surrogym_client.logs.importing.Api", lambda *given: Api(*given, retries=Retries(seconds=0)))
+    with pytest.raises(ServerUnreachable):
+        import_log(log, register="a", url="http://127.0.0.1:9")

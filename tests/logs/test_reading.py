@@ -1,0 +1,168 @@
+"""Files to transitions: the same steps in every format, next states by order, and rows set aside with their reason."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support import reactor
+from surrogym_client.logs import ReadLog, UnusableLog, read_log
+from surrogym_client.logs.columns import roles_by_name
+from surrogym_client.logs.importing import Options, keep_rejected
+from surrogym_client.logs.reading import format_of
+
+
+def read(path: Path, **changes) -> ReadLog:
+    return read_log(path, Options(mapping=reactor.MAPPING | changes))
+
+
+def test_every_format_gives_the_same_steps(tmp_path: Path):
+    pytest.importorskip("pyarrow")
+    module = reactor.example()
+    rows = list(module.operate(runs=3, length=20))
+    found = {}
+    for ending in ("csv", "npz", "parquet"):
+        module.write(str(tmp_path / f"log.{ending}"), rows)
+        found[ending] = read_log(tmp_path / f"log.{ending}")
+    assert {ending: len(log.steps) for ending, log in found.items()} == dict.fromkeys(found, 60)
+    assert len({log.steps.digest for log in found.values()}) == 1
+    assert len({log.spec.model_dump_json() for log in found.values()}) == 1
+
+
+def test_exactly_the_broken_rows_are_set_aside(tmp_path: Path):
+    whole = reactor.log(runs=20, length=100)
+    damaged, ways = reactor.broken(whole, share=0.02)
+    assert set(ways.values()) == set(reactor.WAYS), "every way is there"
+    log = read(damaged.write(tmp_path / "log.csv"))
+    assert [line for line, _ in log.rejected] == sorted(ways)
+    for line, reason in log.rejected:
+        assert reactor.WAYS[ways[line]] in reason
+    assert len(log.steps) == len(whole.rows) - len(ways)
+
+
+def test_rejected_rows_are_written_with_line_reason_and_cells(tmp_path: Path):
+    damaged = reactor.log().at(3, "reward", "oops")
+    path = damaged.write(tmp_path / "log.csv")
+    file = keep_rejected(path, read(path))
+    assert file == tmp_path / "log.rejected.csv"
+    [heading, row] = list(csv.reader(file.read_text().splitlines()))
+    assert heading == ["line", "reason", *damaged.heading]
+    assert row[:2] == ["5", "reward: expected a number, got 'oops'"]
+    assert tuple(row[2:]) == damaged.rows[3]
+
+
+def test_a_whole_log_leaves_no_file_of_rejected_rows(tmp_path: Path):
+    path = reactor.log().write(tmp_path / "log.csv")
+    assert keep_rejected(path, read(path)) is None
+    assert [file.name for file in tmp_path.iterdir()] == ["log.csv"]
+
+
+def test_next_states_come_from_the_order_within_an_episode(tmp_path: Path):
+    whole = reactor.log(runs=3, length=10)
+    with_next = read(whole.write(tmp_path / "a.csv"))
+    by_order = read(whole.without("next_concentration", "next_temperature").write(tmp_path / "b.csv"), next={})
+    inner = np.arange(30) % 10 < 9  # the last row of an episode has no next state
+    assert (len(by_order.steps), by_order.steps.ends) == (27, 3)
+    np.testing.assert_array_equal(by_order.steps.q_next, with_next.steps.q_next[inner])
+    np.testing.assert_array_equal(by_order.steps.u, with_next.steps.u[inner])
+
+
+def test_a_lost_row_leaves_no_step_across_its_gap(tmp_path: Path):
+    whole = reactor.log(runs=1, length=10).without("next_concentration", "next_temperature")
+    log = read(whole.at(5, "temperature", "nan").write(tmp_path / "log.csv"), next={})
+    assert log.steps.row.tolist() == [0, 1, 2, 3, 6, 7, 8], "4 has no next state, 5 no state, 9 is the end"
+
+
+def test_a_bad_action_spoils_its_own_step_alone(tmp_path: Path):
+    whole = reactor.log(runs=1, length=10).without("next_concentration", "next_temperature")
+    log = read(whole.at(5, "action_coolant", "nan").write(tmp_path / "log.csv"), next={})
+    assert log.steps.row.tolist() == [0, 1, 2, 3, 4, 6, 7, 8]
+
+
+def test_a_clock_that_restarts_begins_an_episode(tmp_path: Path):
+    whole = reactor.log(runs=2, length=10).without("run", "next_concentration", "next_temperature")
+    log = read(whole.write(tmp_path / "log.csv"), next={}, episode=None)
+    assert (log.steps.episodes, log.rejected) == ((10, 10), [])
+
+
+def test_a_pause_of_the_clock_is_no_step(tmp_path: Path):
+    whole = reactor.log(runs=1, length=10).without("next_concentration", "next_temperature")
+    for row in range(6, 10):
+        whole = whole.at(row, "time", repr(float(whole.rows[row][1]) + 30))
+    assert read(whole.write(tmp_path / "log.csv"), next={}).steps.row.tolist() == [0, 1, 2, 3, 4, 6, 7, 8]
+
+
+def test_times_may_be_dates(tmp_path: Path):
+    whole = reactor.log(runs=1, length=10)
+    for row in range(10):
+        whole = whole.at(row, "time", f"2026-03-01T12:{row:02d}:00Z")
+    log = read(whole.write(tmp_path / "log.csv"))
+    assert (log.steps.interval, log.rejected) == (60.0, [])
+
+
+def test_columns_are_known_by_their_names():
+    roles = roles_by_name(["Run", "t", "T", "c", "action_valve", "T_next", "next_c", "done", "reward"])
+    assert (roles.state, roles.action) == ({"T": "T", "c": "c"}, {"valve": "action_valve"})
+    assert roles.following == {"T": "T_next", "c": "next_c"}
+    assert (roles.time, roles.episode, roles.terminated, roles.reward) == ("t", "Run", "done", "reward")
+
+
+def test_marked_states_leave_other_columns_out():
+    roles = roles_by_name(["id", "q.theta", "q.speed", "u.0", "next.theta", "next.speed", "late", "reward"])
+    assert (tuple(roles.state), tuple(roles.action), roles.ignored) == (("theta", "speed"), ("0",), ("id", "late"))
+
+
+@pytest.mark.parametrize(
+    ("heading", "says"),
+    [
+        (["a", "b"], "expected a column of the action, such as action_valve, got \\['a', 'b'\\]"),
+        (["action"], "expected a column of the state"),
+        (["a", "b", "action", "next_a"], "expected next states of all of \\['a', 'b'\\] or of none"),
+    ],
+)
+def test_columns_that_say_too_little_are_refused(heading: list[str], says: str):
+    with pytest.raises(UnusableLog, match=says):
+        roles_by_name(heading)
+
+
+def test_a_mapping_that_names_no_column_is_refused(tmp_path: Path):
+    path = reactor.log().write(tmp_path / "log.csv")
+    with pytest.raises(UnusableLog, match="names the column 'TT-101': expected one of"):
+        read(path, state={"T": "TT-101"})
+
+
+def test_a_mapping_may_be_toml_or_json(tmp_path: Path):
+    import json
+
+    path = reactor.log().without("next_concentration", "next_temperature").write(tmp_path / "log.csv")
+    plain = {"state": ["temperature"], "action": ["action_coolant"], "time": "time"}
+    (tmp_path / "map.json").write_text(json.dumps(plain))
+    (tmp_path / "map.toml").write_text('state = ["temperature"]\naction = ["action_coolant"]\ntime = "time"\n')
+    specs = [read_log(path, Options(mapping=tmp_path / f"map.{kind}")).spec for kind in ("json", "toml")]
+    assert specs[0] == specs[1]
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "expected a log with a heading"),
+        (b"a,action\n", "or a log with a heading and rows, got neither"),
+        (b"a,a,action\n1,1,1\n", "expected each column once"),
+        (b"\xff\xfe\x00", "expected text, NPZ, Parquet or a surrogate's file"),
+        (b"PK\x03\x04 no zip", "expected a zip"),
+        (b"a,action\nx,y\n", "expected two usable steps at least, got 0"),
+    ],
+)
+def test_what_is_no_log_is_refused_in_a_sentence(tmp_path: Path, content: bytes, says: str):
+    path = tmp_path / "log"
+    path.write_bytes(content)
+    with pytest.raises(UnusableLog, match=says):
+        read_log(path)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path):
+    with pytest.raises(FileNotFoundError, match=r"nothing\.csv"):
+        format_of(tmp_path / "nothing.csv")
