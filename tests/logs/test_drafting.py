@@ -149,3 +149,19 @@ def test_a_specification_sets_contradicting_rows_aside(tmp_path: Path):
     assert told[2] == "terminated: expected 0, as no declared termination holds at the next state, got 1"
     assert told[3] == "terminated: expected 1, as a declared termination holds at the next state, got 0"
     assert 1 not in told
+
+
+def test_virtual_episodes_start_where_the_log_has_been(tmp_path: Path):
+    columns = rows()
+    alone = drafted(tmp_path, **columns).spec
+    assert len(alone.starts) == 50, "a single episode: any state of it"
+    assert {start[0] for start in alone.starts} == set(columns["x"].tolist())
+    many = drafted(tmp_path, **columns, episode=np.arange(50) // 5).spec
+    assert [start[0] for start in many.starts] == columns["x"][::5].tolist()
+
+
+def test_outside_the_log_counts_as_its_worst_step_where_there_is_no_machine(tmp_path: Path):
+    columns = rows()
+    np.savez(tmp_path / "log.npz", **columns)
+    assert read_log(tmp_path / "log.npz").spec.outside_reward == columns["reward"].min()
+    assert read_log(tmp_path / "log.npz", Options(budget=20)).spec.outside_reward is None

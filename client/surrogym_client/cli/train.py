@@ -144,8 +144,13 @@ class StartOptions:
     """Where episodes and the policy start, and how long a training may go on."""
 
     start_box: Annotated[
-        float, typer.Option(min=0, max=1, help="Share of episodes that start anywhere in the sampling range.")
-    ] = 0.5
+        float | None,
+        typer.Option(
+            min=0,
+            max=1,
+            help="Share of episodes that start anywhere in the sampling range. [default: 0.5; 0 for a model of a log]",
+        ),
+    ] = None
     start_from: Annotated[Path | None, typer.Option(help="Policy file to go on from.")] = None
     trust_policy: Annotated[
         bool,

@@ -17,6 +17,7 @@ from surrogym_shared.network import Network, bounds_of, counts_of
 from surrogym_shared.port import PolicyPort, PolicyRollout, StepResult, SurrogatePort
 
 WHOLE = {"start_box": 0.0, "trust": None}  # an episode cut short would earn more where rewards are costs
+PAID_OUTSIDE = {"start_box": 0.0}  # an episode that leaves what is trusted pays for what it lacks
 STATISTICS_LANES = 1_024
 STEPS_AT_ONCE = 1_000  # of an imagined episode: a bound on a reply, not on an episode
 
@@ -61,7 +62,8 @@ def imagine(
         seed: of their starts, or one an episode; the same seed compares policies on the same starts.
         options: further fields of ``OpenSession``.
     """
-    lanes = Lanes(port, session_request(episodes, "same_step", options | WHOLE))
+    whole = WHOLE if port.spec().outside_reward is None else PAID_OUTSIDE
+    lanes = Lanes(port, session_request(episodes, "same_step", options | whole))
     sums, limit = _Sums(episodes), port.spec().time_limit or LONGEST_EPISODE
     policy = _as_arrays(predict, port)
     try:

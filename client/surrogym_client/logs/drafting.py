@@ -35,6 +35,8 @@ MOST_DISCRETE = 16  # values of an action that is the number of a discrete one
 FULL_TURN = (0.9 * 2 * math.pi, 1.1 * 2 * math.pi)  # sizes of a jump that is a turn around the circle
 FEW_EPISODES = 2
 USUAL_LIMIT = 200  # steps of a virtual episode, where the log is a single one
+MOST_STARTS = 64
+FEW_STARTS = 8  # episodes of a log: fewer begin at too few places to train from
 FAR = 8.0  # widths of the middle half of the data, from its middle: a remark, no fault
 
 
@@ -76,8 +78,10 @@ def draft(roles: Roles, steps: Transitions, name: str, budget: int = 0) -> Draft
         observation=tuple(entry for c in coordinates for entry in _observed(c)),
         action=_action(roles, steps, notes),
         start=starts,
+        starts=_starts(steps, kept, coordinates),
         termination="learned" if bool(steps.terminated.any()) else (),
         time_limit=_time_limit(steps, notes),
+        outside_reward=_outside_reward(steps, budget, notes),
         reward=_reward(steps, notes),
         design=Design(budget=budget),
     )
@@ -149,6 +153,31 @@ def _start(coordinate: Coordinate, steps: Transitions, index: int) -> Uniform | 
         values = wrapped(values)
     low, high = float(values.min()), float(values.max())
     return Fixed(value=low) if low == high else Uniform(low=low, high=high)
+
+
+def _starts(steps: Transitions, kept: list[int], coordinates: list[Coordinate]) -> tuple[tuple[float, ...], ...]:
+    """States that virtual episodes start at: where episodes of the log begin, or, if these are few, any states of it,
+    evenly spaced. A box around them would have corners where the log has never been."""
+    rows = np.flatnonzero(steps.first)
+    if len(rows) < FEW_STARTS:
+        rows = np.arange(len(steps))
+    spaced = rows[np.unique(np.linspace(0, len(rows) - 1, min(MOST_STARTS, len(rows))).round().astype(int))]
+    states = steps.q[spaced][:, kept].copy()
+    for index, coordinate in enumerate(coordinates):
+        if coordinate.kind == "angle":
+            states[:, index] = wrapped(states[:, index])
+    return tuple(tuple(state) for state in states.tolist())
+
+
+def _outside_reward(steps: Transitions, budget: int, notes: list[str]) -> float | None:
+    """The worst reward of the log, where nobody can ask what is beyond it."""
+    if budget or steps.reward is None:
+        return None
+    worst = float(steps.reward.min())
+    notes.append(
+        f"outside the ranges: a virtual episode ends, and each step that it lacks pays {worst:g}, the worst seen"
+    )
+    return worst
 
 
 def wrapped(angles: Floats) -> Floats:

@@ -245,6 +245,8 @@ def draw(spec: EnvironmentSpec, rng: np.random.Generator, *, wide: bool, scale: 
         wide: from the sampling range.
         scale: how many times as far from the middle of each start distribution; bounds are kept.
     """
+    if spec.starts and not wide and scale == 1:
+        return np.array(spec.starts[rng.integers(len(spec.starts))])
     chosen = [c.sampling if wide else spec.start[c.name] for c in spec.coordinates]
     drawn = np.array([_draw_one(distribution, rng) for distribution in chosen])
     if scale == 1:

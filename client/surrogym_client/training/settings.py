@@ -15,6 +15,8 @@ SUGGESTED_STEPS = 1_000_000  # virtual ones, the most that is suggested for all 
 DRAWS: dict[str, Any] = {"variant": "probabilistic", "particles": 1, "spread": 0.0}  # each step of a lane is a draw
 FUNCTIONS: dict[str, Any] = {"variant": "pathwise"}  # each episode follows one function
 
+START_BOX = 0.5  # usually
+
 MOST_THREADS = 1_024  # torch starts as many as it is told, and the process ends where the system has no more
 
 TENSORBOARD = "tensorboard"  # folder beside the policy
@@ -34,7 +36,7 @@ class TrainSettings:
     total_steps: int | None = None
     num_envs: int | None = None
     seed: int = 0
-    start_box: float = 0.5
+    start_box: float | None = None  # share of episodes that start anywhere in the sampling range; None: START_BOX
     start_from: Path | None = None  # go on from a saved policy
     trust_policy: bool = False  # unpickle that policy's objects, which may run code
     anew: bool = False  # begin with a new network, and go on from the saved policy only where that falls short
@@ -55,7 +57,8 @@ class TrainSettings:
     @property
     def learning(self) -> dict[str, Any]:
         """Session fields of the lanes that a policy learns in."""
-        return {"seed": self.seed, "start_box": self.start_box, **self.session}
+        start_box = START_BOX if self.start_box is None else self.start_box
+        return {"seed": self.seed, "start_box": start_box, **self.session}
 
     @property
     def judging(self) -> dict[str, Any]:
@@ -69,7 +72,7 @@ def chosen_for(view: SurrogateView, settings: TrainSettings, *, by_mean: bool = 
     design is not ready the policy learns on draws, a state a lane (TS1 of Chua et al. 2018): what relies on the mean
     where the model is unsure fails in the original environment. Policies are compared by functions of the posterior:
     draws shake a lane out of a state in which the policy would leave it for good. Who names a variant keeps it, and
-    preset ``paper`` has AUR-D.
+    preset ``paper`` has AUR-D. Where the model is of a log alone, no episode starts where the log has not been.
 
     Args:
         view: the surrogate.
@@ -78,6 +81,8 @@ def chosen_for(view: SurrogateView, settings: TrainSettings, *, by_mean: bool = 
     """
     if view.spec.design.preset == "paper":
         return settings
+    if view.phase == "from_log" and settings.start_box is None:
+        settings = replace(settings, start_box=0.0)
     noisy = view.fidelity is not None and any(output.noise > 0 for output in view.fidelity.outputs)
     if noisy and not by_mean:
         settings = replace(settings, session={"process_noise": True, **settings.session})

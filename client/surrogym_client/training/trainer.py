@@ -65,7 +65,7 @@ def _result(found: Found, settings: TrainSettings, out: Path, seconds: float) ->
         seconds=seconds,
         imagined_return=found.imagined_return,
         lost_episodes=found.lost_episodes,
-        settings={**asdict(settings), **found.settings},
+        settings={**asdict(settings), "start_box": settings.learning["start_box"], **found.settings},
         episode_penalty=found.episode_penalty,
         networks=found.networks,
         gaining=found.gaining,

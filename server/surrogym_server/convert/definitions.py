@@ -58,6 +58,8 @@ def stored_definition(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
         learns_termination=spec.termination == "learned",
         declared_reward=_declared_reward(spec),
         max_rollout=_max_rollout(spec) if spec.query == "rollout" else None,
+        starts=spec.starts,
+        outside_reward=spec.outside_reward,
     )
     if definition.moves_observation:
         ObservationInverse.of(definition)

@@ -137,6 +137,8 @@ class EnvironmentDefinition:
     learns_termination: bool = False  # from samples; no groups are declared then
     declared_reward: DeclaredReward | None = None
     max_rollout: int | None = None  # longest action sequence from a reset; None where any state can be set
+    starts: tuple[tuple[float, ...], ...] = ()  # states that episodes start at; none: the coordinates' distributions
+    outside_reward: float | None = None  # of each step that an episode lacks which left the sampling range
     device: torch.device = CPU  # where its tensors are, and those of states and actions that it is given
 
     def on(self, device: torch.device) -> EnvironmentDefinition:
@@ -234,6 +236,11 @@ class EnvironmentDefinition:
     @cached
     def _termination(self) -> Conditions:
         return Conditions.of(self.termination_groups, len(self.coordinates), self.device)
+
+    @cached
+    def start_states(self) -> Tensor:
+        """States that episodes start at, (k, C)."""
+        return torch.tensor(self.starts, dtype=torch.float64, device=self.device).reshape(-1, len(self.coordinates))
 
     @cached
     def _sampled(self) -> tuple[Tensor, Tensor]:

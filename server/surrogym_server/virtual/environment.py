@@ -132,6 +132,8 @@ def step(
     action = torch.from_numpy(u).to(definition.device)
     moved = _move(model, settings, active, action if isinstance(moving, slice) else action[moving], deviations)
     untrusted = _untrusted(model, settings, moved)
+    if definition.outside_reward is not None:
+        moved = _left(definition, settings, active, moved, untrusted)
     active, cut = _advanced(settings, active, moved, untrusted)
     after = lanes.put(moving, active)
     terminated, truncated = _scatter(moving, moved.terminated), _scatter(moving, cut)
@@ -203,6 +205,26 @@ def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) ->
         return None
     assert moved.deviation is not None
     return (moved.deviation > settings.trust * model.scales).any(1)
+
+
+def _left(
+    definition: EnvironmentDefinition,
+    settings: VirtualSettings,
+    before: LaneState,
+    moved: Moved,
+    untrusted: Tensor | None,
+) -> Moved:
+    """The move, with the lanes ended that left the sampling range or the trusted one. They are paid the outside reward
+    for this step and for those that are missing up to the time limit; where a session has none, for this step."""
+    left = ~definition.in_range(moved.q)
+    left = (left if untrusted is None else left | untrusted) & ~moved.terminated
+    lacking = torch.ones_like(moved.reward)
+    if settings.time_limit is not None:
+        lacking = (settings.time_limit - before.elapsed).clamp(min=1).to(moved.reward.dtype)
+    lost = (definition.outside_reward or 0.0) * lacking
+    mean = torch.where(left, lost, moved.reward_mean)
+    reward = mean if moved.reward is moved.reward_mean else torch.where(left, lost, moved.reward)
+    return replace(moved, reward_mean=mean, reward=reward, terminated=moved.terminated | left)
 
 
 def _advanced(

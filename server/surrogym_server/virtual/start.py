@@ -17,7 +17,11 @@ def start_coordinates(definition: EnvironmentDefinition, lanes: LaneState, box_s
     """Start of each lane's present episode, (N, C); a share of the episodes starts anywhere in the sampling range."""
     coordinates = definition.coordinates
     p = uniform_noise(lanes, Purpose.START, len(coordinates))
-    declared = torch.stack([c.start.quantile(p[:, i]) for i, c in enumerate(coordinates)], -1)
+    if definition.starts:
+        states = definition.start_states
+        declared = states[(p[:, 0] * len(states)).long().clamp_(max=len(states) - 1)]
+    else:
+        declared = torch.stack([c.start.quantile(p[:, i]) for i, c in enumerate(coordinates)], -1)
     if box_share == 0:
         return declared
     anywhere = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(coordinates)], -1)

@@ -15,6 +15,7 @@ NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 NAME_IN_WORDS = "1 to 64 letters, digits, '.', '_' or '-', the first a letter or a digit"
 MAX_INEQUALITIES = 16  # in a group, and groups
 MAX_ROLLOUT_QUERY = 4_096  # real steps that one query may ask for
+MAX_STARTS = 256
 REWARD = "reward"
 
 Name = Annotated[str, Field(min_length=1, max_length=64)]

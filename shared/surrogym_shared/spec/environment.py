@@ -8,9 +8,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, StrictBool, StrictFloat, StrictInt, StrictStr, model_validator
 
-from surrogym_shared.checks import Positive, require, require_known, require_unique
+from surrogym_shared.checks import Number, Positive, require, require_known, require_unique
 from surrogym_shared.spec.actions import Action
-from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, REWARD, Frozen, Name
+from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, MAX_STARTS, REWARD, Frozen, Name
 from surrogym_shared.spec.coordinates import Coordinate, StartDistribution, limits
 from surrogym_shared.spec.rewards import AnyReward, DeclaredReward, Reward, Success
 from surrogym_shared.spec.terms import AllOf, ObservationEntry, Term, Termination
@@ -70,8 +70,18 @@ class EnvironmentSpec(Frozen):
     observation: tuple[ObservationEntry, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
     action: Action
     start: dict[Name, StartDistribution]
+    starts: tuple[tuple[Number, ...], ...] = Field(
+        default=(),
+        max_length=MAX_STARTS,
+        description="states that episodes start at, each as likely, in the place of ``start``; a log's, as a rule",
+    )
     termination: Termination = ()
     time_limit: Annotated[int, Field(ge=1, le=10_000_000, strict=True)] | None = None
+    outside_reward: Number | None = Field(
+        default=None,
+        description="ends a virtual episode that leaves the sampling ranges, or what a session trusts, and pays this "
+        "for each step up to the time limit that it lacks then; None: it goes on",
+    )
     query: Literal["step", "rollout"] = Field(
         default="step",
         description="``step``: it can be set to any state; ``rollout``: it can only be reset, and acted on from there",
@@ -126,6 +136,12 @@ class EnvironmentSpec(Frozen):
                 require(
                     inside, f"start of {c.name!r}, [{low}, {high}], leaves its bounds [{c.bounds.low}, {c.bounds.high}]"
                 )
+        for start in self.starts:
+            require(len(start) == len(names), f"starts: expected {len(names)} entries, got {len(start)}")
+        require(
+            self.outside_reward is None or self.time_limit is not None,
+            "outside_reward pays for the steps up to the time limit: expected a time_limit, got none",
+        )
         self._require_reward()
         for where, term in self._terms():
             for part in term.parts:
