@@ -44,6 +44,7 @@ from surrogym_shared.spec import Design as DesignSettings
 if TYPE_CHECKING:
     from surrogym.design import Design, QueriesOpen, Query
     from surrogym.environments import make, make_sb3, make_vec
+    from surrogym_client.logs import Imported, UnusableLog, import_log
     from surrogym_client.original.protocol import RealStep
     from surrogym_client.transport.api import Api as Client
 
@@ -61,6 +62,7 @@ __all__ = [
     "DiscreteAction",
     "EnvironmentSpec",
     "Fixed",
+    "Imported",
     "Inequality",
     "ModelChoice",
     "MultiDiscreteAction",
@@ -76,6 +78,8 @@ __all__ = [
     "Success",
     "Term",
     "Uniform",
+    "UnusableLog",
+    "import_log",
     "make",
     "make_sb3",
     "make_vec",
@@ -89,6 +93,9 @@ _LAZY = {  # name: module, its name there, the extra that brings what the module
     "make_sb3": ("surrogym.environments", "make_sb3", ""),
     "make_vec": ("surrogym.environments", "make_vec", ""),
     "RealStep": ("surrogym_client.original.protocol", "RealStep", ""),
+    "Imported": ("surrogym_client.logs", "Imported", ""),
+    "UnusableLog": ("surrogym_client.logs", "UnusableLog", ""),
+    "import_log": ("surrogym_client.logs", "import_log", ""),
     "Client": ("surrogym_client.transport.api", "Api", ""),
 }
 

@@ -109,6 +109,12 @@ def test_the_rail_is_registered_and_sampled(server: ServerProcess, tmp_path: Pat
     assert (report["answered"], report["failed"]) == (5, 0)
 
 
+def test_a_log_is_drafted_and_imported(server: ServerProcess, tmp_path: Path) -> None:
+    (program,) = programs("logs.md")
+    said = run(tmp_path, "-c", program.replace(PRINTED_URL, server.url))
+    assert said.endswith("400 steps, 0 rows set aside\n")
+
+
 def test_a_reward_that_jumps_and_an_end_that_is_learned(server: ServerProcess, tmp_path: Path) -> None:
     (tmp_path / "track.py").write_text(programs("rewards-and-terminations.md")[0], encoding="utf-8")
     common = ["--server", server.url, "--json", "--quiet"]

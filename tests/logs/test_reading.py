@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import csv
+import json
+import sys
+import warnings
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -30,6 +34,47 @@ def test_every_format_gives_the_same_steps(tmp_path: Path):
     assert {ending: len(log.steps) for ending, log in found.items()} == dict.fromkeys(found, 60)
     assert len({log.steps.digest for log in found.values()}) == 1
     assert len({log.spec.model_dump_json() for log in found.values()}) == 1
+
+
+def test_a_format_whose_package_is_missing_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.setitem(sys.modules, "minari", None)
+    (tmp_path / "log.parquet").write_bytes(b"PAR1 and so on")
+    with pytest.raises(UnusableLog, match=r"needs the package pyarrow: pip install 'surrogym\[logs\]'"):
+        read_log(tmp_path / "log.parquet")
+    with pytest.raises(UnusableLog, match="needs the package minari"):
+        read_log("pendulum/random-v0")
+
+
+def test_a_minari_data_set_gives_its_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    minari = pytest.importorskip("minari")
+    pytest.importorskip("h5py")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    rng = np.random.default_rng(0)
+    episodes = [
+        minari.data_collector.EpisodeBuffer(
+            id=number,
+            observations=rng.normal(size=(6, 2)),
+            actions=rng.uniform(-1, 1, (5, 1)),
+            rewards=rng.normal(size=5).tolist(),
+            terminations=[False] * 4 + [number == 0],
+            truncations=[False] * 4 + [number == 1],
+        )
+        for number in range(2)
+    ]
+    box = gymnasium.spaces.Box
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what it would like to know beside the steps
+        minari.create_dataset_from_buffers(
+            "reactor/made-v0",
+            episodes,
+            action_space=box(-1, 1, (1,), dtype=np.float64),
+            observation_space=box(-9, 9, (2,), dtype=np.float64),
+        )
+    log = read_log("reactor/made-v0")
+    assert (len(log.steps), log.steps.terminated.sum(), log.steps.truncated.sum()) == (10, 1, 1)
+    np.testing.assert_array_equal(log.steps.q_next[4], episodes[0].observations[5])
+    assert log.spec.coordinate_names == ("s0", "s1")
 
 
 def test_exactly_the_broken_rows_are_set_aside(tmp_path: Path):
@@ -135,8 +180,6 @@ def test_a_mapping_that_names_no_column_is_refused(tmp_path: Path):
 
 
 def test_a_mapping_may_be_toml_or_json(tmp_path: Path):
-    import json
-
     path = reactor.log().without("next_concentration", "next_temperature").write(tmp_path / "log.csv")
     plain = {"state": ["temperature"], "action": ["action_coolant"], "time": "time"}
     (tmp_path / "map.json").write_text(json.dumps(plain))

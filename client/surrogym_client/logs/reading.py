@@ -179,7 +179,7 @@ def _minari() -> Any:
     try:
         import minari
     except ModuleNotFoundError as error:
-        raise UnusableLog("a Minari data set needs the package minari: pip install 'minari[hdf5]'") from error
+        raise UnusableLog("a Minari data set needs the package minari: pip install 'surrogym[logs]'") from error
     return minari
 
 
