@@ -30,6 +30,7 @@ LENGTH_BYTES = 8
 METADATA = "__metadata__"
 OWN = "surrogate"  # key of this file's own metadata
 SAMPLES = "samples."
+LOGGED = "logged"  # of the samples; files without a log have no such array
 DTYPES: dict[str, np.dtype[Any]] = {"F64": np.dtype("<f8"), "BOOL": np.dtype("?")}
 UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError)
 
@@ -52,6 +53,7 @@ class RealSamples:
     reward: Floats  # (n,)
     terminated: Bools  # (n,)
     truncated: Bools  # (n,)
+    logged: Bools | None = None  # (n,) those of a log, which cost no budget; None: none is
 
     def __len__(self) -> int:
         return len(self.reward)
@@ -76,7 +78,8 @@ class SurrogateFile:
     def to_bytes(self) -> bytes:
         """The whole as one file. Raises ``NotASurrogateFile`` where ``model`` is no safetensors file."""
         header, body = _split(self.model)
-        arrays = {SAMPLES + name: getattr(self.samples, name) for name in RealSamples.__dataclass_fields__}
+        given = {name: getattr(self.samples, name) for name in RealSamples.__dataclass_fields__}
+        arrays = {SAMPLES + name: array for name, array in given.items() if array is not None}
         parts = [body]
         for name, array in arrays.items():
             kind = "BOOL" if array.dtype == np.bool_ else "F64"
@@ -108,7 +111,8 @@ class SurrogateFile:
             if own["format"] != FORMAT:
                 raise NotASurrogateFile(f"expected a surrogate's file of format {FORMAT}, got {own['format']!r}")
             spec = EnvironmentSpec.model_validate(own["spec"])
-            entries = {name: header.pop(SAMPLES + name) for name in RealSamples.__dataclass_fields__}
+            names = [one for one in RealSamples.__dataclass_fields__ if one != LOGGED or SAMPLES + one in header]
+            entries = {one: header.pop(SAMPLES + one) for one in names}
             samples = RealSamples(**{name: _array(entry, body) for name, entry in entries.items()})
             end = min(entry["data_offsets"][0] for entry in entries.values())
             model = _joined(header, body[:end])
@@ -185,6 +189,8 @@ def _require_shapes(spec: EnvironmentSpec, samples: RealSamples) -> None:
     n, c, f = len(samples.coordinates), len(spec.coordinates), spec.action.size
     wanted = {"coordinates": (n, c), "action": (n, f), "next_coordinates": (n, c)}
     for name in RealSamples.__dataclass_fields__:
-        expected, got = wanted.get(name, (n,)), getattr(samples, name).shape
+        if (array := getattr(samples, name)) is None:
+            continue
+        expected, got = wanted.get(name, (n,)), array.shape
         if got != expected:
             raise NotASurrogateFile(f"{SAMPLES}{name}: expected shape {expected}, got {got}")

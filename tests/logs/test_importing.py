@@ -11,8 +11,10 @@ from support import reactor
 from support.server import ServerProcess
 from surrogym_client.errors import ServerUnreachable, UnknownSurrogate
 from surrogym_client.logs import import_log, importing
+from surrogym_client.surrogates.transfer import export_surrogate, import_surrogate
 from surrogym_client.surrogates.waiting import wait_for_model
 from surrogym_client.transport import Api
+from surrogym_shared.surrogate_file import SurrogateFile
 
 ROWS = 60
 
@@ -73,6 +75,16 @@ def test_a_log_that_has_grown_brings_what_is_new(server_process: ServerProcess, 
     spec = import_log(late).log.spec  # the ranges of all of it
     import_log(early, register=name, spec=spec, url=server_process.url)
     assert import_log(late, to=name, url=server_process.url).taken == 20
+
+
+def test_a_surrogate_of_a_log_moves_as_a_file(server_process: ServerProcess, log: Path, name: str):
+    import_log(log, register=name, url=server_process.url)
+    with Api(server_process.url) as api:
+        before = wait_for_model(api, name, 120)
+        file = SurrogateFile.from_bytes(export_surrogate(api, name).to_bytes())
+        after = import_surrogate(api, file, f"{name}-2")
+    assert (after.ledger.logged, after.ledger.total, after.budget_left) == (ROWS, 0, 0)
+    assert (after.spec, after.model_version) == (before.spec, 1)
 
 
 def test_a_real_environment_goes_on_from_its_log(server_process: ServerProcess, log: Path, name: str):

@@ -78,8 +78,8 @@ def test_a_minari_data_set_gives_its_steps(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_exactly_the_broken_rows_are_set_aside(tmp_path: Path):
-    whole = reactor.log(runs=20, length=100)
-    damaged, ways = reactor.broken(whole, share=0.02)
+    whole = reactor.log(runs=50, length=100)
+    damaged, ways = reactor.broken(whole, share=0.01)
     assert set(ways.values()) == set(reactor.WAYS), "every way is there"
     log = read(damaged.write(tmp_path / "log.csv"))
     assert [line for line, _ in log.rejected] == sorted(ways)

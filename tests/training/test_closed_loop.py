@@ -127,9 +127,10 @@ def test_who_names_a_variant_and_preset_paper_keep_it(pendulum_server: ServerPro
     chosen = chosen_for(unsure, replace(SETTINGS, session={"penalty": 1.0, "particles": 2}))
     assert chosen.session == {**DRAWS, "penalty": 1.0, "particles": 2}
     assert chosen.judging == {"variant": "pathwise", "penalty": 1.0}, "particles are none of a function's"
-    of_a_log = chosen_for(view.model_copy(update={"phase": "from_log"}), SETTINGS)
+    logged = unsure.model_copy(update={"spec": view.spec.model_copy(update={"outside_reward": -1.0})})
+    of_a_log = chosen_for(logged, SETTINGS)
     assert (of_a_log.learning["start_box"], of_a_log.session) == (0.0, DRAWS), "no start where the log has not been"
-    elsewhere = chosen_for(view.model_copy(update={"phase": "from_log"}), replace(SETTINGS, start_box=0.2))
+    elsewhere = chosen_for(logged, replace(SETTINGS, start_box=0.2))
     assert elsewhere.learning["start_box"] == 0.2
     assert SETTINGS.judging == SETTINGS.session, "who learns by the mean is compared by it"
 

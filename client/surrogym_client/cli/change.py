@@ -25,7 +25,7 @@ def command(
     context: typer.Context,
     surrogate: Surrogate,
     tolerance: Tolerances = None,
-    budget: Annotated[int | None, typer.Option(min=2, help="Real steps the design may take.")] = None,
+    budget: Annotated[int | None, typer.Option(min=0, help="Real steps the design may take; 0 of a log.")] = None,
     target: Annotated[float | None, typer.Option(help="Confidence index to reach.")] = None,
     paused: Annotated[
         bool | None,

@@ -33,7 +33,7 @@ class DesignChoices:
     """What of the environment's own specification is chosen anew; None keeps it."""
 
     preset: Annotated[Preset | None, typer.Option(help="default, or paper: the method as printed.")] = None
-    budget: Annotated[int | None, typer.Option(min=2, help="Real steps the design may take.")] = None
+    budget: Annotated[int | None, typer.Option(min=0, help="Real steps the design may take; 0 of a log.")] = None
     initial: Annotated[int | None, typer.Option(min=2, help="Real steps before the first model.")] = None
     target: Annotated[float | None, typer.Option(help="Confidence index to reach.")] = None
     acquisition: Annotated[

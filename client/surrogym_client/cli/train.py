@@ -148,7 +148,7 @@ class StartOptions:
         typer.Option(
             min=0,
             max=1,
-            help="Share of episodes that start anywhere in the sampling range. [default: 0.5; 0 for a model of a log]",
+            help="Share of episodes that start anywhere in the sampling range. [default: 0.5; 0 with a log alone]",
         ),
     ] = None
     start_from: Annotated[Path | None, typer.Option(help="Policy file to go on from.")] = None
@@ -341,9 +341,10 @@ def _trainable(
                     api, surrogate, wait, lambda view: update(share_of_design(view), words_of_design(view))
                 )
         if view.model_version is None:
+            learn = "surrogym import LOG --to" if view.budget == 0 else "surrogym sample"
             raise CommandError(
                 f"{surrogate!r} has no model yet, its phase is {view.phase}: "
-                f"run surrogym sample {surrogate}, or give --wait SECONDS"
+                f"run {learn} {surrogate}, or give --wait SECONDS"
             )
         if view.phase not in COMPLETED and not view.paused:
             typer.echo(f"the design of {surrogate!r} goes on; training starts on model {view.model_version}", err=True)

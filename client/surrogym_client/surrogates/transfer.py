@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import groupby
+from typing import Literal
 
 import numpy as np
 
@@ -42,8 +45,8 @@ def import_surrogate(
 ) -> SurrogateView:
     """Make a surrogate of a file: it serves the same model at once, judged by the same tolerances.
 
-    Its design is paused, and its samples count as manual ones. Where anything fails, or Ctrl-C is pressed, nothing of
-    it stays; a surrogate that another request created is never touched.
+    Its design is paused, and its samples count as manual ones, those of a log as logged. Where anything fails, or
+    Ctrl-C is pressed, nothing of it stays; a surrogate that another request created is never touched.
 
     Args:
         api: the server; needs the role admin.
@@ -62,10 +65,10 @@ def import_surrogate(
     try:
         api.patch_surrogate(name, paused=True, tolerances=file.tolerances or None)
         api.import_model(name, file.model)
-        samples = [_sample(file.samples, i) for i in range(len(file.samples))]
-        for first in range(0, len(samples), BATCH):
-            progress(first / len(samples))
-            api.add_samples(name, "import", samples[first : first + BATCH])
+        for rows in _batches(file.samples):
+            progress(rows[0] / len(file.samples))
+            purpose: Literal["logged", "manual"] = "logged" if _is_logged(file.samples, rows[0]) else "manual"
+            api.add_samples(name, "import", [_sample(file.samples, row) for row in rows], purpose=purpose)
         progress(1.0)
         return api.surrogate(name)
     except BaseException:
@@ -91,7 +94,19 @@ def _samples(api: Api, name: str) -> RealSamples:
         reward=np.array([view.reward for view in views], dtype=np.float64),
         terminated=np.array([view.terminated for view in views], dtype=np.bool_),
         truncated=np.array([view.truncated for view in views], dtype=np.bool_),
+        logged=logged if (logged := np.array([view.purpose == "logged" for view in views])).any() else None,
     )
+
+
+def _batches(samples: RealSamples) -> Iterator[list[int]]:
+    """Rows in their order, in batches of one purpose each."""
+    for _, group in groupby(range(len(samples)), partial(_is_logged, samples)):
+        rows = list(group)
+        yield from (rows[first : first + BATCH] for first in range(0, len(rows), BATCH))
+
+
+def _is_logged(samples: RealSamples, row: int) -> bool:
+    return samples.logged is not None and bool(samples.logged[row])
 
 
 def _sample(samples: RealSamples, i: int) -> NewSample:

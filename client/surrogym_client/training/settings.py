@@ -72,7 +72,8 @@ def chosen_for(view: SurrogateView, settings: TrainSettings, *, by_mean: bool = 
     design is not ready the policy learns on draws, a state a lane (TS1 of Chua et al. 2018): what relies on the mean
     where the model is unsure fails in the original environment. Policies are compared by functions of the posterior:
     draws shake a lane out of a state in which the policy would leave it for good. Who names a variant keeps it, and
-    preset ``paper`` has AUR-D. Where the model is of a log alone, no episode starts where the log has not been.
+    preset ``paper`` has AUR-D. Where a specification pays for leaving what a log has shown, no episode starts
+    anywhere else.
 
     Args:
         view: the surrogate.
@@ -81,7 +82,7 @@ def chosen_for(view: SurrogateView, settings: TrainSettings, *, by_mean: bool = 
     """
     if view.spec.design.preset == "paper":
         return settings
-    if view.phase == "from_log" and settings.start_box is None:
+    if view.spec.outside_reward is not None and settings.start_box is None:
         settings = replace(settings, start_box=0.0)
     noisy = view.fidelity is not None and any(output.noise > 0 for output in view.fidelity.outputs)
     if noisy and not by_mean:

@@ -355,7 +355,7 @@ class Api:
         """The latest model's structure and fidelity. Raises ``NoModel`` before the first fit."""
         view = self.surrogate(name)
         if view.model_version is None:
-            detail = f"{name!r} has no model yet: let a sampler answer its first queries"
+            detail = f"{name!r} has no model yet: let a sampler answer its first queries, or import a log"
             raise NoModel(Problem(title="No model", status=STATUS[Code.NO_MODEL], code=Code.NO_MODEL, detail=detail))
         return self._get(wire.ModelView, f"{routes.surrogate(name)}/models/{view.model_version}")
 
