@@ -60,6 +60,7 @@ class LaneTransition:
     reward_mean: Floats  # (N,)
     deviation: Floats | None  # (N, O)
     untrusted: Bools | None  # (N,) truncated for leaving the trusted range; None without one
+    left: Bools | None = None  # (N,) ended and paid for leaving the sampling range; None where nobody is
 
 
 def expected_bytes(definition: EnvironmentDefinition, settings: VirtualSettings, path_size: int) -> int:
@@ -132,8 +133,9 @@ def step(
     action = torch.from_numpy(u).to(definition.device)
     moved = _move(model, settings, active, action if isinstance(moving, slice) else action[moving], deviations)
     untrusted = _untrusted(model, settings, moved)
-    if definition.outside_reward is not None:
-        moved = _left(definition, settings, active, moved, untrusted)
+    left = _left(definition, moved, untrusted)
+    if left is not None:
+        moved = _paid_outside(definition, settings, active, moved, left)
     active, cut = _advanced(settings, active, moved, untrusted)
     after = lanes.put(moving, active)
     terminated, truncated = _scatter(moving, moved.terminated), _scatter(moving, cut)
@@ -159,6 +161,7 @@ def step(
         reward_mean=_array(_scatter(moving, moved.reward_mean)) if penalised else reward.copy(),
         deviation=None if moved.deviation is None or not deviations else _array(_scatter(moving, moved.deviation)),
         untrusted=None if untrusted is None else _array(_scatter(moving, untrusted)),
+        left=None if left is None else _array(_scatter(moving, left)),
     )
 
 
@@ -207,17 +210,19 @@ def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) ->
     return (moved.deviation > settings.trust * model.scales).any(1)
 
 
-def _left(
-    definition: EnvironmentDefinition,
-    settings: VirtualSettings,
-    before: LaneState,
-    moved: Moved,
-    untrusted: Tensor | None,
-) -> Moved:
-    """The move, with the lanes ended that left the sampling range or the trusted one. They are paid the outside reward
-    for this step and for those that are missing up to the time limit; where a session has none, for this step."""
+def _left(definition: EnvironmentDefinition, moved: Moved, untrusted: Tensor | None) -> Tensor | None:
+    """Which lanes (N,) end as they left the sampling range or the trusted one; None where nobody does for that."""
+    if definition.outside_reward is None:
+        return None
     left = ~definition.in_range(moved.q)
-    left = (left if untrusted is None else left | untrusted) & ~moved.terminated
+    return (left if untrusted is None else left | untrusted) & ~moved.terminated
+
+
+def _paid_outside(
+    definition: EnvironmentDefinition, settings: VirtualSettings, before: LaneState, moved: Moved, left: Tensor
+) -> Moved:
+    """The move, with the lanes ended that left, (N,). They are paid the outside reward for this step and for those that
+    are missing up to the time limit; where a session has none, for this step."""
     lacking = torch.ones_like(moved.reward)
     if settings.time_limit is not None:
         lacking = (settings.time_limit - before.elapsed).clamp(min=1).to(moved.reward.dtype)

@@ -21,11 +21,16 @@ def reward_limits(low: float, high: float) -> Limits:
 
 
 def within(limits: Limits | None, transition: LaneTransition) -> LaneTransition:
-    """A transition whose mean rewards keep to the limits; a penalty comes off after that."""
+    """A transition whose mean rewards keep to the limits; a penalty comes off after that.
+
+    What a lane is paid for leaving the sampling range is none of the model's rewards, and stays.
+    """
     if limits is None:
         return transition
     mean = transition.reward_mean
     kept: NDArray[Any] = np.clip(mean, *limits)
+    if transition.left is not None:
+        kept = np.where(transition.left, mean, kept)
     if (kept == mean).all():
         return transition
     return replace(transition, reward_mean=kept, reward=transition.reward - mean + kept)

@@ -1,5 +1,7 @@
 """Limits of virtual rewards: what lies far beyond every sample is cut, before any penalty."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -31,3 +33,9 @@ def test_rewards_within_the_limits_are_left_as_they_are():
     same = transition([0.5, -0.5])
     assert within((-1.0, 1.0), same) is same
     assert within(None, same) is same
+
+
+def test_what_is_paid_for_leaving_the_range_is_not_cut():
+    left = np.array([True, False])
+    kept = within((-2.0, 2.0), replace(transition([-200.0, -200.0]), left=left))
+    assert kept.reward.tolist() == [-200.0, -2.0]
