@@ -51,6 +51,8 @@ def step(
 def _array_steps(model: DynamicsModel, settings: VirtualSettings) -> ArraySteps | None:
     if not settings.compiled or settings.variant == "probabilistic":
         return None
+    if model.definition.outside_reward is not None:  # what is paid outside a log is known to the reference alone
+        return None
     if settings.variant == "pathwise" and offers(model, FunctionDraws) is None:
         return None
     able = offers(model, CompiledSteps)

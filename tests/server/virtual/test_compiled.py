@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from support.models import gaussian_processes
 from support.real_steps import random_steps
@@ -157,3 +158,17 @@ def test_deviations_of_many_points_are_left_to_torch(monkeypatch):
     monkeypatch.setattr(gaussian_process_model, "COMPILED_SOLVES", len(case.samples.q) - 1)
     assert not in_fastest_form(VirtualSettings(LANES, penalty=1.0), model).compiled
     assert in_fastest_form(VirtualSettings(LANES), model).compiled == compiled.available()
+
+
+def test_a_model_of_a_log_steps_by_torch_which_knows_what_is_paid_outside():
+    slow = pendulum().model_dump() | {"outside_reward": -7.0}
+    slow["coordinates"][1]["sampling"] = {"kind": "uniform", "low": -1.0, "high": 1.0}
+    spec = EnvironmentSpec.model_validate(slow)
+    model = gaussian_processes(definition_from_spec(spec), random_steps(spec, 20, seed=0))
+    assert not in_fastest_form(VirtualSettings(LANES), model).compiled
+    settings = VirtualSettings(LANES, compiled=True, time_limit=10)
+    lanes, _ = reset(model.definition, settings, create(model.definition, settings, 0))
+    fast = replace(lanes, q=torch.tensor([0.0, 6.0], dtype=torch.float64).repeat(LANES, 1))
+    _, transition = step(model, settings, fast, np.zeros((LANES, 1)))
+    assert transition.terminated.all()
+    np.testing.assert_array_equal(transition.reward, -70.0)
