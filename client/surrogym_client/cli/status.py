@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from surrogym_client.transport.api import Api
-    from surrogym_shared.wire import OutputFidelity, SurrogateSummary, SurrogateView
+    from surrogym_shared.wire import ModelView, OutputFidelity, SurrogateSummary, SurrogateView
 
 Form = Literal["json", "short", "words"]
 
@@ -70,7 +70,9 @@ def _one(api: Api, name: str, form: Form) -> str:
     view = api.surrogate(name)
     if form == "json":
         return view.model_dump_json()
-    return _short(view) if form == "short" else _detail(view)
+    if form == "short":
+        return _short(view)
+    return _detail(view, api.models(name) if view.phase == "over_budget" else ())
 
 
 def _patiently(look: Callable[[], str], as_json: bool) -> str:
@@ -111,8 +113,9 @@ def _row(seen: SurrogateSummary) -> tuple[str | float | None, ...]:
     )
 
 
-def _detail(view: SurrogateView) -> str:
+def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
     from surrogym_client.cli.columns import columns
+    from surrogym_client.surrogates.advice import advice, verdict
 
     ledger = view.ledger
     lines = [
@@ -133,7 +136,10 @@ def _detail(view: SurrogateView) -> str:
             f"model {view.model_version}: confidence index {view.fidelity.confidence_index:.4f}, "
             f"target {view.target:g}; as the paper counts it {view.fidelity.confidence_index_paper:.4f}",
             columns([FIDELITY, *(_judged(output) for output in view.fidelity.outputs)]),
+            f"verdict: {verdict(view)}",
         ]
+    if following := advice(view, models):
+        lines.append(f"next: {following}")
     return "\n".join(lines)
 
 

@@ -31,7 +31,7 @@ class Compared:
         errors: (n, O) real less predicted, in each output's unit.
         deviations: (n, O) that the model predicted for the function's value.
         expected: (O,) error that the model claims beside: its tolerance, or its leave-one-out error where that is
-            larger, which holds the noise.
+            larger, which holds the noise; for the reward at least what matters for the return.
         misplaced: steps whose ending was predicted wrongly.
     """
 
@@ -72,8 +72,7 @@ def judge(compared: Compared, before: Promise, after: Promise, floor: float | No
     ]
     if compared.misplaced >= MISPLACED_ENDS:
         faults.append(f"{compared.misplaced} of {n} steps ended, or did not end, against the prediction")
-    earned = abs(before.median - floor) if floor is not None else abs(before.median)
-    if after.median < before.low - SLACK * earned:
+    if after.median < before.low - SLACK * earned(before, floor):
         faults.append(f"the promise fell from {before.median:.4g} to {after.median:.4g} with the audit's steps learned")
     return Audit(
         steps=n,
@@ -84,6 +83,11 @@ def judge(compared: Compared, before: Promise, after: Promise, floor: float | No
         before=before,
         after=after,
     )
+
+
+def earned(promise: Promise, floor: float | None) -> float:
+    """What a policy earns beyond an untrained one, of return ``floor``; beyond nothing where nobody measured that."""
+    return abs(promise.median - (floor or 0.0))
 
 
 def chi_squared(degrees: int, above: float) -> float:

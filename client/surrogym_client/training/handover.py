@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.environments.lanes import Lanes, session_request
-from surrogym_client.evaluation.audit import AUDIT_STEPS, Compared, differences, judge, places
+from surrogym_client.evaluation.audit import AUDIT_STEPS, Compared, differences, earned, judge, places
 from surrogym_client.evaluation.imagined import WHOLE
 from surrogym_client.evaluation.promise import promise_of
 from surrogym_client.original.actions import decode_actions
@@ -22,8 +22,9 @@ from surrogym_client.surrogates.waiting import NobodyAnswers, wait_for_answers, 
 from surrogym_client.transport.api import Api
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire import SampleView, SurrogateView
+from surrogym_shared.wire import OutputFidelity, SampleView, SurrogateView
 
+MATTERS = 0.02  # of what a policy earns: errors of rewards that add up to less in an episode are no fault
 WAY_LANES = 16  # episodes whose states an audit chooses from
 WIDE = 0.5  # of what a policy earns beyond an untrained one: a promise with a wider lower half is no promise
 NO_SAMPLER = "no sampler is connected"
@@ -108,17 +109,8 @@ def take(
     """Take an audit's real steps, let the model learn from them, and judge; None where no step was taken."""
     api, name, spec = subject.api, subject.name, subject.port.spec()
     view = api.surrogate(name)
-    if spec.query == "rollout":
-        longest = min(settings.steps, spec.max_rollout or settings.steps)
-        _, actions = way_of(subject, 1, longest)
-        queries = api.add_queries(name, rollouts=[actions.tolist()], audit=True)
-    else:
-        q, u = way_of(subject, WAY_LANES, spec.time_limit or LONGEST_EPISODE)
-        chosen = places(spec, q, u, settings.steps, np.random.default_rng(settings.seed))
-        if not len(chosen):
-            return None
-        queries = api.add_queries(name, q[chosen].tolist(), u[chosen].tolist(), audit=True)
-    wanted = {query.id for query in queries}
+    q, u = way_of(subject, WAY_LANES, spec.time_limit or LONGEST_EPISODE)
+    wanted = _asked(subject, settings, q, u)
     try:
         wait_for_answers(api, name, wanted, settings.patience_seconds, progress)
     except BaseException:
@@ -128,7 +120,25 @@ def take(
     if not samples:
         return None
     wait_for_design(api, name, settings.patience_seconds, progress, after_round=view.round)
-    return judge(compared(api, spec, view, samples), before, subject.promise(), subject.floor)
+    after, length = subject.promise(), len(q) / WAY_LANES
+    matters = MATTERS * earned(before, subject.floor) / length
+    beside = compared(api, spec, view, samples, matters)
+    return judge(beside, before, after, subject.floor)
+
+
+def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array) -> set[int]:
+    """Ask for an audit's real steps, at some of the states q (m, C) under their actions u (m, F); where no state can be
+    set, along the actions of one episode. Gives the numbers of the queries."""
+    spec = subject.port.spec()
+    if spec.query == "rollout":
+        _, actions = way_of(subject, 1, min(settings.steps, spec.max_rollout or settings.steps))
+        queries = subject.api.add_queries(subject.name, rollouts=[actions.tolist()], audit=True)
+        return {query.id for query in queries}
+    chosen = places(spec, q, u, settings.steps, np.random.default_rng(settings.seed))
+    if not len(chosen):
+        return set()
+    queries = subject.api.add_queries(subject.name, q[chosen].tolist(), u[chosen].tolist(), audit=True)
+    return {query.id for query in queries}
 
 
 def way_of(subject: Subject, episodes: int, steps: int) -> tuple[Array, Array]:
@@ -156,8 +166,11 @@ def way_of(subject: Subject, episodes: int, steps: int) -> tuple[Array, Array]:
     return np.concatenate(states), np.concatenate(actions)
 
 
-def compared(api: Api, spec: EnvironmentSpec, view: SurrogateView, samples: Sequence[SampleView]) -> Compared:
-    """Real steps beside what the model of ``view``, which had not seen them, predicts."""
+def compared(
+    api: Api, spec: EnvironmentSpec, view: SurrogateView, samples: Sequence[SampleView], matters: float = 0.0
+) -> Compared:
+    """Real steps beside what the model of ``view``, which had not seen them, predicts. Errors of the reward count from
+    ``matters`` on."""
     q, u = [sample.coordinates for sample in samples], [sample.action for sample in samples]
     predicted = api.predict(view.name, q, u, model=view.model_version)
     uncertain = api.query_uncertainty(view.name, q, u, model=view.model_version)
@@ -174,9 +187,14 @@ def compared(api: Api, spec: EnvironmentSpec, view: SurrogateView, samples: Sequ
         names=[claim.name for claim in claims],
         errors=np.stack([columns[claim.name] for claim in claims], 1),
         deviations=deviations,
-        expected=np.array([max(claim.tolerance, claim.leave_one_out_error or 0.0) for claim in claims]),
+        expected=np.array([_expected(claim, matters if claim.name == "reward" else 0.0) for claim in claims]),
         misplaced=int((ended != np.array(predicted.terminated)).sum()),
     )
+
+
+def _expected(claim: OutputFidelity, matters: float) -> float:
+    """The error of an output that is no fault: within its tolerance, as left-out samples show it, or without effect."""
+    return max(claim.tolerance, claim.leave_one_out_error or 0.0, matters)
 
 
 def _not_possible(subject: Subject) -> str | None:

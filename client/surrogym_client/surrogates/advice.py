@@ -1,0 +1,123 @@
+"""How sure a design is of its model, in words by degree, and the one next step that is worth most."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import ceil, log
+from statistics import NormalDist
+
+from surrogym_client.surrogates.phases import COMPLETED
+from surrogym_shared.wire import ModelView, OutputFidelity, SurrogateView
+
+NEARLY = 0.9  # of the target
+MOST_STEPS = 10.0  # times the samples there are: a forecast beyond that is none
+FEWEST_MODELS = 4  # that show a rate
+NOISY_SLACK = 1.25  # of a leave-one-out error where noise is established
+TOLERABLE = 1e-6  # of the leave-one-out error: a smaller tolerance comes from samples that were all alike
+
+
+def verdict(view: SurrogateView) -> str:
+    """How sure the design is of its model: ready, ready but for one output, nearly, or not; empty without a model."""
+    if view.fidelity is None:
+        return ""
+    outputs = view.fidelity.outputs
+    doubtful = _doubtful(view)
+    if view.phase == "ready" or not doubtful:
+        return "ready" if view.phase == "ready" else "sure of its model, which has yet to be tested by adaptive queries"
+    named = ", ".join(_named(output, view.target) for output in doubtful)
+    if len(doubtful) == 1 and len(outputs) > 1:
+        return f"ready but for {named}"
+    nearly = all(output.confidence_index >= NEARLY * view.target for output in doubtful)
+    return f"{'nearly ready' if nearly else 'not ready'}: {named}"
+
+
+def advice(view: SurrogateView, models: Sequence[ModelView]) -> str:
+    """The next step for a design that has ended unsure, with its cost in real steps; empty where there is none.
+
+    Args:
+        view: the surrogate.
+        models: its fits, oldest first, which show at what rate it learns.
+    """
+    doubtful = _doubtful(view)
+    if view.phase not in COMPLETED or view.phase in ("ready", "from_log") or not doubtful:
+        return ""
+    worst = doubtful[0]
+    error = worst.leave_one_out_error
+    if error is None:
+        return ""
+    if worst.tolerance < TOLERABLE * error:
+        return (
+            f"all initial samples had the same {worst.name}, so its tolerance is {worst.tolerance:.2g}; declare it in "
+            "the specification, or set a tolerance that matters: "
+            f"surrogym change {view.name} --tolerance {worst.name}=VALUE"
+        )
+    steps = _steps_to_go(view, worst, models)
+    if steps is not None:
+        return f"about {steps} more real steps at the present rate: surrogym improve {view.name} --queries {steps}"
+    reached = f"{_within_reach(view, worst):.2g}"
+    return (
+        f"more real steps hardly help {worst.name}; it would be ready with a tolerance of {reached} (now "
+        f"{worst.tolerance:.2g}): surrogym change {view.name} --tolerance {worst.name}={reached}"
+    )
+
+
+def _doubtful(view: SurrogateView) -> list[OutputFidelity]:
+    """Outputs that keep the design from being ready, least sure first."""
+    outputs = [] if view.fidelity is None else view.fidelity.outputs
+    unsure = [output for output in outputs if output.confidence_index < view.target or not _agrees(output)]
+    return sorted(unsure, key=lambda output: output.confidence_index)
+
+
+def _agrees(output: OutputFidelity) -> bool:
+    limit = output.tolerance * (NOISY_SLACK if output.noise else 1.0)
+    return output.leave_one_out_error is not None and output.leave_one_out_error <= limit
+
+
+def _named(output: OutputFidelity, target: float) -> str:
+    if output.confidence_index < target:
+        return f"{output.name} (confidence {output.confidence_index:.4g} of {target:g})"
+    error = output.leave_one_out_error
+    beyond = "unknown" if error is None else f"{error:.2g}"
+    return f"{output.name} (leave-one-out error {beyond}, tolerance {output.tolerance:.2g})"
+
+
+def _steps_to_go(view: SurrogateView, worst: OutputFidelity, models: Sequence[ModelView]) -> int | None:
+    """Real steps until the output has its target, if what it lacks shrinks as it did over the last half of the fits;
+    None where it does not shrink."""
+    late = models[len(models) // 2 :]
+    if len(late) < FEWEST_MODELS:
+        return None
+    seen = [(model.samples, output) for model in late for output in model.fidelity.outputs if output.name == worst.name]
+    samples = [float(count) for count, _ in seen]
+    lacks = [1 - output.confidence_index for _, output in seen]
+    errors = [output.leave_one_out_error or 0.0 for _, output in seen]
+    needed = [
+        _forecast(samples, lacks, 1 - view.target),
+        _forecast(samples, errors, worst.tolerance * (NOISY_SLACK if worst.noise else 1.0)),
+    ]
+    if any(one is None for one in needed):
+        return None
+    steps = ceil(max(one for one in needed if one is not None))
+    return max(steps, 1) if steps <= MOST_STEPS * view.samples else None
+
+
+def _forecast(samples: Sequence[float], values: Sequence[float], limit: float) -> float | None:
+    """How many samples are missing until values that fall exponentially are at the limit; None where they don't."""
+    if values[-1] <= limit:
+        return 0.0
+    logs = [log(max(value, 1e-300)) for value in values]
+    middle, level = sum(samples) / len(samples), sum(logs) / len(logs)
+    spread = sum((x - middle) ** 2 for x in samples)
+    if not spread or limit <= 0:
+        return None
+    slope = sum((x - middle) * (y - level) for x, y in zip(samples, logs, strict=True)) / spread
+    return (log(limit) - log(values[-1])) / slope if slope < 0 else None
+
+
+def _within_reach(view: SurrogateView, output: OutputFidelity) -> float:
+    """The tolerance with which an output would be sure, if its deviations were all alike."""
+    z = NormalDist().inv_cdf
+    index = min(max(output.confidence_index, 0.5 + 1e-9), 1 - 1e-12)
+    by_deviation = output.tolerance * z(view.target) / z(index) if output.confidence_index < view.target else 0.0
+    error = output.leave_one_out_error or 0.0
+    return max(error, by_deviation) if index > 0.51 else max(error, output.tolerance)

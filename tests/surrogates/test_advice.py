@@ -1,0 +1,124 @@
+"""The verdict by degree, and one next step with its cost."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from surrogym_client.original.classic import pendulum
+from surrogym_client.surrogates.advice import advice, verdict
+from surrogym_shared.wire import Fidelity, Ledger, ModelView, OutputFidelity, QueryCounts, SurrogateView
+
+TARGET = 0.999
+
+
+def output(name: str, index: float, error: float | None = 0.01, **fields: Any) -> OutputFidelity:
+    known = {"structure": "", "confidence_index_paper": 1.0, "tolerance": 0.05, "coverage": 1.0, **fields}
+    return OutputFidelity(name=name, confidence_index=index, leave_one_out_error=error, **known)
+
+
+def fidelity(*outputs: OutputFidelity, samples: int = 40) -> Fidelity:
+    index = min(one.confidence_index for one in outputs)
+    return Fidelity(
+        confidence_index=index, confidence_index_paper=1.0, target=TARGET, samples=samples, outputs=list(outputs)
+    )
+
+
+def view(*outputs: OutputFidelity, phase: str = "over_budget") -> SurrogateView:
+    return SurrogateView(
+        name="rig",
+        environment="",
+        phase=phase,
+        paused=False,
+        round=9,
+        samples=40,
+        model_version=9,
+        confidence_index=None,
+        target=TARGET,
+        budget=40,
+        ledger=Ledger(),
+        queries=QueryCounts(),
+        created_at=0.0,
+        spec=pendulum(),
+        budget_left=0,
+        tolerances={},
+        outputs=[],
+        fidelity=fidelity(*outputs) if outputs else None,
+    )
+
+
+def models(indices: list[float], error: float = 0.01) -> list[ModelView]:
+    """Fits of ten samples more each."""
+    return [
+        ModelView(
+            version=i + 1,
+            created_at=0.0,
+            samples=10 * (i + 1),
+            data_hash="",
+            fidelity=fidelity(output("x", index, error)),
+            fit_seconds=0.0,
+            description={},
+        )
+        for i, index in enumerate(indices)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("outputs", "phase", "words"),
+    [
+        ((output("x", 1.0), output("r", 1.0)), "ready", "ready"),
+        ((output("x", 1.0), output("r", 0.98)), "over_budget", "ready but for r (confidence 0.98 of 0.999)"),
+        (
+            (output("x", 1.0, error=0.2), output("r", 1.0)),
+            "over_budget",
+            "ready but for x (leave-one-out error 0.2, tolerance 0.05)",
+        ),
+        (
+            (output("x", 0.99), output("r", 0.98)),
+            "over_budget",
+            "nearly ready: r (confidence 0.98 of 0.999), x (confidence 0.99 of 0.999)",
+        ),
+        (
+            (output("x", 0.6), output("r", 0.98)),
+            "over_budget",
+            "not ready: x (confidence 0.6 of 0.999), r (confidence 0.98 of 0.999)",
+        ),
+    ],
+)
+def test_the_verdict_names_what_is_in_doubt(outputs: tuple[OutputFidelity, ...], phase: str, words: str) -> None:
+    assert verdict(view(*outputs, phase=phase)) == words
+
+
+def test_established_noise_allows_for_a_larger_error() -> None:
+    assert verdict(view(output("x", 1.0, error=0.06, noise=0.05), output("r", 0.9))).startswith("ready but for r")
+
+
+def test_without_a_model_there_is_nothing_to_say() -> None:
+    assert verdict(view()) == ""
+    assert advice(view(), []) == ""
+
+
+def test_steps_to_go_follow_the_rate_of_the_last_fits() -> None:
+    """What it lacks falls by e in twenty samples: from e^-4 to 1e-3 that takes 58.2."""
+    rate = [1 - 2.718281828 ** -(i / 2) for i in range(1, 9)]
+    assert advice(view(output("x", rate[-1])), models(rate)) == (
+        "about 59 more real steps at the present rate: surrogym improve rig --queries 59"
+    )
+
+
+@pytest.mark.parametrize("indices", [[0.7] * 8, [0.9, 0.9, 0.9, 0.9, 0.85, 0.8, 0.75, 0.7], [0.7, 0.7]])
+def test_without_progress_a_tolerance_within_reach_is_named(indices: list[float]) -> None:
+    said = advice(view(output("x", 0.7, error=0.2)), models(indices))
+    assert "more real steps hardly help x" in said
+    assert said.endswith("surrogym change rig --tolerance x=0.29")
+
+
+def test_an_output_that_never_varied_is_to_be_declared() -> None:
+    said = advice(view(output("reward", 0.5, error=0.08, tolerance=1e-90)), [])
+    assert said.startswith("all initial samples had the same reward")
+
+
+@pytest.mark.parametrize("phase", ["ready", "sampling", "from_log"])
+def test_a_design_that_goes_on_or_is_ready_needs_no_advice(phase: str) -> None:
+    assert advice(view(output("x", 0.7), phase=phase), []) == ""
