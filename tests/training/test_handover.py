@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
@@ -14,8 +15,10 @@ import pytest
 
 from support.moody import SPEC, Line
 from support.server import ServerProcess
+from surrogym_client.cli import main
 from surrogym_client.errors import UnknownSurrogate
 from surrogym_client.original import RealStep
+from surrogym_client.policies.card import PolicyCard, read_card, write_card
 from surrogym_client.sampler import Sampler, SamplerSettings
 from surrogym_client.surrogates import waiting
 from surrogym_client.surrogates.waiting import wait_for_design
@@ -23,6 +26,7 @@ from surrogym_client.training import TrainSettings
 from surrogym_client.training.audited import AuditedTraining
 from surrogym_client.training.handover import NO_SAMPLER, AuditSettings, Subject, hand_over, way_of
 from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_shared.network import Network
 from surrogym_shared.spec import Design, EnvironmentSpec
 
 AUDIT = AuditSettings(patience_seconds=60.0)
@@ -126,3 +130,18 @@ def test_a_failed_audit_is_on_the_result_of_a_training(line: Place, tmp_path: Pa
     assert result.path.exists()
     assert not handover.trusted
     assert line.api.surrogate(line.name).ledger.audit == 8, "no budget is left to learn more"
+
+
+def test_the_command_audits_a_policy_and_notes_it_on_the_card(
+    line: Place, tmp_path: Path, capsys: pytest.CaptureFixture[str], server_process: ServerProcess
+) -> None:
+    policy, spec = tmp_path / "p.zip", line.port.spec()
+    Network.of(spec, np.zeros(1), np.ones(1), 2, np.zeros(Network.size(spec, 2))).save(policy)
+    write_card(policy, PolicyCard(algorithm="CMAES", surrogate=line.name))
+    with pytest.raises(SystemExit) as ended:
+        main(["audit", str(policy), "--steps", "4", "--json", "--server", server_process.url])
+    assert ended.value.code == 0
+    said, card = json.loads(capsys.readouterr().out), read_card(policy)
+    assert said["trusted"] is card.trusted is True
+    assert card.audit is not None
+    assert said["audit"]["steps"] == card.audit.steps == line.api.surrogate(line.name).ledger.audit == 4

@@ -16,6 +16,7 @@ COMMANDS = (
     "register",
     "sample",
     "train",
+    "audit",
     "evaluate",
     "status",
     "report",

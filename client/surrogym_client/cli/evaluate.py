@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, Progress
     from surrogym_client.original.episodes import Episode
     from surrogym_client.policies.card import PolicyCard
+    from surrogym_client.policies.evidence import Promise
     from surrogym_client.policies.predict import Predict
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
@@ -92,8 +93,9 @@ def command(
     enter = partial(_enter, ledger, service.server, service.token_for(context), quiet=output.quiet)
     result = _run(lambda: reading.load(policy, card), policy, opener, settings, enter, quiet=output.quiet)
     enter(result.steps, settings.episodes, f"{settings.episodes} episodes from seed {settings.first_seed}")
-    summary = {"policy": str(policy), **_settings(settings), **result.summary()}
-    give(summary, lambda: _words(result), as_json=output.as_json)  # with --quiet too: it is what was asked for
+    promise = card.promise if settings.wide is False and settings.start_scale == 1 and not settings.perturb else None
+    summary = {"policy": str(policy), **_settings(settings), **result.summary(), "promise_kept": _kept(promise, result)}
+    give(summary, lambda: _words(result, promise), as_json=output.as_json)  # with --quiet too: it is what was asked for
 
 
 def _run(
@@ -216,9 +218,18 @@ def _settings(settings: EvaluationSettings) -> dict[str, Any]:
     return {name: getattr(settings, name) for name in names}
 
 
-def _words(result: Evaluation) -> str:
+def _kept(promise: Promise | None, result: Evaluation) -> bool | None:
+    """Whether the mean return is at least the promise's 5 % quantile; None without a promise."""
+    return None if promise is None else bool(result.returns.mean() >= promise.low)
+
+
+def _words(result: Evaluation, promise: Promise | None) -> str:
     from surrogym_client.cli.columns import columns
 
     summary = result.summary()
     names = ("mean", "iqm", "min", "max", "std", "mean_length", "success_rate", "episodes", "steps")
-    return columns([names, [summary[name] for name in names]])
+    table = columns([names, [summary[name] for name in names]])
+    if promise is None:
+        return table
+    kept = "kept" if _kept(promise, result) else "broken"
+    return f"{table}\nthe promise of {promise.low:.4g} to {promise.high:.4g} was {kept}"

@@ -439,6 +439,7 @@ def _write_card(
         imagined_return=result.imagined_return,
         visited_confidence=result.visited_confidence,
         networks=result.networks,
+        untrained=result.untrained,
         **({} if handover is None else vars(handover)),
         settings=result.settings,
         versions=versions(),

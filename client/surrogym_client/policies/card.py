@@ -44,6 +44,7 @@ class PolicyCard(BaseModel):
     seconds: float | None = None
     imagined_return: float | None = None
     visited_confidence: tuple[float | None, ...] = ()
+    untrained: float | None = None  # imagined return of a network that has learned nothing
     promise: Promise | None = None
     audit: Audit | None = None
     trusted: bool | None = None  # None: nobody judged the promise

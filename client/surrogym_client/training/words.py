@@ -22,7 +22,7 @@ def words_of_result(
         f"{result.path}: {result.virtual_steps} virtual steps in {result.seconds:.1f} s"
         f"{_imagined(result.imagined_return)}{cut}{_loop(result.visited_confidence) if closed_loop else ''}"
         f"{_given_up(result.networks - 1)}{_gaining(result)}; next: surrogym evaluate {result.path}{on_server}"
-        f"{'' if handover is None else words_of_handover(handover)}"
+        f"{'' if handover is None else chr(10) + words_of_handover(handover)}"
     )
 
 
@@ -30,7 +30,7 @@ def words_of_handover(handover: Handover) -> str:
     """The promise of a policy, and whether to trust it, on a line of its own."""
     promise, trusted = handover.promise, "trusted" if handover.trusted else "not trusted"
     return (
-        f"\npromise: mean return {promise.median:.4g}, "
+        f"promise: mean return {promise.median:.4g}, "
         f"between {promise.low:.4g} and {promise.high:.4g} with 90 % chance; "
         f"{trusted}: {handover.reason}"
     )

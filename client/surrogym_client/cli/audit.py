@@ -1,0 +1,66 @@
+"""``surrogym audit``: compare a policy's promise with a few real steps on its way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from surrogym_client.cli.groups import Output, PolicyReading, Service, add
+
+if TYPE_CHECKING:
+    from surrogym_client.policies.card import PolicyCard
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    add(app, "audit", command)
+
+
+def command(
+    context: typer.Context,
+    policy: Annotated[Path, typer.Argument(help="Policy file that surrogym train wrote.")],
+    surrogate: Annotated[str | None, typer.Option(help="The surrogate. [default: as noted beside the policy]")] = None,
+    steps: Annotated[int, typer.Option(min=2, max=256, help="Real steps; they cost none of the budget.")] = 8,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of starts, functions and places.")] = 0,
+    *,
+    reading: PolicyReading,
+    service: Service,
+    output: Output,
+) -> None:
+    """Compare a policy's promise with a few real steps on its way.
+
+    A sampler has to be running. The verdict is whether the promise is to be trusted. Promise, audit and verdict are written into the card beside the policy.
+
+    Example: surrogym audit policy.zip --steps 16
+    """
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.policies.card import read_card, write_card
+    from surrogym_client.training.handover import AuditSettings, Subject, hand_over
+    from surrogym_client.training.words import words_of_handover
+    from surrogym_client.transport import HttpSurrogate
+    from surrogym_shared.terminal import progress
+
+    card = read_card(policy)
+    name = surrogate or card.surrogate
+    if name is None:
+        raise CommandError(f"expected --surrogate, as no card beside {policy} names one")
+    predict, asked = reading.load(policy, card), AuditSettings(steps=steps, seed=seed)
+    with (
+        service.connect(context) as api,
+        HttpSurrogate(api.url, name, service.token_for(context)) as port,
+        progress("audit", quiet=output.quiet) as update,
+    ):
+        subject = Subject(api, name, port, predict, _session(card), card.untrained, seed)
+        found = hand_over(subject, asked, lambda view: update(None, f"{view.ledger.audit} real steps of audits"))
+    noted = card.model_copy(update=vars(found))
+    write_card(policy, noted)
+    result = {"policy": str(policy), **noted.model_dump(mode="json", include=set(vars(found)))}
+    output.give(result, lambda: words_of_handover(found))
+
+
+def _session(card: PolicyCard) -> dict[str, object]:
+    """Fields of the session that the policy was compared in, as its card has them."""
+    judged = card.settings.get("judge") or card.settings.get("session") or {}
+    return dict(judged) if isinstance(judged, dict) else {}
