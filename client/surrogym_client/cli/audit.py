@@ -29,7 +29,7 @@ def command(
     service: Service,
     output: Output,
 ) -> None:
-    """Compare a policy's promise with a few real steps on its way.
+    """Test a policy's promise by a few real steps on its way.
 
     A sampler has to be running. The verdict is whether the promise is to be trusted. Promise, audit and verdict are written into the card beside the policy.
 
