@@ -18,6 +18,7 @@ from support.server import ServerProcess, running_server
 from support.teaching import teach
 from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
+from surrogym_server.engine.compiling import Compiling
 
 # The same examples in every run, on machines of any speed, and none kept in the checkout.
 hypothesis.settings.register_profile(
@@ -33,6 +34,14 @@ hypothesis.settings.load_profile("surrogym")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A run in a shell's background ignores Ctrl-C, and so would every program that a test starts and interrupts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile steps once, before the first test: a dozen servers that do so at once outlast what tests wait for."""
+    if not hasattr(config, "workerinput"):
+        ahead = Compiling()
+        ahead.start()
+        ahead.wait()
 
 
 @pytest.fixture(scope="session", autouse=True)

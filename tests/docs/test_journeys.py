@@ -71,6 +71,7 @@ OTHERWISE = {
     "docs/http-api.md": "test_http_api.py sends its requests without curl",
     "docs/how-to/containers.md": "tests/docker reads it; no container engine is needed",
     "docs/how-to/plugins.md": "tests/plugins installs the package and compares its class with the page",
+    "docs/how-to/logs.md": "tests/logs runs its commands",
     "docs/how-to/trust.md": "tests/training/test_handover.py audits beside a sampler that stays",
     "docs/results.md": "tests/cli runs its studies, in short",
 }

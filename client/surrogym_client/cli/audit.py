@@ -31,7 +31,8 @@ def command(
 ) -> None:
     """Test a policy's promise by a few real steps on its way.
 
-    A sampler has to be running. The verdict is whether the promise is to be trusted. Promise, audit and verdict are written into the card beside the policy.
+    A sampler has to be running. Promise, audit and the verdict, whether the promise is to be trusted, go into the card
+    beside the policy.
 
     Example: surrogym audit policy.zip --steps 16
     """

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from surrogym_server.errors import SurrogymError
-from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.terminal import give, on_interrupt, progress, say
 
 if TYPE_CHECKING:
     from surrogym_server.gradients import GradientSettings, Optimised
+    from surrogym_shared.spec import EnvironmentSpec
 
 
 def register(app: typer.Typer) -> None:

@@ -34,6 +34,7 @@ from surrogym_server.environment.actions import policy_actions
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import Damaged, InvalidInput, NotReset, SurrogymError, TooLarge
 from surrogym_server.models.guard import failure_of, plugin_calls
+from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.uncertainty import visited_confidence
 from surrogym_server.services.activity import SessionActivity, Tallies
 from surrogym_server.services.definitions import Definitions
@@ -277,7 +278,7 @@ class SessionService:
             secrets.token_urlsafe(SESSION_ID_BYTES),
             surrogate,
             definition,
-            in_fastest_form(self._limited(surrogate, resolved(opening, definition), definition), model),
+            in_fastest_form(self._limited(surrogate, resolved(opening, definition), model), model),
             seed=secrets.randbits(63) if opening.seed is None else opening.seed,
             model=opening.model,
             version=version,
@@ -286,10 +287,16 @@ class SessionService:
             surrogate_id=id,
         )
 
-    def _limited(self, surrogate: str, settings: VirtualSettings, definition: EnvironmentDefinition) -> VirtualSettings:
-        """Settings with limits of rewards from the samples. Preset ``paper`` has none."""
-        seen = self._storage.samples.reward_range(surrogate) if definition.learning.limits_rewards else None
-        return settings if seen is None else replace(settings, reward_limits=reward_limits(*seen))
+    def _limited(self, surrogate: str, settings: VirtualSettings, model: DynamicsModel) -> VirtualSettings:
+        """Settings with limits of rewards from the samples. A declared reward is exact and has none. Neither has
+        preset ``paper``, nor an imported model that has learned from more than these samples."""
+        definition = model.definition
+        if definition.declared_reward is not None or not definition.learning.limits_rewards:
+            return settings
+        seen = self._storage.samples.reward_range(surrogate)
+        if seen is None or model.samples > self._storage.samples.count(surrogate):
+            return settings
+        return replace(settings, reward_limits=reward_limits(*seen))
 
     def _step(self, session: Session, u: Array, mask: Bools | None, deviations: bool) -> tuple[Session, StepResult]:
         try:
