@@ -236,7 +236,9 @@ def command(
     service: Service,
     output: Output,
 ) -> None:
-    """Train a policy in the virtual environment. No real step is taken, unless --improve asks a sampler for more.
+    """Train a policy in the virtual environment. A running sampler takes the few real steps of its audit.
+
+    No other real step is taken, unless --improve asks for more.
 
     The imagined return that is shown is what the policy earns in the surrogate, not in the original environment.
 

@@ -11,7 +11,7 @@ from surrogym_client.transport.api import Api
 from surrogym_shared.wire import SurrogateView
 
 LOOK_SECONDS = 0.25
-FIRST_LEASE_SECONDS = 15.0  # a sampler that waits for queries begins within a second
+FIRST_LEASE_SECONDS = 5.0  # a sampler that waits for queries begins within a second
 
 
 def share_of_design(view: SurrogateView) -> float:
