@@ -121,7 +121,8 @@ def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
     lines = [
         f"{view.name}: {view.environment or 'own environment'}, {'paused, ' if view.paused else ''}{view.phase}",
         f"real steps: {ledger.initial} initial, {ledger.adaptive} adaptive, {ledger.manual} manual, "
-        f"{ledger.total} of {view.budget} in all; {ledger.logged} logged, {ledger.evaluation} in evaluation, "
+        f"{ledger.total} of {view.budget} in all; {ledger.audit} of audits, {ledger.logged} logged, "
+        f"{ledger.evaluation} in evaluation, "
         f"{ledger.unresolved} unresolved ({ledger.failed} failed)",
         f"queries: {view.queries.pending} pending, {view.queries.leased} leased, {view.queries.set_aside} set aside",
     ]

@@ -40,6 +40,7 @@ export function ledgerTable() {
     ["adaptive", count(ledger.adaptive), "chosen where the model was not sure"],
     ["manual", count(ledger.manual), "asked for, or handed in, by a person"],
     [h("strong", {}, "total"), h("strong", {}, count(ledger.total)), "what the design cost"],
+    ["audit", count(ledger.audit), "tested the promise of a policy; they cost no budget"],
     ["logged", count(ledger.logged), "recorded before, by somebody else; they cost no budget"],
     ["unresolved", count(ledger.unresolved), `leases that ran out, or failed (${count(ledger.failed)}): at most so many more were taken`],
     ["evaluation", count(ledger.evaluation), "to judge policies; not seen by the model"],
