@@ -11,7 +11,10 @@ after_import("gymnasium", "surrogym_client.registration:register")
 
 
 def register() -> None:
-    """Enter the ids now, where importing this package did not: in a process that was forked or given a copy of it."""
+    """Register ``surrogym/Remote-v0`` with Gymnasium now.
+
+    Importing this package does so by itself. Worker processes that were forked before Gymnasium was loaded call this.
+    """
     from surrogym_client.registration import register as enter
 
     enter()

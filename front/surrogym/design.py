@@ -207,8 +207,10 @@ class Design:
 
     @classmethod
     def load(cls, path: str | Path, **options: Any) -> Self:
-        """A design that goes on from what ``save`` or ``surrogym export`` wrote: its model, its samples, how well the
-        model is known, and the phase that follows from that. It asks for no query where none is missing.
+        """Restore a design from a file that ``save`` or ``surrogym export`` wrote.
+
+        The design has the file's model and samples, and the phase that follows from them. It asks the queries that the
+        saved design would have asked.
 
         Args:
             path: the file.

@@ -8,9 +8,9 @@ OriginalError
 ├── NotParallel             one instance is open, and the environment does not say that another may be
 ├── PolicyMisfit            the policy gives actions that the environment does not have
 ├── QueryRefused            a query asks for what the environment does not allow; nothing was sent to it
-├── MachineFails            the environment failed at so many queries that the fault may be its own; the worker ends
+├── MachineFails            the environment failed at several different queries in a row; the worker stops
 ├── EvaluationFailed        the environment or the policy failed after real steps had been taken
-└── StepFailed              the environment did not give a step; the query fails, the worker goes on
+└── StepFailed              the environment did not give a step; the query fails, the worker continues
     ├── StepTimedOut        it took longer than its limit and was killed; the next step starts a fresh one
     └── EnvironmentDied     its process ended; the next step starts a fresh one
 """
@@ -54,7 +54,7 @@ class QueryRefused(OriginalError):
 
 
 class MachineFails(OriginalError):
-    """The environment failed at one query after the other; what was claimed went back into the queue."""
+    """The environment failed at several different queries in a row. Claimed queries went back into the queue."""
 
 
 class EvaluationFailed(OriginalError):

@@ -20,7 +20,7 @@ class Failures:
 
     def __init__(self) -> None:
         self._queries: set[int] = set()  # ids
-        self._later = 0  # failures since there were so many different queries that the machine may be the cause
+        self._later = 0  # failures since the FIRST_FEW-th different query failed; each lengthens the delay
         self._answered = False  # anything, ever
         self._last = ""
 

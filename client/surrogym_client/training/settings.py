@@ -17,7 +17,7 @@ FUNCTIONS: dict[str, Any] = {"variant": "pathwise"}  # each episode follows one 
 
 START_BOX = 0.5  # usually
 
-MOST_THREADS = 1_024  # torch starts as many as it is told, and the process ends where the system has no more
+MOST_THREADS = 1_024  # more than any machine has; torch would end the process when the system refuses another thread
 
 TENSORBOARD = "tensorboard"  # folder beside the policy
 
