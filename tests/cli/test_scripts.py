@@ -15,6 +15,7 @@ from support.server import ServerProcess
 from surrogym_client.experiments.reproduce.rows import Row, write_rows
 
 ELSEWHERE = {
+    "audit": "tests/training/test_handover.py",
     "conformance": "tests/diagnosis/test_conformance.py",
     "demo": "tests/experiments/test_demo.py",
     "evaluate": "test_commands.py",

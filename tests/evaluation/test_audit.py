@@ -41,10 +41,20 @@ def test_errors_within_the_tolerance_are_never_a_fault():
     assert judge(compared(errors, deviation=1e-9), PROMISE, PROMISE, UNTRAINED).passed
 
 
-@pytest.mark.parametrize(("after", "passed"), [(-155.0, True), (-250.0, True), (-300.0, False), (-100.0, True)])
-def test_a_promise_that_falls_by_a_tenth_of_what_was_learned_fails(after: float, passed: bool):
+@pytest.mark.parametrize(
+    ("after", "passed"), [(-155.0, True), (-250.0, True), (-300.0, False), (-60.0, True), (0.0, False)]
+)
+def test_a_promise_that_moves_by_a_tenth_of_what_was_learned_fails(after: float, passed: bool):
     later = Promise(median=after, low=after - 10, high=after + 10, functions=32, episodes=256)
     assert judge(compared(np.zeros((8, 1))), PROMISE, later, UNTRAINED).passed is passed
+
+
+@pytest.mark.parametrize(("error", "passed"), [(0.5, True), (-1.2, False), (1.2, False)])
+def test_errors_of_rewards_that_add_up_to_a_fifth_fail(error: float, passed: bool):
+    """1,050 is earned beyond an untrained policy, 210 of which are 1.05 a step."""
+    errors = np.full((8, 1), error)
+    beside = Compared(["reward"], errors, np.zeros((8, 1)), np.array([10.0]), length=200)
+    assert judge(beside, PROMISE, PROMISE, UNTRAINED).passed is passed
 
 
 @pytest.mark.parametrize(("misplaced", "passed"), [(0, True), (1, True), (2, False)])

@@ -107,11 +107,16 @@ def test_steps_to_go_follow_the_rate_of_the_last_fits() -> None:
     )
 
 
-@pytest.mark.parametrize("indices", [[0.7] * 8, [0.9, 0.9, 0.9, 0.9, 0.85, 0.8, 0.75, 0.7], [0.7, 0.7]])
+@pytest.mark.parametrize("indices", [[0.7] * 8, [0.9, 0.9, 0.9, 0.9, 0.85, 0.8, 0.75, 0.7]])
 def test_without_progress_a_tolerance_within_reach_is_named(indices: list[float]) -> None:
     said = advice(view(output("x", 0.7, error=0.2)), models(indices))
     assert "more real steps hardly help x" in said
     assert said.endswith("surrogym change rig --tolerance x=0.29")
+
+
+def test_few_rounds_show_no_rate_and_more_steps_are_the_advice() -> None:
+    said = advice(view(output("x", 0.7, error=0.2)), models([0.7, 0.7]))
+    assert said.endswith("as many real steps again: surrogym improve rig --queries 40")
 
 
 def test_an_output_that_never_varied_is_to_be_declared() -> None:

@@ -55,6 +55,8 @@ def command(
     ):
         subject = Subject(api, name, port, predict, _session(card), card.untrained, seed)
         found = hand_over(subject, asked, lambda view: update(None, f"{view.ledger.audit} real steps of audits"))
+    if found.audit is None:
+        raise CommandError(f"no audit was taken, and the card is as it was: {found.reason}")
     noted = card.model_copy(update=vars(found))
     write_card(policy, noted)
     result = {"policy": str(policy), **noted.model_dump(mode="json", include=set(vars(found)))}

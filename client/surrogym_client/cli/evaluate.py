@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from surrogym_shared.terminal import Update
 
 
+FEWEST_TO_JUDGE = 30  # episodes: the mean of fewer says little of a promise
+
+
 def register(app: typer.Typer) -> None:
     """Add the command."""
     add(app, "evaluate", command)
@@ -93,7 +96,7 @@ def command(
     enter = partial(_enter, ledger, service.server, service.token_for(context), quiet=output.quiet)
     result = _run(lambda: reading.load(policy, card), policy, opener, settings, enter, quiet=output.quiet)
     enter(result.steps, settings.episodes, f"{settings.episodes} episodes from seed {settings.first_seed}")
-    promise = card.promise if settings.wide is False and settings.start_scale == 1 and not settings.perturb else None
+    promise = card.promise if settings.declared and settings.episodes >= FEWEST_TO_JUDGE else None
     summary = {"policy": str(policy), **_settings(settings), **result.summary(), "promise_kept": _kept(promise, result)}
     give(summary, lambda: _words(result, promise), as_json=output.as_json)  # with --quiet too: it is what was asked for
 
@@ -231,5 +234,5 @@ def _words(result: Evaluation, promise: Promise | None) -> str:
     table = columns([names, [summary[name] for name in names]])
     if promise is None:
         return table
-    kept = "kept" if _kept(promise, result) else "broken"
-    return f"{table}\nthe promise of {promise.low:.4g} to {promise.high:.4g} was {kept}"
+    kept = "kept: the mean return is at least" if _kept(promise, result) else "broken: the mean return is below"
+    return f"{table}\nthe promise of {promise.low:.4g} to {promise.high:.4g} was {kept} its lower end"

@@ -16,7 +16,8 @@ from surrogym_shared.spec import EnvironmentSpec
 AUDIT_STEPS = 8
 ALARM = 0.01  # chance that a right model is blamed for the errors of its outputs
 MISPLACED_ENDS = 2  # steps whose ending was predicted wrongly: from so many on the model is at fault
-SLACK = 0.1  # of what a policy earns beyond an untrained one: a promise that falls by less stands
+SLACK = 0.1  # of what a policy earns beyond an untrained one: a promise that moves out of its interval by less stands
+BIAS = 0.2  # of the same: what the errors of the rewards may add up to in an episode
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -33,6 +34,7 @@ class Compared:
         expected: (O,) error that the model claims beside: its tolerance, or its leave-one-out error where that is
             larger, which holds the noise; for the reward at least what matters for the return.
         misplaced: steps whose ending was predicted wrongly.
+        length: steps of an episode, on average; 0 where that is not known.
     """
 
     names: Sequence[str]
@@ -40,6 +42,7 @@ class Compared:
     deviations: Array
     expected: Array
     misplaced: int = 0
+    length: float = 0.0
 
     @property
     def claimed(self) -> Array:
@@ -72,8 +75,15 @@ def judge(compared: Compared, before: Promise, after: Promise, floor: float | No
     ]
     if compared.misplaced >= MISPLACED_ENDS:
         faults.append(f"{compared.misplaced} of {n} steps ended, or did not end, against the prediction")
-    if after.median < before.low - SLACK * earned(before, floor):
-        faults.append(f"the promise fell from {before.median:.4g} to {after.median:.4g} with the audit's steps learned")
+    slack = SLACK * max(earned(before, floor), earned(after, floor))
+    if not before.low - slack <= after.median <= before.high + slack:
+        faults.append(
+            f"the promise moved from {before.median:.4g} to {after.median:.4g} with the audit's steps learned"
+        )
+    if "reward" in compared.names and compared.length:
+        missing = float(compared.errors[:, list(compared.names).index("reward")].mean()) * compared.length
+        if abs(missing) > BIAS * earned(before, floor):
+            faults.append(f"rewards differ from the prediction by {missing:.4g} in an episode, if all its steps do so")
     return Audit(
         steps=n,
         passed=not faults,

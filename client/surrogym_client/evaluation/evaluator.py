@@ -48,6 +48,11 @@ class EvaluationSettings:
         if self.wide and self.start_scale != 1:
             raise ValueError("expected starts over the whole range or scaled ones, got both")
 
+    @property
+    def declared(self) -> bool:
+        """Whether episodes start as the specification says, in the environment as it is."""
+        return not self.wide and self.start_scale == 1 and not self.perturb
+
 
 @dataclass(frozen=True)
 class Trace:

@@ -51,6 +51,11 @@ def advice(view: SurrogateView, models: Sequence[ModelView]) -> str:
             "the specification, or set a tolerance that matters: "
             f"surrogym change {view.name} --tolerance {worst.name}=VALUE"
         )
+    if len(models) < 2 * FEWEST_MODELS:
+        return (
+            f"too few rounds to see a rate; as many real steps again: "
+            f"surrogym improve {view.name} --queries {max(view.samples, 1)}"
+        )
     steps = _steps_to_go(view, worst, models)
     if steps is not None:
         return f"about {steps} more real steps at the present rate: surrogym improve {view.name} --queries {steps}"

@@ -8,7 +8,7 @@ COMPLETED: tuple[Phase, ...] = ("ready", "over_budget", "from_log")  # its model
 ENDED: tuple[Phase, ...] = (*COMPLETED, "failed")  # a sampler has nothing left to do
 IN_WORDS: dict[Phase, str] = {
     "ready": "the design is ready",
-    "over_budget": "the budget is spent, and the design is not sure of its model",
+    "over_budget": "the design has ended, and is not sure of its model",
     "from_log": "the model holds what the log shows, and no real step is asked for",
     "failed": "the design has failed",
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -122,7 +122,7 @@ def take(
     wait_for_design(api, name, settings.patience_seconds, progress, after_round=view.round)
     after, length = subject.promise(), len(q) / WAY_LANES
     matters = MATTERS * earned(before, subject.floor) / length
-    beside = compared(api, spec, view, samples, matters)
+    beside = replace(compared(api, spec, view, samples, matters), length=length)
     return judge(beside, before, after, subject.floor)
 
 
@@ -229,4 +229,7 @@ def _too_wide(promise: Promise, floor: float | None) -> str | None:
     """Why a promise is no promise, or None."""
     if floor is None or promise.median - promise.low <= WIDE * abs(promise.median - floor):
         return None
-    return f"the functions that the samples allow earn from {promise.low:.4g} to {promise.high:.4g}"
+    return (
+        f"the promise, from {promise.low:.4g} to {promise.high:.4g}, does not stand out from the {floor:.4g} of an "
+        "untrained policy"
+    )

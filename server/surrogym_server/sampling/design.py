@@ -40,15 +40,16 @@ class DesignState:
     round: int = 0
     usual: tuple[float, ...] = ()  # tolerances, per output, where nobody set one; frozen after the first round
     warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # what the fit leaves for the next one
+    ended_with: tuple[float, ...] = ()  # steps of the budget, budget, target and tolerances, where the design ended
 
     def to_json(self) -> dict[str, Any]:
         warm = {key: array.tolist() for key, array in self.warm.items()}
-        return {"round": self.round, "usual": list(self.usual), WARM: warm}
+        return {"round": self.round, "usual": list(self.usual), WARM: warm, "ended_with": list(self.ended_with)}
 
     @classmethod
     def from_json(cls, state: dict[str, Any]) -> DesignState:
         warm = {key: np.array(array) for key, array in state.get(WARM, {}).items()}
-        return cls(state.get("round", 0), tuple(state.get("usual", ())), warm)
+        return cls(state.get("round", 0), tuple(state.get("usual", ())), warm, tuple(state.get("ended_with", ())))
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,14 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     usual = state.usual or usual_tolerances(definition, sizes_of(definition, samples))
     judged = judge_model(learned.model, samples, usual, request, state.round)
     confidences, tolerances, verdict = judged.confidences, judged.tolerances, judged.verdict
+    now = (
+        float(len(samples) - request.free),
+        float(request.budget),
+        request.target,
+        *definition.tolerances_over(usual),
+    )
+    if verdict == "continue" and now == state.ended_with:
+        verdict = "over_budget"  # audits and logs alone have come since it ended: they ask for no further real step
     candidates, reserved = judged.candidates, judged.reserved
     chosen, rollouts = candidates.points[:0], tuple[Tensor, ...]()
     if definition.max_rollout is None:
@@ -126,7 +135,8 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         rollouts = _plan(learned.model, samples, confidences, tolerances, verdict, request, rng, reserved is not None)
     if verdict == "continue" and not len(chosen) and not rollouts:
         verdict = "over_budget"  # the rest of the budget is pending, or nothing distinct is left to ask
-    new_state = DesignState(state.round + 1, usual, learned.warm)
+    ended = now if verdict != "continue" and not len(chosen) and not rollouts else ()
+    new_state = DesignState(state.round + 1, usual, learned.warm, ended)
     return Decision(learned.model, confidences, tolerances, new_state, verdict, chosen.q, chosen.u, rollouts)
 
 

@@ -333,3 +333,17 @@ def test_queries_go_where_policies_went(acquisition):
     distance, anywhere = ((made.q - there).abs().amax(-1).amin(0) for made in (near_them, wide))
     assert int((distance < 1).sum()) >= 2
     assert int((anywhere < 1).sum()) == 0
+
+
+def test_a_design_that_has_ended_asks_nothing_because_of_an_audit(definition, few):
+    first = advance(definition, few, DesignState(), request(budget=len(few)))
+    assert first.verdict == "over_budget"
+    state = DesignState.from_json(first.state.to_json())
+    audited = replace(request(budget=len(few) + 8), audited=0)
+    assert len(advance(definition, few, state, audited).q), "another budget opens it again"
+    more = random_steps(pendulum(), len(few) + 4, seed=0)
+    same = replace(request(budget=len(few)), audited=4)
+    after = advance(definition, more, state, same)
+    assert (after.verdict, len(after.q)) == ("over_budget", 0)
+    open_again = advance(definition, more, replace(state, ended_with=()), replace(same, budget=len(few) + 8))
+    assert len(open_again.q) > 0
