@@ -83,7 +83,13 @@ def _minimum(objective: _Objective, start: Array) -> tuple[float, Array]:
 @cache
 def _blas() -> ThreadpoolController:
     """L-BFGS-B multiplies matrices of a dozen rows: with more than one thread it waits ten times as long as it works,
-    on a machine that does something else as well."""
+    on a machine that does something else as well.
+
+    SciPy has a library of its own, beside NumPy's. A controller knows only what is loaded when it is made, so SciPy's
+    parts come first.
+    """
+    for part in ("linalg", "optimize"):
+        getattr(scipy, part)
     return ThreadpoolController().select(user_api="blas")
 
 

@@ -1,6 +1,8 @@
 """Hyperparameters: the gradient is that of the objective, the objective the evidence, and its optimum is found."""
 
 import math
+import subprocess
+import sys
 import warnings
 
 import numpy as np
@@ -139,3 +141,22 @@ def test_noise_of_a_fifth_of_the_variance_is_seen(seed):
     y = x[:, 1] + torch.tensor(0.5 * rng.standard_normal(60))
     y = (y - y.mean()) / y.std(correction=0)
     assert 0.05 < fit(x, y, FitOptions()).posterior.hyper.noise_variance < 0.5
+
+
+LIMITED = """
+import torch
+from surrogym_server.gp import FitOptions, fit
+from surrogym_server.gp.fit import _blas
+x = torch.linspace(0, 1, 8, dtype=torch.float64)[:, None]
+fit(x, x[:, 0].sin(), FitOptions())
+from threadpoolctl import ThreadpoolController
+def libraries(controller):
+    return {library.filepath for library in controller.lib_controllers if library.user_api == "blas"}
+print(libraries(ThreadpoolController()) - libraries(_blas()))
+"""
+
+
+def test_the_first_fit_of_a_process_limits_every_blas():
+    """SciPy's own library is loaded on first use, and a controller knows only what was loaded before it."""
+    ran = subprocess.run([sys.executable, "-c", LIMITED], capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == "set()"
