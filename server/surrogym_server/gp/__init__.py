@@ -15,19 +15,21 @@ beta      ``weights`` (n,)        (K + sigma_n^2 I)^-1 y
 ========  ======================  =========================================================
 """
 
-from surrogym_server.gp.fit import FitOptions, Fitted, fit
+from surrogym_server.gp.fit import FitOptions, Fitted, fit, refine
 from surrogym_server.gp.joint import Joint
 from surrogym_server.gp.kernel import Hyperparameters, Reflection
 from surrogym_server.gp.pathwise import Pathwise
-from surrogym_server.gp.posterior import Posterior, Sparse, condition
+from surrogym_server.gp.posterior import LeftOut, Posterior, Sparse, condition
 from surrogym_server.gp.serving import Output, Serving
-from surrogym_server.gp.sparse import condition_sparse, spread
+from surrogym_server.gp.sparse import condition_many, condition_sparse
+from surrogym_server.gp.subsets import spread
 
 __all__ = [
     "FitOptions",
     "Fitted",
     "Hyperparameters",
     "Joint",
+    "LeftOut",
     "Output",
     "Pathwise",
     "Posterior",
@@ -35,7 +37,9 @@ __all__ = [
     "Serving",
     "Sparse",
     "condition",
+    "condition_many",
     "condition_sparse",
     "fit",
+    "refine",
     "spread",
 ]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -21,9 +21,12 @@ from torch import Tensor
 
 from surrogym_server.gp.kernel import Hyperparameters, Polynomial, Reflection
 from surrogym_server.gp.posterior import Posterior, condition
+from surrogym_server.gp.subsets import SOME, spread
 
 NOISE_FLOOR = 1e-8  # of the output's variance
 MANY_POINTS = 24
+REFINEMENTS = ((1_000, 20), (2_000, 10))  # most points of further searches, and iterations: each begins near its end
+SHORTER = 0.5  # logarithm of the second start's length scales, below the first's
 
 Array = NDArray[np.float64]
 
@@ -66,6 +69,29 @@ def fit(
         found = [_minimum(objective, start) for start in _starts(objective.default_start, warm, len(y))]
     value, theta = min(found, key=lambda pair: pair[0])
     return Fitted(condition(objective.hyper(theta), x, y), -value, theta)
+
+
+def refine(
+    x: Tensor, y: Tensor, options: FitOptions, theta: Array, reflection: Reflection | None = None
+) -> Hyperparameters:
+    """Hyperparameters for x (n, d) and y (n,), from ``theta``, those of fewer such points.
+
+    More points have other optima: they resolve what fewer took for noise. So some of them are searched from two starts,
+    and all from the better of what is found, in a few iterations. Both are bounded, see ``gp.subsets``.
+    """
+    rows = spread(len(y), SOME)
+    objective = _Objective(x[rows], y[rows], options, reflection)
+    shorter = theta.copy()
+    shorter[: objective.d] -= SHORTER
+    shorter[-1] = objective.default_start[-1]
+    with _blas().limit(limits=1):
+        _, theta = min((_minimum(objective, start) for start in (theta, shorter)), key=lambda pair: pair[0])
+        for most, iterations in REFINEMENTS:
+            if len(y) > len(rows):
+                rows = spread(len(y), most)
+                objective = _Objective(x[rows], y[rows], replace(options, max_iterations=iterations), reflection)
+                _, theta = _minimum(objective, theta)
+    return objective.hyper(theta)
 
 
 def _minimum(objective: _Objective, start: Array) -> tuple[float, Array]:
@@ -113,6 +139,7 @@ class _Objective:
         n, d = x.shape
         self.n, self.d, self.y = n, d, y.numpy()
         self.rows, self.columns = np.tril_indices(n)
+        self.places = self.rows * n + self.columns  # of the pairs in a matrix by rows
         self.twice = np.where(self.rows == self.columns, 1.0, 2.0)  # how often a pair stands in a symmetric matrix
         mirrored = [] if reflection is None else [x * reflection.signs]
         differences = [other.numpy()[self.columns] - x.numpy()[self.rows] for other in (x, *mirrored)]
@@ -148,12 +175,13 @@ class _Objective:
             smooth[1] *= self.parity
             k += smooth[1]
         matrix = np.zeros((self.n, self.n))
-        matrix[self.rows, self.columns] = k
+        matrix.ravel()[self.places] = k
         matrix.flat[:: self.n + 1] += noise
         if (solved := self._solve(matrix)) is None:  # outside what float64 can factor: a wall for the line search
             return 1e10, np.zeros_like(theta)
         inverse, weights, log_root = solved
-        half = 0.5 * self.twice * (weights[self.rows] * weights[self.columns] - inverse[self.rows, self.columns])
+        product = weights.take(self.rows) * weights.take(self.columns)
+        half = 0.5 * self.twice * (product - inverse.ravel().take(self.places))
         weighted = half * smooth
         slopes = [precision * (self.squared @ weighted.ravel()), [weighted.sum()]]
         slopes += [[linear * (half @ self.linear)]] * self.options.linear

@@ -20,11 +20,28 @@ BLOCK = 16_384  # rows predicted at once: bounds memory at any batch size
 
 
 @dataclass(frozen=True)
+class LeftOut:
+    """How well a process foretells each of its points from all others."""
+
+    error: float  # root mean square, in units of y
+    within_one: float  # share of the points within one predictive deviation
+    within_two: float
+
+    @classmethod
+    def of(cls, error: Tensor, variance: Tensor) -> LeftOut:
+        """Of errors (n,) and the variances (n,) predicted with them, noise included."""
+        size, deviation = error.abs(), variance.sqrt()
+        one, two = (float((size <= width * deviation).double().mean()) for width in (1, 2))
+        return cls(float(size.square().mean().sqrt()), one, two)
+
+
+@dataclass(frozen=True)
 class Sparse:
     """What a process through inducing points stands for, and what it costs."""
 
     points: int  # that were learned from
     unexplained: float  # deviation left at them, prior deviations, root mean square: 0 where nothing is lost
+    left_out: LeftOut | None = None  # of these points; None in models stored before it was kept
 
 
 @dataclass(frozen=True)
@@ -60,6 +77,14 @@ class Posterior:
         v = torch.linalg.solve_triangular(self.factor, k.T, upper=False).reshape(-1, sets, points).transpose(0, 1)
         joint: Tensor = covariance(self.hyper, x, x) - v.mT @ v
         return joint
+
+    @property
+    def left_out(self) -> LeftOut:
+        """How well the points that were learned from are foretold by all others."""
+        if self.sparse is not None and self.sparse.left_out is not None:
+            return self.sparse.left_out
+        mean, variance = self.leave_one_out()
+        return LeftOut.of(mean - self.y, variance)
 
     def leave_one_out(self) -> tuple[Tensor, Tensor]:
         """Predictive mean and variance (noise included) of each y from all others, (n,) each; R&W (2006), eq. 5.12."""

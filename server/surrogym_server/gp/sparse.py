@@ -9,6 +9,12 @@ L L^T = k(Z, Z), and C = V V^T, the projected process (R&W (2006), section 8.3.4
 So it is an exact process of the m points with the factor F, whose noise sigma_n^2 L C^-1 L^T is what is left of the
 noise where n points speak for m, and with the values y_Z = F F^T weights. It is served, stored, extended and drawn
 from as any other. Its variance goes back to the prior's away from Z.
+
+Its m values are no data, as each stands for many points. So leave-one-out errors are those of the n points, with
+h_i = (V^T (C + sigma_n^2 I)^-1 V)_ii:
+
+    y_i - mean_{-i} = (y_i - mean(x_i)) / (1 - h_i),  var_{-i} = sigma_n^2 / (1 - h_i) + what Z leaves of k(x_i, x_i).
+
 Reference: Fine and Scheinberg (2001) for the choice of Z; Seeger, Williams, Lawrence (2003) for the projected process.
 """
 
@@ -18,20 +24,21 @@ import torch
 from torch import Tensor
 
 from surrogym_server.gp.kernel import Hyperparameters, covariance, variance
-from surrogym_server.gp.posterior import Posterior, Sparse, factorise
+from surrogym_server.gp.posterior import BLOCK, LeftOut, Posterior, Sparse, condition, factorise
 
-MAX_EXACT = 2_000  # points; beyond, a fit is sparse
+MAX_EXACT = 2_000  # points; beyond, a process is sparse
 INDUCING = 1_000
-FITTED = 1_000  # points that hyperparameters of a sparse process are fitted to
+SHARE = 1e-12  # least share that all other points have in a prediction
 EXPLAINED, BELOW_NOISE = 1e-10, 1e-3  # of the prior's and the noise variance: a point known so well is not chosen
 
 
-def spread(points: int) -> Tensor:
-    """Which of n points, in the order they came, hyperparameters are fitted to: all up to ``MAX_EXACT``, else
-    ``FITTED`` of them at equal distances, (m,)."""
-    if points <= MAX_EXACT:
-        return torch.arange(points)
-    return torch.linspace(0, points - 1, FITTED, dtype=torch.float64).round().long()
+def condition_many(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
+    """Condition a process on x (n, d) and y (n,): exactly up to ``MAX_EXACT`` points, else through inducing points.
+
+    Raises:
+        NumericalFailure: as ``condition``.
+    """
+    return condition(hyper, x, y) if len(y) <= MAX_EXACT else condition_sparse(hyper, x, y)
 
 
 def condition_sparse(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
@@ -52,8 +59,26 @@ def condition_sparse(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
     inner, _ = factorise(torch.eye(len(gram), dtype=x.dtype, device=x.device) + noise * 0.5 * (inverse + inverse.T))
     factor = lower @ inner
     values = factor @ (factor.T @ weights)
-    sparse = Sparse(len(y), float((left.mean() / variance(hyper, x).mean()).sqrt()))
+    residual = y - known.T @ whitened[:, 0]
+    left_out = LeftOut.of(*_left_out(known, solid, residual, noise, left))
+    sparse = Sparse(len(y), float((left.mean() / variance(hyper, x).mean()).sqrt()), left_out)
     return Posterior(hyper, inducing, values, factor, weights, 0.0, sparse)
+
+
+def _left_out(known: Tensor, solid: Tensor, residual: Tensor, noise: float, left: Tensor) -> tuple[Tensor, Tensor]:
+    """Error and variance, noise included, of each of n points predicted from all others, (n,) each.
+
+    Args:
+        known: V (m, n).
+        solid: factor of C + sigma_n^2 I, (m, m).
+        residual: y less the mean at every point, (n,).
+        noise: sigma_n^2.
+        left: variance that the inducing points leave, (n,).
+    """
+    blocks = torch.split(known, BLOCK, dim=1)
+    own = [torch.linalg.solve_triangular(solid, block, upper=False).square().sum(0) for block in blocks]
+    others = (1 - torch.cat(own)).clamp_min(SHARE)
+    return residual / others, noise / others + left
 
 
 def _pivots(hyper: Hyperparameters, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:

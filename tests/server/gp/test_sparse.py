@@ -15,10 +15,11 @@ from surrogym_server.gp import (
     Posterior,
     Serving,
     condition,
+    condition_many,
     condition_sparse,
     sparse,
-    spread,
 )
+from surrogym_server.gp.kernel import covariance
 
 NOISE = 1e-4
 
@@ -78,9 +79,43 @@ def spread_of_draws(posterior: Posterior, at: Tensor) -> float:
     return float(pathwise.residual(at.expand(2_000, 2), pathwise.draw(noise)).std())
 
 
-@pytest.mark.parametrize(
-    ("points", "taken"), [(sparse.MAX_EXACT, sparse.MAX_EXACT), (sparse.MAX_EXACT + 1, sparse.FITTED)]
-)
-def test_hyperparameters_see_all_points_or_an_even_share(points: int, taken: int):
-    rows = spread(points)
-    assert (len(rows.unique()), int(rows[0]), int(rows[-1])) == (taken, 0, points - 1)
+@pytest.mark.parametrize(("points", "exact"), [(60, True), (61, False)])
+def test_a_process_is_exact_up_to_a_number_of_points(
+    drawn: tuple[Hyperparameters, Tensor, Tensor], points: int, exact: bool, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sparse, "MAX_EXACT", 60)
+    hyper, x, y = drawn
+    assert (condition_many(hyper, x[:points], y[:points]).sparse is None) == exact
+
+
+def test_leave_one_out_is_of_the_points_not_of_the_inducing_ones(drawn: tuple[Hyperparameters, Tensor, Tensor]):
+    exact, through = condition(*drawn).left_out, condition_sparse(*drawn).left_out
+    assert through.error == pytest.approx(exact.error, rel=1e-3)
+    assert through.within_one == pytest.approx(exact.within_one, abs=0.01)
+    assert through.within_two == pytest.approx(exact.within_two, abs=0.01)
+
+
+def test_leave_one_out_of_too_few_inducing_points_counts_what_they_leave(
+    drawn: tuple[Hyperparameters, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sparse, "INDUCING", 12)
+    hyper, x, y = drawn
+    at, _, _ = sparse._pivots(hyper, x)
+    through, errors, within = condition_sparse(hyper, x, y), [], []
+    for i in range(len(y)):
+        others = torch.arange(len(y)) != i
+        mean, variance = _projected(hyper, x[others], y[others], x[at], x[i : i + 1])
+        errors.append(float(mean - y[i]))
+        within.append(abs(errors[-1]) <= math.sqrt(variance + NOISE))
+    assert through.left_out.error == pytest.approx(math.sqrt(sum(e * e for e in errors) / len(errors)), rel=1e-4)
+    assert through.left_out.within_one == pytest.approx(sum(within) / len(within), abs=0.005)
+
+
+def _projected(hyper: Hyperparameters, x: Tensor, y: Tensor, z: Tensor, at: Tensor) -> tuple[Tensor, float]:
+    """Mean and latent variance at one point, by the equations of Rasmussen and Williams (2006), section 8.3.4."""
+    inner, outer, prior = covariance(hyper, z, z), covariance(hyper, z, x), covariance(hyper, at, at)
+    known = hyper.noise_variance * inner + outer @ outer.T
+    k = covariance(hyper, z, at)
+    mean = k.T @ torch.linalg.solve(known, outer @ y)
+    variance = prior - k.T @ torch.linalg.solve(inner, k) + hyper.noise_variance * k.T @ torch.linalg.solve(known, k)
+    return mean[0], float(variance)

@@ -12,8 +12,9 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples
 from surrogym_server.environment.step_rules import paid
 from surrogym_server.errors import InvalidInput
-from surrogym_server.gp import sparse
+from surrogym_server.gp import fit, sparse, subsets
 from surrogym_server.models.files import from_bytes, to_bytes
+from surrogym_server.models.gaussian_process.learning import output_learner
 from surrogym_shared.spec import Design
 
 PAPER = pendulum().model_copy(update={"design": Design(preset="paper")})
@@ -148,7 +149,7 @@ def test_beyond_a_number_of_samples_a_model_is_sparse_and_says_so(
     pendulum_definition, points: int, through: bool, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(sparse, "MAX_EXACT", 40)
-    monkeypatch.setattr(sparse, "FITTED", 30)
+    monkeypatch.setattr(subsets, "FEW", 30)
     monkeypatch.setattr(sparse, "INDUCING", 25)
     steps, later = random_steps(pendulum(), points, seed=0), random_steps(pendulum(), 100, seed=1)
     model = learn(pendulum_definition, steps).model
@@ -162,3 +163,35 @@ def test_beyond_a_number_of_samples_a_model_is_sparse_and_says_so(
     inside = later.q_next[:, 1].abs() < 8
     error = (model.transition(later.q, later.u).q_next - later.q_next)[inside, 1]
     assert float(error.abs().max()) < 0.05
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_structure_of_some_samples_and_a_process_of_all_predict_as_before(
+    pendulum_definition, seed, monkeypatch: pytest.MonkeyPatch
+):
+    """The same samples by the whole path, and by structure and first hyperparameters of a third of them."""
+    steps, later = random_steps(pendulum(), 120, seed=seed), random_steps(pendulum(), 200, seed=9)
+    whole = learn(pendulum_definition, steps).model
+    monkeypatch.setattr(subsets, "FEW", 40)
+    part = learn(pendulum_definition, steps).model
+    assert part.structures == whole.structures
+    assert [len(o.posterior.y) for o in part.outputs] == [len(o.posterior.y) for o in whole.outputs]
+    ours, theirs = (m.transition(later.q, later.u, deviations=True, reward_deviation=True) for m in (part, whole))
+    for name in ("q_next", "reward", "deviation", "reward_deviation"):
+        torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=1e-2, atol=1e-4)
+    again = learn(pendulum_definition, steps).model
+    assert to_bytes(again) == to_bytes(part)
+
+
+def test_no_search_evaluates_more_points_for_more_samples(pendulum_definition, monkeypatch: pytest.MonkeyPatch):
+    """What is compared costs the same for any number of samples: all maps see no more than a few of them."""
+    sizes: list[int] = []
+
+    def counted(x, y, *more):
+        sizes.append(len(y))
+        return fit(x, y, *more)
+
+    monkeypatch.setattr(output_learner, "fit", counted)
+    for points in (subsets.FEW, 3 * subsets.FEW):
+        learn(pendulum_definition, random_steps(pendulum(), points, seed=0))
+    assert max(sizes) == subsets.FEW

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, astuple, replace
 from typing import Any, get_args
 
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import Encoding, FeatureMap, Parity, State, encode
 from surrogym_server.errors import InvalidInput
-from surrogym_server.gp import Hyperparameters, Posterior, Sparse
+from surrogym_server.gp import Hyperparameters, LeftOut, Posterior, Sparse
 from surrogym_server.models.gaussian_process.feature_maps import reflection
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
@@ -98,7 +98,12 @@ def read_output(
 
 
 def _sparse(entry: dict[str, Any] | None) -> Sparse | None:
-    return None if entry is None else Sparse(int(entry["points"]), float(entry["unexplained"]))
+    if entry is None:
+        return None
+    left_out = None
+    if (found := entry.get("left_out")) is not None:
+        left_out = LeftOut(float(found["error"]), float(found["within_one"]), float(found["within_two"]))
+    return Sparse(int(entry["points"]), float(entry["unexplained"]), left_out)
 
 
 def _feature_map(entry: dict[str, Any]) -> FeatureMap:
@@ -125,6 +130,7 @@ def _require_numbers(output: OutputModel) -> None:
         least_zero += [hyper.linear_variance, hyper.quadratic_variance, posterior.jitter]
         if posterior.sparse is not None:
             least_zero += [posterior.sparse.points - len(posterior.y), posterior.sparse.unexplained]
+            least_zero += astuple(posterior.sparse.left_out) if posterior.sparse.left_out else ()
     if not (
         all(math.isfinite(v) for v in (*finite, *positive, *least_zero))
         and min(positive) > 0

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
 from surrogym_server.environment.features import FeatureMap
-from surrogym_server.gp import FitOptions, Fitted, condition_sparse, fit, spread
+from surrogym_server.gp import FitOptions, Fitted, Posterior, condition_many, fit, refine, spread, subsets
 from surrogym_server.models.gaussian_process.feature_maps import reflection
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.settings import Settings
@@ -51,24 +51,33 @@ class OutputLearner:
         around = {m: 0.0 if m.parity == "odd" else centre for m in inputs}
         fits = {m: self._fit(name, m, x[keep], (target[keep] - around[m]) / scale) for m, x in inputs.items()}
         best = max(fits, key=lambda m: fits[m].score + _odds(m))
-        chosen, used, centre = fits[best], keep, around[best]
+        chosen, centre = fits[best], around[best]
         y = (target - centre) / scale
-        if best.lead and bool((keep_lead & ~keep).any()):
-            used = keep_lead
-            chosen = self._fit(name, best, inputs[best][used], y[used], "|all")
+        more = bool(best.lead) and bool((keep_lead & ~keep).any())
+        used = keep_lead if more else keep
+        if int(used.sum()) > subsets.FEW:
+            posterior = self._refined(name, best, inputs[best][used], y[used], chosen.theta)
+        elif more:
+            posterior = self._fit(name, best, inputs[best][used], y[used], "|all").posterior
+        else:
+            posterior = chosen.posterior
         scores = tuple((str(m), f.score) for m, f in fits.items())
-        posterior = chosen.posterior
-        if len(posterior.y) < int(used.sum()):
-            posterior = condition_sparse(posterior.hyper, inputs[best][used], y[used])
         return OutputModel(name, best, posterior, centre, scale, int((~used).sum()), scores)
 
     def _fit(self, name: str, feature_map: FeatureMap, x: Tensor, y: Tensor, also: str = "") -> Fitted:
-        """Fit to all points; of very many, to some of them, and score as if all were alike."""
-        key, rows = f"{name}|{feature_map}{also}", spread(len(y))
+        """Fit to all points; of more than a few, to some of them, and score as if all were alike."""
+        key, rows = f"{name}|{feature_map}{also}", spread(len(y), subsets.FEW)
         mirror = reflection(self.definition, feature_map)
         fitted = fit(x[rows], y[rows], self._options(name), self.warm.get(key), mirror)
         self.thetas[key] = fitted.theta
         return replace(fitted, score=fitted.score * len(y) / len(rows))
+
+    def _refined(
+        self, name: str, feature_map: FeatureMap, x: Tensor, y: Tensor, theta: NDArray[np.float64]
+    ) -> Posterior:
+        """The process of all points x (n, d), y (n,), given the hyperparameters of a few."""
+        mirror = reflection(self.definition, feature_map)
+        return condition_many(refine(x, y, self._options(name), theta, mirror), x, y)
 
     def _options(self, name: str) -> FitOptions:
         """Dynamics tend to be near linear, costs to be quadratic."""

@@ -49,7 +49,5 @@ class OutputModel:
         """How the process without each sample in turn foretells it. One that never varied makes no error."""
         if self.posterior is None:
             return LeaveOneOutErrors(0.0, 1.0, 1.0)
-        mean, variance = self.posterior.leave_one_out()
-        error, deviation = (mean - self.posterior.y).abs(), variance.sqrt()
-        one, two = (float((error <= width * deviation).double().mean()) for width in (1, 2))
-        return LeaveOneOutErrors(float(self.scale * error.square().mean().sqrt()), one, two)
+        found = self.posterior.left_out
+        return LeaveOneOutErrors(self.scale * found.error, found.within_one, found.within_two)

@@ -1,0 +1,54 @@
+"""Fits of many points: hyperparameters of some of them, and processes that predict as those of all."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from surrogym_server.gp import FitOptions, condition, fit, refine, spread, subsets
+from surrogym_server.gp.fit import _minimum, _Objective
+
+
+@pytest.mark.parametrize("points", [1, 30, 31, 1_000])
+def test_a_subset_is_all_points_or_one_from_each_stretch(points: int):
+    rows = spread(points, 30)
+    assert len(rows) == len(rows.unique()) == min(points, 30)
+    stretch = points / len(rows)
+    for place, row in enumerate(rows.tolist()):
+        assert int(place * stretch) <= row < (place + 1) * stretch
+    assert torch.equal(rows, spread(points, 30))
+
+
+def test_a_subset_sees_every_phase_of_what_repeats():
+    assert len((spread(3_000, 150) % 20).unique()) > 10
+
+
+def smooth(points: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+    rng = np.random.default_rng(seed)
+    x = torch.from_numpy(rng.uniform(-1.7, 1.7, (points, 3)))
+    y = torch.sin(2 * x[:, 0]) + 0.5 * x[:, 1] * x[:, 0] + 0.3 * x[:, 2]
+    return x, y + torch.from_numpy(0.02 * rng.normal(size=points))
+
+
+def test_hyperparameters_refined_from_a_few_points_predict_as_those_of_all():
+    (x, y), (at, truth) = smooth(500, 0), smooth(300, 1)
+    few = spread(len(y), subsets.FEW)
+    refined = condition(refine(x, y, FitOptions(), fit(x[few], y[few], FitOptions()).theta), x, y)
+    full = fit(x, y, FitOptions()).posterior
+    for ours, theirs in zip(refined.mean_and_variance(at), full.mean_and_variance(at), strict=True):
+        torch.testing.assert_close(ours.abs().sqrt(), theirs.abs().sqrt(), rtol=0, atol=3e-3)
+    assert refined.left_out.error == pytest.approx(full.left_out.error, rel=0.02)
+    assert refined.hyper.noise_variance == pytest.approx(full.hyper.noise_variance, rel=0.1)
+    assert float((refined.mean(at) - truth).std()) < 0.03
+
+
+def test_what_few_points_took_for_noise_more_points_resolve():
+    """From where few points end, the search ends in noise; the second start finds the wave."""
+    x = torch.linspace(-1.7, 1.7, 200, dtype=torch.float64)[:, None]
+    y, found = torch.sin(6 * x[:, 0]), np.array([0.7, 0.0, -10.0, 0.0])  # as theta: the last is log sigma_n^2
+    _, alone = _minimum(_Objective(x, y, FitOptions(), None), found)
+    assert math.exp(alone[-1]) > 0.1
+    assert refine(x, y, FitOptions(), found).noise_variance < 1e-4
