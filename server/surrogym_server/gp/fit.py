@@ -73,8 +73,9 @@ def fit(
 
 def refine(
     x: Tensor, y: Tensor, options: FitOptions, theta: Array, reflection: Reflection | None = None
-) -> Hyperparameters:
-    """Hyperparameters for x (n, d) and y (n,), from ``theta``, those of fewer such points.
+) -> tuple[Hyperparameters, ...]:
+    """Hyperparameters for x (n, d) and y (n,), from ``theta``, those of fewer such points: of each stage, the last best
+    where it has seen all points.
 
     More points have other optima: they resolve what fewer took for noise. So some of them are searched from two starts,
     and all from the better of what is found, in a few iterations. Both are bounded, see ``gp.subsets``.
@@ -86,12 +87,13 @@ def refine(
     shorter[-1] = objective.default_start[-1]
     with _blas().limit(limits=1):
         _, theta = min((_minimum(objective, start) for start in (theta, shorter)), key=lambda pair: pair[0])
+        found = [theta]
         for most, iterations in REFINEMENTS:
             if len(y) > len(rows):
                 rows = spread(len(y), most)
                 objective = _Objective(x[rows], y[rows], replace(options, max_iterations=iterations), reflection)
-                _, theta = _minimum(objective, theta)
-    return objective.hyper(theta)
+                found.append(_minimum(objective, found[-1])[1])
+    return tuple(objective.hyper(theta) for theta in found)
 
 
 def _minimum(objective: _Objective, start: Array) -> tuple[float, Array]:

@@ -7,6 +7,7 @@ Reference: Rasmussen and Williams (2006), algorithm 2.1.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -26,13 +27,15 @@ class LeftOut:
     error: float  # root mean square, in units of y
     within_one: float  # share of the points within one predictive deviation
     within_two: float
+    log_density: float  # mean log predictive density
 
     @classmethod
     def of(cls, error: Tensor, variance: Tensor) -> LeftOut:
         """Of errors (n,) and the variances (n,) predicted with them, noise included."""
         size, deviation = error.abs(), variance.sqrt()
         one, two = (float((size <= width * deviation).double().mean()) for width in (1, 2))
-        return cls(float(size.square().mean().sqrt()), one, two)
+        log_density = -0.5 * float((size.square() / variance + (2 * math.pi * variance).log()).mean())
+        return cls(float(size.square().mean().sqrt()), one, two, log_density)
 
 
 @dataclass(frozen=True)

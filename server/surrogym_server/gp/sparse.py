@@ -20,6 +20,8 @@ Reference: Fine and Scheinberg (2001) for the choice of Z; Seeger, Williams, Law
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -28,17 +30,23 @@ from surrogym_server.gp.posterior import BLOCK, LeftOut, Posterior, Sparse, cond
 
 MAX_EXACT = 2_000  # points; beyond, a process is sparse
 INDUCING = 1_000
+COMPARED = 2
 SHARE = 1e-12  # least share that all other points have in a prediction
 EXPLAINED, BELOW_NOISE = 1e-10, 1e-3  # of the prior's and the noise variance: a point known so well is not chosen
 
 
-def condition_many(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
-    """Condition a process on x (n, d) and y (n,): exactly up to ``MAX_EXACT`` points, else through inducing points.
+def condition_many(hypers: Sequence[Hyperparameters], x: Tensor, y: Tensor) -> Posterior:
+    """Condition a process on x (n, d) and y (n,): exactly up to ``MAX_EXACT`` points, with the last hyperparameters;
+    else through inducing points, with those of the last ``COMPARED`` that foretell left-out points best.
+
+    Hyperparameters of some points say little of what is rare: all points judge them. R&W (2006), section 5.4.2.
 
     Raises:
         NumericalFailure: as ``condition``.
     """
-    return condition(hyper, x, y) if len(y) <= MAX_EXACT else condition_sparse(hyper, x, y)
+    if len(y) <= MAX_EXACT:
+        return condition(hypers[-1], x, y)
+    return max((condition_sparse(hyper, x, y) for hyper in hypers[-COMPARED:]), key=lambda p: p.left_out.log_density)
 
 
 def condition_sparse(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:

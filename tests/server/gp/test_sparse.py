@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -85,7 +86,16 @@ def test_a_process_is_exact_up_to_a_number_of_points(
 ):
     monkeypatch.setattr(sparse, "MAX_EXACT", 60)
     hyper, x, y = drawn
-    assert (condition_many(hyper, x[:points], y[:points]).sparse is None) == exact
+    assert (condition_many([hyper], x[:points], y[:points]).sparse is None) == exact
+
+
+def test_of_two_sparse_processes_the_one_is_kept_that_foretells_all_points(
+    drawn: tuple[Hyperparameters, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sparse, "MAX_EXACT", 60)
+    hyper, x, y = drawn
+    sure = replace(hyper, noise_variance=NOISE / 100)
+    assert condition_many([hyper, sure], x, y).hyper is condition_many([sure, hyper], x, y).hyper is hyper
 
 
 def test_leave_one_out_is_of_the_points_not_of_the_inducing_ones(drawn: tuple[Hyperparameters, Tensor, Tensor]):

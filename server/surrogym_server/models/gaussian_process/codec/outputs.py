@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, astuple, replace
+from dataclasses import asdict, replace
 from typing import Any, get_args
 
 import torch
@@ -102,7 +102,7 @@ def _sparse(entry: dict[str, Any] | None) -> Sparse | None:
         return None
     left_out = None
     if (found := entry.get("left_out")) is not None:
-        left_out = LeftOut(float(found["error"]), float(found["within_one"]), float(found["within_two"]))
+        left_out = LeftOut(*(float(found[name]) for name in ("error", "within_one", "within_two", "log_density")))
     return Sparse(int(entry["points"]), float(entry["unexplained"]), left_out)
 
 
@@ -130,7 +130,9 @@ def _require_numbers(output: OutputModel) -> None:
         least_zero += [hyper.linear_variance, hyper.quadratic_variance, posterior.jitter]
         if posterior.sparse is not None:
             least_zero += [posterior.sparse.points - len(posterior.y), posterior.sparse.unexplained]
-            least_zero += astuple(posterior.sparse.left_out) if posterior.sparse.left_out else ()
+            if (left_out := posterior.sparse.left_out) is not None:
+                finite += [left_out.log_density]
+                least_zero += [left_out.error, left_out.within_one, left_out.within_two]
     if not (
         all(math.isfinite(v) for v in (*finite, *positive, *least_zero))
         and min(positive) > 0
