@@ -3,6 +3,8 @@
 Run by ``make bench``. Spells with and without take turns. A process of its own answers queries of ``pendulum`` for as
 long as a spell lasts and asks for more of them, so that one fit follows another, each with more samples, and every
 fit becomes a model that lanes move to at their next reset.
+
+Before that, what one fit takes by the number of samples: cart-pole, whose four coordinates are learned.
 """
 
 from __future__ import annotations
@@ -21,14 +23,18 @@ import numpy as np
 from bench_step import surrogym_server
 from common import figures, parser, ratio, started, write
 
+from support.models import learn
+from support.real_steps import random_steps
 from support.teaching import answer
-from surrogym_client.original.classic import pendulum
+from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_client.original.gymnasium import GymnasiumEnvironment
 from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_server.convert import definition_from_spec
 from surrogym_shared import wire
 from surrogym_shared.wire import OpenSession
 
 LANES, TIME_LIMIT, QUERIES = (1, 1_024), 50, 4
+SIZES = (500, 1_000, 2_000, 5_000)  # samples
 SPELLS, SPELL_SECONDS, SETTLING_SECONDS = 6, 2.0, 1.5
 
 
@@ -81,11 +87,22 @@ def measured(url: str, lanes: int, wanted: Event, spells: int) -> dict[str, Any]
     return {**found, "fits": len(models) - before, "samples": models[-1].samples}
 
 
+def fitted(samples: int) -> dict[str, float]:
+    """Seconds, and seconds of processor time, of one fit of random samples."""
+    definition, steps = definition_from_spec(cartpole()), random_steps(cartpole(), samples, seed=0)
+    wall, processor = time.perf_counter(), time.process_time()
+    learn(definition, steps)
+    return {"seconds": time.perf_counter() - wall, "processor": time.process_time() - processor}
+
+
 def main() -> None:
     options = started(parser(__doc__))
     context = mp.get_context("spawn")
     wanted, ending = context.Event(), context.Event()
-    report: dict[str, Any] = {"lanes": {}}
+    report: dict[str, Any] = {"lanes": {}, "sizes": {}}
+    for samples in SIZES[:1] if options.quick else SIZES:
+        report["sizes"][samples] = found = fitted(samples)
+        print(f"n = {samples:,}: {found['seconds']:.1f} s, {found['processor']:.1f} s of processor time")
     with surrogym_server() as url:
         teacher = context.Process(target=teach_on, args=(url, wanted, ending))
         teacher.start()
