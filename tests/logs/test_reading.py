@@ -209,3 +209,18 @@ def test_what_is_no_log_is_refused_in_a_sentence(tmp_path: Path, content: bytes,
 def test_a_file_that_is_not_there_is_named(tmp_path: Path):
     with pytest.raises(FileNotFoundError, match=r"nothing\.csv"):
         format_of(tmp_path / "nothing.csv")
+
+
+def test_a_folder_without_a_data_set_is_refused_in_a_sentence(tmp_path: Path):
+    (tmp_path / "data").mkdir()
+    says = r"expected a CSV, Parquet or NPZ file, or a Minari data set, got the folder .* which has no data/main_data"
+    with pytest.raises(UnusableLog, match=says):
+        read_log(tmp_path, Options(mapping={"state": ["a"], "action": ["b"]}))
+
+
+def test_a_folder_with_a_broken_data_set_is_refused(tmp_path: Path):
+    pytest.importorskip("minari")
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "metadata.json").write_text("{}")
+    with pytest.raises(UnusableLog, match=r"expected a Minari data set in .* got one that can't be read"):
+        read_log(tmp_path)

@@ -192,6 +192,7 @@ def import_log(
 
 def keep_rejected(path: Path, log: ReadLog, where: str | Path | None = None) -> Path | None:
     """Write the rows that were set aside beside the log; None where there are none and no such file stands there."""
+    path = path if path.name else path.resolve()  # "." is the folder of a data set too
     file = Path(where) if where is not None else path.with_name(f"{path.stem}.rejected.csv")
     if not log.steps.rejected and not file.exists():
         return None

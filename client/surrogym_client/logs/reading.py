@@ -29,10 +29,12 @@ def format_of(path: Path) -> Format:
 
     Raises:
         OSError: there is no such file, and no Minari data set of this name.
+        UnusableLog: it is a folder, and no Minari data set.
     """
     if path.suffix == SURROGATE:
         return "surrogate"
     if path.is_dir():
+        _require_data_set(path)
         return "minari"
     try:
         with path.open("rb") as file:
@@ -118,7 +120,10 @@ def read_parquet(path: Path) -> Table:
 def read_minari(path: Path) -> Table:
     """All episodes of a Minari data set, by its name or its folder. Observations and actions have to be vectors."""
     minari = _minari()
-    data = minari.MinariDataset(path / "data") if path.is_dir() else minari.load_dataset(str(path))
+    try:
+        data = minari.MinariDataset(path / "data") if path.is_dir() else minari.load_dataset(str(path))
+    except (ValueError, KeyError, AssertionError) as error:
+        raise UnusableLog(f"expected a Minari data set in {path}, got one that can't be read: {error}") from error
     episodes = list(data.iterate_episodes())
     if not all(isinstance(e.observations, np.ndarray) and isinstance(e.actions, np.ndarray) for e in episodes):
         raise UnusableLog(f"expected observations and actions that are vectors in {path}, got dictionaries or tuples")
@@ -181,6 +186,15 @@ def _minari() -> Any:
     except ModuleNotFoundError as error:
         raise UnusableLog("a Minari data set needs the package minari: pip install 'surrogym[logs]'") from error
     return minari
+
+
+def _require_data_set(folder: Path) -> None:
+    """A folder is a log where Minari keeps a data set: with its metadata, or with its HDF5 file."""
+    if not any((folder / "data" / name).is_file() for name in ("main_data.hdf5", "metadata.json")):
+        raise UnusableLog(
+            f"expected a CSV, Parquet or NPZ file, or a Minari data set, got the folder {folder}, which has no "
+            "data/main_data.hdf5 or data/metadata.json"
+        )
 
 
 def _minari_has(path: Path) -> bool:
