@@ -166,3 +166,20 @@ def test_a_server_that_is_away_is_said_before_anything_is_lost(log: Path, monkey
     monkeypatch.setattr("surrogym_client.logs.importing.Api", lambda *given: Api(*given, retries=Retries(seconds=0)))
     with pytest.raises(ServerUnreachable):
         import_log(log, register="a", url="http://127.0.0.1:9")
+
+
+def test_the_next_command_has_the_options_of_this_one(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    from surrogym_client.cli import main
+
+    monkeypatch.chdir(tmp_path)
+    Path("my map.json").write_text(json.dumps(reactor.MAPPING))
+    given = ["import", "log.csv", "--map", "my map.json", "--budget", "5", "--rejected", "r.csv"]
+    for more, kept in ([], ""), (["--draft", "spec.json"], " --spec spec.json"):
+        with pytest.raises(SystemExit) as ended:
+            main([*given, *more])
+        assert not ended.value.code
+        told = capsys.readouterr().out.splitlines()[-1]
+        common = "nothing was stored; next: surrogym import log.csv --map 'my map.json' --budget 5 --rejected r.csv"
+        assert told == f"{common}{kept} --register NAME"

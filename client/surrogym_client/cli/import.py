@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from surrogym_client.cli.groups import Output, Service, add
-from surrogym_client.cli.options import SpecFile, Wait, connect, read_spec
+from surrogym_client.cli.options import SpecFile, Wait, connect, read_spec, typed
 
 if TYPE_CHECKING:
     from surrogym_client.logs import Imported
@@ -145,7 +146,17 @@ def _import_log(context: typer.Context, file: Path, log: OfLogs, wait: float, se
     view = None
     if imported.surrogate is not None and wait > 0:
         view = _await_model(imported.surrogate, wait, service.server, token, quiet=output.quiet)
-    output.give(_as_json(imported, view), lambda: "\n".join(_words(file, imported, view)))
+    again = _again(context, log)
+    output.give(_as_json(imported, view), lambda: "\n".join(_words(file, imported, view, again)))
+
+
+def _again(context: typer.Context, log: OfLogs) -> str:
+    """The command that stores the log, with the options of this one; what was drafted is then read, as edited."""
+    without = ["token", "as_json", "quiet", *(["draft"] if log.draft is not None else [])]
+    drafted = "" if log.draft is None else f" --spec {shlex.quote(str(log.draft))}"
+    if drafted:
+        without.append("spec")
+    return f"surrogym import {typed(context, without)}{drafted} --register NAME"
 
 
 def _await_model(name: str, wait: float, server: str | None, token: str | None, *, quiet: bool) -> SurrogateView:
@@ -180,7 +191,7 @@ def _as_json(imported: Imported, view: SurrogateView | None) -> dict[str, Any]:
     }
 
 
-def _words(file: Path, imported: Imported, view: SurrogateView | None) -> list[str]:
+def _words(file: Path, imported: Imported, view: SurrogateView | None, again: str) -> list[str]:
     log = imported.log
     lines = [f"{file}: {len(log.table)} rows, {len(log.steps)} steps"]
     if log.steps.ends:
@@ -188,7 +199,7 @@ def _words(file: Path, imported: Imported, view: SurrogateView | None) -> list[s
     lines += [*_rejected(imported), *_specified(log.spec, log.notes)]
     name = imported.surrogate
     if name is None:
-        return [*lines, f"nothing was stored; next: surrogym import {file} --register NAME"]
+        return [*lines, f"nothing was stored; next: {again}"]
     there = f", {imported.duplicates} were there before" if imported.duplicates else ""
     lines.append(f"{name}: {imported.taken} new logged steps{there}")
     if view is not None and view.fidelity is not None:
