@@ -13,7 +13,7 @@ from surrogym_client.cli.groups import Output, Service, add
 from surrogym_client.cli.options import SpecFile, Wait, connect, read_spec, typed
 
 if TYPE_CHECKING:
-    from surrogym_client.logs import Imported
+    from surrogym_client.logs import Imported, ReadLog
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import SurrogateView
 
@@ -185,6 +185,8 @@ def _as_json(imported: Imported, view: SurrogateView | None) -> dict[str, Any]:
         "rejected": [{"line": line, "reason": reason} for line, reason in log.rejected],
         "rejected_file": None if imported.rejected_file is None else str(imported.rejected_file),
         "data_hash": log.steps.digest,
+        "columns": log.roles.used,
+        "ignored": log.ignored,
         "notes": list(log.notes),
         "spec": log.spec.model_dump(mode="json"),
         "view": None if view is None else view.model_dump(mode="json"),
@@ -196,7 +198,7 @@ def _words(file: Path, imported: Imported, view: SurrogateView | None, again: st
     lines = [f"{file}: {len(log.table)} rows, {len(log.steps)} steps"]
     if log.steps.ends:
         lines.append(f"{log.steps.ends} rows have no next state: they end an episode, or stand before a gap")
-    lines += [*_rejected(imported), *_specified(log.spec, log.notes)]
+    lines += [*_columns(log), *_rejected(imported), *_specified(log.spec, log.notes)]
     name = imported.surrogate
     if name is None:
         return [*lines, f"nothing was stored; next: {again}"]
@@ -207,6 +209,11 @@ def _words(file: Path, imported: Imported, view: SurrogateView | None, again: st
         lines.append(f"model {view.model_version} of {view.samples} steps: confidence index {index:.4f}")
     after = f"surrogym train {name}" if view is not None else f"surrogym status {name}"
     return [*lines, f"next: {after}"]
+
+
+def _columns(log: ReadLog) -> list[str]:
+    used = [f"  {column}: {role}" for column, role in log.roles.used.items()]
+    return ["columns:", *used, *(f"  {column}: ignored, as {reason}" for column, reason in log.ignored.items())]
 
 
 def _rejected(imported: Imported) -> list[str]:

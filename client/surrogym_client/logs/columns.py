@@ -57,6 +57,14 @@ class Roles:
     discrete: bool | None = None
     ignored: tuple[str, ...] = ()
 
+    @property
+    def used(self) -> dict[str, str]:
+        """The role of each column that is used, in words, by the column."""
+        found = {column: f"state {name}" for name, column in self.state.items()}
+        found |= {column: f"action {name}" for name, column in self.action.items()}
+        found |= {column: f"next state {name}" for name, column in self.following.items()}
+        return found | {column: role for role in SINGLE if (column := getattr(self, role)) is not None}
+
 
 class Mapped(BaseModel):
     """A mapping file. A list of columns names coordinates by their columns, a table gives names of one's own."""

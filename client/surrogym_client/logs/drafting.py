@@ -241,8 +241,6 @@ def _about(roles: Roles, steps: Transitions) -> list[str]:
         notes.append(
             f"sampling interval: {steps.interval:g}, in the unit of {roles.time}; a virtual step takes as long"
         )
-    if roles.ignored:
-        notes.append(f"ignored columns: {', '.join(roles.ignored)}")
     return notes
 
 

@@ -54,6 +54,11 @@ class ReadLog:
         """The line and the reason of each row that was set aside."""
         return [(int(self.table.lines[row]), reason) for row, reason in self.steps.rejected.items()]
 
+    @property
+    def ignored(self) -> dict[str, str]:
+        """The columns and arrays of the file that are not used, with the reason."""
+        return {**self.table.ignored, **dict.fromkeys(self.roles.ignored, "it has no role")}
+
     def write_rejected(self, path: Path) -> None:
         """Write the rows that were set aside as CSV: line, reason, and the row as it stands in the log."""
         with path.open("w", newline="", encoding="utf-8") as file:
@@ -223,7 +228,7 @@ def _of_spec(roles: Roles, spec: EnvironmentSpec) -> Roles:
         roles,
         state={name: roles.state[name] for name in spec.coordinate_names},
         following={name: roles.following[name] for name in spec.coordinate_names} if roles.following else {},
-        ignored=(*roles.ignored, *(name for name in roles.state if name not in spec.coordinate_names)),
+        ignored=(*roles.ignored, *(one for name, one in roles.state.items() if name not in spec.coordinate_names)),
     )
 
 

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from surrogym_client.logs.arrays import table_of_arrays
 from surrogym_client.logs.errors import UnusableLog
 from surrogym_client.logs.table import Cells, Table
 from surrogym_shared.archives import read_arrays
@@ -19,9 +20,6 @@ Format = Literal["csv", "npz", "parquet", "minari", "surrogate"]
 MOST_BYTES = 4 * 1024**3  # of the arrays in an NPZ file
 SURROGATE = ".surrogate"
 DELIMITERS = ",;\t"
-STATES = ("coordinates", "observations", "observation", "states", "state", "obs", "q")
-ACTIONS = ("actions", "action", "u")
-NEXT = ("next_coordinates", "next_observations", "next_observation", "next_states", "next_state", "next_obs", "next_q")
 
 
 def format_of(path: Path) -> Format:
@@ -89,14 +87,13 @@ def read_csv(path: Path) -> Table:
 
 
 def read_npz(path: Path) -> Table:
-    """Arrays by name: (n,) each, or (n, k) of states, actions and next states. Nothing is unpickled."""
+    """The arrays of an NPZ file, as ``table_of_arrays`` has them. Nothing is unpickled."""
     try:
         arrays = read_arrays(path.read_bytes(), MOST_BYTES)
     except ValueError as error:
         raise UnusableLog(f"{path}: {error}") from error
-    named = [str(name) for name in arrays.pop("coordinate_names", ())]
-    columns = _columns(arrays, named)
-    return _of_columns(path, columns)
+    named = [str(name) for name in np.atleast_1d(arrays.pop("coordinate_names", ()))]
+    return table_of_arrays(path, arrays, named)
 
 
 def read_parquet(path: Path) -> Table:
@@ -114,7 +111,7 @@ def read_parquet(path: Path) -> Table:
         elif cells.dtype == object:
             cells = np.array(["" if cell is None else str(cell) for cell in cells])
         arrays[name] = cells
-    return _of_columns(path, _columns(arrays, []))
+    return table_of_arrays(path, arrays)
 
 
 def read_minari(path: Path) -> Table:
@@ -127,7 +124,8 @@ def read_minari(path: Path) -> Table:
     episodes = list(data.iterate_episodes())
     if not all(isinstance(e.observations, np.ndarray) and isinstance(e.actions, np.ndarray) for e in episodes):
         raise UnusableLog(f"expected observations and actions that are vectors in {path}, got dictionaries or tuples")
-    columns = _columns(
+    return table_of_arrays(
+        path,
         {
             "observations": np.concatenate([_rows(e.observations[:-1]) for e in episodes]),
             "actions": np.concatenate([_rows(e.actions) for e in episodes]),
@@ -137,39 +135,11 @@ def read_minari(path: Path) -> Table:
             "truncated": np.concatenate([e.truncations for e in episodes]),
             "episode": np.concatenate([np.full(len(e.rewards), e.id) for e in episodes]),
         },
-        [],
     )
-    return _of_columns(path, columns)
 
 
 def _rows(array: Cells) -> Cells:
     return array[:, None] if array.ndim == 1 else array
-
-
-def _columns(arrays: dict[str, Any], names: Sequence[str]) -> dict[str, Cells]:
-    """Arrays (n,) as they are, those (n, k) as k columns: ``q.s0`` or ``q.<name>``, ``action.0``, ``next.s0``."""
-    columns: dict[str, Cells] = {}
-    for name, array in arrays.items():
-        if array.ndim < 2:
-            columns[name] = np.atleast_1d(array)
-            continue
-        flat = array.reshape(len(array), -1)
-        if name in ACTIONS:
-            columns |= {f"action.{i}": flat[:, i] for i in range(flat.shape[1])}
-        elif name in (*STATES, *NEXT):
-            own = names if len(names) == flat.shape[1] else [f"s{i}" for i in range(flat.shape[1])]
-            columns |= {f"{'q' if name in STATES else 'next'}.{one}": flat[:, i] for i, one in enumerate(own)}
-        else:
-            columns |= {f"{name}.{i}": flat[:, i] for i in range(flat.shape[1])}
-    return columns
-
-
-def _of_columns(path: Path, columns: dict[str, Cells]) -> Table:
-    _require_names(path, list(columns))
-    lengths = {name: len(column) for name, column in columns.items()}
-    if len(set(lengths.values())) > 1:
-        raise UnusableLog(f"expected columns of one length in {path}, got {lengths}")
-    return Table(columns, np.arange(1, 1 + next(iter(lengths.values()))))
 
 
 def _require_names(path: Path, names: Sequence[str]) -> None:

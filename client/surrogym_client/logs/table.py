@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
@@ -28,12 +28,14 @@ class Table:
         lines: where each row stands in its file, (n,): the line of a CSV file, else the number of the row from 1.
         faults: what is wrong with a row as a whole, by row.
         cells: the row as it stands in the file, where that is text.
+        ignored: arrays of the file that are no columns, with the reason.
     """
 
     columns: dict[str, Cells]
     lines: Ints
     faults: dict[int, str] = field(default_factory=dict)
     cells: Sequence[Sequence[str]] = ()
+    ignored: Mapping[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.lines)

@@ -1,0 +1,67 @@
+"""Arrays of a file: which are columns, which are ignored, and which shapes are refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from surrogym_client.logs import ReadLog, UnusableLog, read_log
+
+RNG = np.random.default_rng(0)
+STATES = RNG.normal(size=(21, 2))
+VECTORS = {"states": STATES[:-1], "next_states": STATES[1:], "u": RNG.uniform(-1, 1, 20), "r": np.arange(20.0)}
+
+
+def read(folder: Path, **arrays) -> ReadLog:
+    np.savez(folder / "log.npz", **arrays)
+    return read_log(folder / "log.npz")
+
+
+@pytest.mark.parametrize("name", ["states", "actions", "next_states"])
+def test_arrays_by_episode_are_refused_with_their_shape(tmp_path: Path, name: str):
+    arrays = {"states": STATES, "actions": STATES, "rewards": np.zeros((6, 100))} | {name: np.zeros((6, 100, 2))}
+    with pytest.raises(UnusableLog, match=rf"expected one row a step, got shape \(6, 100, 2\) for {name}"):
+        read(tmp_path, **arrays)
+
+
+@pytest.mark.parametrize("spare", [np.float64(0.05), np.array([0.05]), np.zeros((2, 3, 4)), np.array(["a", "b"])])
+def test_an_array_that_is_no_column_is_ignored(tmp_path: Path, spare: np.ndarray):
+    log = read(tmp_path, **VECTORS, dt=spare)
+    assert len(log.steps) == 20
+    assert log.ignored == {"dt": f"its shape {spare.shape} is not one value a step"}
+
+
+def test_a_column_of_another_length_is_refused(tmp_path: Path):
+    with pytest.raises(UnusableLog, match="expected columns of one length in"):
+        read(tmp_path, x=np.zeros(20), speed=np.zeros(21), action=np.zeros(20))
+    with pytest.raises(UnusableLog, match="expected columns of one length in"):
+        read(tmp_path, **VECTORS | {"r": np.zeros(21)})
+
+
+def test_rewards_of_one_column_are_the_reward(tmp_path: Path):
+    log = read(tmp_path, **VECTORS | {"r": np.arange(20.0)[:, None]})
+    assert log.steps.reward is not None
+    assert log.steps.reward.tolist() == list(range(20))
+
+
+def test_the_command_says_the_role_of_each_column(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    from surrogym_client.cli import main
+
+    path = tmp_path / "log.npz"
+    np.savez(path, **VECTORS, late=np.zeros(20), dt=0.05)
+    for options in ([], ["--json"]):
+        with pytest.raises(SystemExit) as ended:
+            main(["import", str(path), *options])
+        assert not ended.value.code
+        told = capsys.readouterr().out
+        if not options:
+            assert "  u: action 0\n  next.s0: next state s0\n" in told
+            assert "  dt: ignored, as its shape () is not one value a step\n" in told
+            assert "  late: ignored, as it has no role\n" in told
+            continue
+        read_back = json.loads(told)
+        assert read_back["columns"]["r"] == "reward"
+        assert set(read_back["ignored"]) == {"dt", "late"}
