@@ -120,7 +120,7 @@ def test_episodes_that_begin_at_one_place_start_there(tmp_path: Path):
 def test_a_value_far_from_all_others_is_pointed_out(tmp_path: Path):
     columns = rows()
     columns["next_x"][7] = 500.0
-    assert any("end far from the others, up to 500" in note for note in drafted(tmp_path, **columns).notes)
+    assert any("1 step ends far from the others, up to 500" in note for note in drafted(tmp_path, **columns).notes)
 
 
 @pytest.mark.parametrize(

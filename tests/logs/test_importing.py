@@ -137,7 +137,7 @@ def test_the_command_drafts_registers_and_waits(
     with pytest.raises(SystemExit):
         main(["import", str(path), "--to", name, "--server", server_process.url])
     said = capsys.readouterr().out
-    assert "1 rows can't be used" in said
+    assert "1 row can't be used" in said
     assert f"{name}: 0 new logged steps, {ROWS - 1} were there before" in said
 
 

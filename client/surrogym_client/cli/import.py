@@ -194,19 +194,23 @@ def _as_json(imported: Imported, view: SurrogateView | None) -> dict[str, Any]:
 
 
 def _words(file: Path, imported: Imported, view: SurrogateView | None, again: str) -> list[str]:
+    from surrogym_client.logs.too_few import counted, has
+
     log = imported.log
-    lines = [f"{file}: {len(log.table)} rows, {len(log.steps)} steps"]
+    lines = [f"{file}: {counted(len(log.table), 'row')}, {counted(len(log.steps), 'step')}"]
     if log.steps.ends:
-        lines.append(f"{log.steps.ends} rows have no next state: they end an episode, or stand before a gap")
+        where = "it ends an episode, or stands" if log.steps.ends == 1 else "they end an episode, or stand"
+        lines.append(f"{has(log.steps.ends, 'row')} no next state: {where} before a gap")
     lines += [*_columns(log), *_rejected(imported), *_specified(log.spec, log.notes)]
     name = imported.surrogate
     if name is None:
         return [*lines, f"nothing was stored; next: {again}"]
-    there = f", {imported.duplicates} were there before" if imported.duplicates else ""
-    lines.append(f"{name}: {imported.taken} new logged steps{there}")
+    were = "was" if imported.duplicates == 1 else "were"
+    there = f", {imported.duplicates} {were} there before" if imported.duplicates else ""
+    lines.append(f"{name}: {counted(imported.taken, 'new logged step')}{there}")
     if view is not None and view.fidelity is not None:
         index = view.fidelity.confidence_index
-        lines.append(f"model {view.model_version} of {view.samples} steps: confidence index {index:.4f}")
+        lines.append(f"model {view.model_version} of {counted(view.samples, 'step')}: confidence index {index:.4f}")
     after = f"surrogym train {name}" if view is not None else f"surrogym status {name}"
     return [*lines, f"next: {after}"]
 
@@ -217,10 +221,12 @@ def _columns(log: ReadLog) -> list[str]:
 
 
 def _rejected(imported: Imported) -> list[str]:
+    from surrogym_client.logs.too_few import counted
+
     rejected = imported.log.rejected
     if not rejected:
         return []
-    lines = [f"{len(rejected)} rows can't be used, see {imported.rejected_file}:"]
+    lines = [f"{counted(len(rejected), 'row')} can't be used, see {imported.rejected_file}:"]
     lines += [f"  line {line}: {reason}" for line, reason in rejected[:SHOWN]]
     return [*lines, f"  and {len(rejected) - SHOWN} more"] if len(rejected) > SHOWN else lines
 

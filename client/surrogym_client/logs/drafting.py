@@ -53,15 +53,13 @@ def draft(roles: Roles, steps: Transitions, name: str, budget: int = 0) -> Draft
 
     Args:
         roles: what the columns are, and what of it was declared.
-        steps: its usable transitions.
+        steps: its usable transitions, two at least.
         name: what the environment is called.
         budget: real steps that a design may ask for.
 
     Raises:
-        UnusableLog: no step can be used, or no state ever moves.
+        UnusableLog: no state ever moves, or an action never varies.
     """
-    if len(steps) < 2:
-        raise UnusableLog(f"expected two usable steps at least, got {len(steps)}; see the rejected rows")
     notes: list[str] = []
     coordinates = [
         found
@@ -132,7 +130,7 @@ def _bounds(roles: Roles, name: str, after: Floats, ends: tuple[float, float], n
     for side, end, declared in (("low", shown[0], low), ("high", shown[1], high)):
         if end is not None and declared is None:
             rows = int((after == end).sum())
-            notes.append(f"{name}: saturates at {end:g} ({side}), where {rows} steps end exactly")
+            notes.append(f"{name}: saturates at {end:g} ({side}), where {ending(rows)} exactly")
     low, high = shown[0] if low is None else low, shown[1] if high is None else high
     return None if low is None and high is None else Bounds(low=low, high=high)
 
@@ -251,7 +249,11 @@ def _remarks(values: Floats) -> list[str]:
     if not far.any():
         return []
     worst = values[np.abs(values - middle).argmax()]
-    return [f"{int(far.sum())} steps end far from the others, up to {worst:g}; declare limits if these are faults"]
+    return [f"{ending(int(far.sum()))} far from the others, up to {worst:g}; declare limits if these are faults"]
+
+
+def ending(count: int) -> str:
+    return f"{count} step ends" if count == 1 else f"{count} steps end"
 
 
 def limited(spec: EnvironmentSpec) -> Mapping[str, str]:

@@ -18,6 +18,7 @@ from surrogym_client.logs.reading import read
 from surrogym_client.logs.rewards import declared_reward
 from surrogym_client.logs.rows import rows_of
 from surrogym_client.logs.table import Bools, Floats, Table
+from surrogym_client.logs.too_few import TooFewSteps, require_steps
 from surrogym_client.logs.transitions import Transitions, transitions_of
 from surrogym_client.original.terms import terminates
 from surrogym_client.transport.api import Api
@@ -61,11 +62,7 @@ class ReadLog:
 
     def write_rejected(self, path: Path) -> None:
         """Write the rows that were set aside as CSV: line, reason, and the row as it stands in the log."""
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(["line", "reason", *self.table.names])
-            for row, reason in self.steps.rejected.items():
-                writer.writerow([self.table.lines[row], reason, *self.table.row(row)])
+        _write_rejected(path, self.table, self.steps)
 
 
 @dataclass(frozen=True)
@@ -107,7 +104,8 @@ def read_log(path: str | Path, options: Options | None = None) -> ReadLog:
     """Read a log and check its rows; nothing is sent.
 
     Raises:
-        UnusableLog: no log, columns that nobody can tell apart, or no usable step.
+        UnusableLog: no log, or columns that nobody can tell apart.
+        TooFewSteps: no usable step, or a single one where a specification is to be drafted.
         OSError: a file can't be read.
     """
     path, options = Path(path), options or Options()
@@ -119,9 +117,12 @@ def read_log(path: str | Path, options: Options | None = None) -> ReadLog:
     options.progress(0.1, f"checking {len(table)} rows")
     steps = transitions_of(rows_of(table, roles, options.spec))
     if options.spec is None:
+        require_steps(table, steps, 2)
         drafted: Draft = draft(roles, steps, options.name or path.stem, options.budget)
         return ReadLog(table, roles, _shaped(drafted.spec, roles, steps), drafted.spec, drafted.notes)
-    return ReadLog(table, roles, _consistent(options.spec, _shaped(options.spec, roles, steps)), options.spec)
+    steps = _consistent(options.spec, _shaped(options.spec, roles, steps))
+    require_steps(table, steps, 1)
+    return ReadLog(table, roles, steps, options.spec)
 
 
 def send(api: Api, name: str, log: ReadLog, progress: Progress = lambda _share, _words: None) -> tuple[int, int]:
@@ -170,7 +171,8 @@ def import_log(
 
     Raises:
         ValueError: both ``register`` and ``to``, or ``to`` with ``spec``.
-        UnusableLog: no log, columns that nobody can tell apart, or no usable step.
+        UnusableLog: no log, or columns that nobody can tell apart.
+        TooFewSteps: no usable step, or a single one where a specification is to be drafted.
         SurrogymClientError: as every request.
 
     Example:
@@ -181,13 +183,12 @@ def import_log(
     given = Path(mapping) if isinstance(mapping, str) else mapping
     options = Options(given, spec, budget, progress=lambda share, words: progress(0.3 * share, words))
     if register is None and to is None:
-        log = read_log(path, options)
-        return Imported(log, rejected_file=keep_rejected(Path(path), log, rejected))
+        log, kept = _read_or_keep(Path(path), options, rejected)
+        return Imported(log, rejected_file=kept)
     with Api(url, token) as api:
         if to is not None:
             options = replace(options, spec=api.surrogate(to).spec)
-        log = read_log(path, options)
-        kept = keep_rejected(Path(path), log, rejected)
+        log, kept = _read_or_keep(Path(path), options, rejected)
         if register is not None:
             api.create_surrogate(register, log.spec)
         name = register or to or ""
@@ -197,12 +198,35 @@ def import_log(
 
 def keep_rejected(path: Path, log: ReadLog, where: str | Path | None = None) -> Path | None:
     """Write the rows that were set aside beside the log; None where there are none and no such file stands there."""
+    return _keep(path, log.table, log.steps, where)
+
+
+def _keep(path: Path, table: Table, steps: Transitions, where: str | Path | None) -> Path | None:
     path = path if path.name else path.resolve()  # "." is the folder of a data set too
     file = Path(where) if where is not None else path.with_name(f"{path.stem}.rejected.csv")
-    if not log.steps.rejected and not file.exists():
+    if not steps.rejected and not file.exists():
         return None
-    log.write_rejected(file)
+    _write_rejected(file, table, steps)
     return file
+
+
+def _read_or_keep(path: Path, options: Options, where: str | Path | None) -> tuple[ReadLog, Path | None]:
+    """The log, and the file of the rows that were set aside, which is written in any case."""
+    try:
+        log = read_log(path, options)
+    except TooFewSteps as error:
+        file = _keep(path, error.table, error.steps, where)
+        words = f"{error}; all of these rows are in {file}" if error.steps.rejected else str(error)
+        raise TooFewSteps(words, error.table, error.steps) from error
+    return log, keep_rejected(path, log, where)
+
+
+def _write_rejected(path: Path, table: Table, steps: Transitions) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["line", "reason", *table.names])
+        for row, reason in steps.rejected.items():
+            writer.writerow([table.lines[row], reason, *table.row(row)])
 
 
 def _roles(table: Table, mapping: Path | Mapping_ | None) -> Roles:

@@ -83,7 +83,7 @@ def read_csv(path: Path) -> Table:
         lines.append(reader.line_num)
     padded = [row if len(row) == len(names) else [*row, *([""] * len(names))][: len(names)] for row in rows]
     columns = {name: np.array([row[i] for row in padded], dtype=np.str_) for i, name in enumerate(names)}
-    return Table(columns, np.array(lines, dtype=np.int64), faults, rows)
+    return Table(columns, np.array(lines, dtype=np.int64), faults, rows, delimiter)
 
 
 def read_npz(path: Path) -> Table:

@@ -28,6 +28,7 @@ class Table:
         lines: where each row stands in its file, (n,): the line of a CSV file, else the number of the row from 1.
         faults: what is wrong with a row as a whole, by row.
         cells: the row as it stands in the file, where that is text.
+        delimiter: between two cells of that text.
         ignored: arrays of the file that are no columns, with the reason.
     """
 
@@ -35,6 +36,7 @@ class Table:
     lines: Ints
     faults: dict[int, str] = field(default_factory=dict)
     cells: Sequence[Sequence[str]] = ()
+    delimiter: str = ""
     ignored: Mapping[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:

@@ -1,0 +1,64 @@
+"""A log without enough usable steps: why, by the most frequent reason."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+
+from surrogym_client.logs.errors import UnusableLog
+from surrogym_client.logs.table import Table
+from surrogym_client.logs.transitions import Transitions
+
+DECIMAL_COMMA = re.compile(r"^\s*[-+]?\d+,\d+\s*$")
+
+
+class TooFewSteps(UnusableLog):
+    """No model can be fitted to the usable steps of a log; has its rows, with the reason of each rejected one."""
+
+    def __init__(self, message: str, table: Table, steps: Transitions) -> None:
+        super().__init__(message)
+        self.table = table
+        self.steps = steps
+
+    def __reduce__(self) -> tuple[type[TooFewSteps], tuple[str, Table, Transitions]]:
+        return type(self), (str(self), self.table, self.steps)
+
+
+def require_steps(table: Table, steps: Transitions, least: int) -> None:
+    """Raise ``TooFewSteps``, with what was found in the log, where it has fewer usable steps than needed."""
+    if len(steps) >= least:
+        return
+    wanted = "two usable steps" if least == 2 else "one usable step"
+    parts = [f"expected {wanted} at least, got {len(steps)} of {counted(len(table), 'row')}"]
+    if steps.ends:
+        parts.append(f"{has(steps.ends, 'row')} no next state, as an episode or the log ends there, or a gap follows")
+    if steps.rejected:
+        kinds = {row: _kind(reason) for row, reason in steps.rejected.items()}
+        kind, count = Counter(kinds.values()).most_common(1)[0]
+        row = next(row for row in kinds if kinds[row] == kind)
+        parts.append(
+            f"{counted(len(steps.rejected), 'row')} can't be used, {count} of them for one reason, first in line "
+            f"{table.lines[row]}: {steps.rejected[row]}"
+        )
+    if table.faults:
+        parts.append(f"the columns are separated by {table.delimiter!r}: numbers need a decimal point, not a comma")
+    elif any(DECIMAL_COMMA.match(cell) for row in steps.rejected for cell in table.row(row)):
+        parts.append(
+            f"the columns are separated by {table.delimiter!r}, and the numbers have a decimal comma: write a point"
+        )
+    raise TooFewSteps("; ".join(parts), table, steps)
+
+
+def _kind(reason: str) -> str:
+    """A reason without the value that came, and without the line that it names."""
+    return re.sub(r"line \d+", "line", reason.partition(", got")[0])
+
+
+def counted(count: int, noun: str) -> str:
+    """A number with its noun: 1 row, 2 rows."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def has(count: int, noun: str) -> str:
+    """The same with its verb: 1 row has, 2 rows have."""
+    return f"{counted(count, noun)} {'has' if count == 1 else 'have'}"
