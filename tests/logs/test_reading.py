@@ -179,6 +179,31 @@ def test_a_mapping_that_names_no_column_is_refused(tmp_path: Path):
         read(path, state={"T": "TT-101"})
 
 
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("state = 3\naction = ['b']", "state: expected a list of columns, or a table of your names .*, got 3$"),
+        (
+            "state = ['a']\nakcja = ['b']",
+            "expected the key action with a list of .*, got none; expected the keys state, action, .* got 'akcja'$",
+        ),
+        ("state = ['a']\naction = ['b']\nreward = 1", "reward: expected the name of a column, got 1$"),
+        ("state = ['a']\naction = ['b']\n[limits]\na = [1]", r"limits: expected a table of .*, got {'a': \[1\]}$"),
+        ("state = ['a']\naction = ['b']\nangles = 'a'", "angles: expected a list of names of states, got 'a'$"),
+    ],
+)
+def test_a_mapping_of_another_form_is_refused_in_plain_words(tmp_path: Path, text: str, says: str):
+    (tmp_path / "log.csv").write_text("a,b\n1,1\n2,0\n3,1\n")
+    (tmp_path / "map.toml").write_text(text)
+    with pytest.raises(UnusableLog, match="map.toml is no mapping of columns: .*" + says):
+        read_log(tmp_path / "log.csv", Options(mapping=tmp_path / "map.toml"))
+
+
+def test_more_states_than_a_model_takes_are_refused():
+    with pytest.raises(UnusableLog, match="expected at most 64 states, got 65"):
+        roles_by_name(["action", *(f"x{i}" for i in range(65))])
+
+
 def test_a_mapping_may_be_toml_or_json(tmp_path: Path):
     path = reactor.log().without("next_concentration", "next_temperature").write(tmp_path / "log.csv")
     plain = {"state": ["temperature"], "action": ["action_coolant"], "time": "time"}

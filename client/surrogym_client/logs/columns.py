@@ -13,6 +13,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from surrogym_client.logs.errors import UnusableLog
+from surrogym_shared.spec.base import MAX_DIMENSIONS
 
 SINGLE = {
     "reward": ("reward", "rewards", "r"),
@@ -24,6 +25,21 @@ SINGLE = {
 ACTION = re.compile(r"^(?:actions?|act|u)(?:[._](.+)|\[(\d+)\])?$", re.IGNORECASE)
 STATE = re.compile(r"^(?:q|states?|obs|observations?|coordinates?)(?:[._](.+)|\[(\d+)\])$", re.IGNORECASE)
 NEXT = re.compile(r"^next[._](.+)$|^(.+)[._]next$", re.IGNORECASE)
+
+COLUMN, COLUMNS = "the name of a column", "a list of columns, or a table of your names and their columns"
+NAMES = "a list of names of states"
+EXPECTED = {
+    "state": COLUMNS,
+    "action": COLUMNS,
+    "next": "a table of states and the columns of their next values",
+    **dict.fromkeys(SINGLE, COLUMN),
+    "limits": "a table of names and their two ends, such as level = [0, 2.5]",
+    "angles": NAMES,
+    "constants": NAMES,
+    "discrete": "true or false",
+}
+SHOWN = 60  # letters of what came
+LONGEST = 64  # letters of a coordinate's name
 
 Limits = Annotated[list[float | None], Field(min_length=2, max_length=2)]
 
@@ -124,12 +140,7 @@ def roles_by_file(path: Path, names: Sequence[str]) -> Roles:
 
 def roles_by_map(content: Mapping[str, Any], names: Sequence[str], where: str = "the mapping") -> Roles:
     """What the columns are by a mapping. Raises ``UnusableLog`` as ``roles_by_file``."""
-    try:
-        mapped = Mapped.model_validate(content)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise UnusableLog(f"{where} is no mapping of columns: {place}: {first['msg']}") from error
+    mapped = _mapped(content, where)
     fields: dict[str, Any] = {role: getattr(mapped, role) or None for role in SINGLE}
     state, action = _by_name(mapped.state), _by_name(mapped.action)
     wanted = [*state.values(), *action.values(), *mapped.next.values(), *filter(None, fields.values())]
@@ -154,8 +165,38 @@ def roles_by_map(content: Mapping[str, Any], names: Sequence[str], where: str = 
     )
 
 
+def _mapped(content: Mapping[str, Any], where: str) -> Mapped:
+    """The mapping; everything that is wrong with it is named at once."""
+    if not isinstance(content, Mapping):
+        raise UnusableLog(f"expected a table with the keys state and action in {where}, got {_short(content)}")
+    try:
+        return Mapped.model_validate(content)
+    except ValidationError as error:
+        keys = dict.fromkeys(str(found["loc"][0]) for found in error.errors())
+        faults = "; ".join(_fault(key, content) for key in keys)
+        raise UnusableLog(f"{where} is no mapping of columns: {faults}") from error
+
+
+def _fault(key: str, content: Mapping[str, Any]) -> str:
+    if key not in EXPECTED:
+        return f"expected the keys {', '.join(EXPECTED)}, got {key!r}"
+    if key not in content:
+        return f"expected the key {key} with {EXPECTED[key]}, got none"
+    return f"{key}: expected {EXPECTED[key]}, got {_short(content[key])}"
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
+
+
 def _checked(roles: Roles) -> Roles:
-    """The roles, if there is a next state for every coordinate or for none."""
+    """The roles, if there is a next state for every coordinate or for none, and a model may have as many."""
+    for what, found in (("states", roles.state), ("actions", roles.action)):
+        if len(found) > MAX_DIMENSIONS:
+            raise UnusableLog(f"expected at most {MAX_DIMENSIONS} {what}, got {len(found)}: choose by --map")
+    if long := [name for name in roles.state if not 1 <= len(name) <= LONGEST]:
+        raise UnusableLog(f"expected names of states with 1 to {LONGEST} letters, got {long[0]!r}: rename it by --map")
     if roles.following and set(roles.following) != set(roles.state):
         odd = sorted(set(roles.following) ^ set(roles.state))[0]
         raise UnusableLog(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -23,6 +24,7 @@ from surrogym_client.logs.transitions import Transitions, transitions_of
 from surrogym_client.original.terms import terminates
 from surrogym_client.transport.api import Api
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_shared.spec.base import NAME_PATTERN
 from surrogym_shared.wire import NewSample
 
 BATCH = 2_000  # steps between two reports of progress
@@ -171,7 +173,7 @@ def import_log(
 
     Raises:
         ValueError: both ``register`` and ``to``, or ``to`` with ``spec``.
-        UnusableLog: no log, or columns that nobody can tell apart.
+        UnusableLog: no log, columns that nobody can tell apart, or ``register`` is no name of a surrogate.
         TooFewSteps: no usable step, or a single one where a specification is to be drafted.
         SurrogymClientError: as every request.
 
@@ -180,6 +182,11 @@ def import_log(
     """
     if (register is not None and to is not None) or (to is not None and spec is not None):
         raise ValueError("expected one of register and to, and spec only without to")
+    if register is not None and not re.match(NAME_PATTERN, register):
+        raise UnusableLog(
+            "expected a name of at most 64 letters, digits, '.', '_' and '-' for the surrogate, with a letter or digit "
+            f"first, got {register!r}"
+        )
     given = Path(mapping) if isinstance(mapping, str) else mapping
     options = Options(given, spec, budget, progress=lambda share, words: progress(0.3 * share, words))
     if register is None and to is None:
