@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 import numpy as np
 import pytest
 
+from support import rail
 from support.moody import SPEC, Line
 from support.server import ServerProcess
 from surrogym_client.cli import main
@@ -60,8 +62,15 @@ class Place:
 
 @pytest.fixture
 def line(server_process: ServerProcess) -> Iterator[Place]:
-    name, environment, url = f"handed-{uuid4().hex[:8]}", Changed(), server_process.url
-    spec: EnvironmentSpec = SPEC.model_copy(update={"design": Design(initial=8, budget=16)})
+    with placed(server_process.url, SPEC, Changed()) as place:
+        yield place
+
+
+@contextmanager
+def placed(url: str, spec: EnvironmentSpec, environment: Any) -> Iterator[Place]:
+    """A surrogate whose design has ended, with a sampler in a thread."""
+    name = f"handed-{uuid4().hex[:8]}"
+    spec = spec.model_copy(update={"design": Design(initial=8, budget=16)})
     settings = SamplerSettings(name="beside", wait_seconds=1.0, time_limit=120.0)
     with Api(url) as api, Api(url) as own, HttpSurrogate(url, name) as port:
         api.create_surrogate(name, spec)
@@ -111,6 +120,16 @@ def test_without_a_sampler_an_audit_is_given_up(
         assert api.surrogate("pendulum").queries == before, "nothing is left in the queue"
     assert handover.audit is None
     assert handover.reason.endswith(NO_SAMPLER)
+
+
+def test_where_no_state_can_be_set_an_audit_is_one_rollout(server_process: ServerProcess) -> None:
+    with placed(server_process.url, rail.SPEC, rail.Rail()) as place:
+        handover = hand_over(place.subject(), AUDIT)
+        assert handover.audit is not None
+        assert 1 <= handover.audit.steps <= 8
+        audited = [query for query in place.api.queries(place.name) if query.purpose == "audit"]
+        assert [query.kind for query in audited] == ["rollout"]
+        assert place.api.surrogate(place.name).ledger.audit == handover.audit.steps
 
 
 def test_the_way_of_a_policy_is_what_it_visits(line: Place) -> None:
