@@ -19,7 +19,6 @@ from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.isolated import IsolatedEnvironment
 from surrogym_client.sampler import Sampler, SamplerSettings
 from surrogym_client.sampler.sample_conversion import reset_seed
-from surrogym_client.transport import Api
 from surrogym_shared.wire import NewSample
 
 RIGHT, LEFT = [1.0], [-1.0]
@@ -33,12 +32,6 @@ from surrogym_client.sampler import Sampler, SamplerSettings
 with Api(sys.argv[1]) as api:
     Sampler(api, sys.argv[2], Slow(), SamplerSettings(name="killed", batch=1, lease_seconds=3.0, once=True)).run()
 """
-
-
-@pytest.fixture
-def api(server_process):
-    with Api(server_process.url) as api:
-        yield api
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ SHOWN = 5  # rejected rows and reasons in words; the file has all of them
 
 @dataclass(frozen=True)
 class OfLogs:
-    """What is asked of a log."""
+    """Options of an import that reads a log."""
 
     register: Annotated[
         str | None,
@@ -40,7 +40,7 @@ class OfLogs:
         Path | None, typer.Option("--draft", help="Of a log: write the drafted specification to this file, to edit it.")
     ] = None
     budget: Annotated[
-        int, typer.Option(min=0, help="Of a log: real steps that may be asked for beyond it; 0 if there is no machine.")
+        int, typer.Option(min=0, help="Real steps that the design may take beyond the log; 0 without a machine.")
     ] = 0
     rejected: Annotated[
         Path | None,

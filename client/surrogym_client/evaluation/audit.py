@@ -15,7 +15,7 @@ from surrogym_shared.spec import EnvironmentSpec
 
 AUDIT_STEPS = 8
 ALARM = 0.01  # chance that a right model is blamed for the errors of its outputs
-MISPLACED_ENDS = 2  # steps whose ending was predicted wrongly: from so many on the model is at fault
+MISPLACED_ENDS = 2  # an audit fails where it predicted the ending of so many steps wrongly
 SLACK = 0.1  # of what a policy earns beyond an untrained one: a promise that moves out of its interval by less stands
 BIAS = 0.2  # of the same: what the errors of the rewards may add up to in an episode
 

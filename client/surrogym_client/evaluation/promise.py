@@ -18,7 +18,7 @@ from surrogym_shared.wire import OF_PARTICLES
 
 FUNCTIONS = 32  # drawn from the posterior
 STARTS = 8  # of each function
-EVALUATION_STARTS = 100  # the mean over so many real starts is what the interval is for
+EVALUATION_STARTS = 100  # the promise is for the mean return over so many real starts
 LOW, HIGH = 0.05, 0.95
 NORMAL_POINTS = 201  # of a normal distribution, at equal probabilities
 
@@ -45,9 +45,9 @@ def promise_of(port: SurrogatePort, predict: Predict, seed: int, session: Mappin
 def interval(returns: Array) -> Promise:
     """The promise of episodes' returns, (starts, functions).
 
-    Means of a few starts differ between functions by chance as well. They are drawn together until their variance is
-    what the functions alone explain (one-way analysis of variance); the chance of
-    100 real starts, and of the virtual ones, is added again.
+    The mean returns of the functions differ by chance too, because each is over a few starts. So they are shrunk
+    towards their common mean, until their variance is what the functions alone explain (one-way analysis of
+    variance). Then the chance of 100 real starts, and that of the virtual starts, is added.
     """
     parts = _parts(returns)
     starts, functions = returns.shape

@@ -136,7 +136,7 @@ def _bounds(roles: Roles, name: str, after: Floats, ends: tuple[float, float], n
 
 
 def _stays_at(after: Floats, end: float, ends: tuple[float, float]) -> bool:
-    """Whether so many steps end exactly at an extreme that something stops them there."""
+    """Whether the share of steps that end exactly at an extreme shows a limit there."""
     rows = int((after == end).sum())
     others = np.unique(after[(after != ends[0]) & (after != ends[1])], return_counts=True)[1]
     often = rows >= max(SATURATED_ROWS, SATURATED_SHARE * len(after))

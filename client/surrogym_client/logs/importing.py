@@ -106,7 +106,7 @@ def read_log(path: str | Path, options: Options | None = None) -> ReadLog:
     """Read a log and check its rows; nothing is sent.
 
     Raises:
-        UnusableLog: no log, or columns that nobody can tell apart.
+        UnusableLog: no log, or columns without a clear role.
         TooFewSteps: no usable step, or a single one where a specification is to be drafted.
         OSError: a file can't be read.
     """
@@ -173,7 +173,7 @@ def import_log(
 
     Raises:
         ValueError: both ``register`` and ``to``, or ``to`` with ``spec``.
-        UnusableLog: no log, columns that nobody can tell apart, or ``register`` is no name of a surrogate.
+        UnusableLog: no log, columns without a clear role, or ``register`` is no name of a surrogate.
         TooFewSteps: no usable step, or a single one where a specification is to be drafted.
         SurrogymClientError: as every request.
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TypeAlias
 
 from surrogym_client.original.errors import QueryRefused, UnknownEnvironment
-from surrogym_shared.spec import MAX_ROLLOUT_QUERY, BoxAction, Coordinate, DiscreteAction, EnvironmentSpec
+from surrogym_shared.spec import MAX_ROLLOUT_QUERY, BoxAction, DiscreteAction, EnvironmentSpec
 from surrogym_shared.spec import limits as sampled
 from surrogym_shared.wire import Query, StepQuery
 
@@ -89,15 +89,7 @@ def _action_ranges(spec: EnvironmentSpec) -> list[Range]:
 
 
 def _coordinate_ranges(spec: EnvironmentSpec) -> list[Range]:
-    return [_coordinate_range(coordinate) for coordinate in spec.coordinates]
-
-
-def _coordinate_range(coordinate: Coordinate) -> Range:
-    low, high = sampled(coordinate.sampling)
-    bounds = coordinate.bounds
-    if bounds is None:
-        return low, high
-    return low if bounds.low is None else bounds.low, high if bounds.high is None else bounds.high
+    return [coordinate.settable for coordinate in spec.coordinates]
 
 
 def _shape(spec: EnvironmentSpec) -> str:

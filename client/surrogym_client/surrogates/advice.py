@@ -22,8 +22,10 @@ def verdict(view: SurrogateView) -> str:
         return ""
     outputs = view.fidelity.outputs
     doubtful = _doubtful(view)
-    if view.phase == "ready" or not doubtful:
-        return "ready" if view.phase == "ready" else "sure of its model, which has yet to be tested by adaptive queries"
+    if view.phase == "ready":
+        return "ready"
+    if not doubtful:
+        return "sure of its model, which has yet to be tested by adaptive queries"
     named = ", ".join(_named(output, view.target) for output in doubtful)
     if len(doubtful) == 1 and len(outputs) > 1:
         return f"ready but for {named}"
@@ -53,7 +55,7 @@ def advice(view: SurrogateView, models: Sequence[ModelView]) -> str:
         )
     if len(models) < 2 * FEWEST_MODELS:
         return (
-            f"too few rounds to see a rate; as many real steps again: "
+            "too few rounds to see a rate; as many real steps again: "
             f"surrogym improve {view.name} --queries {max(view.samples, 1)}"
         )
     steps = _steps_to_go(view, worst, models)
@@ -74,8 +76,12 @@ def _doubtful(view: SurrogateView) -> list[OutputFidelity]:
 
 
 def _agrees(output: OutputFidelity) -> bool:
-    limit = output.tolerance * (NOISY_SLACK if output.noise else 1.0)
-    return output.leave_one_out_error is not None and output.leave_one_out_error <= limit
+    return output.leave_one_out_error is not None and output.leave_one_out_error <= _largest_error(output)
+
+
+def _largest_error(output: OutputFidelity) -> float:
+    """The leave-one-out error up to which the server counts an output as known."""
+    return output.tolerance * (NOISY_SLACK if output.noise else 1.0)
 
 
 def _named(output: OutputFidelity, target: float) -> str:
@@ -90,15 +96,13 @@ def _steps_to_go(view: SurrogateView, worst: OutputFidelity, models: Sequence[Mo
     """Real steps until the output has its target, if what it lacks shrinks as it did over the last half of the fits;
     None where it does not shrink."""
     late = models[len(models) // 2 :]
-    if len(late) < FEWEST_MODELS:
-        return None
     seen = [(model.samples, output) for model in late for output in model.fidelity.outputs if output.name == worst.name]
     samples = [float(count) for count, _ in seen]
     lacks = [1 - output.confidence_index for _, output in seen]
     errors = [output.leave_one_out_error or 0.0 for _, output in seen]
     needed = [
         _forecast(samples, lacks, 1 - view.target),
-        _forecast(samples, errors, worst.tolerance * (NOISY_SLACK if worst.noise else 1.0)),
+        _forecast(samples, errors, _largest_error(worst)),
     ]
     if any(one is None for one in needed):
         return None

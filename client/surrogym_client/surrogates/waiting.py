@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from surrogym_client.errors import ServerUnreachable, SurrogymClientError, UnknownSurrogate
 from surrogym_client.surrogates.phases import COMPLETED
@@ -75,20 +75,15 @@ def wait_for_design(
         DesignUnfinished: the design failed, or was not done within ``seconds``.
         UnknownSurrogate: there is none of this name.
     """
-    deadline = time.monotonic() + seconds
-    while True:
-        view = _look(api, name, deadline)
-        if view is not None:
-            if progress is not None:
-                progress(view)
-            if view.phase in COMPLETED and view.round > after_round and not _under_way(view):
-                return view
-            if view.phase == "failed":
-                raise DesignUnfinished(f"the design of {name!r} failed: {view.error}")
-        if time.monotonic() >= deadline:
-            phase = "unknown" if view is None else view.phase
-            raise DesignUnfinished(f"the design of {name!r} was not done after {seconds:g} s: its phase is {phase}")
-        time.sleep(LOOK_SECONDS)
+    view = None
+    for view in _looks(api, name, seconds, progress):
+        if view is None:
+            continue
+        if view.phase in COMPLETED and view.round > after_round and not _under_way(view):
+            return view
+        if view.phase == "failed":
+            raise DesignUnfinished(f"the design of {name!r} failed: {view.error}")
+    raise DesignUnfinished(f"the design of {name!r} was not done after {seconds:g} s: its phase is {_phase(view)}")
 
 
 def wait_for_answers(
@@ -101,42 +96,51 @@ def wait_for_answers(
         DesignUnfinished: some were still open after ``seconds``.
         UnknownSurrogate: there is none of this name.
     """
-    started = time.monotonic()
-    deadline, begun = started + seconds, False
-    while True:
-        view = _look(api, name, deadline)
-        if view is not None:
-            if progress is not None:
-                progress(view)
-            wanted = [query for query in api.queries(name) if query.id in queries]
-            if all(query.status in ("answered", "set_aside") for query in wanted):
-                return
-            begun = begun or view.queries.leased > 0 or any(query.attempts for query in wanted)
-            if not begun and time.monotonic() >= started + FIRST_LEASE_SECONDS:
-                raise NobodyAnswers(f"no sampler has begun a query of {name!r} within {FIRST_LEASE_SECONDS:g} s")
-        if time.monotonic() >= deadline:
-            raise DesignUnfinished(f"{len(queries)} queries of {name!r} were not all answered after {seconds:g} s")
-        time.sleep(LOOK_SECONDS)
+    started, begun = time.monotonic(), False
+    for view in _looks(api, name, seconds, progress):
+        if view is None:
+            continue
+        wanted = [query for query in api.queries(name) if query.id in queries]
+        if all(query.status in ("answered", "set_aside") for query in wanted):
+            return
+        begun = begun or view.queries.leased > 0 or any(query.attempts for query in wanted)
+        if not begun and time.monotonic() >= started + FIRST_LEASE_SECONDS:
+            raise NobodyAnswers(f"no sampler has begun a query of {name!r} within {FIRST_LEASE_SECONDS:g} s")
+    raise DesignUnfinished(f"{len(queries)} queries of {name!r} were not all answered after {seconds:g} s")
 
 
 def wait_for_model(
     api: Api, name: str, seconds: float, progress: Callable[[SurrogateView], None] | None = None
 ) -> SurrogateView:
     """The surrogate, once it has a model of all its samples. Arguments and errors as of ``wait_for_design``."""
+    view = None
+    for view in _looks(api, name, seconds, progress):
+        if view is None:
+            continue
+        if view.fidelity is not None and view.fidelity.samples >= view.samples:
+            return view
+        if view.phase == "failed":
+            raise DesignUnfinished(f"the fit of {name!r} failed: {view.error}")
+    raise DesignUnfinished(f"there was no model of {name!r} after {seconds:g} s: its phase is {_phase(view)}")
+
+
+def _looks(
+    api: Api, name: str, seconds: float, progress: Callable[[SurrogateView], None] | None
+) -> Iterator[SurrogateView | None]:
+    """Look at a surrogate again and again for ``seconds``, and show it; None where the server was away."""
     deadline = time.monotonic() + seconds
     while True:
         view = _look(api, name, deadline)
-        if view is not None:
-            if progress is not None:
-                progress(view)
-            if view.fidelity is not None and view.fidelity.samples >= view.samples:
-                return view
-            if view.phase == "failed":
-                raise DesignUnfinished(f"the fit of {name!r} failed: {view.error}")
+        if view is not None and progress is not None:
+            progress(view)
+        yield view
         if time.monotonic() >= deadline:
-            phase = "unknown" if view is None else view.phase
-            raise DesignUnfinished(f"there was no model of {name!r} after {seconds:g} s: its phase is {phase}")
+            return
         time.sleep(LOOK_SECONDS)
+
+
+def _phase(view: SurrogateView | None) -> str:
+    return "unknown" if view is None else view.phase
 
 
 def _look(api: Api, name: str, deadline: float) -> SurrogateView | None:

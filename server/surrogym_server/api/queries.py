@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated
 
+import numpy as np
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
+from numpy.typing import NDArray
 
 from surrogym_server import convert
 from surrogym_server.api import examples
@@ -28,6 +30,8 @@ from surrogym_shared.wire import (
     WithdrawnQueries,
     WithdrawQueries,
 )
+
+Floats = NDArray[np.float64]
 
 router = APIRouter(prefix="/v1/surrogates/{name}", tags=["queries"], route_class=DoorRoute)
 
@@ -86,10 +90,7 @@ def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.F
 )
 def add_queries(name: str, body: Annotated[AddQueries, example(examples.ADD_QUERIES)], use: Use) -> QueryList:
     """Queued behind those of the design, whose model learns from the answers too."""
-    q = convert.numbers("coordinates", body.coordinates or ())
-    u = convert.numbers("action", body.action or ())
-    rollouts = [convert.numbers("rollouts", actions) for actions in body.rollouts or ()]
-    return convert.query_list(use.queries.add(name, q, u, body.idempotency_key, rollouts))
+    return convert.query_list(use.queries.add(name, *_asked(body)))
 
 
 @router.post(
@@ -102,10 +103,7 @@ def add_queries(name: str, body: Annotated[AddQueries, example(examples.ADD_QUER
 )
 def audit(name: str, body: Annotated[AuditModel, example(examples.ADD_QUERIES)], use: Use) -> QueryList:
     """Where a policy goes, to hold the model against. They cost none of the budget; the model learns from them too."""
-    q = convert.numbers("coordinates", body.coordinates or ())
-    u = convert.numbers("action", body.action or ())
-    rollouts = [convert.numbers("rollouts", actions) for actions in body.rollouts or ()]
-    return convert.query_list(use.queries.add(name, q, u, body.idempotency_key, rollouts, purpose="audit"))
+    return convert.query_list(use.queries.add(name, *_asked(body), purpose="audit"))
 
 
 @router.post(
@@ -128,3 +126,10 @@ def withdraw(name: str, body: Annotated[WithdrawQueries, example(examples.WITHDR
 def list_all(name: str, use: Use, status: Annotated[list[QueryStatus], Query()] = []) -> QueryList:  # noqa: B006
     """Oldest first; ``status`` may be given several times."""
     return convert.query_list(use.queries.list(name, status))
+
+
+def _asked(body: AddQueries) -> tuple[Floats, Floats, str | None, list[Floats]]:
+    """Coordinates (m, C), actions (m, F), the idempotency key and action sequences, (T, F) each, of a body."""
+    q = convert.numbers("coordinates", body.coordinates or ())
+    u = convert.numbers("action", body.action or ())
+    return q, u, body.idempotency_key, [convert.numbers("rollouts", actions) for actions in body.rollouts or ()]

@@ -223,6 +223,12 @@ class EnvironmentDefinition:
         inside: Tensor = ((q >= low) & (q <= high)).all(-1)
         return inside
 
+    def can_be_set(self, q: Tensor) -> Tensor:
+        """Whether the original environment can be set to states q (n, C), (n,) bool."""
+        low, high = torch.tensor([c.settable for c in self.coordinates], dtype=q.dtype, device=q.device).T
+        inside: Tensor = ((q >= low) & (q <= high)).all(-1)
+        return inside
+
     @cached_property
     def angles(self) -> tuple[int, ...]:
         return tuple(i for i, c in enumerate(self.coordinates) if c.kind == "angle")

@@ -64,8 +64,7 @@ def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float
         return None
     if found.degrees and bool((found.deviation <= REFUTED * learned)[doubtful].all()):
         return None
-    inside = torch.tensor([_settable(model, q) for q in samples.q])
-    which = inside.nonzero()[found.degrees : ENOUGH if found.degrees else 1, 0]
+    which = model.definition.can_be_set(samples.q).nonzero()[found.degrees : ENOUGH if found.degrees else 1, 0]
     return Points(samples.q[which], samples.u[which]) if len(which) else None
 
 
@@ -81,8 +80,3 @@ def _learned(model: DynamicsModel, tolerances: Sequence[float]) -> tuple[Tensor,
     if able is None:
         return torch.zeros_like(limits), limits
     return torch.tensor(able.noise_deviations, dtype=limits.dtype), limits
-
-
-def _settable(model: DynamicsModel, q: Tensor) -> bool:
-    ranges = [coordinate.settable for coordinate in model.definition.coordinates]
-    return all(low <= float(value) <= high for value, (low, high) in zip(q, ranges, strict=True))

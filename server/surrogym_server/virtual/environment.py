@@ -119,12 +119,7 @@ def step(
     mask: Bools | None = None,
     deviations: bool = False,
 ) -> tuple[LaneState, LaneTransition]:
-    """Step all lanes, or those of the mask (N,), under u (N, F), the model's actions.
-
-    Raises:
-        InvalidInput: a mask of another length.
-        NotReset: a lane that was never reset, or that ended under autoreset disabled.
-    """
+    """The reference form of ``virtual.step``, by torch; arguments and errors are those there."""
     definition = model.definition
     moving, beginning = divided(settings, lanes, chosen_lanes(mask, lanes))
     active = lanes.take(moving)
