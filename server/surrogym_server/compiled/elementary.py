@@ -15,7 +15,7 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from surrogym_server.compiled.jit import compiled, summing
+from surrogym_shared.compiled.jit import compiled, summing
 
 Floats = NDArray[np.float64]
 

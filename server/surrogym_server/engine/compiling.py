@@ -6,8 +6,8 @@ import subprocess
 import sys
 from contextlib import suppress
 
-from surrogym_server import compiled
-from surrogym_server.compiled import kept
+from surrogym_shared import compiled
+from surrogym_shared.compiled import kept
 
 PROGRAM = """
 import os
@@ -17,6 +17,7 @@ import surrogym_server.models.gaussian_process.prediction.compiled.regions
 import surrogym_server.models.gaussian_process.prediction.compiled.step
 import surrogym_server.virtual.compiled.step
 """
+PACKAGE = "surrogym_server"
 LONGEST = 120.0  # seconds that a session waits for it; then it compiles for itself
 
 
@@ -28,7 +29,8 @@ class Compiling:
 
     def start(self) -> None:
         """Begin, where steps can be compiled and kept on disk, and an earlier process has not done so."""
-        if self._process is None and compiled.available() and kept.folder() is not None and not kept.has_any():
+        to_be_kept = compiled.available() and kept.folder(PACKAGE) is not None and not kept.has_any(PACKAGE)
+        if self._process is None and to_be_kept:
             self._process = subprocess.Popen(
                 [sys.executable, "-c", PROGRAM], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
             )

@@ -10,11 +10,11 @@ import torch
 from numpy.typing import NDArray
 
 from surrogym_server.compiled.elementary import dot, exponential, sine_and_cosine
-from surrogym_server.compiled.jit import inlined
 from surrogym_server.compiled.tables import TablesBuilder, matrix
 from surrogym_server.gp.kernel import to_mirror
 from surrogym_server.gp.pathwise import frequencies
 from surrogym_server.gp.posterior import Posterior
+from surrogym_shared.compiled.jit import inlined
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from surrogym_server import compiled
-from surrogym_server.compiled import kept
 from surrogym_server.engine import compiling
 from surrogym_server.engine.compiling import Compiling
+from surrogym_shared import compiled
+from surrogym_shared.compiled import kept
 
 pytestmark = pytest.mark.skipif(not compiled.available(), reason="numba is not installed, or switched off")
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.skipif(not compiled.available(), reason="numba is not i
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder in the place of the user's."""
-    monkeypatch.setattr(kept, "folder", lambda: tmp_path)
+    monkeypatch.setattr(kept, "folder", lambda _: tmp_path)
     return tmp_path
 
 

@@ -15,13 +15,13 @@ from support.models import gaussian_processes
 from support.real_steps import random_steps
 from surrogym_client.original.classic import acrobot, cartpole, pendulum
 from surrogym_client.original.swingup import swing_up
-from surrogym_server import compiled
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import NotReset
 from surrogym_server.models.gaussian_process import model as gaussian_process_model
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.testing.cases import model_cases
 from surrogym_server.virtual import LaneState, LaneTransition, VirtualSettings, create, in_fastest_form, reset, step
+from surrogym_shared import compiled
 from surrogym_shared.spec import EnvironmentSpec
 
 needs_numba = pytest.mark.skipif(not compiled.available(), reason="numba is not installed, or switched off")

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_server.compiled.elementary import sine_and_cosine, wrapped
-from surrogym_server.compiled.jit import compiled
 from surrogym_server.compiled.tables import TablesBuilder, matrix
 from surrogym_server.environment.compiled.terms import evaluate
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import Encoder
+from surrogym_shared.compiled.jit import compiled
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

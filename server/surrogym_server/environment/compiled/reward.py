@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_server.compiled.elementary import exponential
-from surrogym_server.compiled.jit import inlined
 from surrogym_server.compiled.tables import TablesBuilder, matrix
 from surrogym_server.environment.compiled.terms import add_conditions, add_terms, evaluate, holding
 from surrogym_server.environment.declared_reward import DeclaredReward
+from surrogym_shared.compiled.jit import inlined
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_server.compiled.elementary import wrapped
-from surrogym_server.compiled.jit import compiled, inlined
 from surrogym_server.compiled.tables import TablesBuilder, matrix
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.observation_inverse import ObservationInverse
+from surrogym_shared.compiled.jit import compiled, inlined
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_server.compiled.elementary import sine_and_cosine
-from surrogym_server.compiled.jit import compiled
 from surrogym_server.compiled.tables import Tables, TablesBuilder, matrix
 from surrogym_server.environment.conditions import Conditions
 from surrogym_server.environment.terms import TermSet
+from surrogym_shared.compiled.jit import compiled
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

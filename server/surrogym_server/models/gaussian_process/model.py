@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from surrogym_server import compiled
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.step_rules import paid
@@ -41,6 +40,7 @@ from surrogym_server.models.gaussian_process.prediction.predictor import Predict
 from surrogym_server.models.gaussian_process.prediction.regions import Jump, Region
 from surrogym_server.models.port import DynamicsModel, Transition
 from surrogym_server.tensors import CPU, cached
+from surrogym_shared import compiled
 
 COMPILED_SOLVES = 300  # points; the triangular solves of more are faster in a library of linear algebra
 

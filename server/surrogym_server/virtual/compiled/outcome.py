@@ -6,9 +6,9 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from surrogym_server.compiled.jit import entry
 from surrogym_server.environment.compiled.terms import evaluate
 from surrogym_server.virtual.lanes import ENDED, RUNNING
+from surrogym_shared.compiled.jit import entry
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

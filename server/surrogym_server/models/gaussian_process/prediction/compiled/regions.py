@@ -9,7 +9,6 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from surrogym_server.compiled.jit import compiled, entry, inlined
 from surrogym_server.compiled.tables import TablesBuilder, matrix
 from surrogym_server.environment.compiled.features import add_features, encode
 from surrogym_server.environment.compiled.terms import add_terms, evaluate
@@ -25,6 +24,7 @@ from surrogym_server.models.gaussian_process.prediction.compiled.layout import (
     READS_AFTER,
 )
 from surrogym_server.models.gaussian_process.prediction.regions import Classifier, Jump, Region, Thresholds
+from surrogym_shared.compiled.jit import compiled, entry, inlined
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -10,7 +10,6 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from surrogym_server.compiled.jit import entry, inlined
 from surrogym_server.compiled.tables import Tables, TablesBuilder, matrix
 from surrogym_server.environment.compiled.features import add_features, encode
 from surrogym_server.environment.compiled.reward import add_declared, add_reward
@@ -47,6 +46,7 @@ from surrogym_server.models.gaussian_process.prediction.compiled.layout import (
 )
 from surrogym_server.models.gaussian_process.prediction.predictor import Predictor
 from surrogym_server.models.gaussian_process.prediction.regions import Region
+from surrogym_shared.compiled.jit import entry, inlined
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

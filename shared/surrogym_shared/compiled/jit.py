@@ -12,7 +12,7 @@ from numba import njit
 from numba.core import config
 from numba.core.errors import NumbaError
 
-from surrogym_server.compiled import kept
+from surrogym_shared.compiled import kept
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -43,7 +43,7 @@ def entry(*arguments: Any) -> Callable[[F], F]:
 
     def compile_or_load(function: F) -> F:
         chosen: dict[str, Any] = {"fastmath": {"contract"}, **OPTIONS}
-        folder = kept.folder()
+        folder = kept.folder(function.__module__.partition(".")[0])
         if folder is not None:
             try:
                 with _kept_in(folder):
@@ -51,7 +51,7 @@ def entry(*arguments: Any) -> Callable[[F], F]:
             except NumbaError:
                 raise  # it would fail again
             except Exception as error:  # numba reads its files with pickle, and writes them where it may
-                logger.warning("compiled steps can't be kept in %s, so they are compiled again: %s", folder, error)
+                logger.warning("compiled code can't be kept in %s, so they are compiled again: %s", folder, error)
         return cast(F, njit([arguments], **chosen)(function))
 
     return compile_or_load

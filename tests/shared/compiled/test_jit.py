@@ -13,7 +13,7 @@ pytest.importorskip("numba")
 
 PROGRAM = """
 from numba import types
-from surrogym_server.compiled import jit
+from surrogym_shared.compiled import jit
 
 @jit.entry(types.float64)
 def twice(x):
