@@ -201,7 +201,8 @@ def throughput(url: str, lanes: int, quick: bool) -> Measured:
 FORMS: dict[str, dict[str, Any]] = {
     "mean": {},
     "penalty": {"penalty": 3.0},
-    "drawn": {"variant": "pathwise"},
+    "function": {"variant": "pathwise"},
+    "draws": {"variant": "probabilistic", "particles": 1, "spread": 0.0},
 }
 
 

@@ -16,6 +16,7 @@ if hasattr(os, "nice"):
 import surrogym_server.models.gaussian_process.prediction.compiled.regions
 import surrogym_server.models.gaussian_process.prediction.compiled.step
 import surrogym_server.virtual.compiled.step
+import surrogym_server.virtual.words
 """
 PACKAGE = "surrogym_server"
 LONGEST = 120.0  # seconds that a session waits for it; then it compiles for itself

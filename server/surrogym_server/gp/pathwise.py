@@ -44,7 +44,7 @@ class Pathwise:
         """Weights (N, size) of the residuals that standard normal ``noise`` (N, size) stands for."""
         posterior = self.posterior
         prior, measured = noise[:, : self._features], noise[:, self._features :]
-        at_points = prior @ self._prior(posterior.x).T + self._noise(measured)
+        at_points = prior @ self._prior_at_points.T + self._noise(measured)
         return torch.cat([prior, -torch.cholesky_solve(at_points.T, posterior.factor).T], 1)
 
     def residual(self, x: Tensor, weights: Tensor) -> Tensor:
@@ -71,6 +71,11 @@ class Pathwise:
     @cached_property
     def _features(self) -> int:
         return self._prior(self.posterior.x[:1]).shape[1]
+
+    @cached
+    def _prior_at_points(self) -> Tensor:
+        """Features of the prior at the n points, (n, features)."""
+        return self._prior(self.posterior.x)
 
     def _prior(self, x: Tensor) -> Tensor:
         """Features of the prior at x (m, d), whose scalar products are its covariance: (m, 2 S + polynomial ones)."""

@@ -199,6 +199,7 @@ class ArraySteps(ABC):
         q: Floats,
         u: Floats,
         *,
+        noise: Floats | None,
         process: Floats | None,
         paths: Floats | None,
         deviations: bool,

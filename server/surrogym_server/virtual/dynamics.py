@@ -11,8 +11,9 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.step_rules import paid
+from surrogym_server.models.abilities import ArraySteps
 from surrogym_server.models.guard import require_shapes
-from surrogym_server.models.port import DynamicsModel
+from surrogym_server.models.port import DynamicsModel, Transition
 from surrogym_server.virtual.paths import function_draws
 
 Weighting = Literal["inverse_variance", "uniform"]
@@ -64,17 +65,19 @@ def move_particles(
     weighting: Weighting,
     *,
     process: Tensor | None = None,
+    steps: ArraySteps | None = None,
 ) -> Moved:
     """AUR-P: particles (N, P, C) under one action a lane, u (N, F).
 
     With ``noise`` (N, P, M) each particle moves by a draw, without by the mean, and with ``process`` (N, P, M) by the
     learned noise as well, both standard normal. The output state is the particles'
-    mean; the reward is the mean of their penalised rewards, weighted by 1/U with U the variance of eq. 7.
+    mean; the reward is the mean of their penalised rewards, weighted by 1/U with U the variance of eq. 7. With
+    ``steps`` particles move by compiled code.
     """
     lanes, count, size = particles.shape
     q, action = particles.flatten(0, 1), u.repeat_interleave(count, 0)
     flat_noise, flat_process = (None if n is None else n.flatten(0, 1) for n in (noise, process))
-    transition = model.transition(
+    transition = (model.transition if steps is None else partial(_compiled_transition, steps))(
         q, action, noise=flat_noise, process=flat_process, deviations=True, reward_deviation=True
     )
     require_shapes(model, transition, q)
@@ -96,6 +99,33 @@ def move_particles(
         (weight * penalised(mean, penalty, spread).reshape(lanes, count)).sum(1),
         over,
         deviation.square().mean(1).sqrt(),
+    )
+
+
+def _compiled_transition(
+    steps: ArraySteps,
+    q: Tensor,
+    u: Tensor,
+    *,
+    noise: Tensor | None,
+    process: Tensor | None,
+    deviations: bool,
+    reward_deviation: bool,
+) -> Transition:
+    """As ``DynamicsModel.transition``, by compiled code."""
+    shaken, shaped = (None if n is None else n.contiguous().numpy() for n in (noise, process))
+    moved = steps(
+        q.contiguous().numpy(),
+        u.to(q.dtype).contiguous().numpy(),
+        noise=shaken,
+        process=shaped,
+        paths=None,
+        deviations=deviations,
+        reward_deviation=reward_deviation,
+    )
+    deviation = torch.from_numpy(moved.deviation)
+    return Transition(
+        torch.from_numpy(moved.q_next), torch.from_numpy(moved.reward), deviation[:, :-1], deviation[:, -1]
     )
 
 

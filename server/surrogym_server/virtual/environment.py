@@ -13,6 +13,7 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput, NotReset
+from surrogym_server.models.abilities import ArraySteps
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual.dynamics import Moved, Weighting, move_mean, move_particles
 from surrogym_server.virtual.lanes import ENDED, EVERY, NEW, RUNNING, Chosen, LaneState
@@ -118,15 +119,20 @@ def step(
     u: Floats,
     mask: Bools | None = None,
     deviations: bool = False,
+    particle_steps: ArraySteps | None = None,
 ) -> tuple[LaneState, LaneTransition]:
-    """The reference form of ``virtual.step``, by torch; arguments and errors are those there."""
+    """The reference form of ``virtual.step``, by torch; arguments and errors are those there.
+
+    With ``particle_steps`` particles move by compiled code.
+    """
     definition = model.definition
     moving, beginning = divided(settings, lanes, chosen_lanes(mask, lanes))
     active = lanes.take(moving)
     if settings.variant == "pathwise":
         active = with_paths(model, active, settings.functions)
     action = torch.from_numpy(u).to(definition.device)
-    moved = _move(model, settings, active, action if isinstance(moving, slice) else action[moving], deviations)
+    action = action if isinstance(moving, slice) else action[moving]
+    moved = _move(model, settings, active, action, deviations, particle_steps)
     untrusted = _untrusted(model, settings, moved)
     left = _left(definition, moved, untrusted)
     if left is not None:
@@ -178,14 +184,30 @@ def divided(settings: VirtualSettings, lanes: LaneState, chosen: Chosen) -> tupl
     return chosen & ~waiting, waiting
 
 
-def _move(model: DynamicsModel, settings: VirtualSettings, lanes: LaneState, u: Tensor, deviations: bool) -> Moved:
+def _move(
+    model: DynamicsModel,
+    settings: VirtualSettings,
+    lanes: LaneState,
+    u: Tensor,
+    deviations: bool,
+    particle_steps: ArraySteps | None,
+) -> Moved:
     outputs, particles = len(model.definition.outputs) - 1, lanes.particles.shape[1]
     process = normal_noise(lanes, Purpose.PROCESS, max(particles, 1), outputs) if settings.process_noise else None
     if settings.variant == "probabilistic":
         noise = None
         if settings.propagation == "sample":
             noise = normal_noise(lanes, Purpose.TRANSITION, particles, outputs)
-        return move_particles(model, lanes.particles, u, settings.penalty, noise, settings.weighting, process=process)
+        return move_particles(
+            model,
+            lanes.particles,
+            u,
+            settings.penalty,
+            noise,
+            settings.weighting,
+            process=process,
+            steps=particle_steps,
+        )
     return move_mean(
         model,
         lanes.q,

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from enum import IntEnum
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from surrogym_server.tensors import CPU
 from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.philox import MASK, normals, philox, uniforms
+from surrogym_shared import compiled
 
 STEP_BITS = 24  # of the counter's third word; the purpose has the other eight
 
@@ -37,7 +40,17 @@ def normal_noise(lanes: LaneState, purpose: Purpose, particles: int, size: int) 
 def _words(lanes: LaneState, purpose: Purpose, particles: int, size: int) -> Tensor:
     """Random words, (N, particles, ceil(size / 4), 4): one counter gives four of them."""
     blocks = -(-size // 4)
+    third = lanes.elapsed | (int(purpose) << STEP_BITS)
+    if lanes.seed.device == CPU and compiled.available():
+        return _compiled_words(lanes, third, particles, blocks)
     draw = torch.arange(particles * blocks, device=lanes.seed.device).reshape(1, particles, blocks)
-    seed, lane, episode, step = (x[:, None, None] for x in (lanes.seed, lanes.lane, lanes.episode, lanes.elapsed))
-    third = step | (int(purpose) << STEP_BITS)
-    return philox((lane & MASK, episode & MASK, third, draw), (seed & MASK, (seed >> 32) & MASK))
+    seed, lane, episode, step = (x[:, None, None] for x in (lanes.seed, lanes.lane, lanes.episode, third))
+    return philox((lane & MASK, episode & MASK, step, draw), (seed & MASK, (seed >> 32) & MASK))
+
+
+def _compiled_words(lanes: LaneState, third: Tensor, particles: int, blocks: int) -> Tensor:
+    from surrogym_server.virtual.words import fill
+
+    words = np.empty((len(lanes), particles * blocks, 4), dtype=np.int64)
+    fill(lanes.seed.numpy(), lanes.lane.numpy(), lanes.episode.numpy(), third.numpy(), words)
+    return torch.from_numpy(words).reshape(len(lanes), particles, blocks, 4)

@@ -16,7 +16,8 @@ logger = logging.getLogger(__name__)
 
 def in_fastest_form(settings: VirtualSettings, model: DynamicsModel) -> VirtualSettings:
     """Settings of a session that opens: its steps are compiled where they can be and where that is faster."""
-    able, deviations = offers(model, CompiledSteps), settings.penalty > 0 or settings.trust is not None
+    deviations = settings.variant == "probabilistic" or settings.penalty > 0 or settings.trust is not None
+    able = offers(model, CompiledSteps)
     if able is None or not able.compiled_pays(deviations=deviations):
         return settings
     try:
@@ -41,15 +42,15 @@ def step(
         NotReset: a lane that was never reset, or that ended under autoreset disabled.
     """
     move = _array_steps(model, settings)
-    if move is None:
-        return environment.step(model, settings, lanes, u, mask, deviations)
+    if move is None or settings.variant == "probabilistic":
+        return environment.step(model, settings, lanes, u, mask, deviations, particle_steps=move)
     from surrogym_server.virtual.compiled.step import compiled_step
 
     return compiled_step(model, move, settings, lanes, u, mask, deviations)
 
 
 def _array_steps(model: DynamicsModel, settings: VirtualSettings) -> ArraySteps | None:
-    if not settings.compiled or settings.variant == "probabilistic":
+    if not settings.compiled:
         return None
     if model.definition.outside_reward is not None:  # what is paid outside a log is known to the reference alone
         return None

@@ -36,6 +36,16 @@ CHOICES: dict[str, dict[str, Any]] = {
         "autoreset_mode": "same_step",
         "time_limit": 3,
     },
+    "draws in each step": {"variant": "probabilistic", "particles": 1, "spread": 0.0, "penalty": 1.0},
+    "particles": {
+        "variant": "probabilistic",
+        "particles": 4,
+        "weighting": "uniform",
+        "process_noise": True,
+        "autoreset_mode": "same_step",
+        "time_limit": 3,
+    },
+    "particles by the mean": {"variant": "probabilistic", "particles": 3, "propagation": "mean", "trust": 0.5},
     "noise, trust, box": {"process_noise": True, "trust": 0.05, "start_box": 0.5, "time_limit": 2},
 }
 

@@ -7,10 +7,11 @@ import pytest
 import torch
 from scipy.stats import kstest
 
-from surrogym_server.virtual import VirtualSettings, create
+from surrogym_server.virtual import VirtualSettings, create, noise
 from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise, uniform_noise
 from surrogym_server.virtual.philox import normals, philox, uniforms
+from surrogym_shared import compiled
 
 ONES = 0xFFFFFFFF
 
@@ -30,6 +31,14 @@ ONES = 0xFFFFFFFF
 def test_the_known_answers_of_random123(counter, key, expected):
     words = philox(tuple(map(torch.tensor, counter)), tuple(map(torch.tensor, key)))
     assert words.tolist() == list(expected)
+
+
+@pytest.mark.skipif(not compiled.available(), reason="numba is not installed, or switched off")
+def test_compiled_words_are_those_of_torch(lanes, monkeypatch):
+    lanes = replace(lanes, seed=torch.tensor([0, 1, 2**31, 2**32, 2**40 + 5, 2**62, 2**63 - 1, ONES]))
+    words = noise._words(lanes, Purpose.PROCESS, 5, 9)
+    monkeypatch.setattr(compiled, "available", lambda: False)
+    assert torch.equal(words, noise._words(lanes, Purpose.PROCESS, 5, 9))
 
 
 def test_uniforms_never_reach_their_ends():

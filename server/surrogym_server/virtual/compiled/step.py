@@ -121,6 +121,7 @@ def _moved(
     return move(
         _rows(moving, lanes.q.numpy()),
         _rows(moving, u),
+        noise=None,
         process=None if process is None else _rows(moving, process),
         paths=_rows(moving, lanes.path.numpy()) if settings.variant == "pathwise" else None,
         deviations=wanted,

@@ -146,6 +146,7 @@ def _predict_stage(
     head: Floats,
     stage: int,
     x: Floats,
+    noise: Floats,
     process: Floats,
     paths: Floats,
     deviations: bool,
@@ -164,9 +165,12 @@ def _predict_stage(
         if processes[p, 0] != stage:
             continue
         column, number = int(processes[p, 1]), int(processes[p, 2])
-        wanted = reward_deviation if number == last else deviations
+        wanted = reward_deviation if number == last else deviations or len(noise) > 0
         drawn = paths[:, int(processes[p, 4]) :]
         predict(numbers, places, int(processes[p, 3]), x, wanted, drawn, mean[column], spread[number])
+        if number < last and len(noise):
+            for b in range(x.shape[1]):
+                mean[column, b] += spread[number, b] * noise[b, number]
         if number < last and len(process):
             for b in range(x.shape[1]):
                 mean[column, b] += columns[column, NOISE] * process[b, number]
@@ -211,6 +215,7 @@ def _ended(numbers: Floats, places: Ints, head: Floats, arrived: Floats) -> Bool
     types.float64[:, ::1],
     types.float64[:, ::1],
     types.float64[:, ::1],
+    types.float64[:, ::1],
     types.boolean,
     types.boolean,
     types.float64[:, ::1],
@@ -223,6 +228,7 @@ def step(
     places: Ints,
     q: Floats,
     u: Floats,
+    noise: Floats,
     process: Floats,
     paths: Floats,
     deviations: bool,
@@ -234,9 +240,9 @@ def step(
 ) -> None:
     """Steps from q (N, C) under u (N, F).
 
-    They are moved by ``process`` (N, M) deviations of the noise, and follow the functions ``paths`` (N, W), where these
-    have rows. Results go into ``q_next`` (N, C), ``reward`` (N,), ``deviation`` (N, O), as far as it is asked for, and
-    ``terminated`` (N,).
+    Where these have rows, ``noise`` (N, M) moves the outputs by latent deviations, ``process`` (N, M) moves them by
+    deviations of the learned noise, and they follow the functions ``paths`` (N, W). Results go into ``q_next`` (N, C),
+    ``reward`` (N,), ``deviation`` (N, O), as far as it is asked for, and ``terminated`` (N,).
     """
     head, size, actions = matrix(numbers, places, HEAD), q.shape[1], u.shape[1]
     columns, leads = len(matrix(numbers, places, int(head[0, OUTPUTS]))), int(head[0, LEADS])
@@ -250,14 +256,15 @@ def step(
             for f in range(actions):
                 raw[size + f, b] = u[begin + b, f]
         mean, spread = np.zeros((columns, lanes)), np.zeros((deviation.shape[1], lanes))
-        x, shake, drawn = np.empty((width, lanes)), process[begin : begin + lanes], paths[begin : begin + lanes]
+        x, end = np.empty((width, lanes)), begin + lanes
+        kick, shake, drawn = noise[begin:end], process[begin:end], paths[begin:end]
         for stage in range(STAGES):
             if stage == AFTER:
                 _arrive(numbers, places, head, raw, mean, arrived)
             if head[0, HAS_STAGE + stage]:
                 _encode_stage(numbers, places, head, stage, raw, arrived, mean, x)
                 _predict_stage(
-                    numbers, places, head, stage, x, shake, drawn, deviations, reward_deviation, mean, spread
+                    numbers, places, head, stage, x, kick, shake, drawn, deviations, reward_deviation, mean, spread
                 )
         if head[0, DECLARED] != NONE:
             state, pushed = raw[:size], raw[size : size + actions]
@@ -294,6 +301,7 @@ class StepsOfModel(ArraySteps):
         q: Floats,
         u: Floats,
         *,
+        noise: Floats | None,
         process: Floats | None,
         paths: Floats | None,
         deviations: bool,
@@ -307,6 +315,7 @@ class StepsOfModel(ArraySteps):
             *self.tables,
             q,
             u,
+            NO_ROWS if noise is None else noise,
             NO_ROWS if process is None else process,
             NO_ROWS if paths is None else paths,
             deviations,
