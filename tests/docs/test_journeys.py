@@ -73,7 +73,10 @@ OTHERWISE = {
     "docs/how-to/plugins.md": "tests/plugins installs the package and compares its class with the page",
     "docs/how-to/logs.md": "tests/logs runs its commands",
     "docs/how-to/trust.md": "tests/training/test_handover.py audits beside a sampler that stays",
-    "docs/results.md": "tests/cli runs its studies, in short",
+    "docs/results/efficiency.md": "tests/cli runs its studies, in short",
+    "docs/results/fresh-seeds.md": "tests/cli runs its studies, in short",
+    "docs/results/acquisition.md": "tests/cli runs its studies, in short",
+    "docs/results/paper.md": "tests/cli runs its studies, in short",
 }
 BLOCK = re.compile(r"^```(python|console)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 SAVED = re.compile(r"[Ss]ave (?:this|it) as `(\S+\.py)`")

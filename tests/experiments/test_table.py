@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 
-from surrogym_client.experiments.reproduce.page import NoSuchPlace, present_section, section, update
+from surrogym_client.experiments.reproduce.page import NoSuchPlace, present_sections, section, update
 from surrogym_client.experiments.reproduce.pictures import draw_tasks
 from surrogym_client.experiments.reproduce.rows import Row
-from surrogym_client.experiments.reproduce.table import report
+from surrogym_client.experiments.reproduce.table import headline, report
 
 ROW = Row(
     *("pendulum", "default", 0, 14, 4, 5, 9),
@@ -42,7 +42,7 @@ def test_no_seed_is_left_out():
         "| pendulum | default | 4 | 10.5 (9 to 12) | -157.5 (-1000.0 to -150.0) | -1000.0 | -400.0 | 20 % | 99 % |"
         " -140.0 | 2 of 4 | 589,824 | 50 (50) |"
     )
-    assert line(text, "pendulum", "14").endswith("| 2 of 4 | -1000.0 |")
+    assert line(text, "pendulum", "10.5 (9 to 12)").endswith("| 2 of 4 | -1000.0 |")
     oracle = [replace(ROW, arm="oracle", seed=i, real_steps=steps) for i, steps in enumerate((1_008_448, 900_000))]
     assert "| 954,224 (900,000 to 1,008,448) |" in line(report(oracle), "pendulum", "oracle")
 
@@ -103,10 +103,13 @@ def test_tables_and_pictures_go_between_the_marks_of_a_page(tmp_path):
     page.parent.mkdir()
     page.write_text("before\n<!-- efficiency: begin -->\nold\n<!-- efficiency: end -->\nafter\n")
     update(page, DEFAULT, page.parent / "results")
-    assert present_section(page) == section(DEFAULT, "results")
-    assert page.read_text().startswith("before\n<!-- efficiency: begin -->\n\n| task | budget |")
+    assert present_sections(page) == {"efficiency": section("efficiency", DEFAULT, "results")}
+    assert page.read_text().startswith("before\n<!-- efficiency: begin -->\n\n| task | real steps |")
     assert page.read_text().endswith("![pendulum](results/efficiency-pendulum.png)\n<!-- efficiency: end -->\nafter\n")
     assert (page.parent / "results" / "efficiency-pendulum.png").exists()
+    page.write_text("<!-- headline: begin -->\nold\n<!-- headline: end -->\n")
+    update(page, DEFAULT, page.parent / "results")
+    assert page.read_text() == f"<!-- headline: begin -->\n\n{headline(DEFAULT)}\n<!-- headline: end -->\n"
     page.write_text("no marks")
     with pytest.raises(NoSuchPlace, match="<!-- efficiency: begin -->"):
         update(page, DEFAULT, tmp_path)

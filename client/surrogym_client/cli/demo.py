@@ -32,7 +32,9 @@ def command(
         typer.Option("--json", help="Write the metrics to this file too; - prints them instead of the table."),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Run folder. [default: runs/TASK-seedSEED-TIME]")] = None,
-    arm: Annotated[ArmName, typer.Option(help="How to spend the real steps; see docs/results.md.")] = "default",
+    arm: Annotated[
+        ArmName, typer.Option(help="How to spend the real steps; see docs/results/efficiency.md.")
+    ] = "default",
     budget: Annotated[int | None, typer.Option(min=2, help="Real steps, at most. [default: the task's]")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Virtual steps of the training.")] = None,
     algorithm: Annotated[

@@ -44,10 +44,10 @@ def command(
 ) -> None:
     """Run the demo over tasks, arms and seeds. rows.csv, efficiency.md and a picture of each task go into a folder.
 
-    A run that has its row in rows.csv is not repeated, so that the same command goes on after Ctrl-C. Arms: default,
-    no_symmetry, declared_starts, no_loop, variance, latin_hypercube, paper, paper_hypercube, oracle; docs/results.md
-    says what each is. "study" is what stands there: the default on every task, a hypercube and paper beside it on four,
-    and on the same four the other arms with half of the seeds.
+    A run that has its row in rows.csv is not repeated, so the same command resumes after Ctrl-C. Arms: default,
+    no_symmetry, declared_starts, no_loop, variance, latin_hypercube, paper, paper_hypercube, oracle;
+    docs/results/efficiency.md explains each. "study" runs the default on every task, a hypercube and paper on four of
+    them, and on the same four the other arms with half of the seeds.
 
     Example: surrogym reproduce efficiency --seeds 10 --jobs 2 --out runs/efficiency
 

@@ -25,7 +25,10 @@ def command(
         "runs/table"
     ),
     page: Annotated[
-        Path | None, typer.Option(help="Put table and pictures into this page instead, between the marks efficiency.")
+        Path | None,
+        typer.Option(
+            help="Put tables and pictures into this page instead, between its marks: headline, efficiency, or both."
+        ),
     ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,

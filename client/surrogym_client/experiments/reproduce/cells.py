@@ -103,8 +103,8 @@ def cells(
 
 
 def study(tasks: Sequence[str], seeds: Sequence[int], **chosen: Any) -> Iterator[Cell]:
-    """What docs/results.md shows: the default on every task; on those that are ``COMPARED`` a hypercube and the paper's
-    preset as well, and the other arms on the first half of the seeds. ``chosen`` as for ``cells``."""
+    """The efficiency study of the documentation: the default on every task; on those that are ``COMPARED`` a hypercube
+    and the paper's preset as well, and the other arms on the first half of the seeds. ``chosen`` as for ``cells``."""
     compared = [task for task in tasks if task in COMPARED]
     others = [arm for arm in ARMS if arm not in ("default", *EVERY_SEED)]
     for place, seed in enumerate(seeds):

@@ -1,4 +1,4 @@
-"""The tables of rows inside a page of the documentation, between two marks."""
+"""The tables of rows inside a page of the documentation, between pairs of marks."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 
 from surrogym_client.errors import SurrogymClientError
 from surrogym_client.experiments.reproduce.rows import Row
-from surrogym_client.experiments.reproduce.table import report, tasks_with_results
+from surrogym_client.experiments.reproduce.table import headline, report, tasks_with_results
 
-BEGIN, END = "<!-- efficiency: begin -->\n", "<!-- efficiency: end -->"
+PARTS = ("headline", "efficiency")
 
 
 class NoSuchPlace(SurrogymClientError):
@@ -18,33 +18,47 @@ class NoSuchPlace(SurrogymClientError):
 
 
 def update(page: Path, rows: Sequence[Row], pictures: Path) -> None:
-    """Put the tables of rows into a page, and their pictures into a folder.
+    """Put the tables of rows between the marks that a page has, and their pictures into a folder.
 
     Raises:
-        NoSuchPlace: the page lacks the marks.
+        NoSuchPlace: the page has none of the pairs of marks.
     """
     from surrogym_client.experiments.reproduce.pictures import draw_tasks
 
-    before, _, after = _split(page)
+    text = page.read_text(encoding="utf-8")
+    present = present_sections(page)
     draw_tasks(pictures, rows)
     folder = os.path.relpath(pictures, page.parent)
-    page.write_text(f"{before}{section(rows, folder)}{after}", encoding="utf-8")
+    for name, before in present.items():
+        begin, end = marks(name)
+        text = text.replace(f"{begin}{before}{end}", f"{begin}{section(name, rows, folder)}{end}")
+    page.write_text(text, encoding="utf-8")
 
 
-def section(rows: Sequence[Row], folder: str) -> str:
-    """What belongs between the marks; ``folder`` of the pictures is seen from the page."""
+def section(name: str, rows: Sequence[Row], folder: str) -> str:
+    """What belongs between the marks ``name``; ``folder`` of the pictures is seen from the page."""
+    if not rows:
+        return ""
+    if name == "headline":
+        return f"\n{headline(rows)}\n"
     links = "".join(f"![{task}]({folder}/efficiency-{task}.png)\n" for task in tasks_with_results(rows))
-    return f"\n{report(rows)}\n{links}" if rows else ""
+    return f"\n{report(rows)}\n{links}"
 
 
-def present_section(page: Path) -> str:
-    """What stands between the marks. Raises ``NoSuchPlace``."""
-    return _split(page)[1]
+def present_sections(page: Path) -> dict[str, str]:
+    """What stands between each pair of marks of a page, by name. Raises ``NoSuchPlace`` where it has none."""
+    text, found = page.read_text(encoding="utf-8"), {}
+    for name in PARTS:
+        begin, end = marks(name)
+        _, opened, rest = text.partition(begin)
+        between, closed, _ = rest.partition(end)
+        if opened and closed:
+            found[name] = between
+    if not found:
+        raise NoSuchPlace(f"{page}: expected the lines {' and '.join(m.strip() for m in marks(PARTS[-1]))}")
+    return found
 
 
-def _split(page: Path) -> tuple[str, str, str]:
-    head, found, rest = page.read_text(encoding="utf-8").partition(BEGIN)
-    between, closed, tail = rest.partition(END)
-    if not found or not closed:
-        raise NoSuchPlace(f"{page}: expected the lines {BEGIN.strip()} and {END}")
-    return f"{head}{found}", between, f"{closed}{tail}"
+def marks(name: str) -> tuple[str, str]:
+    """The lines that begin and end the part ``name`` of a page."""
+    return f"<!-- {name}: begin -->\n", f"<!-- {name}: end -->"

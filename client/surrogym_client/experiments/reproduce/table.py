@@ -46,14 +46,26 @@ training: median. Seconds: median (largest). A bootstrap of five seeds is narrow
 
 
 def report(rows: Sequence[Row]) -> str:
-    """Targets, the main table, the questions that pairs of arms answer, and where the rows come from."""
-    parts = [_targets(grouped(rows)), summary(rows), NOTES]
+    """The headline, the main table, the questions that pairs of arms answer, and where the rows come from."""
+    parts = [headline(rows), summary(rows), NOTES]
     if pairs := contrasts(rows):
         parts += [
             "Difference of interquartile means, first arm minus second, with a 95 % bootstrap interval:\n",
             pairs,
         ]
     return "\n".join([*parts, _origin(rows)])
+
+
+def headline(rows: Sequence[Row]) -> str:
+    """A line for each task: what the default reached with the task's whole budget; empty where it was not run."""
+    lines = [("task", "real steps", "target for each seed", "reached", "mean of the worst seed")]
+    for (task, arm, budget), of in grouped(rows).items():
+        if arm == "default" and budget == TASKS[task].budget:
+            means, steps = column(of, "mean"), column(of, "real_steps")
+            worst = _number(means.min()) if len(means) else "-"
+            spent = _spread(steps) if len(steps) else "-"
+            lines.append((task, spent, TASKS[task].target.words, _reached(of), worst))
+    return markdown(lines) if len(lines) > 1 else ""
 
 
 def summary(rows: Sequence[Row]) -> str:
@@ -111,16 +123,6 @@ def markdown(lines: Sequence[Sequence[str]]) -> str:
     """A table, of which the first line is the heading."""
     rows = [lines[0], ["---"] * len(lines[0]), *lines[1:]]
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
-
-
-def _targets(groups: dict[Group, list[Row]]) -> str:
-    lines = [("task", "budget", "target for each seed", "reached", "worst seed")]
-    for (task, arm, budget), rows in groups.items():
-        if arm == "default" and budget == TASKS[task].budget:
-            means = column(rows, "mean")
-            worst = _number(means.min()) if len(means) else "-"
-            lines.append((task, str(budget), TASKS[task].target.words, _reached(rows), worst))
-    return markdown(lines) if len(lines) > 1 else ""
 
 
 def _line(group: Group, rows: Sequence[Row]) -> Sequence[str]:
