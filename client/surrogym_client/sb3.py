@@ -42,7 +42,7 @@ class SurrogateVecEnv(VecEnv):
         ValueError: an option is out of range.
         SurrogymClientError: the session can't be opened.
 
-    Example:
+    Examples:
         >>> PPO("MlpPolicy", SurrogateVecEnv("http://127.0.0.1:8000", "pendulum", num_envs=16)).learn(100_000)
     """
 

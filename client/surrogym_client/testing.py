@@ -1,6 +1,6 @@
 """The laws of a policy search as plain functions, for the tests of whoever writes one.
 
-Example:
+Examples:
     >>> @pytest.mark.parametrize("law", POLICY_SEARCH_LAWS)
     ... def test_my_search_keeps_the_laws(law, tmp_path):
     ...     settings = TrainSettings(algorithm="my_search", total_steps=20_000)

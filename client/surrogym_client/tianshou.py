@@ -36,7 +36,7 @@ class SurrogateVectorEnv(BaseVectorEnv):  # type: ignore[misc]  # tianshou is no
         ValueError: an option is out of range.
         SurrogymClientError: the session can't be opened.
 
-    Example:
+    Examples:
         >>> Collector(policy, SurrogateVectorEnv("http://127.0.0.1:8000", "pendulum", num_envs=16))
     """
 

@@ -2,7 +2,7 @@
 
 Importing it loads neither torch nor Gymnasium. What a name needs is loaded when the name is first used.
 
-Example:
+Examples:
     >>> import surrogym
     >>> design = surrogym.Design(spec, budget=20)
     >>> while (query := design.ask()) is not None:

@@ -73,7 +73,7 @@ class Design:
         InvalidInput: no specification, or another argument is out of its range; or the specification asks for something
             that is not installed.
 
-    Example:
+    Examples:
         >>> design = Design(spec, budget=20)
         >>> while (query := design.ask()) is not None:
         ...     design.tell(query, machine.step_from(query.coordinates, query.action))

@@ -34,7 +34,7 @@ def make(surrogate: Any, **options: Any) -> gymnasium.Env[Any, Any]:
         OSError: the file can't be read, or is not there.
         SurrogymClientError: the server can't be reached or refuses.
 
-    Example:
+    Examples:
         >>> env = surrogym.make("pendulum", url="http://127.0.0.1:8000")
         >>> observation, info = env.reset(seed=0)
     """
@@ -46,7 +46,7 @@ def make(surrogate: Any, **options: Any) -> gymnasium.Env[Any, Any]:
 def make_vec(surrogate: Any, num_envs: int = 1, **options: Any) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
     """A virtual environment with ``num_envs`` lanes; arguments and errors as of ``make``.
 
-    Example:
+    Examples:
         >>> envs = surrogym.make_vec("pendulum.surrogate", num_envs=8)
     """
     if isinstance(surrogate, str | Path):
@@ -58,7 +58,7 @@ def make_sb3(surrogate: Any, num_envs: int = 16, **options: Any) -> SurrogateVec
     """A vector environment of Stable-Baselines3 with ``num_envs`` lanes; arguments and errors as of ``make``, but that
     ``options`` are those of ``SurrogateVecEnv``. It needs the extra ``train``.
 
-    Example:
+    Examples:
         >>> PPO("MlpPolicy", surrogym.make_sb3(design)).learn(100_000)
     """
     from surrogym_client.sb3 import SurrogateVecEnv

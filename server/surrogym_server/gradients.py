@@ -80,7 +80,7 @@ def optimise(
         InvalidInput: the policy's actions are discrete, or the model's family can't be differentiated; or the return
             does not depend on the actions anywhere, as where every step alive pays the same.
 
-    Example:
+    Examples:
         >>> optimise(LocalSurrogate.load("spec.json", "model.safetensors")).policy.save(Path("policy.zip"))
     """
     settings = settings or GradientSettings()

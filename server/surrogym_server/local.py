@@ -42,7 +42,7 @@ class LocalSurrogate:
         spec: the original environment.
         model: a model of it; it is version 1, and the latest.
 
-    Example:
+    Examples:
         >>> surrogate = LocalSurrogate.load("spec.json", "model.safetensors")
         >>> env = SurrogateVecEnv.from_port(surrogate, num_envs=16)
     """

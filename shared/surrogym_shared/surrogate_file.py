@@ -63,7 +63,7 @@ class RealSamples:
 class SurrogateFile:
     """``model`` is a model's own safetensors file, as the server exports it and takes it back.
 
-    Example:
+    Examples:
         >>> SurrogateFile.load("pendulum.surrogate").spec.environment
         'Pendulum-v1'
     """

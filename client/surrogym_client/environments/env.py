@@ -42,7 +42,7 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
         NotRenderable: no picture can be made.
         SurrogymClientError: the session can't be opened.
 
-    Example:
+    Examples:
         >>> env = gymnasium.make("surrogym/Remote-v0", url="http://127.0.0.1:8000", surrogate="pendulum")
         >>> observation, info = env.reset(seed=0)
     """

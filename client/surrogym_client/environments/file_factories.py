@@ -21,7 +21,7 @@ def open_file(path: str | Path) -> SurrogatePort:
         OSError: the file can't be read.
         ValueError: it is no surrogate's file, or its model none of its specification.
 
-    Example:
+    Examples:
         >>> env = SurrogateVecEnv.from_port(open_file("pendulum.surrogate"), num_envs=16)
     """
     (entry,) = entry_points(group=ENTRY_POINTS, name="file")

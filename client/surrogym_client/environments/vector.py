@@ -49,7 +49,7 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         NotRenderable: no picture can be made.
         SurrogymClientError: the session can't be opened.
 
-    Example:
+    Examples:
         >>> envs = gymnasium.make_vec("surrogym/Remote-v0", num_envs=8, surrogate="pendulum")
         >>> observations, infos = envs.reset(seed=0)
     """

@@ -1,6 +1,6 @@
 """Logs of real steps: read, checked row by row, drafted into a specification, and sent to a surrogate.
 
-Example:
+Examples:
     >>> from surrogym_client.logs import import_log
     >>> import_log("reactor.csv", register="reactor").taken
 """

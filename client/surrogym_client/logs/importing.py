@@ -177,7 +177,7 @@ def import_log(
         TooFewSteps: no usable step, or a single one where a specification is to be drafted.
         SurrogymClientError: as every request.
 
-    Example:
+    Examples:
         >>> import_log("reactor.csv", register="reactor").taken
     """
     if (register is not None and to is not None) or (to is not None and spec is not None):

@@ -1,6 +1,6 @@
 """The original environment's side: the protocol, adapters for Gymnasium and MuJoCo, and loading one's own.
 
-Example:
+Examples:
     >>> from surrogym_client import original
     >>> environment = original.make("Pendulum-v1", budget=30)
     >>> environment.step_from([3.1, 0.0], [2.0]).reward  # doctest: +ELLIPSIS

@@ -47,7 +47,7 @@ def make(
         UnknownEnvironment: no adapter knows the name, or its module or factory can't be found.
         ValueError: the options contradict the specification.
 
-    Example:
+    Examples:
         >>> make("CartPole-v1", preset="paper").spec().time_limit
         200
     """

@@ -32,7 +32,7 @@ class OriginalPort:
 
     An environment that runs one instance at a time has one lane, in one session.
 
-    Example:
+    Examples:
         >>> name = "Pendulum-v1"
         >>> spec = original.make(name).spec()
         >>> port = OriginalPort(spec, lambda: open_episode(name, spec, lambda: original.make(name)))

@@ -39,7 +39,7 @@ class OriginalEnvironment(Protocol):
     """An environment that can be set to given coordinates. Any class with these three methods will do. An attribute
     ``parallel = True`` says that several instances may be open at once; without it there is one at a time.
 
-    Example:
+    Examples:
         A cart on a rail that is pushed::
 
             class Cart:
@@ -75,7 +75,7 @@ class ResettableEnvironment(Protocol):
     ``step`` are Gymnasium's, so that a Gymnasium environment needs the other three alone. Its specification says
     ``query="rollout"``.
 
-    Example:
+    Examples:
         A cart that finds its own way back::
 
             class Cart:
@@ -143,7 +143,7 @@ class RolloutEnvironment(Protocol):
 def runs_in_parallel(environment: object) -> bool:
     """Whether several instances of an environment may be open at once: its attribute ``parallel``, False without one.
 
-    Example:
+    Examples:
         A simulator sets the attribute; a machine leaves it out::
 
             class SimulatedCart(Cart):

@@ -44,7 +44,7 @@ def recognise(
     Raises:
         UnknownEnvironment: a range is missing, or an observation entry is no sum of terms.
 
-    Example:
+    Examples:
         >>> speeds = {"slider_velocity": (-3, 3), "hinge_velocity": (-6, 6)}
         >>> recognise("InvertedPendulum-v5", speeds).observation[0].name
         'o0'

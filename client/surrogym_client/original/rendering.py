@@ -28,7 +28,7 @@ DRAWN_WITH = {"gymnasium.envs.classic_control.": ("pygame", "render"), "gymnasiu
 class Drawable(Protocol):
     """What an environment of one's own needs to be shown: one method beside its others.
 
-    Example:
+    Examples:
         >>> def picture(self, coordinates):
         ...     frame = np.full((100, 200, 3), 255, dtype=np.uint8)
         ...     frame[45:55, int(100 + 80 * coordinates[0])] = 0

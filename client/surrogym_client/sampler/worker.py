@@ -97,7 +97,7 @@ class Sampler:
         settings: when to stop, how much to claim.
         report: called after every query with it, what became of it, and the error if there was one.
 
-    Example:
+    Examples:
         >>> with Api("http://127.0.0.1:8000") as api:
         ...     Sampler(api, "pendulum", original.make("Pendulum-v1")).run()
     """

@@ -75,7 +75,7 @@ class Found:
 class PolicySearch(ABC):
     """One way to find a policy. Its hyperparameters are the arguments of its class.
 
-    Example:
+    Examples:
         >>> @dataclass(frozen=True)
         ... class Guess(PolicySearch):
         ...     units: int = 8

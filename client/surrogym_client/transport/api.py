@@ -39,7 +39,7 @@ class Api:
         timeouts: seconds per kind of request.
         retries: how long to go on after lost connections, lost replies and 503.
 
-    Example:
+    Examples:
         >>> with Api() as api:
         ...     api.surrogate("pendulum").phase
     """

@@ -64,7 +64,7 @@ class HttpSurrogate:
         ValueError: a transport there is none of.
         SurrogymClientError: every method; see ``surrogym_client.errors``.
 
-    Example:
+    Examples:
         >>> with HttpSurrogate(None, "pendulum") as surrogate:
         ...     session = surrogate.open(OpenSession(num_envs=4, seed=0))
         ...     start = surrogate.reset(session.id)

@@ -1,6 +1,6 @@
 """Laws of the ports as plain functions, for whoever writes an implementation; a broken law raises AssertionError.
 
-Example:
+Examples:
     >>> import pytest
     >>> from surrogym_server.testing import LAWS_OF_MODELS, model_cases
     >>> @pytest.mark.parametrize("case", model_cases("my_family"), ids=str)
