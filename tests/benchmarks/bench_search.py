@@ -1,4 +1,4 @@
-"""Policy searches side by side on Pendulum's surrogate in this process: PPO of Stable-Baselines3 and in NumPy.
+"""Policy searches side by side on Pendulum's surrogate in this process: PPO of Stable-Baselines3 and FASTPPO.
 
 One batch of an update each, in turns; then whole trainings, in turns, with the imagined return that they came to. Run
 by ``make bench``.
@@ -36,13 +36,16 @@ STEPS, SEEDS, SAMPLES = 600_000, 3, 24
 def updates(rounds: int) -> dict[str, Any]:
     """Microseconds of an update with one batch: of both searches, and of six of the products in it."""
     spec, rng = pendulum(), np.random.default_rng(0)
-    learner = Learner(spec, np.zeros(3), np.ones(3), (64, 64), rng)
+    learner, in_numpy = (
+        Learner(spec, np.zeros(3), np.ones(3), (64, 64), rng, compiled=compiled) for compiled in (True, False)
+    )
     given, batch = batch_of(learner, rng)
     theirs = reference(learner, spec, given)
     rows, weights = torch.randn(ROWS, 64), torch.randn(64, 64)
     subjects = {
         "ppo": timed(theirs.train),
         "fastppo": timed(lambda: learner.update(batch, Objective(), 1e-6)),
+        "fastppo in NumPy": timed(lambda: in_numpy.update(batch, Objective(), 1e-6)),
         "six products": timed(lambda: [rows @ weights for _ in range(6)]),
     }
     turns = take_turns(subjects, rounds, calls=20, warm_up=5)

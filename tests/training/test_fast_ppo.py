@@ -24,13 +24,15 @@ from surrogym_client.policies import UnusablePolicy, load_policy
 from surrogym_client.training import TrainingInterrupted, TrainSettings, train
 from surrogym_client.training.fast_ppo import search as searches
 from surrogym_client.training.fast_ppo.actions import Bounded, Choices
-from surrogym_client.training.fast_ppo.learner import Learner, Objective, noisy
+from surrogym_client.training.fast_ppo.learner import Learner, Objective, compiled_update, noisy
 from surrogym_client.training.fast_ppo.rollouts import Collector, RewardScale
 from surrogym_client.training.search import search_for
 from surrogym_client.training.verdicts import Verdicts
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_shared.spec import EnvironmentSpec, MultiDiscreteAction
+
+needs_numba = pytest.mark.skipif(compiled_update() is None, reason="numba is not installed, or switched off")
 
 SMALL = {"n_steps": 16, "batch_size": 32, "n_epochs": 2}
 
@@ -51,11 +53,12 @@ def several() -> EnvironmentSpec:
 
 
 @pytest.mark.parametrize("make", [pendulum, cartpole, several], ids=["continuous", "discrete", "several choices"])
-def test_an_update_is_that_of_stable_baselines3(make: Callable[[], EnvironmentSpec]):
+@pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_numba), False], ids=["compiled", "numpy"])
+def test_an_update_is_that_of_stable_baselines3(make: Callable[[], EnvironmentSpec], compiled: bool):
     """The same parameters after three updates of the same rollout, where some ratios are clipped."""
     spec, rng = make(), np.random.default_rng(0)
     size = len(spec.observation)
-    learner = Learner(spec, rng.normal(size=size), rng.uniform(0.5, 2, size), (64, 64), rng)
+    learner = Learner(spec, rng.normal(size=size), rng.uniform(0.5, 2, size), (64, 64), rng, compiled=compiled)
     learner.actor.layers[-1][0][:] *= 100  # actions that differ
     given, batch = batch_of(learner, rng)
     made = reference(learner, spec, given)
@@ -109,13 +112,13 @@ def test_a_session_that_is_lost_cuts_its_episodes_and_collecting_goes_on(surroga
         for port in (surrogate, Forgetful(surrogate, at=2))
     )
     first, same = whole.collect(learner, 10), cut.collect(learner, 10)
-    np.testing.assert_array_equal(same.observations, first.observations)
+    np.testing.assert_array_equal(same.rows.observations, first.rows.observations)
     following, lost = whole.collect(learner, 10), cut.collect(learner, 10)
     assert (first.lost, following.lost, lost.lost) == (0, 0, lanes)
-    np.testing.assert_array_equal(lost.observations[:lanes], following.observations[:lanes])
-    np.testing.assert_array_equal(lost.actions[:lanes], following.actions[:lanes])
-    assert not np.array_equal(lost.observations[lanes:], following.observations[lanes:])
-    assert lost.observations.shape == following.observations.shape
+    np.testing.assert_array_equal(lost.rows.observations[:lanes], following.rows.observations[:lanes])
+    np.testing.assert_array_equal(lost.rows.actions[:lanes], following.rows.actions[:lanes])
+    assert not np.array_equal(lost.rows.observations[lanes:], following.rows.observations[lanes:])
+    assert lost.rows.observations.shape == following.rows.observations.shape
     assert len(lost.earned) == 0, "episodes of twenty steps, none of which ended by itself"
     assert len(following.earned) == lanes
 

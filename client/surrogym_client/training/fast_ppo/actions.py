@@ -26,6 +26,10 @@ class Distribution(Sampled, Protocol):
         """The further parameters at first, (K,)."""
         ...
 
+    def arrays(self) -> tuple[tuple[int, ...], Array, Array]:
+        """Counts of choices, centre and reach, as compiled code takes them; what there is none of is empty."""
+        ...
+
     def slopes(self, outputs: Array, further: Array, actions: Array, by: Array) -> tuple[Array, Array]:
         """Derivatives of a loss by outputs and further parameters, from ``by`` (B,), those by log probabilities."""
         ...
@@ -42,6 +46,9 @@ class Bounded(distributions.Bounded):
         logarithms: Array = np.log(EXPLORATION * self.reach).astype(np.float32)
         return logarithms
 
+    def arrays(self) -> tuple[tuple[int, ...], Array, Array]:
+        return (), self.centre, self.reach
+
     def slopes(self, outputs: Array, further: Array, actions: Array, by: Array) -> tuple[Array, Array]:
         bent = np.tanh(outputs)
         z = (actions - self.centre - self.reach * bent) * np.exp(-further)
@@ -57,6 +64,9 @@ class Choices(distributions.Choices):
 
     def further(self) -> Array:
         return np.zeros(0, dtype=np.float32)
+
+    def arrays(self) -> tuple[tuple[int, ...], Array, Array]:
+        return self.counts, self.further(), self.further()
 
     def slopes(self, outputs: Array, further: Array, actions: Array, by: Array) -> tuple[Array, Array]:
         slopes, rows = [], np.arange(len(outputs))

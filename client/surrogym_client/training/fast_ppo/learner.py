@@ -13,7 +13,8 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from surrogym_client.training.fast_ppo.actions import distribution_of
 from surrogym_client.training.fast_ppo.mlp import Array, Mlp, orthogonal
 from surrogym_shared.acting import ActingPolicy
 from surrogym_shared.archives import Header, read_arrays, read_entries
+from surrogym_shared.compiled import available
 from surrogym_shared.network import MAX_BYTES, Layer, Network, bounds_of, counts_of
 from surrogym_shared.spec import EnvironmentSpec
 
@@ -34,6 +36,21 @@ HIDDEN_GAIN, ACTION_GAIN, VALUE_GAIN = 2**0.5, 0.01, 1.0
 FIRST_DECAY, SECOND_DECAY, EPSILON = 0.9, 0.999, 1e-5  # of Adam
 LEARNER = "learner.npz"  # entry of a policy's file, for those who go on from it
 VECTORS = ("parameters", "first", "second")
+
+
+Update = Callable[..., None]
+
+
+@cache
+def compiled_update() -> Update | None:
+    """The update in compiled code; None where this installation can't compile it."""
+    if not available():
+        return None
+    try:
+        from surrogym_client.training.fast_ppo.compiled import update
+    except ImportError:  # no SciPy, or a NumPy that numba does not know
+        return None
+    return update
 
 
 @dataclass(frozen=True)
@@ -47,11 +64,17 @@ class Objective:
 
 @dataclass(frozen=True)
 class Batch:
+    """Transitions that a policy learns from."""
+
     observations: Array  # (B, D) standardised
     actions: Array  # (B, F)
     log_probabilities: Array  # (B,) when they were taken
     advantages: Array  # (B,)
-    returns: Array  # (B,)
+    returns: Array  # (B,) of the scaled rewards, what the critic learns
+
+    def at(self, rows: NDArray[np.int64] | slice) -> Batch:
+        """Some of them."""
+        return Batch(*(getattr(self, one.name)[rows] for one in fields(self)))
 
 
 class Learner:
@@ -64,7 +87,13 @@ class Learner:
         deviation: NDArray[np.float64],
         units: tuple[int, ...],
         rng: np.random.Generator,
+        *,
+        compiled: bool = True,
     ) -> None:
+        """
+        Args:
+            compiled: update in compiled code, where this installation can.
+        """
         self._spec = spec
         self.mean, self.deviation = mean.astype(np.float32), deviation.astype(np.float32)
         self.distribution = distribution_of(counts_of(spec), *bounds_of(spec))
@@ -80,6 +109,10 @@ class Learner:
         self.critic = Mlp(critic, activation, self.parameters[second], self._gradient[second])
         self.further, self._further_gradient = self.parameters[ends[1] :], self._gradient[ends[1] :]
         self.further[:] = further
+        counts, centre, reach = self.distribution.arrays()
+        sizes = (np.array(one, dtype=np.int64) for one in (actor, critic, ends, counts))
+        self._fixed = *sizes, activation == "relu", centre, reach
+        self._update = compiled_update() if compiled else None
         _initialise(self.actor, ACTION_GAIN, rng)
         _initialise(self.critic, VALUE_GAIN, rng)
 
@@ -99,6 +132,12 @@ class Learner:
 
     def update(self, batch: Batch, objective: Objective, rate: float) -> None:
         """One step of Adam on the loss of a batch."""
+        self._updates += 1
+        if self._update is not None:
+            moments = self._first, self._second
+            rows = batch.observations, batch.actions, batch.log_probabilities, batch.advantages, batch.returns
+            self._update(self.parameters, *moments, *self._fixed, *rows, self._updates, *astuple(objective), rate)
+            return
         size = len(batch.returns)
         outputs = self.actor.forward(batch.observations)
         advantages = batch.advantages
@@ -119,7 +158,6 @@ class Learner:
         gradient = self._gradient
         norm = float(np.sqrt(gradient @ gradient))
         gradient *= np.float32(min(1.0, largest / (norm + 1e-6)))
-        self._updates += 1
         self._first *= np.float32(FIRST_DECAY)
         self._first += np.float32(1 - FIRST_DECAY) * gradient
         gradient *= gradient

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from surrogym_client.environments.acting import ActingLanes
 from surrogym_client.environments.lanes import Lanes
-from surrogym_client.training.fast_ppo.learner import Learner
+from surrogym_client.training.fast_ppo.learner import Batch, Learner
 from surrogym_client.training.fast_ppo.mlp import Array
 from surrogym_shared.acting import NoiseKey
 from surrogym_shared.port import PolicyRollout
@@ -24,11 +24,7 @@ LATEST_EPISODES = 100
 class Rollout:
     """What T steps of N lanes gave; rows are T N transitions, lane by lane within a step."""
 
-    observations: Array  # (T N, D) standardised
-    actions: Array  # (T N, F)
-    log_probabilities: Array  # (T N,)
-    advantages: Array  # (T N,)
-    returns: Array  # (T N,) of the scaled rewards, what the critic learns
+    rows: Batch
     earned: list[float]  # by the episodes that ended, not scaled
     penalty_share: float  # of the reward's size
     lost: int  # episodes cut because the server lost the session
@@ -79,12 +75,15 @@ class Collector:
         last = learner.values(learner.standardised(rollout.observation[-1]))
         advantages = self._advantages(rewards, ended, values, last)
         size = float(np.abs(rollout.reward_mean).sum())
-        return Rollout(
+        rows = Batch(
             seen,
             rollout.action.reshape(rewards.size, -1).astype(np.float32),
             rollout.log_probability.ravel().astype(np.float32),
             advantages.ravel(),
             (advantages + values).ravel(),
+        )
+        return Rollout(
+            rows,
             earned,
             float(np.abs(penalty).sum()) / size if size else 0.0,
             int(taken.cut.sum()),
