@@ -74,7 +74,8 @@ class Choices:
         return sum(self.counts)
 
     def sample(self, outputs: Array, further: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        gumbel = -np.log(rng.standard_exponential(outputs.shape, dtype=_kind(outputs)))
+        with np.errstate(divide="ignore"):  # one draw in millions is 0: that choice wins, as it should
+            gumbel = -np.log(rng.standard_exponential(outputs.shape, dtype=_kind(outputs)))
         chosen = [part.argmax(1) for part in self.parts(outputs + gumbel)]  # Gumbel's maximum draws by softmax
         actions = np.stack(chosen, 1).astype(np.float32)
         return actions, self.log_probability(outputs, further, actions)

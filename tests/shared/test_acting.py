@@ -7,6 +7,7 @@ import pytest
 
 from support.acting import random_policy
 from surrogym_shared.acting import ActingPolicy, Actor, KeyedGenerator, NoiseKey
+from surrogym_shared.distributions import Choices
 from surrogym_shared.network import Layer, Network
 
 LOW, HIGH = np.array([-2.0, 0.0]), np.array([2.0, 1.0])
@@ -83,3 +84,13 @@ def test_arrays_of_two_precisions_are_refused():
     mixed = (Layer(policy.layers[0].weights.astype(np.float64), policy.layers[0].bias),)
     with pytest.raises(ValueError, match=r"expected layers\[0\].weights as float32, got float64"):
         ActingPolicy(policy.mean, policy.deviation, mixed)
+
+
+def test_a_choice_whose_draw_is_zero_wins_without_a_warning():
+    class Draws:
+        def standard_exponential(self, shape: tuple[int, int], dtype: type) -> np.ndarray:
+            return np.array([[1.0, 0.0, 1.0]], dtype=dtype)
+
+    outputs = np.array([[5.0, 0.0, 5.0]], dtype=np.float32)
+    actions, _ = Choices((3,)).sample(outputs, np.zeros(0, dtype=np.float32), Draws())
+    assert actions.tolist() == [[1.0]]

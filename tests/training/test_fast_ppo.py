@@ -203,6 +203,20 @@ def test_a_network_that_is_given_up_is_followed_by_stable_baselines3(tmp_path: P
     load_policy(result.path, result.algorithm)
 
 
+def test_training_ends_early_where_nothing_can_be_gained(surrogate, tmp_path: Path, monkeypatch):
+    class Saturated(Verdicts):
+        saturated = property(lambda self: len(self._bests) >= 3)
+
+        def judge(self) -> None:
+            """No network is given up."""
+
+    monkeypatch.setattr(searches, "Verdicts", Saturated)
+    settings = TrainSettings(algorithm="fastppo", total_steps=8_192, num_envs=16, hyperparameters=SMALL, prolong=False)
+    result = train(surrogate, tmp_path / "policy.zip", settings)
+    assert 0 < result.virtual_steps < 8_192
+    load_policy(result.path, result.algorithm)
+
+
 def test_ctrl_c_keeps_the_best_policy_so_far(surrogate, tmp_path: Path):
     def interrupt(now) -> None:
         if now.imagined_return is not None:

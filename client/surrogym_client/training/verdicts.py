@@ -15,6 +15,7 @@ PROOF = 0.5  # of the steps, in which it has to earn half of what the saved poli
 PATIENT_ROLLOUTS = 8  # at least
 LATELY = 0.25  # of the steps, the last of them
 GAIN = 0.01  # of what the best policy earns beyond an untrained one: a training that gained more lately is not done
+SATURATED = 3  # checks in a row in which every episode earned as much as the best one ever did
 LEARNED = 0.01  # of what the best virtual episode earned beyond an untrained network: who earns less learned nothing
 
 
@@ -44,6 +45,7 @@ class Verdicts:
         self._now = 0  # by this one
         self._rollouts = 0  # of this one
         self._checked = 0  # checks made
+        self._full = 0  # checks in a row that nothing can exceed
         self._bests: list[tuple[int, float]] = []  # steps, and the best imagined return by then
         self.latest: float | None = None
         self.best: float | None = None
@@ -75,6 +77,11 @@ class Verdicts:
             return False
         before = [best for steps, best in self._bests if steps <= self.total - LATELY * self._planned]
         return self.best - (before[-1] if before else self.floor) > GAIN * (self.best - self.floor)
+
+    @property
+    def saturated(self) -> bool:
+        """Whether nothing can be gained: in the last checks, no episode earned less than the best one ever did."""
+        return self._full >= SATURATED
 
     def prolong(self) -> bool:
         """Take as many steps again, if that was not done yet and the training still gains."""
@@ -110,6 +117,7 @@ class Verdicts:
         best = self.best is None or imagined >= self.best
         self.best = imagined if self.best is None else max(self.best, imagined)
         self._bests.append((self.steps, self.best))
+        self._full = self._full + 1 if imagined >= self._seen and imagined > self._nothing else 0
         return best
 
     def judge(self) -> None:

@@ -153,7 +153,7 @@ class _Training:
             verdicts.at(before + number * self._rollout)
             self._lost += rollout.lost
             self._after(learner, rollout)
-            if verdicts.given_up:
+            if verdicts.given_up or verdicts.saturated:
                 return
             remaining = 1 - verdicts.own_steps / (before + steps)
             rate = decaying(remaining) if search.learning_rate is None else search.learning_rate

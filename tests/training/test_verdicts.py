@@ -1,0 +1,38 @@
+"""Checks end a training where nothing can be gained, and nowhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pytest
+
+from surrogym_client.training.verdicts import Verdicts
+
+
+def after(untrained: float, earned: Sequence[float], checks: Sequence[float]) -> Verdicts:
+    """Verdicts after episodes of the training, and checks."""
+    verdicts = Verdicts(planned=1_000, untrained=untrained)
+    verdicts.saw(earned)
+    for number, imagined in enumerate(checks):
+        verdicts.at(100 * (number + 1))
+        verdicts.check(imagined)
+    return verdicts
+
+
+def test_training_is_over_once_three_checks_earn_the_most_there_is():
+    assert after(20.0, [500.0], [500.0, 500.0, 500.0]).saturated
+    assert not after(20.0, [500.0], [500.0, 500.0]).saturated
+
+
+@pytest.mark.parametrize(
+    ("untrained", "earned", "checks"),
+    [
+        pytest.param(20.0, [500.0], [500.0, 499.0, 500.0, 500.0], id="one check earned less"),
+        pytest.param(20.0, [500.0, 500.1], [500.0] * 5, id="some episode earned more"),
+        pytest.param(-500.0, [-500.0], [-500.0] * 5, id="nothing is learned yet"),
+        pytest.param(0.0, [0.0], [0.0] * 5, id="a policy that stands still"),
+        pytest.param(-1_200.0, [-1.0], [-150.0] * 5, id="a plateau"),
+    ],
+)
+def test_training_goes_on_while_more_may_be_earned(untrained: float, earned: list[float], checks: list[float]):
+    assert not after(untrained, earned, checks).saturated
