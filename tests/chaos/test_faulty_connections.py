@@ -18,7 +18,7 @@ from surrogym_client.transport import HttpSurrogate, Retries, Timeouts, Transpor
 
 STEPS = times(short=200, full=10_000)
 QUICK = Retries(seconds=60, first_delay=0.001, longest_delay=0.01)
-IMPATIENT = Timeouts(request=0.5, step=0.5, rollout=2.0)
+IMPATIENT = Timeouts(request=0.5, step=0.5, rollout=2.0, open=0.5)
 DROPPED, DELAYED, DUPLICATED = 0.01, 0.05, 0.2
 LONGEST_DELAY = 0.02
 

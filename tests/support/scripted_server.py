@@ -65,7 +65,7 @@ def upgrade(handler: BaseHTTPRequestHandler) -> None:
     handler.end_headers()
 
 
-def session_view(seq: int = 0, protocol: int = wire.PROTOCOL) -> Answer:
+def session_view(seq: int = 0, protocol: int = wire.PROTOCOL, delay: float = 0.0) -> Answer:
     """What opening or reading session ``abc`` of surrogate ``pendulum`` gives: two lanes, two observation entries."""
     session = wire.SessionView(
         protocol=protocol,
@@ -85,7 +85,7 @@ def session_view(seq: int = 0, protocol: int = wire.PROTOCOL) -> Answer:
         outputs=["angle", "reward"],
         idle_seconds=60.0,
     )
-    return reply(session.model_dump_json())
+    return reply(session.model_dump_json(), delay=delay)
 
 
 def lost_reply(handler: BaseHTTPRequestHandler) -> None:

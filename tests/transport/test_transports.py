@@ -113,6 +113,13 @@ def test_a_step_lost_with_its_stream_is_repeated_by_http_under_its_seq():
         assert seqs(server) == [2, 3]
 
 
+def test_a_session_may_take_longer_to_open_than_other_requests():
+    with scripted_server(session_view(delay=0.6)) as server:
+        hasty = Timeouts(request=0.2)
+        with HttpSurrogate(server.url, "pendulum", retries=Retries(seconds=0), timeouts=hasty) as port:
+            assert port.open(wire.OpenSession(num_envs=2)).id == "abc"
+
+
 @pytest.mark.parametrize("useless", [upgrade_and_cut, upgrade_and_swallow])
 def test_a_stream_that_opens_and_never_answers_is_left_at_once(useless: Answer):
     script = [session_view(), useless, step(1), step(2)]

@@ -51,6 +51,7 @@ class Timeouts:
     request: float = 30.0
     step: float = 60.0
     rollout: float = 600.0
+    open: float = 150.0  # of a session: a server that is new on its machine first compiles its steps
 
 
 @dataclass(frozen=True)

@@ -116,7 +116,8 @@ class HttpSurrogate:
         if request.idempotency_key is None:
             request = request.model_copy(update={"idempotency_key": new_key()})
         route = f"{self._route}/sessions"
-        content = self.connection.send("POST", route, request.model_dump_json().encode())
+        body = request.model_dump_json().encode()
+        content = self.connection.send("POST", route, body, timeout=self.connection.timeouts.open)
         view = parse(wire.SessionView, content, route)
         check_protocol(view.protocol, self.connection.url)
         self._know(view)
