@@ -27,6 +27,7 @@ PARTS = (
     "evidence",
     "lists",
     "attacks",
+    "start",
 )
 
 

@@ -92,6 +92,17 @@ def search(found: dict[str, Any]) -> Iterator[Line]:
     )
 
 
+def start(found: dict[str, Any]) -> Iterator[Line]:
+    for name, taken in found["subjects"].items():
+        low, high, goal = min(taken["all"]), max(taken["all"]), taken["goal"]
+        yield (
+            f"start: {name}",
+            f"{goal:g} s",
+            f"{taken['seconds']:.2f} s ({low:.2f} to {high:.2f})",
+            taken["seconds"] < goal,
+        )
+
+
 def fit(found: dict[str, Any]) -> Iterator[Line]:
     for samples, taken in found["sizes"].items():
         reached = f"{taken['seconds']:.1f} s ({taken['processor']:.1f} s of processor time)"
@@ -185,6 +196,7 @@ PARTS = {
     "train": train,
     "rollout": rollout,
     "search": search,
+    "start": start,
     "fit": fit,
     "predict": predict,
     "evidence": evidence,

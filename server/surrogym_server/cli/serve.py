@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from importlib.metadata import version
@@ -88,9 +89,10 @@ def serve(
 
     Example: surrogym serve --port 8000 --database surrogym.db
     """
-    from surrogym_server.settings import read_settings
-
+    gc.disable()  # what is imported stays: to look for garbage in it takes an eighth of the start
     try:
+        from surrogym_server.settings import read_settings
+
         _refuse_workers()
         given = {name: value for name, value in context.params.items() if name not in OF_THE_COMMAND}
         settings = read_settings(os.environ, **given)
@@ -107,6 +109,8 @@ def serve(
     except SurrogymError as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(1) from None
+    finally:
+        gc.enable()
 
 
 def _refuse_workers() -> None:
