@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import statistics
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from common import OUT
 
 Line = tuple[str, str, str, bool | None]  # what, target, reached, whether; None where there is no target
 FIT_SECONDS = {"500": 5, "2000": 20, "5000": 30}
+PHASES = ("start", "design", "train", "checks", "evaluate", "total")  # of a demo
 PEERS = ("openenv", "rlmesh", "dm_env_rpc")
 
 
@@ -90,6 +92,22 @@ def search(found: dict[str, Any]) -> Iterator[Line]:
         reached,
         whole["ppo / fastppo"] >= 3,
     )
+
+
+def phases(found: dict[str, Any]) -> Iterator[Line]:
+    """Totals are compared; a line has the phases of both sides."""
+    for task in dict.fromkeys(run["task"] for run in found["runs"]):
+        taken = {
+            side: [run["seconds"] for run in found["runs"] if (run["task"], run["side"]) == (task, side)]
+            for side in ("before", "after")
+        }
+        middle = {
+            side: {phase: statistics.median(run[phase] for run in runs) for phase in PHASES}
+            for side, runs in taken.items()
+        }
+        shown = "; ".join(f"{phase} {middle['before'][phase]:.1f}, {middle['after'][phase]:.1f}" for phase in PHASES)
+        share = middle["after"]["total"] / middle["before"]["total"]
+        yield f"demo {task}, seconds before and after", "a third", f"{share:.2f}: {shown}", share <= 1 / 3
 
 
 def start(found: dict[str, Any]) -> Iterator[Line]:
@@ -197,6 +215,7 @@ PARTS = {
     "rollout": rollout,
     "search": search,
     "start": start,
+    "phases": phases,
     "fit": fit,
     "predict": predict,
     "evidence": evidence,

@@ -3,6 +3,7 @@
 import pytest
 
 from surrogym_client.experiments.arms import ARMS
+from surrogym_client.experiments.demo.learning import later_imports
 from surrogym_client.experiments.settings import DemoSettings
 from surrogym_client.experiments.tasks import ROUNDS, TASKS, Outcome, Target, design_budget, queries_a_round
 from surrogym_client.original.loading import is_known
@@ -78,3 +79,8 @@ def test_a_task_is_solved_by_whole_episodes():
     assert success["invertedpendulum"].min_steps == 1_000
     for task in ("pendulum", "swingup", "swingup-narrow"):
         assert (success[task].hold_steps, abs(success[task].hold[0].value)) == (20, 0.95)
+
+
+def test_a_demo_imports_torch_early_only_where_its_policy_needs_it():
+    assert later_imports(DemoSettings(pictures=False)) == ("stable_baselines3",)
+    assert later_imports(DemoSettings(algorithm="fastppo", pictures=False)) == ()

@@ -6,7 +6,7 @@ import json
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -17,8 +17,9 @@ from surrogym_client.experiments.demo.judging import Judgement
 from surrogym_client.experiments.processes import Child, Children, await_file
 from surrogym_client.experiments.settings import DemoSettings
 from surrogym_client.experiments.tasks import ROUNDS, queries_a_round
-from surrogym_client.policies.card import read_card
+from surrogym_client.policies.card import DEFAULT_ALGORITHM, read_card
 from surrogym_client.surrogates.waiting import share_of_design, wait_for_design, words_of_design
+from surrogym_client.training.search import ALGORITHMS, SEARCHES
 from surrogym_client.training.words import words_of
 from surrogym_client.transport.api import Api
 from surrogym_client.transport.connection import Retries
@@ -143,7 +144,7 @@ class SurrogateRun:
             view = wait_for_design(self._api, name, PATIENCE_SECONDS, look, after_round=view.round)
 
     def _train(self, trainer: Child) -> None:
-        threading.Thread(target=_warm_up, args=(self._settings.pictures,), daemon=True).start()
+        threading.Thread(target=_warm_up, args=(later_imports(self._settings),), daemon=True).start()
         with progress("train", quiet=self._quiet) as update:
             while trainer.process.poll() is None:
                 self._children.check()
@@ -178,8 +179,15 @@ def read_curve(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in lines if line.endswith("\n")]
 
 
-def _warm_up(pictures: bool) -> None:
-    """Import what evaluation and pictures need while there is nothing to do but wait."""
+def later_imports(settings: DemoSettings) -> tuple[str, ...]:
+    """Modules that evaluation and pictures will need."""
+    by_sb3 = SEARCHES.name_of(settings.algorithm or DEFAULT_ALGORITHM) in ALGORITHMS
+    pictures = ["surrogym_client.experiments.demo.pictures"] if settings.pictures else []
+    return (*(["stable_baselines3"] if by_sb3 else []), *pictures)
+
+
+def _warm_up(modules: Sequence[str]) -> None:
+    """Import while there is nothing to do but wait."""
     with suppress(ImportError):  # told by whoever needs it
-        for module in ("stable_baselines3", *(["surrogym_client.experiments.demo.pictures"] if pictures else [])):
+        for module in modules:
             import_module(module)
