@@ -53,12 +53,16 @@ def _rows(raw: NDArray[Any], expected: tuple[int, int]) -> Array:
         rows = rows[:, None]
     if rows.shape != expected:
         raise InvalidInput(f"action: expected shape {expected}, got {np.shape(raw)}")
-    if not np.isfinite(rows).all():
-        raise InvalidInput("action: expected finite numbers, got NaN or infinity")
     return rows
 
 
+def _require_finite(rows: Array) -> None:
+    if not np.isfinite(rows).all():
+        raise InvalidInput("action: expected finite numbers, got NaN or infinity")
+
+
 def _require_counts(rows: Array, counts: tuple[int, ...]) -> None:
+    _require_finite(rows)
     if (rows != np.floor(rows)).any():
         raise InvalidInput(f"action: expected integers, got {rows[rows != np.floor(rows)][0]:g}")
     bad = (rows < 0) | (rows >= np.array(counts))
@@ -71,8 +75,9 @@ def _require_counts(rows: Array, counts: tuple[int, ...]) -> None:
 
 def _in_box(action: ActionDefinition, rows: Array) -> Array:
     low, high = action.limits
-    if ((rows >= low) & (rows <= high)).all():
+    if ((rows >= low) & (rows <= high)).all():  # so they are finite
         return rows
+    _require_finite(rows)
     slack = FLOAT32_SLACK * (high - low)  # a policy's float32 bound may round to just outside
     bad = (rows < low - slack) | (rows > high + slack)
     if bad.any():

@@ -27,8 +27,10 @@ def within(limits: Limits | None, transition: LaneTransition) -> LaneTransition:
     """
     if limits is None:
         return transition
-    mean = transition.reward_mean
-    kept: NDArray[Any] = np.clip(mean, *limits)
+    mean, (low, high) = transition.reward_mean, limits
+    if np.minimum.reduce(mean) >= low and np.maximum.reduce(mean) <= high:
+        return transition
+    kept: NDArray[Any] = np.clip(mean, low, high)
     if transition.left is not None:
         kept = np.where(transition.left, mean, kept)
     if (kept == mean).all():
