@@ -13,6 +13,7 @@ SurrogymClientError
     │   ├── UnknownSurrogate
     │   ├── UnknownQuery
     │   ├── UnknownModel
+    │   ├── UnknownPolicy
     │   └── SessionLost     the environments open a new session and end the running episodes as truncated
     │       ├── UnknownSession
     │       └── SessionExpired
@@ -99,6 +100,10 @@ class UnknownQuery(NotThere):
 
 class UnknownModel(NotThere):
     """No model of this version."""
+
+
+class UnknownPolicy(NotThere):
+    """No policy of this version or alias, or it lacks the file or evaluation that was asked for."""
 
 
 class SessionLost(NotThere):
@@ -193,6 +198,7 @@ BY_CODE: dict[Code, type[ProblemError]] = {
     Code.SESSION_EXPIRED: SessionExpired,
     Code.UNKNOWN_QUERY: UnknownQuery,
     Code.UNKNOWN_MODEL: UnknownModel,
+    Code.UNKNOWN_POLICY: UnknownPolicy,
     Code.METHOD_NOT_ALLOWED: InvalidInput,
     Code.SPEC_CONFLICT: SpecConflict,
     Code.IDEMPOTENCY_CONFLICT: IdempotencyConflict,

@@ -23,6 +23,7 @@ from surrogym_server.api import (
     metrics,
     models,
     openapi,
+    policies,
     problems,
     queries,
     samples,
@@ -56,6 +57,7 @@ from surrogym_server.services.events import EventService
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.models import ModelService, load_model
 from surrogym_server.services.notices import Notices
+from surrogym_server.services.policies import PolicyService
 from surrogym_server.services.queries import QueryService
 from surrogym_server.services.samples import SampleService
 from surrogym_server.services.sessions import SessionService
@@ -107,7 +109,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     """
     _check_device(settings.device)
     keep_private(settings)
-    storage = open_storage(settings.database_url, settings.synchronous)
+    storage = open_storage(settings.database_url, settings.synchronous, settings.files)
     app = FastAPI(
         title="Surrogym",
         version=version("surrogym"),
@@ -136,7 +138,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
         app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", *settings.host_names}))
     app.add_middleware(Observed, metrics=app.state.metrics)
     app.router.routes.extend(steps.router.routes)  # tried first, and directly: an included router is another search
-    for room in (sessions, service, metrics, surrogates, queries, samples, models, events):
+    for room in (sessions, service, metrics, surrogates, queries, samples, models, policies, events):
         app.include_router(room.router)
     _add_dashboard(app)
     return app
@@ -233,6 +235,7 @@ def _build_services(
         queries=QueryService(storage, definitions, engine.notices, samplers),
         samples=SampleService(storage, definitions, engine.notices, samplers),
         models=ModelService(storage, definitions, cache, engine.notices),
+        policies=PolicyService(storage, _complete, engine.notices, settings.policies_mib * MEBIBYTE),
         sessions=SessionService(
             storage,
             definitions,

@@ -8,6 +8,7 @@ SurrogymError
 │   ├── UnknownSurrogate
 │   ├── UnknownQuery
 │   ├── UnknownModel
+│   ├── UnknownPolicy
 │   ├── UnknownSession
 │   └── SessionExpired      it was there; open a new one
 ├── Conflict                the request is well formed but does not fit the present state
@@ -65,6 +66,10 @@ class UnknownQuery(NotThere):
 
 class UnknownModel(NotThere):
     """No model of this version."""
+
+
+class UnknownPolicy(NotThere):
+    """No policy of this version or alias, or it lacks the file or evaluation that was asked for."""
 
 
 class UnknownSession(NotThere):

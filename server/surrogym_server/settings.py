@@ -31,6 +31,10 @@ class Settings(BaseModel):
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65_535, description="0 takes any free port")] = 8000
     database: str = Field(default="surrogym.db", min_length=1, description="SQLite file, or a SQLAlchemy URL")
+    files: Annotated[
+        Path | None,
+        Field(description="folder for the files of policies. None: beside a SQLite file, or in PostgreSQL"),
+    ] = None
     synchronous: Annotated[
         Synchronous, Field(description="of a SQLite file: full survives a loss of power, normal a crash alone")
     ] = "full"
@@ -54,6 +58,7 @@ class Settings(BaseModel):
     max_sessions_mib: Annotated[int, Field(ge=1, description="memory of the lanes of all sessions")] = 2_048
     max_waiting: Annotated[int, Field(ge=1, description="requests of sessions, at work or waiting")] = 1_024
     max_lanes: Annotated[int, Field(ge=1, le=MAX_LANES, description="of one session")] = MAX_LANES
+    policies_mib: Annotated[int, Field(ge=1, description="files of the policies of one surrogate, together")] = 1_024
     sweep_seconds: Annotated[float, Field(gt=0, description="between looks at leases and sessions")] = 1.0
     log_level: LogLevel = "info"
     log_format: Annotated[LogFormat, Field(description="a line of text for each record, or a JSON object")] = "text"

@@ -23,6 +23,7 @@ class Code(StrEnum):
     SESSION_EXPIRED = "session_expired"  # idle for too long, or lost with a crash; open a new one
     UNKNOWN_QUERY = "unknown_query"
     UNKNOWN_MODEL = "unknown_model"
+    UNKNOWN_POLICY = "unknown_policy"  # no such version or alias, or a file or an evaluation that it lacks
     METHOD_NOT_ALLOWED = "method_not_allowed"
     SPEC_CONFLICT = "spec_conflict"  # the name exists with another specification
     IDEMPOTENCY_CONFLICT = "idempotency_conflict"  # the same key with another body
@@ -54,6 +55,7 @@ STATUS: dict[Code, int] = {
     Code.SESSION_EXPIRED: 410,
     Code.UNKNOWN_QUERY: 404,
     Code.UNKNOWN_MODEL: 404,
+    Code.UNKNOWN_POLICY: 404,
     Code.METHOD_NOT_ALLOWED: 405,
     Code.SPEC_CONFLICT: 409,
     Code.IDEMPOTENCY_CONFLICT: 409,

@@ -7,11 +7,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, Self, TypeVar
 from uuid import uuid4
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from surrogym_client.errors import NoModel, ProtocolMismatch, ServerUnreachable
 from surrogym_client.transport import routes
 from surrogym_client.transport.connection import Connection, Retries, Timeouts
+from surrogym_client.transport.policies import PolicyCalls
+from surrogym_client.transport.replies import parse
 from surrogym_shared import wire
 from surrogym_shared.codes import STATUS, Code, Problem
 from surrogym_shared.spec import EnvironmentSpec
@@ -370,6 +372,13 @@ class Api:
         reply = self.connection.send("POST", route, data, media_type=_MODEL_FILE, repeatable=False)
         return parse(wire.ModelView, reply, route)
 
+    # Policies
+
+    @property
+    def policies(self) -> PolicyCalls:
+        """Policies of surrogates: store, list, give out, evaluate, name."""
+        return PolicyCalls(self.connection)
+
     # Events
 
     def events(self, name: str, after: int | None = None) -> Iterator[wire.Event]:
@@ -458,20 +467,6 @@ def check_protocol(protocol: int, url: str) -> None:
     """Refuse a server of another protocol version."""
     if protocol != wire.PROTOCOL:
         raise ProtocolMismatch(f"expected protocol {wire.PROTOCOL} at {url}, got {protocol}: upgrade the older side")
-
-
-def parse(reply: type[R], content: bytes, path: str) -> R:
-    """Read a reply.
-
-    Raises:
-        ProtocolMismatch: it is not of this protocol.
-    """
-    try:
-        return reply.model_validate_json(content)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "body"
-        raise ProtocolMismatch(f"unexpected answer of {path}: {where}: {first['msg']}") from error
 
 
 def _batches(samples: Sequence[wire.NewSample]) -> list[list[wire.NewSample]]:

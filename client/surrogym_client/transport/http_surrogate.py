@@ -13,8 +13,9 @@ import numpy as np
 
 from surrogym_client.errors import ProtocolMismatch, SessionLost, refused_here
 from surrogym_client.transport import routes
-from surrogym_client.transport.api import Api, check_protocol, new_key, parse
+from surrogym_client.transport.api import Api, check_protocol, new_key
 from surrogym_client.transport.connection import Connection, Retries, Timeouts
+from surrogym_client.transport.replies import parse
 from surrogym_client.transport.step_codecs import UNREADABLE, BinaryForm, Form, JsonForm
 from surrogym_client.transport.stream import Stream, StreamLost, StreamUnavailable
 from surrogym_shared import wire

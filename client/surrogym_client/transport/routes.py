@@ -12,12 +12,24 @@ from surrogym_client.errors import refused_here
 from surrogym_shared.codes import Code
 from surrogym_shared.spec import NAME_IN_WORDS, NAME_PATTERN
 
+POLICY_PATTERN = r"[a-z0-9][a-z0-9_-]{0,31}"
 SESSION_PATTERN = r"[^/\\]*[^/\\.][^/\\]*"  # a server chooses the form of its ids
 
 
 def surrogate(name: str) -> str:
     """The route of a surrogate. Raises ``InvalidInput`` for a name that none can have."""
     return f"/v1/surrogates/{_segment(name, NAME_PATTERN, f'name of a surrogate: expected {NAME_IN_WORDS}')}"
+
+
+def policy(name: str, which: str | int) -> str:
+    """The route of a policy by its version, an alias or ``latest``. Raises ``InvalidInput`` for what can be none."""
+    expected = "policy: expected a version, an alias or latest"
+    return f"{surrogate(name)}/policies/{_segment(str(which), POLICY_PATTERN, expected)}"
+
+
+def alias(name: str) -> str:
+    """An alias as the last part of a route. Raises ``InvalidInput`` for what can be none."""
+    return _segment(name, POLICY_PATTERN, "alias of a policy: expected lower-case letters, digits, - and _")
 
 
 def session(identity: str) -> str:

@@ -10,6 +10,7 @@ from fastapi import Depends, Request
 from surrogym_server.services.designer import Designer
 from surrogym_server.services.events import EventService
 from surrogym_server.services.models import ModelService
+from surrogym_server.services.policies import PolicyService
 from surrogym_server.services.queries import QueryService
 from surrogym_server.services.samples import SampleService
 from surrogym_server.services.sessions import SessionService
@@ -25,6 +26,7 @@ class Services:
     queries: QueryService
     samples: SampleService
     models: ModelService
+    policies: PolicyService
     sessions: SessionService
     designer: Designer
     events: EventService

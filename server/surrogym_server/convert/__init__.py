@@ -2,6 +2,17 @@
 
 from surrogym_server.convert.definitions import default_budget, definition_from_spec, stored_definition
 from surrogym_server.convert.numbers import numbers
+from surrogym_server.convert.policies import (
+    episodes,
+    evaluation_detail,
+    evaluation_view,
+    new_policy,
+    policy_detail,
+    policy_file,
+    policy_list,
+    policy_view,
+    pushed_policy,
+)
 from surrogym_server.convert.resources import (
     added_samples,
     claimed,
@@ -45,6 +56,9 @@ __all__ = [
     "created",
     "default_budget",
     "definition_from_spec",
+    "episodes",
+    "evaluation_detail",
+    "evaluation_view",
     "event",
     "framed_policy_run",
     "imagined",
@@ -52,11 +66,17 @@ __all__ = [
     "lane_mask",
     "ledger",
     "model_view",
+    "new_policy",
     "new_sample",
     "numbers",
     "opening",
+    "policy_detail",
+    "policy_file",
+    "policy_list",
     "policy_run",
+    "policy_view",
     "prediction",
+    "pushed_policy",
     "query_list",
     "query_view",
     "reset_frame",

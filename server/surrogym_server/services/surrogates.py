@@ -176,13 +176,11 @@ class SurrogateService:
 def check_same(name: str, had: Any, got: Any) -> None:
     """Raises ``SpecConflict`` where two specs differ, which says where."""
     if had != got:
-        where, old, new = _difference(had, got)
-        raise SpecConflict(
-            f"{name!r} exists with another spec: {where} was created as {_short(old)}, got {_short(new)}"
-        )
+        where, old, new = difference(had, got)
+        raise SpecConflict(f"{name!r} exists with another spec: {where} was created as {short(old)}, got {short(new)}")
 
 
-def _difference(had: Any, got: Any, where: str = "") -> tuple[str, Any, Any]:
+def difference(had: Any, got: Any, where: str = "") -> tuple[str, Any, Any]:
     """The first place where two JSON values differ, as ``coordinates.0.name``, and what stands there."""
     if isinstance(had, dict) and isinstance(got, dict):
         pairs = [(key, had.get(key, ABSENT), got.get(key, ABSENT)) for key in {**had, **got}]
@@ -191,8 +189,8 @@ def _difference(had: Any, got: Any, where: str = "") -> tuple[str, Any, Any]:
     else:
         return where, had, got
     key, old, new = next(pair for pair in pairs if pair[1] != pair[2])
-    return _difference(old, new, f"{where}.{key}" if where else key)
+    return difference(old, new, f"{where}.{key}" if where else key)
 
 
-def _short(value: Any) -> str:
+def short(value: Any) -> str:
     return "nothing" if value is ABSENT else textwrap.shorten(json.dumps(value), SHOWN, placeholder=" ...")

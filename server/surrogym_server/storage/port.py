@@ -19,6 +19,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
+from surrogym_server.storage.policies import Blobs, Policies
 from surrogym_server.storage.records import (
     AddedSamples,
     Array,
@@ -396,6 +397,8 @@ class Storage(ABC):
     occupancy: Occupancy
     sessions: Sessions
     events: Events
+    policies: Policies
+    blobs: Blobs
 
     @abstractmethod
     def ping(self) -> None:

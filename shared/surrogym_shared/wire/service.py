@@ -31,6 +31,6 @@ class Event(Reply):
     """One server-sent event of a surrogate; ``id`` grows, so a reader goes on with Last-Event-ID."""
 
     id: int
-    kind: Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged"]
+    kind: Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged", "policy"]
     created_at: float
     body: dict[str, Any]

@@ -29,6 +29,9 @@ EXAMPLES = {
     "STEP": wire.StepSession,
     "ROLLOUT": wire.RolloutSession,
     "OCCUPANCY": wire.SubmitOccupancy,
+    "POLICY": wire.AddPolicy,
+    "EVALUATION": wire.AddEvaluation,
+    "ALIAS": wire.PutAlias,
 }
 
 

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import sqlalchemy as sa
+
 from surrogym_server.errors import Damaged
+from surrogym_server.storage.policies import Blobs
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import Synchronous
+from surrogym_server.storage.sql.blobs import FolderBlobs, RowBlobs
 from surrogym_server.storage.sql.checks import check_pages, check_tables
 from surrogym_server.storage.sql.database import Database, connect
 from surrogym_server.storage.sql.designs import SqlDesigns
@@ -12,6 +18,7 @@ from surrogym_server.storage.sql.ledger import SqlLedger
 from surrogym_server.storage.sql.memory import SqlEvents, SqlOccupancy, SqlSessions
 from surrogym_server.storage.sql.migrate import migrate
 from surrogym_server.storage.sql.models import SqlModels
+from surrogym_server.storage.sql.policies import SqlPolicies
 from surrogym_server.storage.sql.queries import SqlQueries
 from surrogym_server.storage.sql.readiness import Readiness
 from surrogym_server.storage.sql.samples import SqlSamples
@@ -21,7 +28,7 @@ from surrogym_server.storage.sql.surrogates import SqlSurrogates
 class SqlStorage(Storage):
     """The port on SQLite or PostgreSQL."""
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, blobs: Blobs) -> None:
         self._database = database
         self._readiness = Readiness(database)
         self.surrogates = SqlSurrogates(database)
@@ -33,6 +40,8 @@ class SqlStorage(Storage):
         self.occupancy = SqlOccupancy(database)
         self.sessions = SqlSessions(database)
         self.events = SqlEvents(database)
+        self.policies = SqlPolicies(database)
+        self.blobs = blobs
 
     def ping(self) -> None:
         self._readiness.require()
@@ -42,13 +51,15 @@ class SqlStorage(Storage):
         self._database.close()
 
 
-def open_storage(url: str, synchronous: Synchronous = "full") -> Storage:
+def open_storage(url: str, synchronous: Synchronous = "full", files: Path | None = None) -> Storage:
     """Open a database, and bring its schema up to date.
 
     Args:
         url: ``sqlite:///path/to/file`` (made if it is not there, for one server at a time) or
             ``postgresql://user:password@host/name`` (for several).
         synchronous: as in ``connect``.
+        files: folder for the files of policies; None is ``<database>.files`` beside a SQLite file, and the database
+            itself for PostgreSQL.
 
     Raises:
         InvalidInput: another kind of address.
@@ -62,7 +73,13 @@ def open_storage(url: str, synchronous: Synchronous = "full") -> Storage:
     except BaseException:
         database.close()
         raise
-    return SqlStorage(database)
+    folder = files or _beside(url)
+    return SqlStorage(database, RowBlobs(database) if folder is None else FolderBlobs(folder))
+
+
+def _beside(url: str) -> Path | None:
+    parsed = sa.make_url(url)
+    return Path(f"{parsed.database}.files") if parsed.get_backend_name() == "sqlite" else None
 
 
 def _bring_up(database: Database) -> None:

@@ -160,6 +160,7 @@ surrogates = sa.Table(
     sa.Column("fit_owner", sa.Text),
     sa.Column("fit_expires", sa.Double),
     sa.Column("fit_seconds", sa.Double),  # for how long the right was given out last
+    sa.Column("policy_versions", sa.Integer, nullable=False, server_default="0"),  # so many were ever given out
     sa.Column("created_at", sa.Double, nullable=False),
     sqlite_autoincrement=True,
 )
@@ -306,6 +307,69 @@ events = sa.Table(
     sa.Column("body", Json("events.body"), nullable=False),
     sa.Index(None, "surrogate_id", "id"),
     sqlite_autoincrement=True,
+)
+
+policies = sa.Table(
+    "policies",
+    metadata,
+    _owner(primary_key=True),
+    sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("created_at", sa.Double, nullable=False),
+    sa.Column("card", Json("policies.card"), nullable=False),
+    sa.Column("curve", Json("policies.curve"), nullable=False),
+)
+
+
+def _policy() -> sa.ForeignKeyConstraint:
+    columns = ["surrogate_id", "version"]
+    return sa.ForeignKeyConstraint(columns, [f"policies.{name}" for name in columns], ondelete="CASCADE")
+
+
+policy_files = sa.Table(
+    "policy_files",
+    metadata,
+    sa.Column("surrogate_id", Id, primary_key=True, autoincrement=False),
+    sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("form", sa.Text, primary_key=True),
+    sa.Column("main", sa.Boolean, nullable=False),  # the file that the version came with
+    sa.Column("bytes", sa.BigInteger, nullable=False),
+    sa.Column("digest", sa.Text, nullable=False),  # SHA-256 of its content
+    sa.Column("blob", sa.Text),  # NULL: not there
+    _policy(),
+)
+
+policy_aliases = sa.Table(
+    "policy_aliases",
+    metadata,
+    sa.Column("surrogate_id", Id, primary_key=True, autoincrement=False),
+    sa.Column("alias", sa.Text, primary_key=True),
+    sa.Column("version", sa.Integer, nullable=False),
+    _policy(),
+)
+
+policy_evaluations = sa.Table(
+    "policy_evaluations",
+    metadata,
+    _id(),
+    sa.Column("surrogate_id", Id, nullable=False),
+    sa.Column("version", sa.Integer, nullable=False),
+    sa.Column("key", sa.Text, nullable=False),
+    sa.Column("created_at", sa.Double, nullable=False),
+    sa.Column("summary", Json("policy_evaluations.summary"), nullable=False),
+    sa.Column("bytes", sa.BigInteger, nullable=False),
+    sa.Column("digest", sa.Text, nullable=False),  # SHA-256 of its episodes
+    sa.Column("blob", sa.Text),  # NULL: not there
+    sa.UniqueConstraint("surrogate_id", "version", "key"),
+    _policy(),
+    sqlite_autoincrement=True,
+)
+
+blobs = sa.Table(  # files, where they have no folder; a backup leaves this table out
+    "blobs",
+    metadata,
+    sa.Column("name", sa.Text, primary_key=True),
+    sa.Column("created_at", sa.Double, nullable=False),
+    sa.Column("content", sa.LargeBinary, nullable=False),
 )
 
 _check_plain_columns()

@@ -1,0 +1,154 @@
+"""Routes of policies: store, list, give out, evaluate, name."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Path, Query, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import Response
+
+from surrogym_server import convert
+from surrogym_server.api import examples
+from surrogym_server.api.auth import ADMIN, READ, TRAIN
+from surrogym_server.api.body import example
+from surrogym_server.api.door import DoorRoute, json_up_to
+from surrogym_server.api.problems import documented
+from surrogym_server.api.state import Use
+from surrogym_shared.codes import Code
+from surrogym_shared.wire import (
+    AddEvaluation,
+    AddPolicy,
+    AliasName,
+    EvaluationDetail,
+    EvaluationView,
+    FileNotice,
+    PolicyDetail,
+    PolicyForm,
+    PolicyList,
+    PolicyView,
+    PushedPolicy,
+    PutAlias,
+)
+
+router = APIRouter(prefix="/v1/surrogates/{name}/policies", tags=["policies"], route_class=DoorRoute)
+
+BINARY = "application/octet-stream"
+MEDIA_TYPES = {"mp4": "video/mp4", "gif": "image/gif"}
+HEADERS = {"x-content-type-options": "nosniff", "content-security-policy": "default-src 'none'; sandbox"}
+
+Version = Annotated[int, Path(ge=1, le=2**31 - 1)]
+Which = Annotated[str, Path(max_length=32, description="a version, an alias, or latest")]
+THERE = (Code.UNKNOWN_SURROGATE, Code.UNKNOWN_POLICY, Code.INVALID_REQUEST)
+
+
+@router.get("", summary="All policies", dependencies=[READ], responses=documented(*THERE))
+def list_all(name: str, use: Use) -> PolicyList:
+    """Newest first, each with its promise, its files and the statistics of its real episodes."""
+    return convert.policy_list(use.policies.list(name))
+
+
+@router.post(
+    "",
+    status_code=201,
+    summary="Store a policy",
+    dependencies=[TRAIN],
+    openapi_extra=json_up_to(128),
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.SPEC_CONFLICT, Code.INVALID_REQUEST, Code.TOO_LARGE),
+)
+def add(name: str, body: Annotated[AddPolicy, example(examples.POLICY)], use: Use) -> PushedPolicy:
+    """Its card, the curve of its training, and which file is to come with ``PUT .../files/{form}``. A file that is
+    known is the same policy: it keeps its version, and gets this card. One that was made for other observations or
+    actions is refused; other differences of its specification are named in ``differs``."""
+    record, created = use.policies.add(name, *convert.new_policy(body))
+    return convert.pushed_policy(record, created=created)
+
+
+@router.get("/{which}", summary="One policy", dependencies=[READ], responses=documented(*THERE))
+def get(name: str, which: Which, use: Use) -> PolicyDetail:
+    """With the settings and the curve of its training. ``which`` is a version, an alias, or ``latest``."""
+    return convert.policy_detail(use.policies.get(name, which))
+
+
+@router.delete(
+    "/{version}", status_code=204, summary="Delete a policy", dependencies=[ADMIN], responses=documented(*THERE)
+)
+def delete(name: str, version: Version, use: Use) -> Response:
+    """With its files, evaluations and aliases. There is no way back."""
+    use.policies.delete(name, version)
+    return Response(status_code=204)
+
+
+@router.put(
+    "/{version}/files/{form}",
+    summary="Send a file of a policy",
+    dependencies=[TRAIN],
+    openapi_extra={
+        "requestBody": {"required": True, "content": {BINARY: {"schema": {"type": "string", "format": "binary"}}}}
+    },
+    responses=documented(*THERE, Code.TOO_LARGE),
+)
+async def put_file(
+    name: str,
+    version: Version,
+    form: PolicyForm,
+    digest: Annotated[str, Query(pattern=r"^[0-9a-f]{64}$", description="SHA-256 of the body, as hex")],
+    request: Request,
+    use: Use,
+) -> PolicyView:
+    """The body is the file. Its size, digest and outer form are checked; it is never loaded. Beyond the room for a
+    surrogate's policies, the files of the oldest without an alias are given up."""
+    content = await request.body()
+    file = convert.policy_file(FileNotice(form=form, bytes=max(1, len(content)), digest=digest))
+    return convert.policy_view(await run_in_threadpool(use.policies.put_file, name, version, file, content))
+
+
+@router.get(
+    "/{which}/files/{form}",
+    summary="A file of a policy",
+    response_class=Response,
+    dependencies=[READ],
+    responses={200: {"content": {BINARY: {}}}, **documented(*THERE, Code.DAMAGED)},
+)
+def file(name: str, which: Which, form: PolicyForm, use: Use) -> Response:
+    """As it was sent. A program that loads a zip should never unpickle what it does not trust."""
+    version, content = use.policies.file(name, which, form)
+    disposition = f'attachment; filename="{name}-{version}.{form}"'
+    media_type = MEDIA_TYPES.get(form, BINARY)
+    return Response(content, media_type=media_type, headers={**HEADERS, "content-disposition": disposition})
+
+
+@router.post(
+    "/{version}/evaluations",
+    status_code=201,
+    summary="Report real episodes of a policy",
+    dependencies=[TRAIN],
+    openapi_extra=json_up_to(4_096),
+    responses=documented(*THERE, Code.TOO_LARGE),
+)
+def evaluate(
+    name: str, version: Version, body: Annotated[AddEvaluation, example(examples.EVALUATION)], use: Use
+) -> EvaluationView:
+    """Once per idempotency key. The real steps are counted by ``POST .../ledger``, apart."""
+    return convert.evaluation_view(*use.policies.evaluate(name, version, convert.episodes(body), body.idempotency_key))
+
+
+@router.get("/{which}/evaluations/{id}", summary="One evaluation", dependencies=[READ], responses=documented(*THERE))
+def evaluation(name: str, which: Which, id: Annotated[int, Path(ge=1, le=2**63 - 1)], use: Use) -> EvaluationDetail:
+    """With the return of each episode, and traces of some. Where those can't be read, ``missing`` says why."""
+    return convert.evaluation_detail(*use.policies.episodes(name, which, id))
+
+
+@router.put("/aliases/{alias}", summary="Name a policy", dependencies=[ADMIN], responses=documented(*THERE))
+def put_alias(name: str, alias: AliasName, body: Annotated[PutAlias, example(examples.ALIAS)], use: Use) -> PolicyView:
+    """The alias, such as ``production``, leads to this version from now on, and to no other."""
+    return convert.policy_view(use.policies.put_alias(name, alias, body.version))
+
+
+@router.delete(
+    "/aliases/{alias}", status_code=204, summary="Take a name away", dependencies=[ADMIN], responses=documented(*THERE)
+)
+def drop_alias(name: str, alias: AliasName, use: Use) -> Response:
+    """The policy itself stays."""
+    use.policies.drop_alias(name, alias)
+    return Response(status_code=204)

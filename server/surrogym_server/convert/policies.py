@@ -1,0 +1,96 @@
+"""Policies: requests to records, records to replies."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from surrogym_server.convert.stored import read_stored
+from surrogym_server.services.policies import Episodes
+from surrogym_server.storage.policies import EvaluationRecord, PolicyFile, PolicyRecord
+from surrogym_server.storage.records import JSON
+from surrogym_shared import wire
+
+CARD = "the card of a policy"  # in the error where it is damaged
+
+
+def new_policy(body: wire.AddPolicy) -> tuple[JSON, list[JSON], PolicyFile]:
+    """Card, curve and announced file."""
+    curve = [point.model_dump(mode="json") for point in body.curve]
+    return body.card.model_dump(mode="json"), curve, policy_file(body.file)
+
+
+def policy_file(notice: wire.FileNotice) -> PolicyFile:
+    return PolicyFile(notice.form, notice.bytes, notice.digest)
+
+
+def episodes(body: wire.AddEvaluation) -> Episodes:
+    return Episodes(
+        body.controller,
+        body.note,
+        body.declared,
+        body.first_seed,
+        body.returns,
+        body.lengths,
+        body.success,
+        [trace.model_dump(mode="json") for trace in body.traces],
+    )
+
+
+def policy_list(records: list[PolicyRecord]) -> wire.PolicyList:
+    return wire.PolicyList(policies=[policy_view(record) for record in records])
+
+
+def policy_view(record: PolicyRecord) -> wire.PolicyView:
+    return wire.PolicyView(**_fields(record, _card(record)))
+
+
+def pushed_policy(record: PolicyRecord, *, created: bool) -> wire.PushedPolicy:
+    return wire.PushedPolicy(**_fields(record, _card(record)), created=created)
+
+
+def policy_detail(record: PolicyRecord) -> wire.PolicyDetail:
+    """With the settings and the curve of its training."""
+    card = _card(record)
+    curve = [read_stored(wire.CurvePoint, "the curve of a training", point) for point in record.curve]
+    of_training = {name: getattr(card, name) for name in ("seed", "seconds", "settings", "versions")}
+    return wire.PolicyDetail(**_fields(record, card), **of_training, curve=curve)
+
+
+def evaluation_view(policy: PolicyRecord, record: EvaluationRecord) -> wire.EvaluationView:
+    return read_stored(wire.EvaluationView, "an evaluation", _evaluation(record, _card(policy)))
+
+
+def evaluation_detail(
+    policy: PolicyRecord, record: EvaluationRecord, episodewise: JSON | None, missing: str | None
+) -> wire.EvaluationDetail:
+    """``episodewise`` is None where it is ``missing``."""
+    there = episodewise or {"returns": [], "lengths": [], "success": None, "traces": []}
+    fields = {**_evaluation(record, _card(policy)), **there, "missing": missing}
+    return read_stored(wire.EvaluationDetail, "an evaluation", fields)
+
+
+def _card(record: PolicyRecord) -> wire.PushedCard:
+    return read_stored(wire.PushedCard, CARD, record.card)
+
+
+def _fields(record: PolicyRecord, card: wire.PushedCard) -> dict[str, Any]:
+    names = ("algorithm", "virtual_steps", "imagined_return", "promise", "audit", "trusted", "reason")
+    return {
+        "version": record.version,
+        "created_at": record.created_at,
+        "aliases": list(record.aliases),
+        **{name: getattr(card, name) for name in names},
+        "differs": record.card.get("differs"),
+        "files": [
+            {"form": file.form, "bytes": file.bytes, "digest": file.digest, "stored": file.blob is not None}
+            for file in record.files
+        ],
+        "evaluations": [_evaluation(evaluation, card) for evaluation in record.evaluations],
+    }
+
+
+def _evaluation(record: EvaluationRecord, card: wire.PushedCard) -> dict[str, Any]:
+    summary, promise = record.summary, card.promise
+    about = promise is not None and summary.get("controller") == "policy" and summary.get("declared")
+    kept = bool(summary["mean"] >= promise.low) if promise is not None and about else None
+    return {"id": record.id, "created_at": record.created_at, **summary, "promise_kept": kept}

@@ -1,0 +1,225 @@
+"""Policies: stored with their trainings and evaluations, given out again as they came."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from surrogym_server.errors import Damaged, InvalidInput, SpecConflict, UnknownPolicy
+from surrogym_server.services.notices import Notices
+from surrogym_server.services.policy_files import check_file
+from surrogym_server.services.surrogates import Complete, difference, short
+from surrogym_server.storage.policies import LATEST, EvaluationRecord, NewEvaluation, PolicyFile, PolicyRecord
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import JSON
+from surrogym_shared import intervals
+
+MUST_AGREE = ("observation", "action")  # of two specifications: what a policy sees, and what it gives
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Real episodes that somebody reports; lists have one entry for each."""
+
+    controller: str
+    note: str
+    declared: bool
+    first_seed: int
+    returns: Sequence[float]
+    lengths: Sequence[int]
+    success: Sequence[bool] | None
+    traces: Sequence[JSON]
+
+
+class PolicyService:
+    def __init__(self, storage: Storage, complete: Complete, notices: Notices, most_bytes: int) -> None:
+        """
+        Args:
+            storage: holds them.
+            complete: a specification with every field that this program knows, as JSON.
+            notices: of this process.
+            most_bytes: of all files of one surrogate's policies.
+        """
+        self._storage = storage
+        self._complete = complete
+        self._notices = notices
+        self._most_bytes = most_bytes
+
+    def add(self, name: str, card: JSON, curve: list[JSON], file: PolicyFile) -> tuple[PolicyRecord, bool]:
+        """Store a policy whose file is to come; says whether it is new, or known by its file.
+
+        Raises:
+            SpecConflict: it was made for another specification: it sees, or does, something else.
+        """
+        differs = self._difference(name, card["spec"])
+        kept = {**card, "spec": card["spec"] if differs else None, "differs": differs}
+        version, created, freed = self._storage.policies.add(name, kept, curve, file)
+        self._changed(name, freed)
+        return self._storage.policies.get(name, str(version)), created
+
+    def list(self, name: str) -> list[PolicyRecord]:
+        """All policies, newest first."""
+        return self._storage.policies.list(name)
+
+    def get(self, name: str, which: str) -> PolicyRecord:
+        """Raises ``UnknownPolicy``."""
+        return self._storage.policies.get(name, which)
+
+    def put_file(self, name: str, version: int, file: PolicyFile, content: bytes) -> PolicyRecord:
+        """Store a file as it was announced; a policy's own file has its announcement from ``add``.
+
+        Raises:
+            InvalidInput: it is not what was announced, or not of its form.
+            TooLarge: there is no room for it.
+        """
+        record = self._storage.policies.get(name, str(version))
+        own = next((known for known in record.files if known.form == file.form and known.main), None)
+        if own is not None and own.digest != file.digest:
+            raise InvalidInput(f"expected the file that version {version} was announced with, got another")
+        check_file(file.form, content, file.bytes, file.digest)
+        blob = self._storage.blobs.put(content)
+        try:
+            stored = PolicyFile(file.form, file.bytes, file.digest, blob)
+            freed = self._storage.policies.attach(name, version, stored, self._most_bytes)
+        except BaseException:
+            self._storage.blobs.remove((blob,))
+            raise
+        self._changed(name, freed)
+        return self._storage.policies.get(name, str(version))
+
+    def file(self, name: str, which: str, form: str) -> tuple[int, bytes]:
+        """A file and the version that it belongs to.
+
+        Raises:
+            UnknownPolicy: no such policy, or it has no such file.
+            Damaged: it is no longer what was stored.
+        """
+        record = self._storage.policies.get(name, which)
+        place = f"version {record.version} of {name!r}'s policies"
+        file = next((one for one in record.files if one.form == form and one.blob is not None), None)
+        if file is None:
+            there = ", ".join(one.form for one in record.files if one.blob is not None) or "none"
+            raise UnknownPolicy(f"expected a file of {place}, got {form!r}; those that are there: {there}")
+        return record.version, self._content(file.blob, file.digest, f"the {form} file of {place}")
+
+    def evaluate(self, name: str, version: int, episodes: Episodes, key: str) -> tuple[PolicyRecord, EvaluationRecord]:
+        """Store real episodes of a policy, once per key; gives the policy and the evaluation.
+
+        Raises:
+            InvalidInput: lists of different lengths.
+            TooLarge: there is no room for it.
+        """
+        _require_lengths(episodes)
+        episodewise = {name: getattr(episodes, name) for name in ("returns", "lengths", "success", "traces")}
+        content = json.dumps(episodewise, separators=(",", ":")).encode()
+        digest = hashlib.sha256(content).hexdigest()
+        blob = self._storage.blobs.put(content)
+        new = NewEvaluation(key, _summary(episodes), len(content), digest, blob)
+        try:
+            stored, created, freed = self._storage.policies.evaluate(name, version, new, self._most_bytes)
+        except BaseException:
+            self._storage.blobs.remove((blob,))
+            raise
+        self._changed(name, freed if created else (blob,))
+        return self._storage.policies.get(name, str(version)), stored
+
+    def episodes(
+        self, name: str, which: str, id: int
+    ) -> tuple[PolicyRecord, EvaluationRecord, JSON | None, str | None]:
+        """An evaluation, its episodes, and why they are missing where they are.
+
+        Raises:
+            UnknownPolicy: no such policy, or it has no such evaluation.
+        """
+        record = self._storage.policies.get(name, which)
+        found = next((one for one in record.evaluations if one.id == id), None)
+        if found is None:
+            raise UnknownPolicy(f"expected an evaluation of version {record.version} of {name!r}'s policies, got {id}")
+        if found.blob is None:
+            return record, found, None, "they were removed to make room for newer files"
+        try:
+            content = self._content(found.blob, found.digest, f"the episodes of evaluation {id}")
+            return record, found, json.loads(content), None
+        except Damaged as error:
+            return record, found, None, str(error)
+
+    def put_alias(self, name: str, alias: str, version: int) -> PolicyRecord:
+        """Let an alias lead to a version. Raises ``UnknownPolicy``, or ``InvalidInput`` for what means the newest."""
+        if alias == LATEST:
+            raise InvalidInput(f"expected another alias than {LATEST!r}, which is always the newest version")
+        self._storage.policies.put_alias(name, alias, version)
+        self._changed(name)
+        return self._storage.policies.get(name, alias)
+
+    def drop_alias(self, name: str, alias: str) -> None:
+        """Raises ``UnknownPolicy``."""
+        self._storage.policies.drop_alias(name, alias)
+        self._changed(name)
+
+    def delete(self, name: str, version: int) -> None:
+        """Remove a policy with its files and evaluations. Raises ``UnknownPolicy``."""
+        self._changed(name, self._storage.policies.delete(name, version))
+
+    def _content(self, blob: str | None, digest: str, what: str) -> bytes:
+        assert blob is not None
+        content = self._storage.blobs.get(blob)
+        if hashlib.sha256(content).hexdigest() != digest:
+            raise Damaged(f"{what} is not what was stored: its digest is another")
+        return content
+
+    def _difference(self, name: str, spec: JSON | None) -> str | None:
+        """Where the specification of a card differs from the surrogate's."""
+        own = self._complete(self._storage.surrogates.get(name).spec)
+        if spec is None or own == spec:
+            return None
+        for part in MUST_AGREE:
+            if own[part] != spec[part]:
+                where, had, got = difference(own[part], spec[part])
+                place = f"{part}.{where}".rstrip(".")
+                raise SpecConflict(
+                    f"expected a policy for {name!r}, got one for another specification: {place} is "
+                    f"{short(had)} there, {short(got)} in the policy's card"
+                )
+        return difference(own, spec)[0]
+
+    def _changed(self, name: str, freed: tuple[str, ...] = ()) -> None:
+        self._storage.blobs.remove(freed)
+        self._notices.post(name)
+
+
+def _require_lengths(episodes: Episodes) -> None:
+    count = len(episodes.returns)
+    for what in ("lengths", "success"):
+        values = getattr(episodes, what)
+        if values is not None and len(values) != count:
+            raise InvalidInput(f"{what}: expected one entry for each of {count} returns, got {len(values)}")
+    for number, trace in enumerate(episodes.traces):
+        steps = len(trace["reward"])
+        if (len(trace["coordinates"]), len(trace["action"])) != (steps + 1, steps):
+            came = f"{len(trace['coordinates'])} states and {len(trace['action'])} actions"
+            raise InvalidInput(f"traces.{number}: expected {steps + 1} states and {steps} actions, got {came}")
+
+
+def _summary(episodes: Episodes) -> JSON:
+    """Statistics of the episodes, with intervals of 95 %."""
+    returns, success = list(episodes.returns), episodes.success
+    share = None if success is None else intervals.of_share(sum(success), len(success))
+    interval = intervals.of_mean(returns)
+    return {
+        "controller": episodes.controller,
+        "note": episodes.note,
+        "declared": episodes.declared,
+        "first_seed": episodes.first_seed,
+        "episodes": len(returns),
+        "steps": sum(episodes.lengths),
+        "mean": statistics.fmean(returns),
+        "mean_interval": None if interval is None else interval._asdict(),
+        "median": statistics.median(returns),
+        "least": min(returns),
+        "most": max(returns),
+        "success_rate": None if not success else sum(success) / len(success),
+        "success_interval": None if share is None else share._asdict(),
+    }

@@ -1,0 +1,117 @@
+"""Blobs as files of a folder, and as rows of a table.
+
+A SQLite file has one server and lies on a disk, so its blobs are files in a folder beside it. Several servers may share
+a PostgreSQL database and no disk, so there they are rows, in a table that a backup may leave out.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from contextlib import suppress
+from pathlib import Path
+from uuid import uuid4
+
+import sqlalchemy as sa
+
+from surrogym_server.errors import Unavailable
+from surrogym_server.storage import policies as port
+from surrogym_server.storage.policies import Freed
+from surrogym_server.storage.sql.damage import damaged
+from surrogym_server.storage.sql.database import Database, clock
+from surrogym_server.storage.sql.tables import blobs
+
+NAME = re.compile(r"[0-9a-f]{32}")
+PART = ".part"  # of a file that is being written
+
+
+class FolderBlobs(port.Blobs):
+    """Files in a folder, which is made with the first of them; only their owner may read them."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def put(self, content: bytes) -> str:
+        name = uuid4().hex
+        part = self._folder / f"{name}{PART}"
+        try:
+            self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with open(os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            part.rename(self._folder / name)
+            self._sync()
+        except OSError as error:
+            with suppress(OSError):
+                part.unlink()
+            raise Unavailable(f"a file can't be stored in {self._folder} now: {error.strerror}") from error
+        return name
+
+    def get(self, name: str) -> bytes:
+        try:
+            return (self._folder / _checked(name)).read_bytes()
+        except OSError as error:
+            raise damaged(f"a file of a policy can't be read from {self._folder}: {error.strerror}") from error
+
+    def remove(self, names: Freed) -> None:
+        for name in names:
+            with suppress(OSError):  # the next sweep tries again
+                (self._folder / _checked(name)).unlink()
+
+    def older(self, seconds: float) -> set[str]:
+        begun = time.time() - seconds
+        found = set()
+        with suppress(FileNotFoundError):
+            for entry in os.scandir(self._folder):
+                with suppress(FileNotFoundError):
+                    if entry.stat().st_mtime < begun and NAME.fullmatch(entry.name.removesuffix(PART)):
+                        found.add(entry.name)
+        return found
+
+    def _sync(self) -> None:
+        """Make the new name durable."""
+        descriptor = os.open(self._folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+class RowBlobs(port.Blobs):
+    """Rows of the table ``blobs``."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def put(self, content: bytes) -> str:
+        name = uuid4().hex
+        with self._database.write() as connection:
+            row = sa.insert(blobs).values(name=name, created_at=clock(connection), content=content)
+            connection.execute(row)
+        return name
+
+    def get(self, name: str) -> bytes:
+        with self._database.read() as connection:
+            content = connection.execute(sa.select(blobs.c.content).where(blobs.c.name == name)).scalar()
+        if content is None:
+            raise damaged("a file of a policy is not in the table blobs")
+        return bytes(content)
+
+    def remove(self, names: Freed) -> None:
+        if not names:
+            return
+        with self._database.write() as connection:
+            connection.execute(sa.delete(blobs).where(blobs.c.name.in_(names)))
+
+    def older(self, seconds: float) -> set[str]:
+        with self._database.read() as connection:
+            old = blobs.c.created_at < clock(connection) - seconds
+            return set(connection.execute(sa.select(blobs.c.name).where(old)).scalars())
+
+
+def _checked(name: str) -> str:
+    if not NAME.fullmatch(name.removesuffix(PART)):
+        raise damaged(f"expected the name of a blob, got {name!r}")
+    return name

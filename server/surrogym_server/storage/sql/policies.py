@@ -1,0 +1,280 @@
+"""Policies by version, their files, evaluations and aliases."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection, Row
+
+from surrogym_server.errors import TooLarge, UnknownPolicy
+from surrogym_server.storage import policies as port
+from surrogym_server.storage.policies import (
+    LATEST,
+    MAX_EVALUATIONS,
+    MAX_POLICIES,
+    EvaluationRecord,
+    Freed,
+    NewEvaluation,
+    PolicyFile,
+    PolicyRecord,
+)
+from surrogym_server.storage.records import JSON
+from surrogym_server.storage.sql.database import Database, conflict_insert
+from surrogym_server.storage.sql.rows import append_event, find, hold
+from surrogym_server.storage.sql.tables import policies, policy_aliases, policy_evaluations, policy_files, surrogates
+
+OWNED = (policy_files, policy_evaluations)  # tables whose rows may have a blob
+
+
+class SqlPolicies(port.Policies):
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def add(self, name: str, card: JSON, curve: list[JSON], file: PolicyFile) -> tuple[int, bool, Freed]:
+        with self._database.write() as connection:
+            held = hold(connection, name)
+            known = _known(connection, held.id, file.digest)
+            if known is not None:
+                update = sa.update(policies).where(_own(policies, held.id, known))
+                connection.execute(update.values(card=card, curve=curve))
+                append_event(connection, held, "policy", version=known, what="card")
+                return known, False, ()
+            freed = _make_place(connection, held.id, name)
+            version = _next_version(connection, held.id)
+            place = {"surrogate_id": held.id, "version": version}
+            connection.execute(sa.insert(policies).values(**place, created_at=held.now, card=card, curve=curve))
+            connection.execute(sa.insert(policy_files).values(**place, **_of_file(file), main=True))
+            append_event(connection, held, "policy", version=version, what="new")
+            return version, True, freed
+
+    def list(self, name: str) -> list[PolicyRecord]:
+        with self._database.read() as connection:
+            return _records(connection, find(connection, name), sa.true(), curves=False)
+
+    def get(self, name: str, which: str) -> PolicyRecord:
+        with self._database.read() as connection:
+            surrogate = find(connection, name)
+            version = _resolve(connection, surrogate, name, which)
+            (record,) = _records(connection, surrogate, policies.c.version == version, curves=True)
+            return record
+
+    def attach(self, name: str, version: int, file: PolicyFile, most: int) -> Freed:
+        with self._database.write() as connection:
+            held = hold(connection, name)
+            _require(connection, held.id, name, version)
+            own = _own(policy_files, held.id, version) & (policy_files.c.form == file.form)
+            before = connection.execute(sa.select(policy_files.c.blob, policy_files.c.main).where(own)).one_or_none()
+            if before is None:
+                place = {"surrogate_id": held.id, "version": version, "main": False}
+                connection.execute(sa.insert(policy_files).values(**place, **_of_file(file)))
+            else:
+                connection.execute(sa.update(policy_files).where(own).values(**_of_file(file)))
+            freed = _within(connection, held.id, version, most, name)
+            append_event(connection, held, "policy", version=version, what=file.form)
+            replaced = () if before is None or before.blob is None else (before.blob,)
+            return (*replaced, *freed)
+
+    def evaluate(self, name: str, version: int, new: NewEvaluation, most: int) -> tuple[EvaluationRecord, bool, Freed]:
+        table = policy_evaluations
+        with self._database.write() as connection:
+            held = hold(connection, name)
+            _require(connection, held.id, name, version)
+            own = _own(table, held.id, version)
+            known = connection.execute(sa.select(table).where(own, table.c.key == new.key)).one_or_none()
+            if known is not None:
+                return _evaluation(known), False, ()
+            values = {"surrogate_id": held.id, "version": version, "created_at": held.now, **vars(new)}
+            connection.execute(sa.insert(table).values(**values))
+            kept = sa.select(table.c.id).where(own).order_by(table.c.id.desc()).limit(MAX_EVALUATIONS)
+            beyond = sa.delete(table).where(own, table.c.id.not_in(kept)).returning(table.c.blob)
+            gone = tuple(blob for blob in connection.execute(beyond).scalars() if blob is not None)
+            freed = _within(connection, held.id, version, most, name)
+            append_event(connection, held, "policy", version=version, what="evaluation")
+            row = connection.execute(sa.select(table).where(own, table.c.key == new.key)).one()
+            return _evaluation(row), True, (*gone, *freed)
+
+    def put_alias(self, name: str, alias: str, version: int) -> None:
+        with self._database.write() as connection:
+            held = hold(connection, name)
+            _require(connection, held.id, name, version)
+            insert = conflict_insert(connection, policy_aliases)
+            insert = insert.values(surrogate_id=held.id, alias=alias, version=version)
+            moved = insert.on_conflict_do_update(
+                index_elements=["surrogate_id", "alias"], set_={"version": insert.excluded.version}
+            )
+            connection.execute(moved)
+            append_event(connection, held, "policy", version=version, what="alias", alias=alias)
+
+    def drop_alias(self, name: str, alias: str) -> None:
+        with self._database.write() as connection:
+            held = hold(connection, name)
+            own = (policy_aliases.c.surrogate_id == held.id) & (policy_aliases.c.alias == alias)
+            if not connection.execute(sa.delete(policy_aliases).where(own)).rowcount:
+                raise _unknown(name, alias)
+            append_event(connection, held, "policy", what="alias", alias=alias)
+
+    def delete(self, name: str, version: int) -> Freed:
+        with self._database.write() as connection:
+            held = hold(connection, name)
+            _require(connection, held.id, name, version)
+            freed = _delete(connection, held.id, [version])
+            append_event(connection, held, "policy", version=version, what="deleted")
+            return freed
+
+    def blobs(self) -> set[str]:
+        with self._database.read() as connection:
+            return {
+                name
+                for table in OWNED
+                for name in connection.execute(sa.select(table.c.blob).where(table.c.blob.is_not(None))).scalars()
+            }
+
+
+def _next_version(connection: Connection, surrogate: int) -> int:
+    """A version that was never given out."""
+    count = sa.update(surrogates).where(surrogates.c.id == surrogate)
+    given = count.values(policy_versions=surrogates.c.policy_versions + 1).returning(surrogates.c.policy_versions)
+    return int(connection.execute(given).scalar_one())
+
+
+def _own(table: sa.Table, surrogate: int, version: int) -> sa.ColumnElement[bool]:
+    return (table.c.surrogate_id == surrogate) & (table.c.version == version)
+
+
+def _of_file(file: PolicyFile) -> dict[str, Any]:
+    return {"form": file.form, "bytes": file.bytes, "digest": file.digest, "blob": file.blob}
+
+
+def _known(connection: Connection, surrogate: int, digest: str) -> int | None:
+    """The version that came with this file."""
+    files = policy_files.c
+    same = sa.select(files.version).where(files.surrogate_id == surrogate, files.digest == digest, files.main)
+    return connection.execute(same.limit(1)).scalar()
+
+
+def _resolve(connection: Connection, surrogate: int, name: str, which: str) -> int:
+    if which.isascii() and which.isdecimal() and len(which) < 10:
+        _require(connection, surrogate, name, int(which))
+        return int(which)
+    if which == LATEST:
+        wanted = sa.select(sa.func.max(policies.c.version)).where(policies.c.surrogate_id == surrogate)
+    else:
+        aliases = policy_aliases.c
+        wanted = sa.select(aliases.version).where(aliases.surrogate_id == surrogate, aliases.alias == which)
+    version = connection.execute(wanted).scalar()
+    if version is None:
+        raise _unknown(name, which)
+    return int(version)
+
+
+def _require(connection: Connection, surrogate: int, name: str, version: int) -> None:
+    own = _own(policies, surrogate, version)
+    if connection.execute(sa.select(policies.c.version).where(own)).scalar() is None:
+        raise _unknown(name, version)
+
+
+def _unknown(name: str, which: object) -> UnknownPolicy:
+    return UnknownPolicy(f"expected a version or an alias of {name!r}'s policies, got {which}, which is not there")
+
+
+def _make_place(connection: Connection, surrogate: int, name: str) -> Freed:
+    """Let the oldest policies without an alias go until one more has a place."""
+    versions = _unaliased(connection, surrogate)
+    own = sa.select(sa.func.count()).select_from(policies).where(policies.c.surrogate_id == surrogate)
+    beyond = connection.execute(own).scalar_one() + 1 - MAX_POLICIES
+    if beyond > len(versions):
+        raise TooLarge(f"expected at most {MAX_POLICIES} policies of {name!r}, got one more, and all have aliases")
+    return _delete(connection, surrogate, versions[: max(0, beyond)])
+
+
+def _within(connection: Connection, surrogate: int, version: int, most: int, name: str) -> Freed:
+    """Give up files of the oldest policies without an alias until all have ``most`` bytes together."""
+    sizes = _sizes(connection, surrogate)
+    beyond = sum(sizes.values()) - most
+    freed: list[str] = []
+    for oldest in [v for v in _unaliased(connection, surrogate) if v != version]:
+        if beyond <= 0:
+            break
+        beyond -= sizes.get(oldest, 0)
+        freed += _blobs(connection, surrogate, [oldest])
+        for table in OWNED:
+            connection.execute(sa.update(table).where(_own(table, surrogate, oldest)).values(blob=None))
+    if beyond > 0:
+        kept = f"files of {name!r}'s policies of at most {most} bytes"
+        raise TooLarge(f"expected {kept}, got {beyond} more; delete a policy, or take an alias away")
+    return tuple(freed)
+
+
+def _sizes(connection: Connection, surrogate: int) -> dict[int, int]:
+    """Bytes of the blobs of each version."""
+    sizes: defaultdict[int, int] = defaultdict(int)
+    for table in OWNED:
+        there = sa.select(table.c.version, table.c.bytes)
+        for row in connection.execute(there.where(table.c.surrogate_id == surrogate, table.c.blob.is_not(None))):
+            sizes[row.version] += row.bytes
+    return sizes
+
+
+def _unaliased(connection: Connection, surrogate: int) -> list[int]:
+    """Versions that no alias leads to, oldest first."""
+    aliased = sa.select(policy_aliases.c.version).where(policy_aliases.c.surrogate_id == surrogate)
+    own = (policies.c.surrogate_id == surrogate) & policies.c.version.not_in(aliased)
+    return list(connection.execute(sa.select(policies.c.version).where(own).order_by(policies.c.version)).scalars())
+
+
+def _blobs(connection: Connection, surrogate: int, versions: Sequence[int]) -> list[str]:
+    found: list[str] = []
+    for table in OWNED:
+        there = (table.c.surrogate_id == surrogate) & table.c.version.in_(versions) & table.c.blob.is_not(None)
+        found += connection.execute(sa.select(table.c.blob).where(there)).scalars()
+    return found
+
+
+def _delete(connection: Connection, surrogate: int, versions: Sequence[int]) -> Freed:
+    freed = _blobs(connection, surrogate, versions)
+    gone = (policies.c.surrogate_id == surrogate) & policies.c.version.in_(versions)
+    connection.execute(sa.delete(policies).where(gone))
+    return tuple(freed)
+
+
+def _records(
+    connection: Connection, surrogate: int, condition: sa.ColumnElement[bool], *, curves: bool
+) -> list[PolicyRecord]:
+    """Policies, newest first, by as many statements however many there are."""
+    columns = [policies.c.version, policies.c.created_at, policies.c.card, *([policies.c.curve] if curves else [])]
+    wanted = sa.select(*columns).where(policies.c.surrogate_id == surrogate, condition)
+    rows = connection.execute(wanted.order_by(policies.c.version.desc())).all()
+    files, aliases, evaluations = (
+        _by_version(connection.execute(sa.select(table).where(table.c.surrogate_id == surrogate).order_by(order)))
+        for table, order in (
+            (policy_files, policy_files.c.main.desc()),
+            (policy_aliases, policy_aliases.c.alias),
+            (policy_evaluations, policy_evaluations.c.id),
+        )
+    )
+    return [
+        PolicyRecord(
+            row.version,
+            row.created_at,
+            row.card,
+            row.curve if curves else [],
+            tuple(PolicyFile(f.form, f.bytes, f.digest, f.blob, f.main) for f in files[row.version]),
+            tuple(a.alias for a in aliases[row.version]),
+            tuple(map(_evaluation, evaluations[row.version])),
+        )
+        for row in rows
+    ]
+
+
+def _by_version(rows: Iterable[Row[Any]]) -> defaultdict[int, list[Row[Any]]]:
+    found: defaultdict[int, list[Row[Any]]] = defaultdict(list)
+    for row in rows:
+        found[row.version].append(row)
+    return found
+
+
+def _evaluation(row: Row[Any]) -> EvaluationRecord:
+    return EvaluationRecord(row.id, row.created_at, row.summary, row.bytes, row.digest, row.blob)

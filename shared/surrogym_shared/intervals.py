@@ -1,0 +1,48 @@
+"""Intervals of 95 % for what episodes measure: the mean of a return, and a share of successes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+RESAMPLES = 2_000
+QUANTILES = (0.025, 0.975)
+Z = 1.959964  # of a normal distribution: 95 % lie within
+
+
+class Interval(NamedTuple):
+    low: float
+    high: float
+
+
+def of_mean(values: Sequence[float]) -> Interval | None:
+    """The mean of new values, by a bootstrap with a fixed seed; None for fewer than two values.
+
+    Returns of episodes are often skewed, so no normal distribution is assumed.
+    """
+    if len(values) < 2:
+        return None
+    given = np.asarray(values, dtype=np.float64)
+    rows = max(1, 2**20 // len(given))  # resamples at once: 8 MB
+    rng = np.random.default_rng(0)
+    means = np.concatenate(
+        [
+            given[rng.integers(len(given), size=(min(rows, RESAMPLES - begun), len(given)))].mean(1)
+            for begun in range(0, RESAMPLES, rows)
+        ]
+    )
+    low, high = np.quantile(means, QUANTILES)
+    return Interval(float(low), float(high))
+
+
+def of_share(successes: int, trials: int) -> Interval | None:
+    """A share of successes, by Wilson's score; None without trials. 100 of 100 gives 0.963 to 1."""
+    if not trials:
+        return None
+    share, spread = successes / trials, Z**2 / trials
+    middle = (share + spread / 2) / (1 + spread)
+    reach = Z * math.sqrt(share * (1 - share) / trials + spread / (4 * trials)) / (1 + spread)
+    return Interval(max(0.0, middle - reach), min(1.0, middle + reach))

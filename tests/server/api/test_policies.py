@@ -1,0 +1,196 @@
+"""Policies over HTTP: what came is given out again, what does not fit changes nothing, nothing is ever loaded."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import pickle
+import sqlite3
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from support.server import ServerProcess
+from surrogym_client.errors import InvalidInput, ServerFailure, SpecConflict, UnknownPolicy
+from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_client.transport import Api
+from surrogym_shared import wire
+from surrogym_shared.network import Network
+from surrogym_shared.spec import EnvironmentSpec
+
+PROMISE = wire.PolicyPromise(median=-150, low=-170, high=-130)
+
+
+class Bomb:
+    """Writes a file where somebody unpickles it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        return open, (str(self.path), "w")
+
+
+@pytest.fixture
+def api(server_process: ServerProcess) -> Iterator[Api]:
+    with Api(server_process.url) as opened:
+        yield opened
+
+
+@pytest.fixture
+def surrogate(api: Api, name: str) -> Iterator[str]:
+    api.create_surrogate(name, pendulum())
+    yield name
+    api.delete_surrogate(name)
+
+
+def network_file(tmp_path: Path, seed: int = 0) -> bytes:
+    """A policy of random arrays for Pendulum."""
+    spec = pendulum()
+    vector = np.random.default_rng(seed).normal(size=Network.size(spec, 4))
+    Network.of(spec, np.zeros(3), np.ones(3), 4, vector).save(tmp_path / "policy.zip")
+    return (tmp_path / "policy.zip").read_bytes()
+
+
+def card(spec: EnvironmentSpec | None = None, **fields: Any) -> wire.PushedCard:
+    return wire.PushedCard(algorithm="CMAES", spec=spec or pendulum(), promise=PROMISE, trusted=True, **fields)
+
+
+def episodes(key: str = "a", **fields: Any) -> wire.AddEvaluation:
+    given: dict[str, Any] = {"first_seed": 10_000, "returns": [-140.0, -160.0, -150.0], "lengths": [200] * 3}
+    return wire.AddEvaluation(**{**given, "idempotency_key": key, **fields})
+
+
+def test_a_policy_is_given_out_as_it_came(api: Api, surrogate: str, tmp_path: Path):
+    file = network_file(tmp_path)
+    curve = [wire.CurvePoint(steps=10, imagined_return=-900.0, seconds=0.5)]
+    pushed = api.policies.push(surrogate, card(settings={"units": 4}), curve, "zip", file)
+    assert (pushed.version, pushed.created, pushed.promise, pushed.differs) == (1, True, PROMISE, None)
+    assert [(one.form, one.bytes, one.stored) for one in pushed.files] == [("zip", len(file), True)]
+    assert api.policies.file(surrogate, "latest", "zip") == file
+    found = api.policies.get(surrogate, 1)
+    assert (found.settings, found.curve) == ({"units": 4}, curve)
+    again = api.policies.push(surrogate, card(reason="audited"), curve, "zip", file)
+    assert (again.version, again.created, again.reason) == (1, False, "audited")
+
+
+def test_an_evaluation_has_intervals_and_says_whether_the_promise_was_kept(api: Api, surrogate: str, tmp_path: Path):
+    api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))
+    trace = wire.EpisodeTrace(
+        rank="worst", seed=10_001, coordinates=[[3.0, 0.0], [3.1, 0.2]], action=[[1.0]], reward=[-9.0]
+    )
+    success = [True, False, True]
+    said = api.policies.evaluate(surrogate, 1, episodes(success=success, traces=[trace]))
+    assert (said.mean, said.median, said.least, said.steps, said.promise_kept) == (-150, -150, -160, 600, True)
+    assert said.mean_interval is not None
+    assert -160 <= said.mean_interval.low < -150 < said.mean_interval.high <= -140
+    assert said.success_interval is not None
+    assert said.success_rate == pytest.approx(2 / 3)
+    assert 0 < said.success_interval.low < 2 / 3 < said.success_interval.high < 1
+    again = api.policies.evaluate(surrogate, 1, episodes(success=success, traces=[trace]))
+    assert again == said  # the same key: once
+    detail = api.policies.evaluation(surrogate, "latest", said.id)
+    assert (detail.returns, detail.traces, detail.missing) == ([-140, -160, -150], [trace], None)
+    worse = api.policies.evaluate(surrogate, 1, episodes("b", returns=[-180.0] * 3))
+    wide = api.policies.evaluate(surrogate, 1, episodes("c", returns=[-180.0] * 3, declared=False))
+    assert (worse.promise_kept, wide.promise_kept) == (False, None)
+    (policy,) = api.policies.list(surrogate)
+    assert [one.id for one in policy.evaluations] == [said.id, worse.id, wide.id]
+
+
+def test_an_alias_moves_and_a_deleted_policy_is_unknown(api: Api, surrogate: str, tmp_path: Path):
+    for seed in range(2):
+        api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path, seed))
+    api.policies.put_alias(surrogate, "production", 1)
+    assert api.policies.put_alias(surrogate, "production", 2).aliases == ["production"]
+    assert api.policies.get(surrogate, "production").version == 2
+    api.policies.drop_alias(surrogate, "production")
+    with pytest.raises(UnknownPolicy, match="got production"):
+        api.policies.get(surrogate, "production")
+    api.policies.delete(surrogate, 2)
+    with pytest.raises(UnknownPolicy):
+        api.policies.file(surrogate, 2, "zip")
+    with pytest.raises(InvalidInput):
+        api.policies.put_alias(surrogate, "latest", 1)
+
+
+def test_a_policy_for_another_specification_is_refused_and_says_where(api: Api, surrogate: str, tmp_path: Path):
+    with pytest.raises(SpecConflict, match="got one for another specification: observation is "):
+        api.policies.push(surrogate, card(cartpole()), [], "zip", network_file(tmp_path))
+    assert api.policies.list(surrogate) == []
+    shorter = pendulum().model_copy(update={"time_limit": 100})
+    assert api.policies.push(surrogate, card(shorter), [], "zip", network_file(tmp_path)).differs == "time_limit"
+
+
+def test_a_file_that_is_not_of_its_form_is_refused(api: Api, surrogate: str, tmp_path: Path):
+    zipped = io.BytesIO()
+    with zipfile.ZipFile(zipped, "w") as archive:
+        archive.writestr("holiday.jpg", b"not a policy")
+    for content in (b"PK\x03\x04 broken", zipped.getvalue(), b"#!/bin/sh"):
+        with pytest.raises(InvalidInput, match=r"expected a zip of Stable-Baselines3.*got something else"):
+            api.policies.push(surrogate, card(), [], "zip", content)
+    broken, *_ = api.policies.list(surrogate)
+    assert [one.stored for one in broken.files] == [False]  # it says so, and the card is there
+    version = api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path)).version
+    for form, content in (("mp4", b"<html>no video"), ("gif", b"GIF88a"), ("onnx", b"PK"), ("pt2", b"\x08\x01")):
+        with pytest.raises(InvalidInput, match="got something else that begins with"):
+            api.policies.put_file(surrogate, version, form, content)
+    api.policies.put_file(surrogate, version, "gif", b"GIF89a and so on")
+    with pytest.raises(InvalidInput, match="was announced with, got another"):
+        api.policies.put_file(surrogate, version, "zip", network_file(tmp_path, seed=1))
+    with pytest.raises(UnknownPolicy, match="got 'onnx'; those that are there: zip, gif"):
+        api.policies.file(surrogate, version, "onnx")
+
+
+def test_a_body_that_was_cut_is_refused(api: Api, surrogate: str, tmp_path: Path):
+    file = network_file(tmp_path)
+    version = api.policies.push(surrogate, card(), [], "zip", file).version
+    digest = {"digest": hashlib.sha256(file).hexdigest()}
+    route = f"/v1/surrogates/{surrogate}/policies/{version}/files/zip"
+    with pytest.raises(InvalidInput, match="expected a file with SHA-256"):
+        api.connection.send("PUT", route, file[:-1], params=digest, media_type="application/octet-stream")
+    assert api.policies.file(surrogate, version, "zip") == file
+
+
+def test_nothing_in_a_file_is_unpickled(api: Api, surrogate: str, tmp_path: Path):
+    exploded = tmp_path / "exploded"
+    zipped = io.BytesIO()
+    with zipfile.ZipFile(zipped, "w") as archive:
+        for entry in ("data", "policy.pth", "data.pkl"):
+            archive.writestr(entry, pickle.dumps(Bomb(exploded)))
+    version = api.policies.push(surrogate, card(), [], "zip", zipped.getvalue()).version
+    api.policies.put_file(surrogate, version, "pt2", zipped.getvalue())
+    assert api.policies.file(surrogate, version, "pt2") == zipped.getvalue()
+    api.policies.get(surrogate, version)
+    assert not exploded.exists()
+
+
+def test_lists_that_do_not_belong_together_change_nothing(api: Api, surrogate: str, tmp_path: Path):
+    api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))
+    with pytest.raises(InvalidInput, match="lengths: expected one entry for each of 3 returns, got 2"):
+        api.policies.evaluate(surrogate, 1, episodes(lengths=[200, 200]))
+    trace = wire.EpisodeTrace(rank="best", seed=1, coordinates=[[0.0, 0.0]], action=[[1.0]], reward=[0.0])
+    with pytest.raises(InvalidInput, match=r"traces.0: expected 2 states and 1 actions, got 1 states"):
+        api.policies.evaluate(surrogate, 1, episodes(traces=[trace]))
+    assert api.policies.get(surrogate, 1).evaluations == []
+
+
+def test_damage_is_named_and_the_rest_is_shown(api: Api, surrogate: str, tmp_path: Path, server_process: ServerProcess):
+    version = api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path)).version
+    said = api.policies.evaluate(surrogate, version, episodes())
+    folder = Path(f"{server_process.folder}/surrogym.db.files")
+    with sqlite3.connect(server_process.folder / "surrogym.db") as database:
+        own = "SELECT blob FROM {} WHERE surrogate_id = (SELECT id FROM surrogates WHERE name = ?)"
+        for table in ("policy_files", "policy_evaluations"):
+            for (blob,) in database.execute(own.format(table), (surrogate,)):
+                (folder / blob).write_bytes(b"something else")
+    with pytest.raises(ServerFailure, match=r"the zip file of version 1 .* is not what was stored"):
+        api.policies.file(surrogate, version, "zip")
+    detail = api.policies.evaluation(surrogate, version, said.id)
+    assert (detail.returns, detail.mean) == ([], said.mean)
+    assert "is not what was stored" in (detail.missing or "")
+    assert api.policies.get(surrogate, version).promise == PROMISE
