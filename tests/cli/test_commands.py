@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
@@ -167,12 +168,14 @@ def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum
     assert card["settings"]["start_box"] == 0.25
     assert (card["surrogate"], card["seed"]) == (pendulum, 3)
     assert 0 < card["virtual_steps"] == trained.json["virtual_steps"] <= 2000
-    evaluated = on_server("evaluate", "policy.zip", "--episodes", "3", "--json", "--quiet")
+    assert trained.json["version"] == 1
+    evaluated = on_server("evaluate", "policy.zip", "--episodes", "3", "--compare", "zero", "--json", "--quiet")
     assert evaluated.code == 0, evaluated.err
-    assert evaluated.json["steps"] == 600
+    assert (evaluated.json["version"], evaluated.json["steps"], evaluated.json["without"]["steps"]) == (1, 600, 600)
     assert len(evaluated.json["per_episode"]) == 3
     with Api(server_process.url) as api:
-        assert api.surrogate(pendulum).ledger.evaluation == 600
+        assert api.surrogate(pendulum).ledger.evaluation == 1200
+    _look_at(on_server, pendulum, tmp_path)
     nothing = on_server("sample", pendulum, "--max-queries", "1", "--time-limit", "0.5")
     assert "None" not in nothing.out
     other = on_server("evaluate", "policy.zip", "--env", "CartPole-v1", "--episodes", "1")
@@ -189,6 +192,24 @@ def test_a_policy_of_bins_pushes_ones_own_machine_as_its_surrogate_was_pushed(su
         said = surrogym("evaluate", "policy.zip", "--env", "support.machine:Machine", "--episodes", "1")
         assert said.code == 0, said.err
         assert set(diary.read_text().splitlines()) == {"open", "reset 10000", "step -0.5", "close"}
+
+
+def _look_at(on_server, pendulum, tmp_path):
+    """The policy that the server keeps, by its commands."""
+    assert "production leads to version 1" in on_server("policy", "alias", f"{pendulum}@1", "production").out
+    listed = on_server("policies", pendulum).out
+    assert f"{pendulum}@1" in listed
+    assert "production" in listed
+    shown = on_server("policy", f"{pendulum}@production").out
+    assert re.search(r"zero +declared starts, from seed 10000 +3 ", shown)
+    taken = on_server("policy", "get", f"{pendulum}@production", "--out", "taken.zip")
+    assert taken.code == 0, taken.err
+    assert (tmp_path / "taken.zip").read_bytes() == (tmp_path / "policy.zip").read_bytes()
+    assert PolicyCard.model_validate_json((tmp_path / "taken.json").read_text()).surrogate == pendulum
+    pushed = on_server("policy", "push", "taken.zip")
+    assert pushed.out.startswith(f"{pendulum}@1: known already")
+    unknown = on_server("policy", f"{pendulum}@7")
+    assert (unknown.code, "got 7, which is not there" in unknown.err) == (1, True)
 
 
 def _no(*_, **__):

@@ -18,6 +18,8 @@ COMMANDS = (
     "train",
     "audit",
     "evaluate",
+    "policies",
+    "policy",
     "status",
     "report",
     "improve",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from surrogym_client.cli.groups import Output, PolicyReading, Service, add
+from surrogym_client.cli.pushing import push_or_say
 
 if TYPE_CHECKING:
     from surrogym_client.policies.card import PolicyCard
@@ -59,7 +60,8 @@ def command(
         raise CommandError(f"no audit was taken, and the card is as it was: {found.reason}")
     noted = card.model_copy(update=vars(found))
     write_card(policy, noted)
-    result = {"policy": str(policy), **noted.model_dump(mode="json", include=set(vars(found)))}
+    version = push_or_say(service.server, service.token_for(context), policy, name, quiet=output.quiet)
+    result = {"policy": str(policy), **noted.model_dump(mode="json", include=set(vars(found))), "version": version}
     output.give(result, lambda: words_of_handover(found))
 
 

@@ -5,18 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from surrogym_client.cli.groups import Output, PolicyReading, Service, add
-from surrogym_client.cli.options import (
-    SpecFile,
-    read_spec,
-)
+from surrogym_client.cli.options import SpecFile, read_spec
+from surrogym_client.cli.pushing import push_or_say
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, Progress
     from surrogym_client.original.episodes import Episode
@@ -25,8 +23,10 @@ if TYPE_CHECKING:
     from surrogym_client.policies.predict import Predict
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
+    from surrogym_shared.wire import Controller
 
 
+Compare = Literal["zero", "random"]
 FEWEST_TO_JUDGE = 30  # episodes: the mean of fewer says little of a promise
 
 
@@ -80,10 +80,20 @@ def command(
     surrogate: Annotated[
         str | None, typer.Option(help="Enter the real steps into this surrogate's ledger. [default: as noted]")
     ] = None,
+    compare: Annotated[
+        Compare | None,
+        typer.Option(
+            help="Run the same starts without the policy as well: with an action of zero, or random actions. These "
+            "real steps count too."
+        ),
+    ] = None,
+    push: Annotated[bool, typer.Option("--push/--no-push", help="Store the episodes on the server as well.")] = True,
     service: Service,
     output: Output,
 ) -> None:
     """Run real episodes with a policy and count successes. The real steps go to the surrogate's ledger.
+
+    The server keeps the policy and the episodes. While it is away, they wait beside the policy.
 
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 100
     """
@@ -94,16 +104,54 @@ def command(
     opener = _opener(env, read_spec(spec), card, quiet=output.quiet)
     ledger = _ledger(surrogate, service.server, card, card_path(policy), quiet=output.quiet)
     enter = partial(_enter, ledger, service.server, service.token_for(context), quiet=output.quiet)
-    result = _run(lambda: reading.load(policy, card), policy, opener, settings, enter, quiet=output.quiet)
-    enter(result.steps, settings.episodes, f"{settings.episodes} episodes from seed {settings.first_seed}")
+    run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
+    result = run(lambda: reading.load(policy, card), what=str(policy))
+    note = f"{settings.episodes} episodes from seed {settings.first_seed}"
+    enter(result.steps, settings.episodes, note)
+    reports: list[tuple[Controller, Evaluation]] = [("policy", result)]
+    if compare is not None:
+        without = run(lambda: _baseline(opener, compare), what=f"{compare} actions")
+        enter(without.steps, settings.episodes, f"{note}, {compare} actions")
+        reports.append((compare, without))
+    version = None
+    if push and ledger is not None:
+        _keep(policy, reports, settings)
+        version = push_or_say(service.server, service.token_for(context), policy, ledger, quiet=output.quiet)
     promise = card.promise if settings.declared and settings.episodes >= FEWEST_TO_JUDGE else None
-    summary = {"policy": str(policy), **_settings(settings), **result.summary(), "promise_kept": _kept(promise, result)}
-    give(summary, lambda: _words(result, promise), as_json=output.as_json)  # with --quiet too: it is what was asked for
+    judged = {"promise_kept": _kept(promise, result), "version": version}
+    summary = {"policy": str(policy), **_settings(settings), **result.summary(), **judged}
+    if compare is not None:
+        summary["without"] = {"actions": compare, **without.summary()}
+    give(summary, lambda: _words(reports, promise), as_json=output.as_json)  # with --quiet too: it was asked for
+
+
+def _baseline(opener: Callable[[], Episode], compare: Compare) -> Predict:
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.evaluation.uncontrolled import baseline
+
+    episode = opener()
+    try:
+        return baseline(episode.spec, compare)
+    except ValueError as error:
+        raise CommandError(f"--compare: {error}") from error
+    finally:
+        episode.close()
+
+
+def _keep(policy: Path, reports: Sequence[tuple[Controller, Evaluation]], settings: EvaluationSettings) -> None:
+    """Note the episodes beside the policy, from where they are sent."""
+    from uuid import uuid4
+
+    from surrogym_client.evaluation.reporting import as_reported
+    from surrogym_client.policies.pushing import keep
+
+    for controller, result in reports:
+        keep(policy, as_reported(result, settings, uuid4().hex, controller=controller))
 
 
 def _run(
     load: Callable[[], Predict],
-    policy: Path,
+    what: str,
     opener: Callable[[], Episode],
     settings: EvaluationSettings,
     enter: Callable[[int, int, str], None],
@@ -118,7 +166,7 @@ def _run(
 
     try:
         with terminations_as_interrupts(), progress("evaluate", quiet=quiet) as update:
-            update(0.0, f"reading {policy}")
+            update(0.0, f"reading {what}")
             return evaluate(load(), opener, settings, _telling(update, settings.episodes))
     except EvaluationFailed as failure:
         enter(failure.steps, 0, "failed")
@@ -226,13 +274,16 @@ def _kept(promise: Promise | None, result: Evaluation) -> bool | None:
     return None if promise is None else bool(result.returns.mean() >= promise.low)
 
 
-def _words(result: Evaluation, promise: Promise | None) -> str:
+def _words(reports: Sequence[tuple[Controller, Evaluation]], promise: Promise | None) -> str:
     from surrogym_client.cli.columns import columns
 
-    summary = result.summary()
     names = ("mean", "iqm", "min", "max", "std", "mean_length", "success_rate", "episodes", "steps")
-    table = columns([names, [summary[name] for name in names]])
+    several = len(reports) > 1
+    rows = [
+        ([controller] if several else []) + [result.summary()[name] for name in names] for controller, result in reports
+    ]
+    table = columns([[*(["actions of"] if several else []), *names], *rows])
     if promise is None:
         return table
-    kept = "kept: the mean return is at least" if _kept(promise, result) else "broken: the mean return is below"
+    kept = "kept: the mean return is at least" if _kept(promise, reports[0][1]) else "broken: the mean return is below"
     return f"{table}\nthe promise of {promise.low:.4g} to {promise.high:.4g} was {kept} its lower end"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -24,6 +24,7 @@ from surrogym_client.cli.options import (
     require_known,
     typed,
 )
+from surrogym_client.cli.pushing import push_or_say
 from surrogym_client.cli.train_options import LogOptions, LoopOptions, SearchOptions, SessionOptions, StartOptions
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from surrogym_client.training.handover import Handover
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
-    from surrogym_shared.wire import SurrogateView
+    from surrogym_shared.wire import CurvePoint, SurrogateView
 
     Record = Callable[[TrainProgress], None]
 
@@ -80,10 +81,14 @@ def command(
         with connect(service.server, token) as api:
             say(words_of_rounds(api, surrogate, loop.improve, loop.rounds), quiet=output.quiet)
     _import(search.algorithm, quiet=output.quiet)
-    card = partial(_write_card, surrogate=surrogate, spec=spec, url=url, seed=search.seed)
+    curve: list[CurvePoint] = []
+    card = partial(_write_card, surrogate=surrogate, spec=spec, url=url, seed=search.seed, curve=curve)
     with _keeping(card, typed(context, without=("out", "start_from", "trust_policy", "token"))):
-        result, handover = _train(url, token, surrogate, out, settings, loop, log.progress_file, quiet=output.quiet)
+        recording = partial(_recording, log.progress_file, curve)
+        result, handover = _train(url, token, surrogate, out, settings, loop, recording, quiet=output.quiet)
     summary = card(result, handover)
+    if log.push:
+        summary["version"] = push_or_say(url, token, result.path, surrogate, quiet=output.quiet)
     named = service.server if given_here(context, "server") else None
     output.give(summary, lambda: words_of_result(result, handover, closed_loop=loop.improve > 0, server=named))
 
@@ -176,9 +181,10 @@ def _trainable(
 
 
 @contextmanager
-def _recording(path: Path | None, update: Update) -> Iterator[Record]:
-    """Shows progress, and writes it to a file for those who watch from outside."""
+def _recording(path: Path | None, curve: list[CurvePoint], update: Update) -> Iterator[Record]:
+    """Shows progress, collects the curve, and writes it to a file for those who watch from outside."""
     from surrogym_client.training.words import words_of
+    from surrogym_shared.wire import CurvePoint
 
     started = time.monotonic()
     with path.open("a", encoding="utf-8") if path is not None else nullcontext() as file:
@@ -186,6 +192,7 @@ def _recording(path: Path | None, update: Update) -> Iterator[Record]:
         def record(now: TrainProgress) -> None:
             seconds = round(time.monotonic() - started, 3)
             update(now.steps / now.total_steps, words_of(asdict(now)))
+            curve.append(CurvePoint(steps=now.steps, imagined_return=now.imagined_return, seconds=seconds))
             if file is not None:
                 file.write(json.dumps({**asdict(now), "seconds": seconds}) + "\n")
                 file.flush()
@@ -200,7 +207,7 @@ def _train(
     out: Path,
     settings: TrainSettings,
     loop: LoopOptions,
-    progress_file: Path | None,
+    recording: Callable[[Update], AbstractContextManager[Record]],
     *,
     quiet: bool,
 ) -> tuple[TrainResult, Handover]:
@@ -213,7 +220,7 @@ def _train(
         HttpSurrogate(url, surrogate, token) as port,
         Api(url, token) as api,
         progress("train", quiet=quiet) as update,
-        _recording(progress_file, update) as record,
+        recording(update) as record,
     ):
         try:
             training = AuditedTraining(
@@ -247,9 +254,11 @@ def _write_card(
     spec: EnvironmentSpec,
     url: str,
     seed: int,
+    curve: list[CurvePoint],
 ) -> dict[str, Any]:
     """Write the policy's card; gives back the result as JSON."""
     from surrogym_client.policies.card import NotedAddress, PolicyCard, write_card
+    from surrogym_client.policies.pushing import thinned
     from surrogym_client.runtime.versions import versions
 
     card = PolicyCard(
@@ -263,6 +272,7 @@ def _write_card(
         imagined_return=result.imagined_return,
         visited_confidence=result.visited_confidence,
         networks=result.networks,
+        curve=thinned(curve),
         untrained=result.untrained,
         **({} if handover is None else vars(handover)),
         settings=result.settings,
@@ -272,5 +282,5 @@ def _write_card(
     return {
         "policy": str(result.path),
         "lost_episodes": result.lost_episodes,
-        **card.model_dump(mode="json", exclude={"spec"}),
+        **card.model_dump(mode="json", exclude={"spec", "curve"}),
     }

@@ -189,4 +189,10 @@ class LogOptions:
     tensorboard: Annotated[
         Path | None, typer.Option(help="Folder for TensorBoard. [default: tensorboard beside the policy]")
     ] = None
+    push: Annotated[
+        bool,
+        typer.Option(
+            "--push/--no-push", help="Store the policy on the server as well; surrogym policy push does so later."
+        ),
+    ] = True
     progress_file: Annotated[Path | None, typer.Option(hidden=True, help="Write progress as JSON lines.")] = None

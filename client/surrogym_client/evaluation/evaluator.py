@@ -18,6 +18,7 @@ from surrogym_client.original.terms import holds
 from surrogym_client.policies.predict import Predict
 from surrogym_client.runtime.lifetime import signals_between_steps
 from surrogym_shared.spec import EnvironmentSpec, Success
+from surrogym_shared.wire import TraceRank
 
 Array = NDArray[np.float64]
 Progress = Callable[[float, int], None]  # share done in [0, 1], episodes that terminated
@@ -56,7 +57,7 @@ class EvaluationSettings:
 
 @dataclass(frozen=True)
 class Trace:
-    """The first episode, step by step."""
+    """One episode, step by step."""
 
     coordinates: Array  # (T + 1, C)
     action: Array  # (T, F)
@@ -70,7 +71,18 @@ class Evaluation:
     returns: Array  # (N,)
     lengths: NDArray[np.int64]  # (N,)
     success: NDArray[np.bool_] | None  # (N,); None where the specification has no criterion
-    trace: Trace
+    traces: tuple[Trace, ...]  # of every episode
+
+    @property
+    def trace(self) -> Trace:
+        """The first episode."""
+        return self.traces[0]
+
+    def ranked(self) -> dict[TraceRank, int]:
+        """Which episode was the first, and which the best, the median and the worst by its return; of few episodes they
+        may be the same."""
+        order = np.argsort(self.returns, kind="stable")
+        return {"first": 0, "best": int(order[-1]), "median": int(order[(len(order) - 1) // 2]), "worst": int(order[0])}
 
     @property
     def steps(self) -> int:
@@ -260,12 +272,12 @@ def _start(episode: Episode, settings: EvaluationSettings, index: int) -> Moment
 
 
 def _account(tallies: Sequence[_Tally]) -> Evaluation:
-    first, criterion = tallies[0], tallies[0].episode.spec.success
+    criterion = tallies[0].episode.spec.success
     return Evaluation(
         returns=np.array([t.total for t in tallies]),
         lengths=np.array([t.length for t in tallies], dtype=np.int64),
         success=None if criterion is None else np.array([_succeeds(criterion, t) for t in tallies]),
-        trace=Trace(np.stack(first.path), np.stack(first.actions), np.array(first.rewards)),
+        traces=tuple(Trace(np.stack(t.path), np.stack(t.actions), np.array(t.rewards)) for t in tallies),
     )
 
 

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, RootModel, ValidationError
 from surrogym_client.errors import SurrogymClientError
 from surrogym_client.policies.evidence import Audit, Promise
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire import SurrogateName
+from surrogym_shared.wire import CurvePoint, SurrogateName
 
 DEFAULT_ALGORITHM = "PPO"
 MAX_CARD_BYTES = 1024 * 1024
@@ -49,6 +49,7 @@ class PolicyCard(BaseModel):
     audit: Audit | None = None
     trusted: bool | None = None  # None: nobody judged the promise
     reason: str = ""  # why it is trusted, or not
+    curve: tuple[CurvePoint, ...] = ()  # of its training
     networks: int = 1  # that learned in the last training
     settings: dict[str, Any] = Field(default_factory=dict)
     versions: dict[str, str] = Field(default_factory=dict)

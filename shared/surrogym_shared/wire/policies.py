@@ -11,7 +11,7 @@ from surrogym_shared.wire.base import VISIBLE, Key, Measured, Reply, Request, Ve
 
 PolicyForm = Literal["zip", "onnx", "pt2", "mp4", "gif"]  # how a file of a policy ends
 Controller = Literal["policy", "zero", "random", "reference"]
-TraceRank = Literal["best", "median", "worst"]
+TraceRank = Literal["first", "best", "median", "worst"]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="SHA-256 of the file, as hex")]
 AliasName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
 Count = Annotated[int, Field(ge=0, le=2**53)]
@@ -31,6 +31,8 @@ class PolicyPromise(BaseModel):
     median: float
     low: float
     high: float
+    functions: Count = Field(default=0, description="how many functions of the posterior were drawn")
+    episodes: Count = Field(default=0, description="how many virtual episodes were run")
 
 
 class PolicyAudit(BaseModel):
@@ -41,6 +43,10 @@ class PolicyAudit(BaseModel):
     steps: Count
     passed: bool
     faults: tuple[Text, ...] = Field(default=(), max_length=100)
+    errors: dict[str, float] = Field(default={}, description="root mean square by output, in its unit")
+    expected: dict[str, float] = Field(default={}, description="the same, as the model expected it")
+    before: PolicyPromise | None = None
+    after: PolicyPromise | None = None
 
 
 class PushedCard(BaseModel):

@@ -1,0 +1,228 @@
+"""``surrogym policy``: one policy that the server keeps, or will keep."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from surrogym_client.cli.groups import Output, Service, add
+
+if TYPE_CHECKING:
+    from surrogym_client.policies.card import PolicyCard
+    from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.wire import EvaluationView, PolicyDetail
+
+SHOW = "show"
+Named = Annotated[
+    str, typer.Argument(metavar="NAME@WHICH", help="A surrogate and a version, an alias or latest, such as pendulum@3.")
+]
+
+
+class PolicyGroup(TyperGroup):
+    """Takes ``surrogym policy pendulum@3`` for ``surrogym policy show pendulum@3``."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command of the first word, or ``show`` where that is none and names a policy."""
+        named = bool(args) and args[0] not in self.commands and not args[0].startswith("-")
+        return super().resolve_command(ctx, [SHOW, *args] if named else args)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command and its parts."""
+    parts = typer.Typer(
+        cls=PolicyGroup,
+        help="Look at a policy that the server keeps, take its file, name it, or send one.\n\n"
+        "Example: surrogym policy pendulum@3",
+        no_args_is_help=True,
+        rich_markup_mode=None,
+    )
+    for name, command in ((SHOW, show), ("push", push), ("get", get), ("alias", alias), ("delete", delete)):
+        add(parts, name, command)
+    app.add_typer(parts, name="policy")
+
+
+def show(context: typer.Context, policy: Named, *, service: Service, output: Output) -> None:
+    """Say what a policy promises, what it gave in reality, and which files there are.
+
+    Example: surrogym policy show pendulum@3
+    """
+    name, which = _parsed(policy)
+    with service.connect(context) as api:
+        found = api.policies.get(name, which)
+    output.give(found.model_dump(mode="json"), lambda: _words(name, found))
+
+
+def push(
+    context: typer.Context,
+    policy: Annotated[Path, typer.Argument(help="Policy file, with its card beside it.")],
+    surrogate: Annotated[str | None, typer.Option(help="Whose policy it is. [default: as the card says]")] = None,
+    forms: Annotated[
+        list[str] | None,
+        typer.Option("--with", help="Convert to this form and send it as well: onnx or pt2. May be repeated."),
+    ] = None,
+    *,
+    service: Service,
+    output: Output,
+) -> None:
+    """Store a policy on the server, with its card, its curve and the evaluations that wait beside it.
+
+    A repeat is harmless. The server never loads the file.
+
+    Example: surrogym policy push policy.zip
+    """
+    from surrogym_client.policies.pushing import push as send
+
+    converted = {form: _converted(policy, form) for form in forms or ()}
+    with service.connect(context) as api:
+        sent = send(api, policy, surrogate)
+        for form, content in converted.items():
+            api.policies.put_file(sent.surrogate, sent.policy.version, form, content)  # type: ignore[arg-type]
+    known = "stored" if sent.policy.created else "known already, its card is up to date"
+    words = f"{sent.surrogate}@{sent.policy.version}: {known}; {sent.evaluations} evaluations sent"
+    differs = f"; its specification differs in {sent.policy.differs}" if sent.policy.differs else ""
+    result = {"surrogate": sent.surrogate, "evaluations": sent.evaluations, **sent.policy.model_dump(mode="json")}
+    output.give(result, lambda: words + differs)
+
+
+def get(
+    context: typer.Context,
+    policy: Named,
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write; its ending says which form.")],
+    *,
+    service: Service,
+    output: Output,
+) -> None:
+    """Take a policy's file from the server, with its card. A form that is not there is converted from the zip.
+
+    Example: surrogym policy get pendulum@production --out policy.zip
+    """
+    from surrogym_client.errors import UnknownPolicy
+    from surrogym_client.policies.card import write_card
+
+    name, which = _parsed(policy)
+    form: Any = out.suffix.lower().removeprefix(".")
+    with service.connect(context) as api:
+        found, spec = api.policies.get(name, which), api.surrogate(name).spec
+        card = _card(name, found, spec if found.differs is None else None)
+        try:
+            content = api.policies.file(name, found.version, form)
+        except UnknownPolicy:
+            if form not in ("onnx", "pt2"):
+                raise
+            content = _from_zip(api.policies.file(name, found.version, "zip"), form, card.algorithm)
+    out.write_bytes(content)
+    write_card(out, card)
+    result = {"file": str(out), "bytes": len(content), "version": found.version}
+    output.give(result, lambda: f"{out}: {len(content)} bytes of {name}@{found.version}, its card beside it")
+
+
+def alias(
+    context: typer.Context,
+    policy: Named,
+    name: Annotated[str, typer.Argument(help="Such as production.")],
+    remove: Annotated[bool, typer.Option("--remove", help="Take the name away instead.")] = False,
+    *,
+    service: Service,
+    output: Output,
+) -> None:
+    """Give a policy a name that leads to it and to no other; needs a token of role admin.
+
+    Example: surrogym policy alias pendulum@3 production
+    """
+    surrogate, which = _parsed(policy)
+    with service.connect(context) as api:
+        version = api.policies.get(surrogate, which).version
+        if remove:
+            api.policies.drop_alias(surrogate, name)
+        else:
+            api.policies.put_alias(surrogate, name, version)
+    words = f"{surrogate}@{name} leads to {'nothing now' if remove else f'version {version}'}"
+    output.give({"surrogate": surrogate, "alias": name, "version": None if remove else version}, lambda: words)
+
+
+def delete(context: typer.Context, policy: Named, *, service: Service, output: Output) -> None:
+    """Remove a policy with its files and evaluations; needs a token of role admin. There is no way back.
+
+    Example: surrogym policy delete pendulum@3
+    """
+    name, which = _parsed(policy)
+    with service.connect(context) as api:
+        version = api.policies.get(name, which).version
+        api.policies.delete(name, version)
+    output.give({"surrogate": name, "deleted": version}, lambda: f"{name}@{version} is deleted")
+
+
+def _parsed(policy: str) -> tuple[str, str]:
+    """Surrogate and version of ``NAME@WHICH``; the newest where no version is named."""
+    name, _, which = policy.partition("@")
+    return name, which or "latest"
+
+
+def _card(name: str, found: PolicyDetail, spec: EnvironmentSpec | None) -> PolicyCard:
+    """The card as it came, as far as the server keeps it."""
+    from surrogym_client.policies.card import PolicyCard
+
+    noted = found.model_dump(mode="json", include=set(PolicyCard.model_fields))
+    if found.audit is not None and (found.audit.before is None or found.audit.after is None):
+        del noted["audit"]
+    return PolicyCard.model_validate({**noted, "surrogate": name, "spec": spec})
+
+
+def _converted(policy: Path, form: str) -> bytes:
+    from tempfile import TemporaryDirectory
+
+    from surrogym_client.policies.card import read_card
+    from surrogym_client.policies.export import export_policy
+
+    with TemporaryDirectory() as folder:
+        out = Path(folder) / f"policy.{form}"
+        export_policy(policy, out, read_card(policy).algorithm)
+        return out.read_bytes()
+
+
+def _from_zip(content: bytes, form: str, algorithm: str) -> bytes:
+    from tempfile import TemporaryDirectory
+
+    from surrogym_client.policies.export import export_policy
+
+    with TemporaryDirectory() as folder:
+        policy, out = Path(folder) / "policy.zip", Path(folder) / f"policy.{form}"
+        policy.write_bytes(content)
+        export_policy(policy, out, algorithm)
+        return out.read_bytes()
+
+
+def _words(name: str, policy: PolicyDetail) -> str:
+    from surrogym_client.cli.columns import columns
+
+    aliases = f", {', '.join(policy.aliases)}" if policy.aliases else ""
+    lines = [f"{name}@{policy.version}{aliases}: {policy.algorithm or 'unknown algorithm'}"]
+    if policy.virtual_steps is not None:
+        lines.append(f"training: {policy.virtual_steps} virtual steps")
+    if policy.promise is None:
+        lines.append("promise: none was made")
+    else:
+        promise, trusted = policy.promise, {True: "trusted", False: "not trusted", None: "not judged"}[policy.trusted]
+        between = f"between {promise.low:.4g} and {promise.high:.4g} with 90 % chance"
+        lines.append(f"promise: mean return {promise.median:.4g}, {between}; {trusted}: {policy.reason or '-'}")
+    if policy.differs:
+        lines.append(f"made for another specification: it differs in {policy.differs}")
+    files = [f"{one.form} {one.bytes} bytes" if one.stored else f"{one.form} missing" for one in policy.files]
+    lines.append(f"files: {', '.join(files) or 'none'}")
+    if policy.evaluations:
+        heading = ("real episodes of", "starts", "episodes", "mean return (95 %)", "success", "promise kept")
+        lines.append(columns([heading, *map(_evaluation, policy.evaluations)]))
+    else:
+        lines.append(f"no real episodes yet; next: surrogym policy get {name}@{policy.version} --out policy.zip")
+    return "\n".join(lines)
+
+
+def _evaluation(one: EvaluationView) -> tuple[str | int, ...]:
+    from surrogym_client.cli.policies import words_of_mean
+
+    success = "-" if one.success_rate is None else f"{one.success_rate:.0%}"
+    kept = {True: "yes", False: "no", None: "-"}[one.promise_kept]
+    return one.controller, one.note or "-", one.episodes, words_of_mean(one), success, kept

@@ -1,0 +1,63 @@
+"""Real episodes as the server stores them: every return, and a few as traces.
+
+The first episode is among them, because every controller has it from the same start.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
+from surrogym_shared import wire
+
+MAX_POINTS = 2_000  # of a trace that is stored; longer ones are stored up to there
+
+
+def as_reported(
+    result: Evaluation,
+    settings: EvaluationSettings,
+    key: str,
+    *,
+    controller: wire.Controller = "policy",
+) -> wire.AddEvaluation:
+    """An evaluation as a request.
+
+    Args:
+        result: of the episodes.
+        settings: which starts, of which machine.
+        key: idempotency key: the same evaluation is stored once.
+        controller: who acted.
+    """
+    return wire.AddEvaluation(
+        controller=controller,
+        note=words_of(settings),
+        declared=settings.declared,
+        first_seed=settings.first_seed,
+        returns=result.returns.tolist(),
+        lengths=result.lengths.tolist(),
+        success=None if result.success is None else result.success.tolist(),
+        traces=[_trace(rank, settings.first_seed + at, result.traces[at]) for rank, at in result.ranked().items()],
+        idempotency_key=key,
+    )
+
+
+def words_of(settings: EvaluationSettings) -> str:
+    """Which starts, of which machine."""
+    starts = "declared starts"
+    if settings.wide:
+        starts = "starts anywhere in the sampling range"
+    elif settings.start_scale != 1:
+        starts = f"starts {settings.start_scale:g} times as far apart as declared"
+    machine = f", masses, lengths and limits changed by {settings.perturb:.0%}" if settings.perturb else ""
+    return f"{starts}, from seed {settings.first_seed}{machine}"
+
+
+def _trace(rank: wire.TraceRank, seed: int, trace: Trace) -> wire.EpisodeTrace:
+    steps = min(len(trace.reward), MAX_POINTS)
+    return wire.EpisodeTrace(
+        rank=rank,
+        seed=seed,
+        coordinates=np.asarray(trace.coordinates[: steps + 1]).tolist(),
+        action=np.asarray(trace.action[:steps]).tolist(),
+        reward=np.asarray(trace.reward[:steps]).tolist(),
+    )

@@ -1,0 +1,58 @@
+"""What the environment does without a policy: the same action always, or random ones.
+
+A policy's return says little by itself. Beside that of an environment that is left alone, from the same starts, it says
+what the policy is worth.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.policies.predict import Predict
+from surrogym_shared.network import counts_of
+from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_shared.wire import Controller
+
+
+def default_baseline(spec: EnvironmentSpec) -> Controller:
+    """Zero where an action of zero is one of the environment's; random actions where actions are choices."""
+    action = spec.action
+    if not isinstance(action, BoxAction):
+        return "random"
+    zero = all(low <= 0 <= high for low, high in zip(action.low, action.high, strict=True))
+    return "zero" if zero and action.bins is None else "random"
+
+
+def baseline(spec: EnvironmentSpec, controller: Controller, seed: int = 0) -> Predict:
+    """A function of observations (N, D) that does not look at them.
+
+    Raises:
+        ValueError: ``zero`` where an action of zero is none of the environment's, or another controller.
+    """
+    if controller == "random":
+        return _random(spec, np.random.default_rng(seed))
+    if controller != "zero":
+        raise ValueError(f"expected zero or random, got {controller}")
+    if default_baseline(spec) != "zero":
+        raise ValueError("an action of zero is none of this environment's: compare with random actions")
+
+    def zero(observations: NDArray[np.float32]) -> NDArray[Any]:
+        return np.zeros((len(observations), spec.action.size))
+
+    return zero
+
+
+def _random(spec: EnvironmentSpec, rng: np.random.Generator) -> Predict:
+    counts = counts_of(spec)
+
+    def choose(observations: NDArray[np.float32]) -> NDArray[Any]:
+        return rng.integers(counts, size=(len(observations), len(counts)))
+
+    def draw(observations: NDArray[np.float32]) -> NDArray[Any]:
+        assert isinstance(spec.action, BoxAction)
+        return rng.uniform(spec.action.low, spec.action.high, size=(len(observations), spec.action.size))
+
+    return choose if counts else draw

@@ -1,0 +1,108 @@
+"""A policy and what was found out about it, sent to the server; what can't be sent waits beside the policy's file."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast, get_args
+
+from pydantic import TypeAdapter, ValidationError
+
+from surrogym_client.policies.card import PolicyCard, UnusablePolicy, read_card
+from surrogym_client.transport import Api
+from surrogym_shared import wire
+
+MAX_WAITING_BYTES = 64 * 1024 * 1024
+CURVE_POINTS = 200
+_WAITING = TypeAdapter(list[wire.AddEvaluation])
+
+
+@dataclass(frozen=True)
+class Pushed:
+    """A policy that the server has, and how many evaluations were sent with it."""
+
+    surrogate: str
+    policy: wire.PushedPolicy
+    evaluations: int
+
+
+def thinned(curve: Sequence[wire.CurvePoint]) -> tuple[wire.CurvePoint, ...]:
+    """A curve of at most ``CURVE_POINTS`` points, evenly chosen, with its last."""
+    every = max(1, -(-len(curve) // CURVE_POINTS))
+    return tuple(curve[(len(curve) - 1) % every :: every]) if curve else ()
+
+
+def keep(policy: Path, evaluation: wire.AddEvaluation) -> None:
+    """Note an evaluation beside the policy, until ``push`` has sent it."""
+    _write(policy, [*_read(policy), evaluation])
+
+
+def waiting_path(policy: Path) -> Path:
+    """Where evaluations wait that the server does not have yet."""
+    return policy.with_suffix(".evaluations.json")
+
+
+def push(api: Api, policy: Path, surrogate: str | None = None) -> Pushed:
+    """Send a policy's file and card, and the evaluations that wait beside it. A repeat is harmless.
+
+    Args:
+        api: the server.
+        policy: the file.
+        surrogate: whose policy it is; None: as the card says.
+
+    Raises:
+        UnusablePolicy: no surrogate is known, the file is of no known form, or the card is none.
+        SpecConflict: it was made for other observations or actions than the surrogate's.
+        SurrogymClientError: the server can't be reached, or refuses; everything stays as it was.
+    """
+    card, form = read_card(policy), _form(policy)
+    name = surrogate or card.surrogate
+    if name is None:
+        raise UnusablePolicy(f"expected the name of a surrogate, as no card beside {policy} names one")
+    sent = api.policies.push(name, as_pushed(card), card.curve, form, policy.read_bytes())
+    waiting = _read(policy)
+    for done, evaluation in enumerate(waiting, start=1):
+        api.policies.evaluate(name, sent.version, evaluation)
+        _write(policy, waiting[done:])
+    return Pushed(name, sent, len(waiting))
+
+
+def as_pushed(card: PolicyCard) -> wire.PushedCard:
+    """A card without the address that it notes, which is nobody else's business."""
+    return wire.PushedCard.model_validate(card.model_dump(mode="json", exclude={"server", "curve"}))
+
+
+def _form(policy: Path) -> wire.PolicyForm:
+    form, known = policy.suffix.lower().removeprefix("."), get_args(wire.PolicyForm)
+    if form not in known:
+        raise UnusablePolicy(f"expected a file ending in {', '.join(known)}, got {policy.name}")
+    return cast(wire.PolicyForm, form)
+
+
+def _read(policy: Path) -> list[wire.AddEvaluation]:
+    path = waiting_path(policy)
+    if not path.exists():
+        return []
+    with path.open("rb") as file:
+        content = file.read(MAX_WAITING_BYTES + 1)
+    try:
+        if len(content) > MAX_WAITING_BYTES:
+            raise ValueError(f"expected at most {MAX_WAITING_BYTES} bytes")
+        return _WAITING.validate_json(content)
+    except (ValidationError, ValueError) as error:
+        said = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
+        raise UnusablePolicy(f"{path} is no list of evaluations: {said}") from error
+
+
+def _write(policy: Path, evaluations: Sequence[wire.AddEvaluation]) -> None:
+    path = waiting_path(policy)
+    if not evaluations:
+        with contextlib.suppress(FileNotFoundError):
+            path.unlink()
+        return
+    part = path.with_suffix(".part")
+    part.write_bytes(_WAITING.dump_json([*evaluations]))
+    os.replace(part, path)

@@ -1,0 +1,47 @@
+"""What is compared with a policy does not look at the state, and stays within the actions of the environment."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
+from surrogym_client.evaluation.reporting import as_reported
+from surrogym_client.evaluation.uncontrolled import baseline, default_baseline
+from surrogym_client.original.actions import decode_actions
+from surrogym_client.original.classic import cartpole, pendulum
+from surrogym_shared.spec import BoxAction
+
+
+def test_zero_where_zero_is_an_action_and_random_choices_elsewhere():
+    assert default_baseline(pendulum()) == "zero"
+    assert default_baseline(cartpole()) == "random"
+    positive = pendulum().model_copy(update={"action": BoxAction(low=(1.0,), high=(2.0,))})
+    assert default_baseline(positive) == "random"
+    with pytest.raises(ValueError, match="zero is none of this environment's"):
+        baseline(positive, "zero")
+
+
+def test_actions_are_those_of_the_environment():
+    observations = np.zeros((500, 3), dtype=np.float32)
+    zero = decode_actions(pendulum(), baseline(pendulum(), "zero")(observations), 500)
+    assert not zero.any()
+    drawn = decode_actions(pendulum(), baseline(pendulum(), "random")(observations), 500)
+    assert -2 <= drawn.min() < -1.8 < 1.8 < drawn.max() <= 2
+    chosen = decode_actions(cartpole(), baseline(cartpole(), "random")(observations), 500)
+    assert set(np.unique(chosen)) == {0.0, 1.0}
+
+
+def test_first_best_median_and_worst_episodes_are_reported_with_their_seeds():
+    returns = np.array([-3.0, -1.0, -5.0, -2.0])
+    traces = tuple(Trace(np.full((2, 2), r), np.zeros((1, 1)), np.array([r])) for r in returns)
+    result = Evaluation(returns, np.ones(4, dtype=np.int64), np.array([True, True, False, True]), traces)
+    said = as_reported(result, EvaluationSettings(episodes=4, first_seed=100, wide=True), "key")
+    assert {trace.rank: (trace.seed, trace.reward) for trace in said.traces} == {
+        "first": (100, [-3.0]),
+        "best": (101, [-1.0]),
+        "median": (100, [-3.0]),
+        "worst": (102, [-5.0]),
+    }
+    assert (said.returns, said.success, said.declared) == (returns.tolist(), [True, True, False, True], False)
+    assert said.note == "starts anywhere in the sampling range, from seed 100"
