@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
-from surrogym_client.evaluation.reporting import as_reported
+from surrogym_client.evaluation.reporting import as_reported, paired_start
 from surrogym_client.evaluation.uncontrolled import baseline, default_baseline
 from surrogym_client.original.actions import decode_actions
 from surrogym_client.original.classic import cartpole, pendulum
@@ -32,16 +32,17 @@ def test_actions_are_those_of_the_environment():
     assert set(np.unique(chosen)) == {0.0, 1.0}
 
 
-def test_first_best_median_and_worst_episodes_are_reported_with_their_seeds():
+def test_paired_best_median_and_worst_episodes_are_reported_with_their_seeds():
     returns = np.array([-3.0, -1.0, -5.0, -2.0])
     traces = tuple(Trace(np.full((2, 2), r), np.zeros((1, 1)), np.array([r])) for r in returns)
     result = Evaluation(returns, np.ones(4, dtype=np.int64), np.array([True, True, False, True]), traces)
-    said = as_reported(result, EvaluationSettings(episodes=4, first_seed=100, wide=True), "key")
+    said = as_reported(result, EvaluationSettings(episodes=4, first_seed=100, wide=True), "key", paired=3)
     assert {trace.rank: (trace.seed, trace.reward) for trace in said.traces} == {
-        "first": (100, [-3.0]),
+        "paired": (103, [-2.0]),
         "best": (101, [-1.0]),
         "median": (100, [-3.0]),
         "worst": (102, [-5.0]),
     }
+    assert [paired_start(result, among) for among in (1, 2, 4)] == [0, 0, 0]
     assert (said.returns, said.success, said.declared) == (returns.tolist(), [True, True, False, True], False)
     assert said.note == "starts anywhere in the sampling range, from seed 100"

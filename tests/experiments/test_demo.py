@@ -90,7 +90,8 @@ def test_a_small_demo_from_start_to_run_folder(demo, tmp_path):
     assert set(metrics["seconds"]) == {"start", "design", "train", "evaluate", "report", "total"}
     assert metrics["seconds"]["total"] >= metrics["seconds"]["train"]
     assert metrics["real_return"]["episodes"] == len(metrics["returns"]) == 3
-    assert metrics["evaluation_steps"] == 2 * 600  # from Gymnasium's starts, and from the whole box
+    assert metrics["evaluation_steps"] == 3 * 600  # Gymnasium's starts, the whole box, and without the policy
+    assert metrics["without"]["actions"] == "zero"
     assert not metrics["reached"]
     assert row_of(metrics).key == ("pendulum", "default", 8, 1)
     assert len(metrics["configuration"]) == len(metrics["specification"]) == 12

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
+from dataclasses import replace
 from functools import partial
 from html.parser import HTMLParser
 from xml.etree import ElementTree
@@ -14,13 +15,13 @@ import pytest
 
 from support.server import ServerProcess
 from surrogym_client.report.figures import draw_fidelity, svg
+from surrogym_client.report.known import Known
 from surrogym_client.report.maps import Cut, cuts
 from surrogym_client.report.page import page
 from surrogym_client.transport import Api
-from surrogym_shared.wire import ModelView, SampleView, SurrogateView
 
 SVG = "data:image/svg+xml;base64,"
-Known = tuple[SurrogateView, list[ModelView], list[SampleView], str, list[Cut]]
+Both = tuple[Known, list[Cut]]
 
 
 class Page(HTMLParser):
@@ -50,15 +51,16 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def known(pendulum_server: ServerProcess) -> Known:
+def known(pendulum_server: ServerProcess) -> Both:
     with Api(pendulum_server.url) as api:
         view = api.surrogate("pendulum")
+        models, samples = api.models("pendulum"), list(api.samples("pendulum"))
         shown = cuts(view, partial(api.query_uncertainty, "pendulum"))
-        return view, api.models("pendulum"), list(api.samples("pendulum")), "http://here, surrogym 0.1.0", shown
+    return Known(view, models, samples, "http://here, surrogym 0.1.0"), shown
 
 
-def test_it_says_what_is_known(known: Known) -> None:
-    view, models, *_ = known
+def test_it_says_what_is_known(known: Both) -> None:
+    view, models = known[0].view, known[0].models
     read = Page(page(*known))
     titles = [
         "Ledger",
@@ -78,7 +80,7 @@ def test_it_says_what_is_known(known: Known) -> None:
     assert f"{view.ledger.total} of {view.budget}" in read.texts
 
 
-def test_it_loads_nothing_and_its_policy_lets_nothing_load(known: Known) -> None:
+def test_it_loads_nothing_and_its_policy_lets_nothing_load(known: Both) -> None:
     text = page(*known)
     read = Page(text)
     assert {tag for tag, _ in read.tags} & {"script", "link", "iframe", "object", "a"} == set()
@@ -92,7 +94,7 @@ def test_it_loads_nothing_and_its_policy_lets_nothing_load(known: Known) -> None
     assert policy == f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'"
 
 
-def test_its_figures_are_whole_pictures_with_words_for_who_can_not_see_them(known: Known) -> None:
+def test_its_figures_are_whole_pictures_with_words_for_who_can_not_see_them(known: Both) -> None:
     images = Page(page(*known)).of("img")
     assert len(images) == 3
     for image in images:
@@ -102,13 +104,13 @@ def test_its_figures_are_whole_pictures_with_words_for_who_can_not_see_them(know
         assert re.findall(r"(?:href|src)=\"(?!#|data:image/png;)", drawn) == []
 
 
-def test_the_same_figure_is_the_same_text(known: Known) -> None:
-    assert svg(draw_fidelity(known[1], 0.999)) == svg(draw_fidelity(known[1], 0.999))
+def test_the_same_figure_is_the_same_text(known: Both) -> None:
+    assert svg(draw_fidelity(known[0].models, 0.999)) == svg(draw_fidelity(known[0].models, 0.999))
 
 
-def test_a_map_says_what_the_server_says_of_its_points(known: Known, pendulum_server: ServerProcess) -> None:
+def test_a_map_says_what_the_server_says_of_its_points(known: Both, pendulum_server: ServerProcess) -> None:
     (cut,) = known[-1]
-    tolerances = np.array([output.tolerance for output in known[1][-1].fidelity.outputs])
+    tolerances = np.array([output.tolerance for output in known[0].models[-1].fidelity.outputs])
     with Api(pendulum_server.url) as api:
         corner = api.query_uncertainty("pendulum", [[np.pi, -8.0]], [[0.0]])
     assert (cut.across, cut.up) == (0, 1)
@@ -116,19 +118,18 @@ def test_a_map_says_what_the_server_says_of_its_points(known: Known, pendulum_se
     assert cut.log_index[0, -1] == pytest.approx(max(corner.log_uncertainty_index[0]))
 
 
-def test_what_strangers_wrote_stays_text(known: Known) -> None:
-    view, models, samples, *_ = known
+def test_what_strangers_wrote_stays_text(known: Both) -> None:
     hostile = "</td><script>alert(1)</script>"
-    model = models[0].model_copy(update={"description": {"outputs": [{"name": hostile, hostile: [hostile]}]}})
-    view = view.model_copy(update={"error": hostile, "environment": hostile})
-    text = page(view, [model], samples, hostile)
+    model = known[0].models[0].model_copy(update={"description": {"outputs": [{"name": hostile, hostile: [hostile]}]}})
+    view = known[0].view.model_copy(update={"error": hostile, "environment": hostile})
+    text = page(replace(known[0], view=view, models=[model], server=hostile, missing=(hostile,)))
     assert "<script" not in text
     assert hostile in Page(text).texts
 
 
-def test_a_surrogate_without_samples_or_models_has_a_page(known: Known) -> None:
-    view = known[0].model_copy(update={"confidence_index": None, "model_version": None, "fidelity": None})
-    read = Page(page(view, [], [], "here"))
+def test_a_surrogate_without_samples_or_models_has_a_page(known: Both) -> None:
+    view = known[0].view.model_copy(update={"confidence_index": None, "model_version": None, "fidelity": None})
+    read = Page(page(Known(view, [], [], "here")))
     assert "no model yet, target 0.999" in read.texts
     assert read.of("img") == []
 
@@ -140,5 +141,5 @@ def test_the_command_writes_it(pendulum_server: ServerProcess, tmp_path, monkeyp
     with pytest.raises(SystemExit) as ended:
         main(["report", "pendulum", "--server", pendulum_server.url])
     assert not ended.value.code
-    assert "bytes written to report.html" in capsys.readouterr().out
+    assert "bytes written to report.html, about no policy yet" in capsys.readouterr().out
     assert (tmp_path / "report.html").read_text(encoding="utf-8").startswith("<!doctype html>")

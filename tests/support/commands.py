@@ -39,6 +39,8 @@ def parse(arguments: list[str]) -> dict[str, Any]:
     command, name, rest = command_line(), "surrogym", arguments
     while hasattr(command, "commands"):
         name, *rest = rest
+        if name not in command.commands and (default := getattr(command, "default", None)):
+            name, rest = default, [name, *rest]
         command = command.commands[name]
     values: dict[str, Any] = command.make_context(name, rest).params
     return values

@@ -142,11 +142,12 @@ def _keep(policy: Path, reports: Sequence[tuple[Controller, Evaluation]], settin
     """Note the episodes beside the policy, from where they are sent."""
     from uuid import uuid4
 
-    from surrogym_client.evaluation.reporting import as_reported
+    from surrogym_client.evaluation.reporting import as_reported, paired_start
     from surrogym_client.policies.pushing import keep
 
+    paired = paired_start(reports[0][1], settings.episodes)
     for controller, result in reports:
-        keep(policy, as_reported(result, settings, uuid4().hex, controller=controller))
+        keep(policy, as_reported(result, settings, uuid4().hex, controller=controller, paired=paired))
 
 
 def _run(

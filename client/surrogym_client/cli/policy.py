@@ -24,17 +24,19 @@ Named = Annotated[
 class PolicyGroup(TyperGroup):
     """Takes ``surrogym policy pendulum@3`` for ``surrogym policy show pendulum@3``."""
 
+    default = SHOW
+
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command of the first word, or ``show`` where that is none and names a policy."""
         named = bool(args) and args[0] not in self.commands and not args[0].startswith("-")
-        return super().resolve_command(ctx, [SHOW, *args] if named else args)
+        return super().resolve_command(ctx, [self.default, *args] if named else args)
 
 
 def register(app: typer.Typer) -> None:
     """Add the command and its parts."""
     parts = typer.Typer(
         cls=PolicyGroup,
-        help="Look at a policy that the server keeps, take its file, name it, or send one.\n\n"
+        help="Look at a policy that the server keeps.\n\nTake its file, name it, delete it, or send one.\n\n"
         "Example: surrogym policy pendulum@3",
         no_args_is_help=True,
         rich_markup_mode=None,

@@ -79,10 +79,9 @@ class Evaluation:
         return self.traces[0]
 
     def ranked(self) -> dict[TraceRank, int]:
-        """Which episode was the first, and which the best, the median and the worst by its return; of few episodes they
-        may be the same."""
+        """Which episode was the best, the median and the worst by its return; of few episodes they may be the same."""
         order = np.argsort(self.returns, kind="stable")
-        return {"first": 0, "best": int(order[-1]), "median": int(order[(len(order) - 1) // 2]), "worst": int(order[0])}
+        return {"best": int(order[-1]), "median": int(order[(len(order) - 1) // 2]), "worst": int(order[0])}
 
     @property
     def steps(self) -> int:

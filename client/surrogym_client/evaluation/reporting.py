@@ -1,6 +1,6 @@
 """Real episodes as the server stores them: every return, and a few as traces.
 
-The first episode is among them, because every controller has it from the same start.
+One of them is paired: every controller that is compared has it from the same start.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ def as_reported(
     key: str,
     *,
     controller: wire.Controller = "policy",
+    paired: int = 0,
 ) -> wire.AddEvaluation:
     """An evaluation as a request.
 
@@ -27,7 +28,9 @@ def as_reported(
         settings: which starts, of which machine.
         key: idempotency key: the same evaluation is stored once.
         controller: who acted.
+        paired: number of the episode that is compared, see ``paired_start``.
     """
+    shown: dict[wire.TraceRank, int] = {"paired": paired, **result.ranked()}
     return wire.AddEvaluation(
         controller=controller,
         note=words_of(settings),
@@ -36,9 +39,15 @@ def as_reported(
         returns=result.returns.tolist(),
         lengths=result.lengths.tolist(),
         success=None if result.success is None else result.success.tolist(),
-        traces=[_trace(rank, settings.first_seed + at, result.traces[at]) for rank, at in result.ranked().items()],
+        traces=[_trace(rank, settings.first_seed + at, result.traces[at]) for rank, at in shown.items()],
         idempotency_key=key,
     )
+
+
+def paired_start(result: Evaluation, among: int) -> int:
+    """Which of the first ``among`` starts to compare: the one from which the policy had its median return."""
+    order = np.argsort(result.returns[:among], kind="stable")
+    return int(order[(len(order) - 1) // 2])
 
 
 def words_of(settings: EvaluationSettings) -> str:

@@ -11,7 +11,7 @@ from surrogym_shared.wire.base import VISIBLE, Key, Measured, Reply, Request, Ve
 
 PolicyForm = Literal["zip", "onnx", "pt2", "mp4", "gif"]  # how a file of a policy ends
 Controller = Literal["policy", "zero", "random", "reference"]
-TraceRank = Literal["first", "best", "median", "worst"]
+TraceRank = Literal["paired", "best", "median", "worst"]  # paired: from the same start, whoever acts
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="SHA-256 of the file, as hex")]
 AliasName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
 Count = Annotated[int, Field(ge=0, le=2**53)]

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
+from surrogym_client.evaluation.uncontrolled import baseline, default_baseline
 from surrogym_client.experiments.settings import DemoSettings
 from surrogym_client.experiments.tasks import Outcome
 from surrogym_client.original import make
@@ -16,24 +17,48 @@ from surrogym_client.original.episodes import Episode, open_episode
 from surrogym_client.policies.card import read_card
 from surrogym_client.policies.files import load_policy
 from surrogym_shared.terminal import progress
+from surrogym_shared.wire import Controller
+
+COMPARED = 20  # starts that are run without the policy as well
+
+
+@dataclass(frozen=True)
+class Part:
+    """Real episodes from some starts, and who acted in them."""
+
+    controller: Controller
+    settings: EvaluationSettings
+    result: Evaluation
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """``also`` is from the task's other starts, None where it has none."""
+    """``also`` is from the task's other starts, None where it has none; ``without`` is without the policy, from the
+    first of the declared starts, None where nothing is drawn."""
 
-    real: Evaluation
-    also: Evaluation | None
+    real: Part
+    also: Part | None
+    without: Part | None
     reached: bool  # the task's target
+
+    @property
+    def parts(self) -> list[Part]:
+        return [part for part in (self.real, self.also, self.without) if part is not None]
+
+    @property
+    def results(self) -> tuple[Evaluation, Evaluation | None, Evaluation | None]:
+        """Of the policy, of the other starts, and without the policy."""
+        also, without = (None if part is None else part.result for part in (self.also, self.without))
+        return self.real.result, also, without
 
     @property
     def steps(self) -> int:
         """Real steps taken."""
-        return self.real.steps + (0 if self.also is None else self.also.steps)
+        return sum(part.result.steps for part in self.parts)
 
     @property
     def episodes(self) -> int:
-        return len(self.real.returns) + (0 if self.also is None else len(self.also.returns))
+        return sum(part.settings.episodes for part in self.parts)
 
 
 def judge(settings: DemoSettings, policy: Path, *, quiet: bool) -> Judgement:
@@ -48,13 +73,17 @@ def judge(settings: DemoSettings, policy: Path, *, quiet: bool) -> Judgement:
         def look(share: float, ended: int) -> None:
             update(share, f"{plain.episodes} real episodes, {ended} terminated")
 
-        real = evaluate(predict, opener, plain, look)
-        also = None
+        real = Part("policy", plain, evaluate(predict, opener, plain, look))
+        also = without = None
         if starts is not None:
             other = EvaluationSettings(episodes=settings.episodes, wide=starts.wide, start_scale=starts.scale)
-            also = evaluate(predict, opener, other, look)
-    reached = task.target.reached(_outcome(real), None if also is None else _outcome(also))
-    return Judgement(real, also, reached)
+            also = Part("policy", other, evaluate(predict, opener, other, look))
+        if settings.pictures:
+            few, spec = EvaluationSettings(episodes=min(COMPARED, settings.episodes)), settings.judged_by()
+            left_alone = default_baseline(spec)
+            without = Part(left_alone, few, evaluate(baseline(spec, left_alone, settings.seed), opener, few))
+    reached = task.target.reached(_outcome(real.result), None if also is None else _outcome(also.result))
+    return Judgement(real, also, without, reached)
 
 
 def episodes_of(settings: DemoSettings) -> Callable[[], Episode]:

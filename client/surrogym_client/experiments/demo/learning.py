@@ -12,11 +12,14 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
+from surrogym_client.evaluation.reporting import as_reported, paired_start
 from surrogym_client.experiments.demo.judging import Judgement
 from surrogym_client.experiments.processes import Child, Children, await_file
 from surrogym_client.experiments.settings import DemoSettings
 from surrogym_client.experiments.tasks import ROUNDS, queries_a_round
+from surrogym_client.policies import pushing
 from surrogym_client.policies.card import DEFAULT_ALGORITHM, read_card
 from surrogym_client.surrogates.waiting import share_of_design, wait_for_design, words_of_design
 from surrogym_client.training.search import ALGORITHMS, SEARCHES
@@ -27,6 +30,7 @@ from surrogym_shared.terminal import progress, say
 from surrogym_shared.wire import SurrogateView
 
 PATIENCE_SECONDS = 3_600.0
+REPORT = "report.html"  # in the run folder
 LOOK_SECONDS = 1.0  # a look costs the server a little of what the trainer wants
 
 
@@ -74,9 +78,16 @@ class SurrogateRun:
         )
 
     def keep(self, judgement: Judgement) -> None:
-        """Enter the evaluation into the ledger; write specification, samples and, unless unwanted, pictures."""
+        """Enter the evaluation into the ledger, store its episodes with the policy; write specification, samples and,
+        unless unwanted, pictures."""
         name = self._settings.task
         self._api.report_steps(name, judgement.steps, episodes=judgement.episodes, note="demo")
+        compared = min(part.settings.episodes for part in judgement.parts)
+        paired = paired_start(judgement.real.result, compared)
+        for part in judgement.parts:
+            noted = as_reported(part.result, part.settings, uuid4().hex, controller=part.controller, paired=paired)
+            pushing.keep(self._policy, noted)
+        pushing.push(self._api, self._policy, name)
         view = self._api.surrogate(name)
         for file_format in ("csv", "npz"):
             content = self._api.export_samples(name, file_format)
@@ -85,7 +96,16 @@ class SurrogateRun:
         if self._settings.pictures:
             from surrogym_client.experiments.demo.pictures import draw_all
 
-            draw_all(self._folder, view, list(self._api.samples(name)), read_curve(self._curve), judgement.real)
+            self._write_report(name)
+            draw_all(self._folder, view, list(self._api.samples(name)), read_curve(self._curve), judgement.real.result)
+
+    def _write_report(self, name: str) -> None:
+        from surrogym_client.report.files import write
+        from surrogym_client.report.known import collect, cuts_of
+        from surrogym_client.report.page import page
+
+        known = collect(self._api, name)
+        write(self._folder / REPORT, page(known, cuts_of(self._api, known)[0]))
 
     def linger(self) -> None:
         """Leave the server running until Ctrl-C."""

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from surrogym_client.evaluation.evaluator import Evaluation, Trace
+from surrogym_client.evaluation.evaluator import Evaluation
 from surrogym_client.report.figures import WIDTH, draw_samples, with_unit
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import SampleView, SurrogateView
@@ -27,7 +27,7 @@ def draw_all(
     _save(folder / "samples.png", draw_samples(view, samples))
     _save(folder / "learning.png", draw_learning(curve))
     _save(folder / "returns.png", draw_returns(result))
-    _save(folder / "rollout.png", draw_rollout(view.spec, result.trace))
+    _save(folder / "rollout.png", draw_rollout(view.spec, result))
 
 
 def draw_learning(curve: Sequence[dict[str, Any]]) -> Figure:
@@ -46,8 +46,10 @@ def draw_returns(result: Evaluation) -> Figure:
     return figure
 
 
-def draw_rollout(spec: EnvironmentSpec, trace: Trace) -> Figure:
-    """The first real episode: coordinates, and the action."""
+def draw_rollout(spec: EnvironmentSpec, result: Evaluation) -> Figure:
+    """The real episode of the median return: coordinates, and the action. Half of all episodes went better."""
+    at = result.ranked()["median"]
+    trace = result.traces[at]
     actions = trace.action.shape[1]
     labels = [*map(with_unit, spec.coordinates), *(f"action {i}" if actions > 1 else "action" for i in range(actions))]
     lines = [*trace.coordinates.T, *trace.action.T]
@@ -58,7 +60,7 @@ def draw_rollout(spec: EnvironmentSpec, trace: Trace) -> Figure:
         axes.set(ylabel=label)
     grid[-1].set(xlabel="step")
     figure.align_ylabels()
-    figure.suptitle("the first real episode")
+    figure.suptitle(f"the median of {len(result.returns)} real episodes, return {result.returns[at]:.4g}")
     return figure
 
 

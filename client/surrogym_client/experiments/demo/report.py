@@ -8,7 +8,7 @@ from typing import Any
 
 from surrogym_client.evaluation.evaluator import Evaluation
 from surrogym_client.experiments.demo.judging import Judgement
-from surrogym_client.experiments.demo.learning import Learned
+from surrogym_client.experiments.demo.learning import REPORT, Learned
 from surrogym_client.experiments.settings import DemoSettings, fingerprint
 from surrogym_client.policies.card import PolicyCard, read_card
 from surrogym_client.runtime.versions import machine, versions
@@ -28,7 +28,7 @@ def metrics_of(
     settings: DemoSettings, learned: Learned, judgement: Judgement, seconds: dict[str, float]
 ) -> dict[str, Any]:
     """Every number of one run, JSON-able."""
-    card, real, also = read_card(learned.policy), judgement.real, judgement.also
+    card, real, also, without = read_card(learned.policy), *judgement.results
     return {
         "task": settings.task,
         "arm": settings.arm,
@@ -53,6 +53,9 @@ def metrics_of(
         "returns": real.returns.tolist(),
         "lengths": real.lengths.tolist(),
         "also": None if also is None else {**_returns(also), "success_rate": also.success_rate},
+        "without": None
+        if judgement.without is None or without is None
+        else {**_returns(without), "actions": judgement.without.controller},
         "target": settings.demo_task.target.words,
         "reached": judgement.reached,
         "settings": {"algorithm": card.algorithm, **card.settings},
@@ -87,8 +90,10 @@ def table(metrics: dict[str, Any], folder: Path) -> str:
         *_promise(metrics),
         ("success", _share(metrics["success_rate"])),
         *_also(metrics),
+        *_without(metrics),
         ("target", f"{metrics['target']}: {'reached' if metrics['reached'] else 'not reached'}"),
         ("run folder", str(folder)),
+        *([("report", str(folder / REPORT))] if (folder / REPORT).exists() else []),
     ]
     width = max(len(name) for name, _ in rows)
     return "\n".join(f"  {name.ljust(width)}  {value}" for name, value in rows)
@@ -110,6 +115,14 @@ def _also(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     if also is None or starts is None:
         return []
     return [(starts.words, f"mean {_number(also['mean'])}, success {_share(also['success_rate'])}")]
+
+
+def _without(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    without = metrics["without"]
+    if without is None:
+        return []
+    actions = "an action of zero" if without["actions"] == "zero" else "random actions"
+    return [("without the policy", f"mean {_number(without['mean'])}, {without['episodes']} starts, {actions}")]
 
 
 def _promise(metrics: dict[str, Any]) -> list[tuple[str, str]]:

@@ -1,0 +1,70 @@
+"""What nobody has tested, and the next steps that follow, in plain sentences. Each follows from what is stored."""
+
+from __future__ import annotations
+
+from surrogym_client.report.known import Known
+from surrogym_client.surrogates.advice import advice
+
+FEW = 30  # episodes: fewer say little of an average
+PREFERRED = "production"
+
+
+def untested(known: Known) -> list[str]:
+    """What the real episodes do not cover."""
+    policy, real = known.policy, known.real
+    if policy is None:
+        return ["Everything: there is no controller yet."]
+    if real is None:
+        return ["The controller itself: no real episode was run with it."]
+    found = []
+    if real.episodes < FEW:
+        found.append(f"Many starts: {real.episodes} episodes say little of an average; {FEW} or more would.")
+    own = [one for one in policy.evaluations if one.controller == "policy"]
+    if not any("anywhere" in one.note or "times as far" in one.note for one in own):
+        found.append("Starts outside the declared ones.")
+    if not any("changed by" in one.note for one in own):
+        found.append("Another unit of the machine, or a worn one: masses, lengths and limits were as they are.")
+    limit = known.view.spec.time_limit
+    if limit is not None:
+        found.append(f"Episodes longer than {limit} steps.")
+    if policy.audit is None:
+        found.append("The model's prediction, by an audit before the test.")
+    if not any(one.controller == "reference" for one in policy.evaluations):
+        found.append("A controller of reference, such as the one in use today.")
+    found.append("Disturbances, faults of sensors, and everything outside the declared ranges of the coordinates.")
+    return found
+
+
+def next_steps(known: Known) -> list[str]:
+    """What is worth doing, the most urgent first."""
+    view, policy, real = known.view, known.policy, known.real
+    name = view.name
+    if policy is None:
+        first = f"Train a controller: surrogym train {name}"
+        return [first if known.models else f"Let a sampler answer the first queries: surrogym sample {name}"]
+    found = []
+    if real is None:
+        found.append(
+            f"Test it in reality: surrogym policy get {name}@{policy.version} --out policy.zip, and then "
+            "surrogym evaluate policy.zip --compare zero"
+        )
+        return found + _of_the_model(known)
+    if real.promise_kept is False or policy.trusted is False:
+        found.append("Don't use it yet: the model was wrong, or not sure, where this controller goes.")
+        found.append(f"Ask for real steps on its way, and train again: surrogym train {name} --improve 8")
+    elif real.success_rate is not None and real.success_rate < 1:
+        found.append("Look at the worst episode above before it is used: not every start succeeded.")
+    if real.episodes < FEW:
+        found.append(f"Run more episodes: surrogym evaluate policy.zip --episodes {FEW}")
+    if known.without is None:
+        found.append("Run the same starts without it: surrogym evaluate policy.zip --compare random")
+    if not any("changed by" in one.note for one in policy.evaluations):
+        found.append("Find out how much change of the machine it stands: surrogym evaluate policy.zip --perturb 0.1")
+    if real.promise_kept and PREFERRED not in policy.aliases:
+        found.append(f"If that is good enough, name it: surrogym policy alias {name}@{policy.version} {PREFERRED}")
+    return found + _of_the_model(known)
+
+
+def _of_the_model(known: Known) -> list[str]:
+    said = advice(known.view, known.models)
+    return [f"To make the model surer: {said}"] if said else []

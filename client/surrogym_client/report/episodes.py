@@ -1,0 +1,87 @@
+"""Figures of real episodes, and of what was predicted beside what came. Lines differ by their strokes, so that they can
+be told apart in black and white."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from surrogym_client.report.figures import WIDTH, with_unit
+from surrogym_shared.spec import Coordinate, EnvironmentSpec
+from surrogym_shared.wire import EpisodeTrace
+
+Array = NDArray[np.float64]
+
+
+class Stroke(NamedTuple):
+    """How a line is drawn."""
+
+    colour: str
+    style: str
+    width: float
+
+
+STROKES = (Stroke("black", "-", 1.6), Stroke("#2457c5", "--", 1.4), Stroke("#b3261e", ":", 2.0))
+
+
+class Range(NamedTuple):
+    """A number with its interval, of one kind of episodes."""
+
+    label: str
+    value: float
+    low: float | None
+    high: float | None
+
+
+def draw_episodes(spec: EnvironmentSpec, shown: Sequence[tuple[str, EpisodeTrace]]) -> Figure:
+    """Coordinates and actions over the steps, one line for each of at most three episodes."""
+    actions = len(shown[0][1].action[0]) if shown[0][1].action else 0
+    labels = [
+        *map(with_unit, spec.coordinates),
+        *(f"action {i + 1}" if actions > 1 else "action" for i in range(actions)),
+    ]
+    figure = Figure(figsize=(1.5 * WIDTH, 1.5 * len(labels) + 0.6), layout="constrained")
+    grid = figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0]
+    for (name, trace), stroke in zip(shown, STROKES, strict=False):
+        states, given = np.array(trace.coordinates), np.array(trace.action).reshape(len(trace.action), -1)
+        lines = [_unbroken(c, states[:, i]) for i, c in enumerate(spec.coordinates)]
+        lines += [given[:, i] for i in range(actions)]
+        for axes, line in zip(grid, lines, strict=True):
+            axes.plot(line, color=stroke.colour, linestyle=stroke.style, linewidth=stroke.width, label=name)
+    for axes, label in zip(grid, labels, strict=True):
+        axes.set(ylabel=label)
+        axes.grid(alpha=0.3)
+    grid[-1].set(xlabel="step")
+    figure.align_ylabels()
+    handles, names = grid[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside upper left", ncols=3, frameon=False)
+    return figure
+
+
+def draw_ranges(ranges: Sequence[Range], label: str) -> Figure:
+    """Numbers with their intervals under each other, on one axis."""
+    figure = Figure(figsize=(1.5 * WIDTH, 0.55 * len(ranges) + 0.9), layout="constrained")
+    axes = figure.add_subplot()
+    places = list(range(len(ranges)))[::-1]
+    for place, one in zip(places, ranges, strict=True):
+        if one.low is not None and one.high is not None:
+            axes.plot([one.low, one.high], [place, place], color="black", linewidth=2, marker="|", markersize=12)
+        axes.plot([one.value], [place], color="black", marker="o", markersize=8, linestyle="none")
+        axes.annotate(f"{one.value:.4g}", (one.value, place), (0, 9), textcoords="offset points", ha="center")
+    axes.set(yticks=places, yticklabels=[one.label for one in ranges], ylim=(-0.6, len(ranges) - 0.3), xlabel=label)
+    axes.margins(x=0.12)
+    axes.grid(axis="x", alpha=0.3)
+    return figure
+
+
+def _unbroken(coordinate: Coordinate, values: Array) -> Array:
+    """An angle without the line across the picture where it jumps from pi to -pi: a value after a jump is not drawn."""
+    if coordinate.kind != "angle":
+        return values
+    shown = values.copy()
+    shown[1:][np.abs(np.diff(values)) > np.pi] = np.nan
+    return shown

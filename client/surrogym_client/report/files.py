@@ -1,0 +1,53 @@
+"""The report as a file: HTML, or PDF where Chromium is."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from surrogym_client.errors import SurrogymClientError
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+SECONDS = 120.0
+
+
+class NoPdf(SurrogymClientError):
+    """No PDF could be made."""
+
+
+def write(out: Path, page: str) -> int:
+    """Write a page as the ending of the file says; gives the size in bytes.
+
+    Raises:
+        NoPdf: Chromium is not here, or it failed; nothing was written.
+    """
+    if out.suffix.lower() == ".pdf":
+        content = as_pdf(page)
+        out.write_bytes(content)
+        return len(content)
+    return out.write_text(page, encoding="utf-8")
+
+
+def as_pdf(page: str) -> bytes:
+    """A page printed by a headless Chromium. Raises ``NoPdf``."""
+    browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if browser is None:
+        raise NoPdf("a PDF needs Chromium, which is not installed; --out report.html needs nothing")
+    with TemporaryDirectory() as folder:
+        html, pdf = Path(folder) / "report.html", Path(folder) / "report.pdf"
+        html.write_text(page, encoding="utf-8")
+        options = (
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--no-pdf-header-footer",
+            f"--user-data-dir={folder}/own",
+        )
+        command = [browser, *options, f"--print-to-pdf={pdf}", html.as_uri()]
+        try:
+            subprocess.run(command, check=True, capture_output=True, timeout=SECONDS)
+            return pdf.read_bytes()
+        except (OSError, subprocess.SubprocessError) as error:
+            raise NoPdf(f"no PDF was made: {browser} failed: {error}") from error

@@ -1,0 +1,106 @@
+"""What a report is written from: all that a server knows of a surrogate and of one of its policies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+from surrogym_client.errors import NotInstalled, SurrogymClientError, UnknownPolicy
+from surrogym_client.report.maps import Cut, cuts
+from surrogym_client.transport import Api
+from surrogym_shared.wire import EvaluationDetail, EvaluationView, ModelView, PolicyDetail, SampleView, SurrogateView
+
+PREFERRED = "production"
+
+
+@dataclass(frozen=True)
+class Known:
+    """A surrogate, and a policy with its real episodes.
+
+    Attributes:
+        view: the surrogate.
+        models: all fits, oldest first.
+        samples: all real steps.
+        server: where it is, and of which version.
+        policy: the one that the report is about; None: there is none.
+        real: its newest real episodes from the declared starts.
+        without: real episodes without the policy, from the same starts.
+        missing: sentences about what could not be read.
+    """
+
+    view: SurrogateView
+    models: list[ModelView]
+    samples: list[SampleView]
+    server: str
+    policy: PolicyDetail | None = None
+    real: EvaluationDetail | None = None
+    without: EvaluationDetail | None = None
+    missing: tuple[str, ...] = ()
+
+
+def collect(api: Api, name: str, which: str | None = None) -> Known:
+    """Everything for a report; what can't be read is named in it.
+
+    Args:
+        api: the server.
+        name: of the surrogate.
+        which: version or alias of the policy. None: the one in production, otherwise the newest.
+
+    Raises:
+        UnknownSurrogate, UnknownPolicy: there is none of this name.
+    """
+    view, models, samples = api.surrogate(name), api.models(name), list(api.samples(name))
+    server = f"{api.url}, surrogym {api.health().version}"
+    policy, missing = _policy(api, name, which), list[str]()
+    if policy is None:
+        return Known(view, models, samples, server)
+    chosen = [chosen_real(policy), None]
+    chosen[1] = chosen_without(policy, chosen[0])
+    details: list[EvaluationDetail | None] = []
+    for evaluation in chosen:
+        detail = None if evaluation is None else api.policies.evaluation(name, policy.version, evaluation.id)
+        if detail is not None and detail.missing:
+            missing.append(f"the single episodes of evaluation {detail.id} are missing: {detail.missing}")
+        details.append(detail)
+    return Known(view, models, samples, server, policy, details[0], details[1], tuple(missing))
+
+
+def cuts_of(api: Api, known: Known) -> tuple[list[Cut], str]:
+    """What the latest model says over two coordinates, and why it says nothing where it can't."""
+    try:
+        return cuts(known.view, partial(api.query_uncertainty, known.view.name)), ""
+    except NotInstalled as error:
+        return [], str(error)
+
+
+def chosen_real(policy: PolicyDetail) -> EvaluationView | None:
+    """The newest evaluation of the policy from the declared starts; where there is none, from others."""
+    own = [one for one in policy.evaluations if one.controller == "policy"]
+    return next((one for one in reversed(own) if one.declared), own[-1] if own else None)
+
+
+def chosen_without(policy: PolicyDetail, real: EvaluationView | None) -> EvaluationView | None:
+    """The newest evaluation without the policy that has the same starts."""
+    if real is None:
+        return None
+    same = [
+        one
+        for one in policy.evaluations
+        if one.controller in ("zero", "random") and (one.first_seed, one.note) == (real.first_seed, real.note)
+    ]
+    return same[-1] if same else None
+
+
+def _policy(api: Api, name: str, which: str | None) -> PolicyDetail | None:
+    if which is not None:
+        return api.policies.get(name, which)
+    for wanted in (PREFERRED, "latest"):
+        try:
+            return api.policies.get(name, wanted)
+        except UnknownPolicy:
+            continue
+        except SurrogymClientError as error:  # a server of before: it keeps no policies
+            if getattr(getattr(error, "problem", None), "status", None) != 404:
+                raise
+            return None
+    return None
