@@ -14,7 +14,7 @@ from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
 
 Open = Callable[..., Page]
-PARTS = ("Learning", "Maps", "Probe", "Sessions", "Queue", "Ledger", "Steer", "Model versions")
+PARTS = ("Policies", "Learning", "Maps", "Probe", "Sessions", "Queue", "Ledger", "Steer", "Model versions")
 
 
 @pytest.fixture
@@ -43,8 +43,10 @@ def test_a_surrogate_is_shown_whole_and_without_a_complaint(
     headings = page.locator("section h2").all_text_contents()
     assert set(headings) == set(PARTS)
     expect(page.locator(".facts")).to_contain_text("12 real steps")
-    assert page.locator("#learning canvas").count() == 1  # both on one axis of samples
-    expect(page.locator("#learning")).to_contain_text("speed, error")
+    assert page.locator("#learning canvas").count() == 2  # one axis of values each
+    expect(page.locator("#learning .u-legend").last).to_contain_text(
+        re.compile(r"speed: *\S+")
+    )  # values without a mouse
     expect(page.locator("#queue tbody tr")).to_have_count(12)
     page.locator(".model summary").first.click()
     expect(page.locator(".model").first).to_contain_text("lengthscale")

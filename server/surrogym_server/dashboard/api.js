@@ -50,6 +50,17 @@ export async function call(method, path, body, signal) {
   }
 }
 
+/** Saves what a route gives as a file: a link would carry no token. */
+export async function download(path, name) {
+  const reply = await send(path, { headers: headers() });
+  const address = URL.createObjectURL(await reply.blob());
+  const link = document.createElement("a");
+  link.href = address;
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(address), 10_000);
+}
+
 /** Server-sent events, one after the other as {event, data}; also {event: "open"} first. Ends when the server ends. */
 export async function* events(path, signal) {
   const reply = await send(path, { headers: headers(), signal });

@@ -1,6 +1,7 @@
 // What is shown where, and whether the server is there.
 
 import { call, events, Gone, Problem, token } from "/page/api.js";
+import { compareView } from "/page/compare.js";
 import { h } from "/page/dom.js";
 import { listView } from "/page/list.js";
 import { surrogateView } from "/page/surrogate.js";
@@ -25,10 +26,12 @@ function say(state, text = state) {
 }
 
 function route() {
-  const name = location.hash.startsWith("#/s/") ? decodeURIComponent(location.hash.slice(4)) : null;
+  const [kind, ...names] = location.hash.slice(2).split("/").map(decodeURIComponent);
   page.view?.close();
-  page.view = name === null ? listView(main, { refresh }) : surrogateView(main, name, { role: () => page.role, refresh });
-  document.title = name === null ? "Surrogym" : `${name} · Surrogym`;
+  if (kind === "compare") page.view = compareView(main, names);
+  else if (kind === "s") page.view = surrogateView(main, names.join("/"), { role: () => page.role, refresh });
+  else page.view = listView(main, { refresh });
+  document.title = { compare: "Compare policies · Surrogym", s: `${names.join("/")} · Surrogym` }[kind] ?? "Surrogym";
   refresh();
 }
 

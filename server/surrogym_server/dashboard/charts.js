@@ -5,7 +5,7 @@ import { nines, number, percent } from "/page/format.js";
 
 const uPlot = window.uPlot;
 const HEIGHT = 190;
-const LEARNING_HEIGHT = 280;
+const LEARNING_HEIGHT = 240;
 const ALL = "every output";
 const LEGEND = { markers: { fill: (plot, at) => plot.series[at].stroke(plot, at) } };
 const LEAST_ERROR = 1e-6;
@@ -30,19 +30,18 @@ function chart(label) {
   return { place, draw, repaint: () => last && draw(...last), close: () => watcher.disconnect() };
 }
 
-/** Heights of the two scales, so that the target of the one and the tolerance of the other are the same line. */
-function heights(target, errors) {
-  const top = Math.max(4, Math.ceil(nines(target)) + 2);
-  const line = nines(target) / top;
-  const span = Math.max(2, -Math.min(0, ...errors) / line, Math.max(0, ...errors) / (1 - line));
-  return { top, error: [-line * span, (1 - line) * span] };
-}
+const samplesAxis = (more) => axis({ label: "real steps the model has seen", font: FONT, labelFont: FONT, labelSize: 20, size: 34, space: 40, incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000], ...more });
+const FONT = "12px system-ui";
+const STROKES = [[], [8, 5], [2, 4]];
+const samplesScale = { time: false, range: (_, low, high) => (low === high ? [low - 1, high + 1] : [low, high]) };
 
-/** Confidence and leave-one-out error of each output against samples; the newest model of each number of samples. */
+/** Where no point is pointed at, the legend has the values of the last one. */
+const lastShown = { hooks: { setCursor: [(plot) => plot.cursor.idx === null && plot.setLegend({ idx: plot.data[0].length - 1 }, false)], ready: [(plot) => plot.setLegend({ idx: plot.data[0].length - 1 }, false)] } };
+
+/** Confidence and leave-one-out error of each output against samples, one picture each; the newest model of each number of samples. */
 export function learningCurves() {
-  const both = chart("Confidence index and leave-one-out error of each output against samples");
+  const [sure, wrong] = [chart("Confidence index of each output against samples"), chart("Leave-one-out error of each output, in tolerances, against samples")];
   const which = h("select", {}, h("option", {}, ALL));
-  const text = { font: "12px system-ui", labelFont: "12px system-ui", labelSize: 20 };
   const power = (value) => (Math.abs(value) < 4 ? String(10 ** value) : `1e${value}`.replace("-", "−"));
   let latest = [];
 
@@ -56,32 +55,30 @@ export function learningCurves() {
     }));
     const index = of((output) => output.confidence_index);
     const errors = of((output) => (output.leave_one_out_error === null ? null : Math.log10(Math.max(LEAST_ERROR, output.leave_one_out_error / output.tolerance))));
-    const { top, error } = heights(fidelity.target, errors.flat());
     const x = latest.map((model) => model.samples);
-    both.draw(() => ({
-      height: LEARNING_HEIGHT,
-      cursor: { drag: { x: false, y: false } },
-      scales: { x: { time: false, range: (_, low, high) => (low === high ? [low - 1, high + 1] : [low, high]) }, y: { range: [0, top] }, error: { range: error } },
-      axes: [
-        axis({ ...text, label: "real steps the model has seen", size: 34, space: 40, incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000] }),
-        axis({ ...text, label: "confidence index", size: 60, splits: () => [...SURE.keys()].slice(0, top + 1), values: (_, at) => at.map((k) => (k ? `${100 * SURE[k]} %`.replace(/(\.\d*?9)0+\d* %/, "$1 %") : "0")) }),
-        axis({ ...text, scale: "error", side: 1, label: "error / tolerance", size: 48, grid: { show: false }, incrs: [1, 2, 3], values: (_, at) => at.map(power) }),
-      ],
-      series: [
-        { label: "samples" },
-        ...names.map((name, at) => line(name, colour(name), { value: (plot, shown, series, place) => (place === null ? "–" : percent(index[at][place])) })),
-        { ...dashed("target"), value: (plot, shown, series, place) => (place === null ? "–" : percent(latest[place].fidelity.target)) },
-        ...names.map((name) => line(`${name}, error`, colour(name), { scale: "error", dash: [2, 4], points: { show: true, size: 3 }, value: (_, value) => (value === null ? "–" : number(10 ** value)) })),
-      ],
-    }), [x, ...index.map((shares) => shares.map((share) => share && Math.min(top, nines(share)))), latest.map((model) => nines(model.fidelity.target)), ...errors]);
+    const series = (drawn, value, limit, limitValue) => [
+      { label: "samples" }, ...names.map((name, at) => line(name, colour(name), { value: (plot, shown, which, place) => (place === null ? "" : value(at, place)) })),
+      { ...dashed(limit), value: (plot, shown, which, place) => (place === null ? "" : limitValue(place)) }];
+    const top = Math.max(4, Math.ceil(nines(fidelity.target)) + 2);
+    sure.draw(() => ({
+      ...lastShown, height: LEARNING_HEIGHT, cursor: { drag: { x: false, y: false } }, scales: { x: samplesScale, y: { range: [0, top] } },
+      axes: [samplesAxis(), axis({ font: FONT, labelFont: FONT, labelSize: 20, label: "confidence index", size: 60, splits: () => [...SURE.keys()].slice(0, top + 1), values: (_, at) => at.map((k) => (k ? `${100 * SURE[k]} %`.replace(/(\.\d*?9)0+\d* %/, "$1 %") : "0")) })],
+      series: series(index, (at, place) => percent(index[at][place]), "target", (place) => percent(latest[place].fidelity.target)),
+    }), [x, ...index.map((shares) => shares.map((share) => share && Math.min(top, nines(share)))), latest.map((model) => nines(model.fidelity.target))]);
+    wrong.draw(() => ({
+      ...lastShown, height: LEARNING_HEIGHT, cursor: { drag: { x: false, y: false } }, scales: { x: samplesScale },
+      axes: [samplesAxis(), axis({ font: FONT, labelFont: FONT, labelSize: 20, label: "error / tolerance", size: 60, incrs: [1, 2, 3], values: (_, at) => at.map(power) })],
+      series: series(errors, (at, place) => (errors[at][place] === null ? "" : number(10 ** errors[at][place])), "allowed", () => "1"),
+    }), [x, ...errors, latest.map(() => 0)]);
   }
   which.addEventListener("change", draw);
 
   return {
     parts: [
       h("div", { class: "picks" }, h("label", { class: "pick" }, "of", which)),
-      h("p", { class: "note" }, "Solid, left: confidence index. Dotted, right: leave-one-out error in tolerances. Dashed: the target of the one and a whole tolerance of the other."),
-      both.place,
+      h("div", { class: "two" },
+        h("div", {}, h("h3", {}, "How sure it was"), h("p", { class: "note" }, "A line above the dashed one has reached the target."), sure.place),
+        h("div", {}, h("h3", {}, "How wrong it was"), h("p", { class: "note" }, "A line below the dashed one is within tolerance."), wrong.place)),
     ],
     show(models) {
       latest = [...new Map(models.map((model) => [model.samples, model])).values()].sort((a, b) => a.samples - b.samples);
@@ -91,8 +88,26 @@ export function learningCurves() {
       which.value = names.includes(kept) ? kept : ALL;
       draw();
     },
-    repaint: both.repaint,
-    close: both.close,
+    repaint: () => [sure, wrong].forEach((part) => part.repaint()),
+    close: () => [sure, wrong].forEach((part) => part.close()),
+  };
+}
+
+/** A plain chart of lines that differ by their strokes; `show(data, names, x)` draws it. */
+export function lines(label, height) {
+  const part = chart(label);
+  return {
+    place: part.place,
+    show: (data, names, x) => part.draw(() => ({
+      height: height + (names.length > 1 ? 0 : 20),
+      cursor: { show: false },
+      legend: { show: names.length > 1, live: false, markers: { ...LEGEND.markers, dash: (plot, at) => (at > 1 ? "dashed" : "solid") } },
+      scales: { x: { time: false } },
+      axes: [axis({ size: x ? 40 : 26, space: x ? 90 : 45, label: x, labelFont: FONT, labelSize: 16 }), axis({ size: 56, space: 22, values: (_, at) => at.map((value) => number(value, 2)) })],
+      series: [{}, ...names.map((name, at) => ({ label: name, stroke: css(`--series-${at}`), width: 2, dash: STROKES[at % STROKES.length], points: { show: false } }))],
+    }), data),
+    repaint: part.repaint,
+    close: part.close,
   };
 }
 
@@ -116,7 +131,7 @@ export function episodeCharts(coordinates) {
           legend: { show: false },
           cursor: { show: false },
           scales: { x: { time: false } },
-          axes: [axis({ size: 26, space: 45 }), axis({ size: 52, space: 22 })],
+          axes: [axis({ size: 26, space: 45 }), axis({ size: 56, space: 22, values: (_, at) => at.map((value) => number(value, 2)) })],
           series: [{}, ...rows.map((_, at) => at === rows.length - 1
             ? { stroke: css("--accent"), width: 2.5, points: { show: false } }
             : { stroke: css("--draw"), width: 1, points: { show: false } })],

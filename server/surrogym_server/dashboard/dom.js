@@ -1,6 +1,6 @@
 // Elements by hand: no markup in strings, so nothing that a server says can become markup.
 
-const SVG = new Set(["svg", "polyline", "line", "circle", "path", "text", "title"]);
+const SVG = new Set(["svg", "polyline", "line", "circle", "path", "rect", "text", "title"]);
 
 /** h("p", {class: "note", onclick: f}, "text", otherElement) makes an element. */
 export function h(tag, properties = {}, ...children) {

@@ -5,6 +5,7 @@ export function number(value, digits = 3) {
   if (value === null || value === undefined) return "–";
   if (!Number.isFinite(value)) return String(value);
   if (value === 0) return "0";
+  if (Math.abs(value) < 1e-12) return "≈ 0";
   const size = Math.abs(value);
   if (size >= 1e6 || size < 1e-3) return value.toExponential(digits - 1).replace("e+", "e").replace("-", "−");
   const decimals = Math.max(0, digits - 1 - Math.floor(Math.log10(size)));

@@ -3,6 +3,7 @@
 import { css, h } from "/page/dom.js";
 import { number } from "/page/format.js";
 
+const FEW = 100; // samples; more are drawn as dots
 const PAD = { left: 46, right: 10, top: 8, bottom: 34 };
 
 /** Colours of a scale from nothing to much, as the style sheet has them: [[r, g, b], ...]. */
@@ -48,7 +49,8 @@ export function heatMap({ name, title, onpoint }) {
     if (shown.values) cells(pen, f);
     axes(pen, f);
     path(pen, f);
-    for (const sample of shown.samples) marker(pen, f.px(sample.x), f.py(sample.y), sample.purpose);
+    const draws = shown.samples.length > FEW ? dot : marker;
+    for (const sample of shown.samples) draws(pen, f.px(sample.x), f.py(sample.y), sample.purpose);
     cross(pen, f.px(shown.point.x), f.py(shown.point.y));
   }
 
@@ -102,6 +104,13 @@ export function heatMap({ name, title, onpoint }) {
     pen.lineWidth = 1.5;
     pen.strokeStyle = "#fff";
     pen.stroke();
+  }
+
+  function dot(pen, x, y, purpose) {
+    pen.fillStyle = css(`--${purpose}`) || css("--manual");
+    pen.globalAlpha = 0.7;
+    pen.fillRect(x - 1.25, y - 1.25, 2.5, 2.5);
+    pen.globalAlpha = 1;
   }
 
   function path(pen, f) {

@@ -47,15 +47,15 @@ export function sure({ confidence_index: index, target, fidelity, phase, error }
 }
 
 export function where(found, names, onshow, model) {
-  if (!found && model) return card("Where not", h("p", { class: "big" }, "looking…"), h("p", { class: "note" }, `Asking the model about ${LOOKS} points.`));
-  if (!found) return card("Where not", h("p", { class: "big" }, "everywhere"), h("p", { class: "note" }, "Nothing is known before the first model."));
+  if (!found && model) return card("Where it is unsure", h("p", { class: "big" }, "looking…"), h("p", { class: "note" }, `Asking the model about ${LOOKS} points.`));
+  if (!found) return card("Where it is unsure", h("p", { class: "big" }, "everywhere"), h("p", { class: "note" }, "Nothing is known before the first model."));
   const { times, within, output, coordinates, action } = found;
   const place = `${told(names, coordinates)}, action ${action.map((value) => number(value, 2)).join(", ")}`;
-  return card("Where not",
-    h("p", { class: times <= 1 ? "big good" : "big" }, times <= 1 ? "nowhere" : percent(1 - within)),
+  return card("Where it is unsure",
+    h("p", { class: times <= 1 ? "big good" : "big" }, `${count(Math.round((1 - within) * LOOKS))} of ${LOOKS} points`),
     h("p", { class: "note" }, times <= 1
-      ? `Every one of ${LOOKS} points looked at is within tolerance; ${output} comes closest, with ${number(times, 2)} of it.`
-      : `of states and actions are beyond tolerance. Worst: ${output}, ${number(times, 2)} tolerances.`),
+      ? `None of the states and actions looked at is beyond tolerance; ${output} comes closest, with ${number(times, 2)} of it.`
+      : `of all states and actions are beyond tolerance. Worst: ${output}, ${number(times, 2)} tolerances.`),
     h("p", { class: "note" }, `Least sure near ${place}. `, h("button", { type: "button", class: "link", onclick: () => onshow(coordinates, action) }, "Show it")));
 }
 

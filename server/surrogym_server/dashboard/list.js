@@ -19,7 +19,7 @@ function row(surrogate) {
     h("span", { class: "who" }, h("strong", {}, name), h("span", { class: "note" }, environment)),
     phaseBadge(surrogate),
     h("span", { class: "cell" }, h("span", { class: "note" }, "how sure"), confidenceMeter(index, target),
-      h("span", { class: "value" }, index === null ? "no model yet" : `${percent(index)} of ${percent(target)}`)),
+      h("span", { class: "value" }, index === null ? "no model yet" : `${percent(index)}, target ${percent(target)}${index >= target ? " reached" : ""}`)),
     h("span", { class: "cell" }, h("span", { class: "note" }, "what it cost"), costBar(ledger, budget),
       h("span", { class: "value" }, `${count(ledger.total)} of ${count(budget)} real steps`)),
     h("span", { class: "alive note" }, alive(surrogate))));
@@ -44,7 +44,8 @@ export function listView(main, { refresh }) {
   const more = h("button", { type: "button", hidden: true, onclick: () => { wished += PAGE; refresh(); } }, `Show ${PAGE} more`);
   const place = h("div", {}, h("div", { class: "card loading", "aria-busy": "true" }, "Asking the server…"));
   const rows = keyed(list, row);
-  main.replaceChildren(h("h1", {}, "Surrogates"), place, more);
+  const compare = h("p", { hidden: true }, h("a", { href: "#/compare" }, "Compare policies of two surrogates"));
+  main.replaceChildren(h("h1", {}, "Surrogates"), place, more, compare);
   return {
     async refresh() {
       const { found, rest } = await firstOf(wished);
@@ -52,6 +53,7 @@ export function listView(main, { refresh }) {
       const wanted = found.length ? list : place.querySelector(".welcome") ?? EMPTY();
       if (place.firstChild !== wanted) place.replaceChildren(wanted);
       more.hidden = !rest;
+      compare.hidden = found.length < 2;
     },
     fail: (error) => place.replaceChildren(h("div", { class: "card bad", role: "alert" }, error.message)),
     repaint() {},

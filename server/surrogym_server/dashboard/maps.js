@@ -10,6 +10,15 @@ const DECADES = 6; // of the index: what lies further below its highest value is
 const WORST = "the worst output";
 const LOG_10 = Math.log(10);
 
+const MOST_MARKS = 400;
+const NOTHING = -9; // decades of the index below which nothing is worth a real step
+
+/** At most so many samples, evenly chosen and the newest among them: more would hide the map. */
+function thinned(samples) {
+  const every = Math.ceil(samples.length / MOST_MARKS);
+  return every > 1 ? samples.filter((_, at) => (samples.length - 1 - at) % every === 0) : samples;
+}
+
 const largest = (rows) => rows.map((row) => Math.max(...row));
 
 export function maps(name, spec, controls) {
@@ -33,6 +42,9 @@ export function maps(name, spec, controls) {
     if (x.select.value !== y.select.value) moved[y.select.value] = py;
     controls.move(moved);
   };
+  const marks = h("input", { type: "checkbox", checked: true });
+  const many = h("span", { class: "note" });
+  marks.addEventListener("change", () => draw());
   const kinds = {
     uncertainty: heatMap({ name: "uncertainty", title: "Uncertainty, in tolerances", onpoint }),
     occupancy: heatMap({ name: "occupancy", title: "Occupancy: where policies go", onpoint }),
@@ -66,7 +78,7 @@ export function maps(name, spec, controls) {
     const chosen = (rows) => (which < 0 ? largest(rows) : rows.map((row) => row[which]));
     const base = {
       x: ranges[across], y: ranges[up], size: SIZE, paths: state.paths.map(({ coordinates, mean }) => ({ mean, points: coordinates.map((q) => [q[across], q[up]]) })),
-      samples: state.samples.map(({ coordinates, purpose }) => ({ x: coordinates[across], y: coordinates[up], purpose })),
+      samples: marks.checked ? thinned(state.samples).map(({ coordinates, purpose }) => ({ x: coordinates[across], y: coordinates[up], purpose })) : [],
       point: { x: point.coordinates[across], y: point.coordinates[up] },
     };
     const show = (kind, values, [low, high], [lowText, highText], remark) =>
@@ -81,11 +93,12 @@ export function maps(name, spec, controls) {
       `Up to ${number(Math.max(...ratio), 2)} of the tolerance on this cut.`);
     const visited = occupancy.map((row) => row[0]);
     const [least, most] = [Math.min(...visited), Math.max(...visited)];
-    const even = most - least < 1e-9;
-    show("occupancy", visited, even ? [most, most + 1] : [0, most], ["never", "often"], even ? "The same everywhere: no policy has told yet." : "As the latest checkpoint told.");
+    kinds.occupancy.figure.hidden = most - least < 1e-9; // the same everywhere: no training has submitted its states
+    show("occupancy", visited, [0, most], ["never", "often"], "States of the training that submitted them last.");
     const log = chosen(index).map((value) => value / LOG_10);
     const high = Math.max(...log);
-    show("index", log, [high - DECADES, high], [`≤ 1e${Math.round(high - DECADES)}`, `1e${Math.round(high)}`], "Uncertainty weighted by occupancy (eq. 12).");
+    if (high < NOTHING) show("index", null, [0, 1], ["least", "most"], "Nothing on this cut is worth a real step: all of it is far within tolerance.");
+    else show("index", log, [high - DECADES, high], ["a millionth", "the most"], "Relative to the highest index on this cut (eq. 12), by powers of ten.");
   }
 
   return {
@@ -93,12 +106,14 @@ export function maps(name, spec, controls) {
       h("div", { class: "picks" }, x.label, y.label, h("label", { class: "pick" }, "of", output)),
       h("p", { class: "key" },
         ["initial", "adaptive", "manual"].map((purpose) => h("span", { class: `mark ${purpose}` }, purpose)),
+        h("label", { class: "pick" }, marks, "show them"), many,
         h("span", { class: "mark cross" }, "the point"), h("span", { class: "mark path" }, "episodes from there")),
       h("div", { class: "maps" }, Object.values(kinds).map((kind) => kind.figure)),
     ],
     moved: () => { draw(); ask(); },
     show({ samples, fidelity, version }) {
       state.samples = samples;
+      many.textContent = samples.length > MOST_MARKS ? `${thinned(samples).length} of ${samples.length} are drawn.` : "";
       if (fidelity && version !== state.version) {
         state.tolerances = fidelity.outputs.map((entry) => entry.tolerance);
         const kept = output.value;

@@ -8,11 +8,13 @@ import { cost, leastSure, sure, where } from "/page/hero.js";
 import { maps } from "/page/maps.js";
 import { alive, phaseBadge, section } from "/page/parts.js";
 import { pointControls } from "/page/point.js";
+import { policyList } from "/page/policies.js";
 import { probe } from "/page/probe.js";
 import { ledgerTable, modelTable, queueTable, sessionTable } from "/page/tables.js";
 
 const PAGE = 10_000;
-const LINKS = [["learning", "Learning"], ["maps", "Maps"], ["probe", "Probe"], ["sessions", "Sessions"], ["queue", "Queue"], ["ledger", "Ledger"], ["models", "Models"], ["actions", "Steer"]];
+const OF_MODELS = ["learning", "maps", "probe"]; // parts that are empty before the first model
+const LINKS = [["policies", "Policies"], ["learning", "Learning"], ["maps", "Maps"], ["probe", "Probe"], ["queue", "Queue"], ["sessions", "Sessions"], ["ledger", "Ledger"], ["models", "Models"], ["actions", "Steer"]];
 
 export function surrogateView(main, name, context) {
   const url = path(name);
@@ -35,10 +37,10 @@ export function surrogateView(main, name, context) {
     const now = await call("GET", url);
     const newSamples = samples.length !== now.samples && allSamples();
     const newModels = version !== now.model_version && call("GET", `${url}/models`).then((reply) => { models = reply.models; });
-    const [queries, sessions] = await Promise.all([call("GET", `${url}/queries`), call("GET", `${url}/sessions`), newSamples, newModels]);
+    const [queries, sessions, stored] = await Promise.all([call("GET", `${url}/queries`), call("GET", `${url}/sessions`), call("GET", `${url}/policies`), newSamples, newModels]);
     if (closed) return;
     parts ??= build(main, name, now.spec, context);
-    parts.show({ now, samples, models: newModels && models, queries: queries.queries, sessions: sessions.sessions });
+    parts.show({ now, samples, models: newModels && models, queries: queries.queries, sessions: sessions.sessions, policies: stored.policies });
     version = now.model_version;
   }
 
@@ -63,8 +65,7 @@ function build(main, name, spec, context) {
   const title = h("div", { class: "title" });
   const facts = h("div", { class: "facts" });
   const curves = learningCurves();
-  const waiting = h("p", { class: "empty" }, "The first model follows the initial queries.");
-  const plots = h("div", { hidden: true }, curves.parts);
+  const stored = policyList(name, spec, context);
   const controls = pointControls(spec, () => { map.moved(); probing.moved(); });
   const map = maps(name, spec, controls);
   const steer = actions(name, context);
@@ -88,12 +89,14 @@ function build(main, name, spec, context) {
   };
   main.replaceChildren(title, facts,
     h("nav", { class: "jumps", "aria-label": "Parts of this page" }, LINKS.map(([id, text]) => h("a", { href: `#${id}`, onclick: jump(id) }, text))),
-    section("learning", "Learning", "How sure the model was after so many real steps, and how wrong it was where it left each of them out.", waiting, plots),
+    stored.element,
+    section("learning", "Learning", "How sure the model was after so many real steps, and how wrong it was where it left each of them out.", curves.parts),
     section("maps", "Maps", "Two coordinates at a time; the sliders set the others. Click a map, or move with the arrow keys.",
       h("div", { class: "cut" }, controls.form, h("div", {}, map.parts))),
     section("probe", "Probe", "What the model says of one step from the point above, with its standard deviations.", probing.parts),
-    sessions.element, queue.element, h("div", { class: "two" }, ledger.element, steer.element), versions.element);
+    queue.element, sessions.element, h("div", { class: "two" }, ledger.element, steer.element), versions.element);
 
+  const parted = OF_MODELS.map((id) => [document.getElementById(id), main.querySelector(`.jumps a[href="#${id}"]`)]).flat();
   let found = null;
   let looked = null;
   async function look(now) {
@@ -108,15 +111,13 @@ function build(main, name, spec, context) {
   }
 
   return {
-    show({ now, samples, models, queries, sessions: open }) {
+    show({ now, samples, models, queries, sessions: open, policies }) {
       const { created_at, spec: _, ...rest } = now;
       render.title(rest);
       render.facts({ now: rest, found });
-      if (models && models.length) {
-        plots.hidden = false;
-        waiting.hidden = true;
-        curves.show(models);
-      }
+      for (const part of parted) part.hidden = !now.fidelity;
+      if (models && models.length) curves.show(models);
+      stored.show(policies);
       if (models) versions.show(models);
       const point = { samples, fidelity: now.fidelity, version: now.model_version };
       map.show(point);
@@ -127,7 +128,7 @@ function build(main, name, spec, context) {
       steer.show(now);
       look(rest);
     },
-    repaint: () => [curves, map, probing].forEach((part) => part.repaint()),
-    close: () => [curves, map, probing].forEach((part) => part.close()),
+    repaint: () => [curves, map, probing, stored].forEach((part) => part.repaint()),
+    close: () => [curves, map, probing, stored].forEach((part) => part.close()),
   };
 }

@@ -1,0 +1,53 @@
+// What the page says of a policy: promise beside real return. Higher is better.
+
+import { number, percent, plural } from "/page/format.js";
+
+const Z = 1.959964; // a 95 % interval reaches so many standard errors to both sides
+
+const newest = (evaluations, wanted) => evaluations.filter(wanted).at(-1) ?? null;
+
+/** The newest real episodes of a policy from the declared starts. */
+export const realOf = ({ evaluations }) => newest(evaluations, ({ controller, declared }) => controller === "policy" && declared);
+
+/** The newest real episodes without it from the same starts. */
+export function withoutOf(policy) {
+  const real = realOf(policy);
+  return real && newest(policy.evaluations, ({ controller, first_seed: seed, note }) =>
+    ["zero", "random"].includes(controller) && seed === real.first_seed && note === real.note);
+}
+
+/** The marks of a policy for `ranges`. */
+export function marksOf(policy) {
+  const [real, without] = [realOf(policy), withoutOf(policy)];
+  const mark = (kind, { mean, mean_interval: interval }) => ({ kind, value: mean, low: interval?.low ?? null, high: interval?.high ?? null });
+  return [
+    policy.promise && { kind: "promise", value: policy.promise.median, low: policy.promise.low, high: policy.promise.high },
+    real && mark("real", real),
+    without && mark("without", without),
+  ].filter(Boolean);
+}
+
+export function meanWords({ mean, mean_interval: interval }) {
+  return number(mean, 4) + (interval ? ` (${number(interval.low)} to ${number(interval.high)})` : "");
+}
+
+/** One sentence: what it promised, and what came. */
+export function sentence(policy) {
+  const [real, { promise }] = [realOf(policy), policy];
+  const said = promise ? `Promised ${number(promise.low)} to ${number(promise.high)}` : "Nothing was promised";
+  if (!real) return `${said}; no real episode from the declared starts yet.`;
+  const kept = real.promise_kept === null ? "" : real.promise_kept ? ": the promise was kept" : ": the promise was broken";
+  const success = real.success_rate === null ? "" : `; ${percent(real.success_rate)} succeeded`;
+  return `${said}; really ${meanWords(real)} in ${plural(real.episodes, "episode")}${success}${kept}.`;
+}
+
+/** Which of two policies is better in reality: {better, worse, by, low, high}; null where that is not known. */
+export function compared(one, other) {
+  const [a, b] = [realOf(one.policy), realOf(other.policy)];
+  if (!a?.mean_interval || !b?.mean_interval) return null;
+  const error = ({ low, high }) => (high - low) / (2 * Z);
+  const reach = Z * Math.hypot(error(a.mean_interval), error(b.mean_interval));
+  const [better, worse] = a.mean >= b.mean ? [one, other] : [other, one];
+  const by = Math.abs(a.mean - b.mean);
+  return { better, worse, by, low: by - reach, high: by + reach };
+}

@@ -1,0 +1,50 @@
+// Numbers with their intervals on one axis: told apart by shape, so that no colour is needed.
+
+import { h } from "/page/dom.js";
+import { number } from "/page/format.js";
+
+const WIDTH = 600;
+const ROW = 40;
+const LABEL = 24; // characters
+const PAD = { left: 170, right: 8, top: 4, bottom: 22 };
+
+const text = (x, y, said, anchor = "middle") => h("text", { x, y, "text-anchor": anchor }, said);
+
+function shape({ kind, value, low, high }, x, y) {
+  const parts = [];
+  if (low !== null && low !== undefined) {
+    parts.push(kind === "promise"
+      ? h("line", { class: "wide", x1: x(low), x2: x(high), y1: y, y2: y })
+      : [h("line", { x1: x(low), x2: x(high), y1: y, y2: y }), ...[low, high].map((end) => h("line", { x1: x(end), x2: x(end), y1: y - 5, y2: y + 5 }))]);
+  }
+  if (kind === "without") parts.push([[-4, -4, 4, 4], [-4, 4, 4, -4]].map(([a, b, c, d]) => h("line", { x1: x(value) + a, y1: y + b, x2: x(value) + c, y2: y + d })));
+  else parts.push(h("circle", { class: kind === "promise" ? "hollow" : "", cx: x(value), cy: y, r: 4.5 }));
+  return parts;
+}
+
+/** `rows` are {label, marks: [{kind: "promise" | "real" | "without", value, low, high}]}; null where nothing is known. */
+export function ranges(rows, label) {
+  const all = rows.flatMap(({ marks }) => marks.flatMap(({ value, low, high }) => [value, low ?? value, high ?? value]));
+  if (!all.length) return null;
+  const [least, most] = [Math.min(...all), Math.max(...all)];
+  const span = most - least || Math.abs(most) || 1;
+  const [from, to] = [least - 0.04 * span, most + 0.04 * span];
+  const x = (value) => PAD.left + ((WIDTH - PAD.left - PAD.right) * (value - from)) / (to - from);
+  const height = PAD.top + ROW * rows.length + PAD.bottom;
+  const said = rows.map(({ label: who, marks }) => `${who}: ${marks.map(({ kind, value, low, high }) => `${kind} ${number(value)}${low === null || low === undefined ? "" : ` between ${number(low)} and ${number(high)}`}`).join(", ") || "nothing known"}`);
+  const ticks = [from + 0.04 * span, (from + to) / 2, to - 0.04 * span];
+  return h("svg", { class: "ranges", viewBox: `0 0 ${WIDTH} ${height}`, role: "img", "aria-label": `${label}. ${said.join("; ")}` },
+    rows.map(({ label: who, marks }, at) => {
+      const top = PAD.top + ROW * at;
+      const label = text(0, top + 22, who.length > LABEL ? `${who.slice(0, LABEL - 1)}…` : who, "start");
+      label.append(h("title", {}, who));
+      return [label, ...marks.map((mark, which) => shape(mark, x, top + 8 + 11 * which))];
+    }),
+    h("line", { class: "axis", x1: PAD.left, x2: WIDTH - PAD.right, y1: height - PAD.bottom, y2: height - PAD.bottom }),
+    ticks.map((value, at) => text(x(value), height - 6, number(value), ["start", "middle", "end"][at])));
+}
+
+/** What the shapes mean. */
+export const rangesKey = () => h("p", { class: "key" },
+  h("span", { class: "shape promise" }, "promised: 90 % interval"), h("span", { class: "shape real" }, "real: mean with 95 % interval"),
+  h("span", { class: "shape without" }, "real, without the policy"));

@@ -1,0 +1,129 @@
+"""Policies on the page: promise beside real return, aliases, episodes, files, and two surrogates compared."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Page, expect
+
+from support.policies import store
+from support.server import ServerProcess
+from surrogym_client.original.classic import pendulum
+from surrogym_client.transport import Api
+
+Open = Callable[..., Page]
+SERIOUS = ("serious", "critical")
+
+
+@pytest.fixture(scope="module")
+def url(pendulum_server: ServerProcess) -> Iterator[str]:
+    """A server with two surrogates of the same environment; the second has the better policies."""
+    expect.set_options(timeout=30_000)
+    with Api(pendulum_server.url) as api:
+        for name, means in (("worse", (-300, -250)), ("better", (-260, -150))):
+            api.create_surrogate(name, pendulum())
+            for number, mean in enumerate(means):
+                store(api, name, seed=100 * len(name) + number, mean=mean)
+        api.create_surrogate("bare", pendulum())
+        yield pendulum_server.url
+        for name in ("worse", "better", "bare"):
+            api.delete_surrogate(name)
+
+
+def serious(page: Page) -> list[str]:
+    """What axe finds that keeps somebody from using the page."""
+    found = Axe().run(page).response["violations"]
+    return [f"{one['id']}: {one['nodes'][0]['html'][:200]}" for one in found if one["impact"] in SERIOUS]
+
+
+def test_promise_and_real_return_stand_beside_each_other(url: str, open_page: Open, complaints: list[str]):
+    page = open_page(f"{url}/#/s/better")
+    part = page.locator("#policies")
+    expect(part.locator("summary").first).to_contain_text(
+        re.compile(r"version 2 .*Promised −170 to −130; really −1[45]\d")
+    )
+    expect(part.locator("summary").first).to_contain_text("the promise was kept")
+    picture = part.locator(".ranges")
+    expect(picture).to_have_attribute(
+        "aria-label", re.compile(r"better@2: promise −150 between −170 and −130, real .*without")
+    )
+    part.locator("summary").first.click()
+    expect(part.get_by_role("region", name="Real episodes of version 2")).to_contain_text("an action of zero")
+    expect(part.locator(".episodes canvas")).to_have_count(2)  # a picture for each coordinate
+    part.get_by_role("button", name="Make it production").click()
+    expect(part.locator("summary").first).to_contain_text("production")
+    assert complaints == []
+
+
+def test_a_file_is_downloaded_as_it_came(url: str, open_page: Open, tmp_path: Path):
+    page = open_page(f"{url}/#/s/worse")
+    page.locator("#policies summary").last.click()
+    with page.expect_download() as downloading:
+        page.get_by_role("button", name=re.compile("^Download zip")).click()
+    assert downloading.value.suggested_filename == "worse-1.zip"
+    downloading.value.save_as(tmp_path / "got.zip")
+    with Api(url) as api:
+        assert (tmp_path / "got.zip").read_bytes() == api.policies.file("worse", 1, "zip")
+
+
+def test_the_better_of_two_surrogates_is_named_with_its_interval(url: str, open_page: Open, complaints: list[str]):
+    page = open_page(f"{url}/#/compare/worse/better")
+    said = page.locator(".big")
+    expect(said).to_contain_text(
+        re.compile(r"^better@2.* is better than worse@2 by (9\d|10\d)[.\d]* \(95 %: \S+ to \S+\)\.$")
+    )
+    assert serious(page) == []
+    page.get_by_role("combobox").nth(1).select_option("bare")
+    expect(said).to_contain_text("are needed to say which is better")
+    page.get_by_role("combobox").nth(0).select_option("pendulum")
+    expect(page.locator("main")).to_contain_text("Neither has a policy yet.")
+    assert complaints == []
+
+
+def test_a_surrogate_without_a_policy_or_a_model_says_how_to_get_one(url: str, open_page: Open):
+    page = open_page(f"{url}/#/s/bare")
+    expect(page.locator("#policies")).to_contain_text("No policy is stored. surrogym train bare")
+    for empty in ("learning", "maps", "probe"):
+        expect(page.locator(f"#{empty}")).to_be_hidden()
+    assert serious(page) == []
+
+
+def test_damaged_episodes_are_named_and_the_rest_is_shown(
+    url: str, open_page: Open, pendulum_server: ServerProcess, complaints: list[str]
+):
+    with Api(url) as api:
+        store(api, "bare", seed=7, mean=-200.0)
+    folder = pendulum_server.folder / "surrogym.db.files"
+    for path in sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime_ns)[-3:]:
+        path.write_bytes(b"broken")
+    page = open_page(f"{url}/#/s/bare")
+    part = page.locator("#policies")
+    part.locator("summary").first.click()
+    expect(part).to_contain_text("The single episodes can't be shown")
+    expect(part).to_contain_text("Promised −220 to −180")
+    page.get_by_role("button", name=re.compile("^Download zip")).click()
+    expect(part.get_by_role("alert")).to_contain_text("is not what was stored")
+    with Api(url) as api:
+        api.policies.delete("bare", 1)
+    assert [said for said in complaints if "500" not in said] == []
+
+
+@pytest.mark.parametrize(
+    ("where", "scheme", "width"), [("", "light", 1280), ("s/better", "dark", 1280), ("s/pendulum", "light", 390)]
+)
+def test_axe_finds_nothing_serious(url: str, open_page: Open, where: str, scheme: str, width: int):
+    page = open_page(f"{url}/#/{where}", scheme=scheme, width=width)
+    if where:
+        page.locator("#policies").wait_for()
+        if where == "s/pendulum":
+            expect(page.locator("#maps")).to_contain_text("of the tolerance on this cut")
+        else:
+            page.locator("#policies summary").first.click()
+            expect(page.locator("#policies .episodes canvas")).to_have_count(2)
+    else:
+        expect(page.get_by_role("link", name=re.compile("^pendulum"))).to_be_visible()
+    assert serious(page) == []
