@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -40,11 +39,12 @@ from surrogym_server.api.state import Services
 from surrogym_server.api.turns import Turns
 from surrogym_server.convert import definition_from_spec, stored_definition
 from surrogym_server.convert.stored import read_stored
-from surrogym_server.engine.compiling import Compiling
 from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
 from surrogym_server.engine.fits import Fits
+from surrogym_server.engine.local import LocalEngine
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.engine.sessions import MEBIBYTE, Limits, LiveSessions, Threads
+from surrogym_server.engine.port import SessionEngine
+from surrogym_server.engine.sessions import MEBIBYTE, Limits
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.registry import MODELS
@@ -55,7 +55,7 @@ from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import Designer
 from surrogym_server.services.events import EventService
 from surrogym_server.services.metrics import ProcessMetrics
-from surrogym_server.services.models import ModelService, load_model
+from surrogym_server.services.models import ModelService, load_model, stored_tolerances
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.policies import PolicyService
 from surrogym_server.services.queries import QueryService
@@ -74,7 +74,6 @@ DESCRIPTION = """Learns a virtual environment from a handful of real steps and s
 
 A sampler claims queries and adds samples; a trainer opens a session and steps it; the server chooses the queries.
 """
-STEP_THREADS, ROLLOUT_THREADS = 4, 2
 
 
 @dataclass(frozen=True)
@@ -92,12 +91,16 @@ class State(TypedDict):
 
 
 @dataclass(frozen=True)
-class _Engine:
+class _Process:
+    """What a server process has beside its services."""
+
+    storage: Storage
+    definitions: Definitions
+    models: ModelCache
+    engine: SessionEngine
     fits: Fits
-    compiling: Compiling
-    live: LiveSessions
-    threads: tuple[ThreadPoolExecutor, ...]
     notices: Notices
+    metrics: ProcessMetrics
 
 
 def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI:
@@ -160,97 +163,79 @@ def say_goodbye(app: FastAPI) -> None:
 async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: DesignPort) -> AsyncIterator[State]:
     torch.set_num_threads(settings.threads)
     threadpool_limits(settings.threads, user_api="blas")  # of NumPy, in which policies act
-    engine = _build_engine(settings, design)
-    app.state.notices = engine.notices
-    definitions = Definitions(storage, _stored_definition)
-    services, sweeper = _build_services(settings, design, storage, definitions, engine, app.state.metrics)
+    process = _build_process(settings, design, storage, app.state.metrics)
+    app.state.notices = process.notices
+    services = _build_services(settings, design, process)
+    sweeper = Sweeper(storage, process.engine, settings.sweep_seconds, process.metrics)
     for registry in (ACQUISITIONS, MODELS):
         logger.info("%ss: %s", registry.kind, ", ".join(registry.names))
         for name, why in registry.broken.items():
             logger.warning("the %s %r is left out: %s", registry.kind, name, why)
-    engine.fits.start()
-    compiling = asyncio.to_thread(engine.compiling.start)
-    restored = services.sessions.restore()
+    process.fits.start()
+    restored = await services.sessions.restore()
     if restored:
         logger.info("sessions that came back: %d", restored)
-    looking = asyncio.to_thread(_name_lacking, definitions)
-    tasks = [asyncio.create_task(work) for work in (services.designer.run(), sweeper.run(), looking, compiling)]
+    looking = asyncio.to_thread(_name_lacking, process.definitions)
+    work = (services.designer.run(), sweeper.run(), looking, process.engine.start())
+    tasks = [asyncio.create_task(one) for one in work]
     try:
         yield {"services": services}
     finally:
-        engine.notices.close()
+        process.notices.close()
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        engine.live.stop()
-        for threads in engine.threads:
-            threads.shutdown()
-        await asyncio.to_thread(engine.fits.close)
-        engine.compiling.close()
-        logger.info("sessions saved: %d", services.sessions.save())
+        await process.engine.stop()
+        await asyncio.to_thread(process.fits.close)
+        logger.info("sessions saved: %d", await services.sessions.save())
         storage.close()
 
 
-def _build_engine(settings: Settings, design: DesignPort) -> _Engine:
-    for_steps = ThreadPoolExecutor(STEP_THREADS, thread_name_prefix="step")
-    for_rollouts = ThreadPoolExecutor(ROLLOUT_THREADS, thread_name_prefix="rollout")
-    live = LiveSessions(
-        Threads(for_steps, STEP_THREADS),
-        Threads(for_rollouts, ROLLOUT_THREADS),
-        limits=Limits(settings.max_sessions, settings.max_sessions_mib * MEBIBYTE, settings.max_waiting),
-        idle_seconds=settings.session_idle_seconds,
-    )
-    return _Engine(Fits(design.run), Compiling(), live, (for_steps, for_rollouts), Notices())
-
-
-def _build_services(
-    settings: Settings,
-    design: DesignPort,
-    storage: Storage,
-    definitions: Definitions,
-    engine: _Engine,
-    metrics: ProcessMetrics,
-) -> tuple[Services, Sweeper]:
-    cache = ModelCache(
+def _build_process(settings: Settings, design: DesignPort, storage: Storage, metrics: ProcessMetrics) -> _Process:
+    definitions = Definitions(storage, _stored_definition)
+    models = ModelCache(
         load=lambda surrogate, version: load_model(storage, definitions, surrogate, version),
         newest=storage.models.newest,
     )
+    engine = LocalEngine(
+        models,
+        lambda surrogate, version: stored_tolerances(storage, surrogate, version),
+        limits=Limits(settings.max_sessions, settings.max_sessions_mib * MEBIBYTE, settings.max_waiting),
+        max_lanes=settings.max_lanes,
+        idle_seconds=settings.session_idle_seconds,
+        device=torch.device(settings.device),
+    )
+    return _Process(storage, definitions, models, engine, Fits(design.run), Notices(), metrics)
+
+
+def _build_services(settings: Settings, design: DesignPort, process: _Process) -> Services:
+    storage, definitions, notices, samplers = process.storage, process.definitions, process.notices, Samplers()
     designer = Designer(
         storage,
         definitions,
-        engine.fits,
-        cache,
-        engine.notices,
-        metrics,
+        process.fits,
+        process.models,
+        notices,
+        process.metrics,
         owner=uuid4().hex,
         threads=settings.threads,
         look_seconds=settings.sweep_seconds,
         fit_seconds=settings.fit_seconds,
     )
-    samplers = Samplers()
-    services = Services(
+    return Services(
         surrogates=SurrogateService(
-            storage, definitions, _define, _complete, design.plan, cache, engine.live, engine.notices, samplers
+            storage, definitions, _define, _complete, design.plan, process.engine, notices, samplers
         ),
-        queries=QueryService(storage, definitions, engine.notices, samplers),
-        samples=SampleService(storage, definitions, engine.notices, samplers),
-        models=ModelService(storage, definitions, cache, engine.notices),
-        policies=PolicyService(storage, _complete, engine.notices, settings.policies_mib * MEBIBYTE),
-        sessions=SessionService(
-            storage,
-            definitions,
-            cache,
-            engine.live,
-            settings.max_lanes,
-            metrics,
-            torch.device(settings.device),
-            engine.compiling.wait,
-        ),
+        queries=QueryService(storage, definitions, notices, samplers),
+        samples=SampleService(storage, definitions, notices, samplers),
+        models=ModelService(storage, definitions, process.models, notices),
+        policies=PolicyService(storage, _complete, notices, settings.policies_mib * MEBIBYTE),
+        sessions=SessionService(storage, definitions, process.engine),
+        engine=process.engine,
         designer=designer,
-        events=EventService(storage, engine.notices),
+        events=EventService(storage, notices),
         storage=storage,
     )
-    return services, Sweeper(storage, engine.live, cache, settings.sweep_seconds, metrics)
 
 
 def _name_lacking(definitions: Definitions) -> None:

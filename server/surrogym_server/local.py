@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Self
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from surrogym_server.convert import opening, session_view, stored_definition
-from surrogym_server.engine.rollouts import roll, roll_policy
-from surrogym_server.engine.session import (
-    Session,
-    check_opening,
-    digest_of,
-    open_session,
-    reset_session,
-    step_session,
-)
-from surrogym_server.environment.actions import policy_actions
-from surrogym_server.errors import InvalidInput, NotReset, UnknownModel, UnknownSession
+from surrogym_server.engine.core import carried_out, opened, visited_states
+from surrogym_server.engine.requests import Advance, Open, PolicySteps, Reset, Rollout, Step, info_of
+from surrogym_server.engine.session import Outcome, Session, check_opening, digest_of
+from surrogym_server.errors import InvalidInput, UnknownModel, UnknownSession
 from surrogym_server.models.files import from_bytes
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.services.sessions import resolved
-from surrogym_server.virtual import in_fastest_form
 from surrogym_shared.acting import ActingPolicy, NoiseKey, PolicyRun
 from surrogym_shared.port import Bools, Floats, Ints, PolicyRollout, ResetResult, StepResult
 from surrogym_shared.spec import EnvironmentSpec
@@ -50,6 +41,7 @@ class LocalSurrogate:
     def __init__(self, spec: EnvironmentSpec, model: DynamicsModel) -> None:
         self._spec = spec
         self._model = model
+        self._models = _OneModel(model)
         self._sessions: dict[str, Session] = {}
 
     @classmethod
@@ -92,40 +84,32 @@ class LocalSurrogate:
     def open(self, request: OpenSession) -> SessionView:
         if request.model not in ("latest", VERSION):
             raise UnknownModel(f"expected model 'latest' or {VERSION}, got {request.model}")
-        asked, definition = opening(request), self._model.definition
+        asked = opening(request)
         digest = digest_of("open", asked)
         for live in self._sessions.values():
             if asked.key is not None and live.opened_by is not None and live.opened_by[0] == asked.key:
-                return session_view(check_opening(live, digest), float("inf"))
-        session = open_session(
-            secrets.token_urlsafe(8),
-            "local",
-            definition,
-            in_fastest_form(resolved(asked, definition), self._model),
-            seed=secrets.randbits(63) if asked.seed is None else asked.seed,
-            model=asked.model,
-            version=VERSION,
-            occupancy=asked.occupancy,
-            opened_by=None if asked.key is None else (asked.key, digest),
-        )
+                return session_view(info_of(check_opening(live, digest)), float("inf"))
+        definition = self._model.definition
+        session = opened(Open("local", 0, definition, asked), definition, self._model, VERSION, digest)
         self._sessions[session.id] = session
-        return session_view(session, float("inf"))
+        return session_view(info_of(session), float("inf"))
 
     def reset(self, session: str, *, seed: int | Sequence[int] | None = None, mask: Bools | None = None) -> ResetResult:
-        self._sessions[session], result = reset_session(self._get(session), seed, mask, VERSION)
-        return result
+        outcome = self._advance(Reset(session, None, seed, mask))
+        assert isinstance(outcome, ResetResult)
+        return outcome
 
     def step(
         self, session: str, action: Floats | Ints, *, mask: Bools | None = None, deviations: bool = False
     ) -> StepResult:
-        live = self._get(session)
-        u = policy_actions(live.definition.action, action, live.settings.num_envs)
-        self._sessions[session], result = step_session(live, u, mask, deviations, self._version, VERSION)
-        return result
+        outcome = self._advance(Step(session, None, np.asarray(action), mask, deviations))
+        assert isinstance(outcome, tuple)
+        return outcome[0]
 
     def rollout(self, session: str, actions: Floats | Ints) -> list[StepResult]:
-        self._sessions[session], results = roll(self._get(session), np.asarray(actions), self._step)
-        return list(results)
+        outcome = self._advance(Rollout(session, None, np.asarray(actions)))
+        assert isinstance(outcome, tuple)
+        return list(outcome)
 
     def rollout_policy(
         self,
@@ -140,22 +124,17 @@ class LocalSurrogate:
             run = PolicyRun(policy, steps, noise, None if until is None else np.asarray(until, dtype=bool))
         except ValueError as error:
             raise InvalidInput(str(error)) from error
-        self._sessions[session], result = roll_policy(self._get(session), run, self._step)
-        return result
+        outcome = self._advance(PolicySteps(session, None, run))
+        assert isinstance(outcome, PolicyRollout)
+        return outcome
 
     def submit_occupancy(self, session: str, checkpoint: str) -> SubmittedOccupancy:
         """There is no design here to weigh; says how many states there are, and keeps none."""
-        states = len(self.visited(session))
-        if not states:
-            raise NotReset("this session has visited no state yet: reset and step it first")
-        return SubmittedOccupancy(checkpoint=checkpoint, states=states)
+        return SubmittedOccupancy(checkpoint=checkpoint, states=len(self.visited(session)))
 
     def visited(self, session: str) -> NDArray[np.float64]:
         """The states that a session opened with occupancy visited, (v, C)."""
-        visited = self._get(session).visited
-        if visited is None:
-            raise InvalidInput("expected a session opened with occupancy=true, got one without")
-        return visited.states
+        return visited_states(self._get(session))
 
     def close(self, session: str) -> None:
         self._sessions.pop(session, None)
@@ -165,9 +144,26 @@ class LocalSurrogate:
             raise UnknownSession(f"no session {session!r}: open a new one")
         return self._sessions[session]
 
-    def _step(self, session: Session, u: NDArray[np.float64]) -> tuple[Session, StepResult]:
-        return step_session(session, u, None, False, self._version, VERSION)
+    def _advance(self, request: Advance) -> Outcome:
+        session, outcome = carried_out(request, self._models, _always, False, self._get(request.session))
+        self._sessions[session.id] = session
+        return outcome
 
-    def _version(self, version: int) -> DynamicsModel:
-        del version  # there is one
+
+class _OneModel:
+    """The models of a surrogate that has one."""
+
+    def __init__(self, model: DynamicsModel) -> None:
+        self._model = model
+
+    def get(self, surrogate: int, version: int, device: torch.device) -> DynamicsModel:
+        del surrogate, version, device
         return self._model
+
+    def latest(self, surrogate: int) -> int:
+        del surrogate
+        return VERSION
+
+
+def _always() -> None:
+    """Rollouts go on to their end."""

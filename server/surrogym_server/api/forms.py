@@ -1,94 +1,117 @@
-"""reset, step and rollout in their two forms, JSON and frames: the body of a request in, that of its reply out."""
+"""reset, step and rollout in their two forms, JSON and frames: a body to a request, a reply to a body."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Mapping
+from typing import Literal
 
 import msgspec
 
 from surrogym_server import convert
-from surrogym_server.api.json_body import JSON, parse_as
-from surrogym_server.engine.session import Answer, steps_of
-from surrogym_server.services.sessions import SessionService
+from surrogym_server.api.json_body import parse_as
+from surrogym_server.engine.port import SessionEngine
+from surrogym_server.engine.requests import Advance, PolicySteps, Reply, Reset, Rollout, Step
+from surrogym_server.engine.session import steps_of
 from surrogym_shared import frames
 from surrogym_shared.wire import ResetSession, RolloutSession, StepSession
 
-Carry = Callable[[SessionService, str, bytes], Awaitable[bytes]]
+Operation = Literal["reset", "step", "rollout"]
+Writers = Mapping[type[Advance], Callable[[Reply], bytes]]  # of the reply to each kind of request
 
 SHORT_ROLLOUT = 32  # steps; a longer one's reply takes milliseconds to write, and others don't wait for that
+
+FRAMES: Mapping[Operation, tuple[type[frames.Request], ...]] = {
+    "reset": (frames.ResetRequest,),
+    "step": (frames.StepRequest,),
+    "rollout": (frames.RolloutRequest, frames.PolicyRequest),
+}
 
 _JSON = msgspec.json.Encoder()
 
 
-async def reset_json(sessions: SessionService, id: str, content: bytes) -> bytes:
-    body = parse_as(ResetSession, content)
-    answer = await sessions.reset(id, body.seq, body.seed, convert.lane_mask(body.mask))
-    return _JSON.encode(convert.reset_reply(answer))
+def request_in_json(operation: Operation, session: str, content: bytes, within: float | None) -> Advance:
+    """Raises what ``parse_as`` does, and ``InvalidInput``."""
+    match operation:
+        case "step":
+            step = parse_as(StepSession, content)
+            action, mask = convert.numbers("action", step.action), convert.lane_mask(step.mask)
+            return Step(session, step.seq, action, mask, step.deviations, within)
+        case "reset":
+            reset = parse_as(ResetSession, content)
+            return Reset(session, reset.seq, reset.seed, convert.lane_mask(reset.mask), within)
+        case "rollout":
+            rollout = parse_as(RolloutSession, content)
+            if rollout.actions is None:
+                return PolicySteps(session, rollout.seq, convert.policy_run(rollout), within)
+            return Rollout(session, rollout.seq, convert.numbers("actions", rollout.actions), within)
 
 
-async def step_json(sessions: SessionService, id: str, content: bytes) -> bytes:
-    body = parse_as(StepSession, content)
-    action = convert.numbers("action", body.action)
-    answer = await sessions.step(id, body.seq, action, convert.lane_mask(body.mask), body.deviations)
-    return _JSON.encode(convert.step_reply(answer))
+def frame_of(operation: Operation, content: bytes) -> frames.Request:
+    """Raises ``FrameError`` where the content is no frame of this operation."""
+    request = frames.read_request(content)
+    if not isinstance(request, FRAMES[operation]):
+        expected = " or a ".join(kind.__name__ for kind in FRAMES[operation])
+        raise frames.FrameError(f"expected a {expected}, got a {type(request).__name__}")
+    return request
 
 
-async def rollout_json(sessions: SessionService, id: str, content: bytes) -> bytes:
-    body = parse_as(RolloutSession, content)
-    if body.actions is None:
-        answer = await sessions.rollout_policy(id, body.seq, convert.policy_run(body))
-    else:
-        answer = await sessions.rollout(id, body.seq, convert.numbers("actions", body.actions))
-    return await _rollout_written(_rollout_in_json, answer)
-
-
-async def carry_out(sessions: SessionService, id: str, shape: frames.Shape, request: frames.Request) -> bytes:
-    """A frame's request, whatever carried it; raises ``FrameError`` where it does not fit the session's shape."""
-    match request:
+def request_in_frame(frame: frames.Request, session: str, shape: frames.Shape, within: float | None = None) -> Advance:
+    """Raises ``FrameError`` where a frame does not fit the session's shape."""
+    match frame:
         case frames.StepRequest():
-            action, mask = frames.action_of(request, shape), frames.mask_of(request, shape)
-            answer = await sessions.step(id, request.seq, action, mask, request.deviations)
-            return frames.encode(convert.step_frame(answer))
+            action, mask = frames.action_of(frame, shape), frames.mask_of(frame, shape)
+            return Step(session, frame.seq, action, mask, frame.deviations, within)
         case frames.ResetRequest():
-            seed, mask = frames.seed_of(request, shape), frames.mask_of(request, shape)
-            return frames.encode(convert.reset_frame(await sessions.reset(id, request.seq, seed, mask)))
+            return Reset(session, frame.seq, frames.seed_of(frame, shape), frames.mask_of(frame, shape), within)
         case frames.RolloutRequest():
-            answer = await sessions.rollout(id, request.seq, frames.actions_of(request, shape))
-            return await _rollout_written(_rollout_in_frames, answer)
+            return Rollout(session, frame.seq, frames.actions_of(frame, shape), within)
         case frames.PolicyRequest():
-            answer = await sessions.rollout_policy(id, request.seq, convert.framed_policy_run(request, shape))
-            return await _rollout_written(_rollout_in_frames, answer)
+            return PolicySteps(session, frame.seq, convert.framed_policy_run(frame, shape), within)
 
 
-async def _rollout_written(write: Callable[[Answer], bytes], answer: Answer) -> bytes:
-    return write(answer) if steps_of(answer.outcome) <= SHORT_ROLLOUT else await asyncio.to_thread(write, answer)
+async def carried_out(engine: SessionEngine, request: Advance, writers: Writers) -> bytes:
+    """The reply of a request, written; a long one in a thread."""
+    reply = await engine.advance(request)
+    write = writers[type(request)]
+    return write(reply) if steps_of(reply.outcome) <= SHORT_ROLLOUT else await asyncio.to_thread(write, reply)
 
 
-def _rollout_in_json(answer: Answer) -> bytes:
+def _reset_in_json(reply: Reply) -> bytes:
+    return _JSON.encode(convert.reset_reply(reply))
+
+
+def _step_in_json(reply: Reply) -> bytes:
+    return _JSON.encode(convert.step_reply(reply))
+
+
+def _rollout_in_json(reply: Reply) -> bytes:
     """Step by step: a thread that encodes lets no other one in."""
-    steps = [msgspec.Raw(_JSON.encode(step)) for step in convert.rollout_steps(answer)]
-    return _JSON.encode({"seq": answer.seq, "steps": steps, **convert.rollout_actions(answer)})
+    steps = [msgspec.Raw(_JSON.encode(step)) for step in convert.rollout_steps(reply)]
+    return _JSON.encode({"seq": reply.seq, "steps": steps, **convert.rollout_actions(reply)})
 
 
-def _rollout_in_frames(answer: Answer) -> bytes:
-    return frames.encode(convert.rollout_frame(answer))
+def _reset_in_frame(reply: Reply) -> bytes:
+    return frames.encode(convert.reset_frame(reply))
 
 
-def _framed(*kinds: type[frames.Request]) -> Carry:
-    async def carry(sessions: SessionService, id: str, content: bytes) -> bytes:
-        request = frames.read_request(content)
-        if not isinstance(request, kinds):
-            expected = " or a ".join(kind.__name__ for kind in kinds)
-            raise frames.FrameError(f"expected a {expected}, got a {type(request).__name__}")
-        return await carry_out(sessions, id, convert.session_shape(sessions.get(id)), request)
-
-    return carry
+def _step_in_frame(reply: Reply) -> bytes:
+    return frames.encode(convert.step_frame(reply))
 
 
-RESET: dict[str, Carry] = {JSON: reset_json, frames.MEDIA_TYPE: _framed(frames.ResetRequest)}
-STEP: dict[str, Carry] = {JSON: step_json, frames.MEDIA_TYPE: _framed(frames.StepRequest)}
-ROLLOUT: dict[str, Carry] = {
-    JSON: rollout_json,
-    frames.MEDIA_TYPE: _framed(frames.RolloutRequest, frames.PolicyRequest),
+def _rollout_in_frame(reply: Reply) -> bytes:
+    return frames.encode(convert.rollout_frame(reply))
+
+
+AS_JSON: Writers = {
+    Reset: _reset_in_json,
+    Step: _step_in_json,
+    Rollout: _rollout_in_json,
+    PolicySteps: _rollout_in_json,
+}
+AS_FRAME: Writers = {
+    Reset: _reset_in_frame,
+    Step: _step_in_frame,
+    Rollout: _rollout_in_frame,
+    PolicySteps: _rollout_in_frame,
 }

@@ -21,7 +21,8 @@ from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.problems import documented
 from surrogym_server.api.series import exposition
 from surrogym_server.api.state import Services, Use
-from surrogym_server.services.metrics import Durations, ProcessMetrics
+from surrogym_server.engine.tallies import Durations
+from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_shared.codes import Code
 
 router = APIRouter(tags=["service"], route_class=DoorRoute)
@@ -52,19 +53,17 @@ class _Reading:
 
     def collect(self) -> Iterator[Metric]:
         yield InfoMetricFamily("surrogym_build", "Version of the server.", {"version": self._version})
-        metrics = self._metrics
+        metrics, engine = self._metrics, self._use.engine.counts()
         yield _requests(metrics)
-        yield _durations("surrogym_step_seconds", "Of a request that steps a session, waiting included.", metrics.steps)
+        yield _durations("surrogym_step_seconds", "Of a request that steps a session, waiting included.", engine.steps)
         yield _durations("surrogym_fit_seconds", "Of a fit with the choice of the next queries.", metrics.fits)
-        yield CounterMetricFamily("surrogym_lane_steps", "Virtual environment steps.", metrics.lane_steps)
+        yield CounterMetricFamily("surrogym_lane_steps", "Virtual environment steps.", engine.lane_steps)
         yield CounterMetricFamily("surrogym_failed_fits", "Fits that failed.", metrics.failed_fits)
         yield CounterMetricFamily("surrogym_expired_leases", "Leases that ended unanswered.", metrics.expired_leases)
-        yield CounterMetricFamily("surrogym_expired_sessions", "Sessions idle for too long.", metrics.expired_sessions)
-        sessions, lanes = self._use.sessions.alive()
-        yield GaugeMetricFamily("surrogym_sessions", "Open sessions.", sessions)
-        yield GaugeMetricFamily("surrogym_lanes", "Lanes of all open sessions.", lanes)
-        requests = self._use.sessions.requests
-        yield GaugeMetricFamily("surrogym_session_requests", "Of sessions, at work or waiting.", requests)
+        yield CounterMetricFamily("surrogym_expired_sessions", "Sessions idle for too long.", engine.expired)
+        yield GaugeMetricFamily("surrogym_sessions", "Open sessions.", sum(engine.sessions.values()))
+        yield GaugeMetricFamily("surrogym_lanes", "Lanes of all open sessions.", engine.lanes)
+        yield GaugeMetricFamily("surrogym_session_requests", "Of sessions, at work or waiting.", engine.requests)
 
 
 def _requests(metrics: ProcessMetrics) -> Metric:

@@ -14,8 +14,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from surrogym_server.api.caller import caller
 from surrogym_server.api.headers import raw_header
 from surrogym_server.api.problems import REQUEST_HEADER
+from surrogym_server.engine.tallies import Durations
 from surrogym_server.logs import REQUEST_ID
-from surrogym_server.services.metrics import Durations, ProcessMetrics
+from surrogym_server.services.metrics import ProcessMetrics
 
 logger = logging.getLogger("surrogym_server.requests")
 

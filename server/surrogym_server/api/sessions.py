@@ -65,7 +65,7 @@ async def list_sessions(name: str, use: Use) -> SessionList:
 @router.get("/sessions/{id}", summary="One session", dependencies=[TRAIN], responses=documented(*SESSION_ERRORS))
 async def get_session(id: str, use: Use) -> SessionView:
     """Its settings, the last seq answered, and the model version of each lane."""
-    return convert.session_view(use.sessions.get(id), use.sessions.idle_seconds)
+    return convert.session_view(await use.sessions.get(id), use.sessions.idle_seconds)
 
 
 @router.get(
@@ -76,7 +76,7 @@ async def get_session(id: str, use: Use) -> SessionView:
 )
 async def session_coordinates(id: str, use: Use) -> SessionCoordinates:
     """The coordinates of every lane, as the original environment can be set to them."""
-    return convert.session_coordinates(use.sessions.get(id))
+    return convert.session_coordinates(await use.sessions.coordinates(id))
 
 
 @router.delete(
@@ -88,7 +88,7 @@ async def session_coordinates(id: str, use: Use) -> SessionCoordinates:
 )
 async def close_session(id: str, use: Use) -> Response:
     """Closing one that has ended is harmless."""
-    use.sessions.close(id)
+    await use.sessions.close(id)
     return Response(status_code=204)
 
 

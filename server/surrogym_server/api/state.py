@@ -7,6 +7,7 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
+from surrogym_server.engine.port import SessionEngine
 from surrogym_server.services.designer import Designer
 from surrogym_server.services.events import EventService
 from surrogym_server.services.models import ModelService
@@ -28,6 +29,7 @@ class Services:
     models: ModelService
     policies: PolicyService
     sessions: SessionService
+    engine: SessionEngine
     designer: Designer
     events: EventService
     storage: Storage

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -13,6 +13,7 @@ from starlette.requests import ClientDisconnect
 from starlette.routing import WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from surrogym_server import convert
 from surrogym_server.api import examples, forms
 from surrogym_server.api.auth import TRAIN
 from surrogym_server.api.body import BINARY, LeanRoute, described
@@ -21,6 +22,8 @@ from surrogym_server.api.door import MEDIA_TYPE, json_up_to
 from surrogym_server.api.json_body import JSON, take_turn
 from surrogym_server.api.problems import answer_to, documented
 from surrogym_server.api.stream import StepStream
+from surrogym_server.engine.port import SessionEngine
+from surrogym_server.engine.requests import Advance
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import ResetReply, ResetSession, RolloutReply, RolloutSession, StepReply, StepSession
 
@@ -64,14 +67,14 @@ def _documented(body: type[BaseModel], example: dict[str, Any], reply: type[Base
 @router.post("/reset", summary="Start new episodes", **_documented(ResetSession, examples.RESET, ResetReply))
 async def reset(id: str, request: Request) -> Response:
     """In all lanes, or those of the mask. A seed starts them at episode 0; without one each goes on."""
-    return await _carried(forms.RESET, id, request)
+    return await _carried("reset", id, request)
 
 
 @router.post("/step", summary="Step all lanes", **_documented(StepSession, examples.STEP, StepReply))
 async def step(id: str, request: Request) -> Response:
     """Or those of the mask. The same ``seq`` with the same body gets the same reply, so a lost one may be
     asked for again, over this or another transport."""
-    return await _carried(forms.STEP, id, request)
+    return await _carried("step", id, request)
 
 
 @router.post(
@@ -81,17 +84,28 @@ async def step(id: str, request: Request) -> Response:
 )
 async def rollout(id: str, request: Request) -> Response:
     """With given actions, or with those of a policy that is sent as arrays, in one request; all steps or none."""
-    return await _carried(forms.ROLLOUT, id, request)
+    return await _carried("rollout", id, request)
 
 
-async def _carried(by_type: Mapping[str, forms.Carry], id: str, request: Request) -> Response:
+async def _carried(operation: forms.Operation, id: str, request: Request) -> Response:
     """The reply, in the form of the request."""
-    media_type: str = request.scope[MEDIA_TYPE]
-    sessions = request.state.services.sessions.within(seconds_left(request.headers))
+    scope = request.scope
+    media_type: str = scope[MEDIA_TYPE]
+    engine: SessionEngine = scope["state"]["services"].engine
+    limit, began = seconds_left(request.headers), time.monotonic()
     body = await _body(request)
     if media_type == JSON:
-        await take_turn(request.scope, body)
-    return Response(await by_type[media_type](sessions, id, body), media_type=media_type)
+        await take_turn(scope, body)
+        asked: Advance = forms.request_in_json(operation, id, body, _left(limit, began))
+        return Response(await forms.carried_out(engine, asked, forms.AS_JSON), media_type=media_type)
+    frame = forms.frame_of(operation, body)
+    shape = convert.session_shape(await engine.describe(id))
+    asked = forms.request_in_frame(frame, id, shape, _left(limit, began))
+    return Response(await forms.carried_out(engine, asked, forms.AS_FRAME), media_type=media_type)
+
+
+def _left(limit: float | None, began: float) -> float | None:
+    return None if limit is None else limit - (time.monotonic() - began)
 
 
 async def _body(request: Request) -> bytes:

@@ -20,10 +20,10 @@ from starlette.types import Receive, Scope, Send
 from surrogym_server import convert
 from surrogym_server.api.auth import Gate, bearer_token
 from surrogym_server.api.deadline import seconds_left
-from surrogym_server.api.forms import carry_out
+from surrogym_server.api.forms import AS_FRAME, carried_out, request_in_frame
 from surrogym_server.api.problems import problem_of, response_of
+from surrogym_server.engine.port import SessionEngine
 from surrogym_server.errors import SurrogymError
-from surrogym_server.services.sessions import SessionService
 from surrogym_shared import frames
 
 logger = logging.getLogger(__name__)
@@ -36,12 +36,12 @@ class StepStream:
     """The stream as an ASGI app; one call serves one connection."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        sessions: SessionService = scope["state"]["services"].sessions
+        engine: SessionEngine = scope["state"]["services"].engine
         id: str = scope["path_params"]["id"]
         await receive()  # the client's wish to connect
         try:
             _admit(scope)
-            shape = convert.session_shape(sessions.get(id))
+            shape = convert.session_shape(await engine.describe(id))
             limit = seconds_left(Headers(scope=scope))
         except SurrogymError as error:
             await response_of(problem_of(error))(scope, receive, send)
@@ -49,9 +49,9 @@ class StepStream:
         await send({"type": "websocket.accept"})
         if (offered := scope.get("extensions", {}).get(EXTENSION)) is not None:
             within = copy_context()  # log lines carry the id of the connection's request
-            offered(lambda content: within.run(_at_once, sessions, limit, id, shape, content))
+            offered(lambda content: within.run(_at_once, engine, limit, id, shape, content))
         while (message := await receive())["type"] == "websocket.receive":
-            reply = await _reply(sessions.within(limit), id, shape, message.get("bytes"))
+            reply = await _reply(engine, limit, id, shape, message.get("bytes"))
             await send({"type": "websocket.send", "bytes": reply})
             await asyncio.sleep(0)  # others' turn, also while this client has sent ahead
 
@@ -62,46 +62,42 @@ def _admit(scope: Scope) -> None:
     gate.check(bearer_token(scope), ("train",))
 
 
-def _at_once(
-    sessions: SessionService, limit: float | None, id: str, shape: frames.Shape, content: bytes
-) -> bytes | None:
+def _at_once(engine: SessionEngine, limit: float | None, id: str, shape: frames.Shape, content: bytes) -> bytes | None:
     """The reply to one message where it needs no waiting, else None and nothing is done."""
-    if not sessions.prompt(id):
-        return None
     try:
-        request = frames.read_request(content)
+        frame = frames.read_request(content)
     except frames.FrameError:
         return None
-    if isinstance(request, frames.RolloutRequest | frames.PolicyRequest):
+    if isinstance(frame, frames.RolloutRequest | frames.PolicyRequest):  # whose reply may take long to write
         return None
-    carried = _carried(sessions.within(limit), id, shape, request)
     try:
-        carried.send(None)
-    except StopIteration as done:
-        reply: bytes = done.value
-        return reply
-    carried.close()
-    raise AssertionError("a request that was to be answered at once waited")
+        request = request_in_frame(frame, id, shape, limit)
+        reply = engine.try_now(request)
+        return None if reply is None else AS_FRAME[type(request)](reply)
+    except Exception as error:
+        return _refused(error, frame.seq)
 
 
-async def _reply(sessions: SessionService, id: str, shape: frames.Shape, content: bytes | None) -> bytes:
+async def _reply(
+    engine: SessionEngine, limit: float | None, id: str, shape: frames.Shape, content: bytes | None
+) -> bytes:
     """The reply to one message, as a frame; never raises but when it is cancelled."""
     try:
         if content is None:
             raise frames.FrameError("expected a binary message, got text")
-        request = frames.read_request(content)
+        frame = frames.read_request(content)
     except frames.FrameError as error:
         return _refusal(error, None)
-    return await _carried(sessions, id, shape, request)
-
-
-async def _carried(sessions: SessionService, id: str, shape: frames.Shape, request: frames.Request) -> bytes:
     try:
-        return await carry_out(sessions, id, shape, request)
+        return await carried_out(engine, request_in_frame(frame, id, shape, limit), AS_FRAME)
     except Exception as error:
-        if not isinstance(error, SurrogymError | frames.FrameError):
-            logger.exception("a request of the stream failed")
-        return _refusal(error, request.seq)
+        return _refused(error, frame.seq)
+
+
+def _refused(error: Exception, seq: int | None) -> bytes:
+    if not isinstance(error, SurrogymError | frames.FrameError):
+        logger.exception("a request of the stream failed", exc_info=error)
+    return _refusal(error, seq)
 
 
 def _refusal(error: Exception, seq: int | None) -> bytes:

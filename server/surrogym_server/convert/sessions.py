@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_server.convert.numbers import numbers
-from surrogym_server.engine.session import Answer, Session
+from surrogym_server.engine.requests import Array, Opening, Reply, SessionInfo
+from surrogym_server.engine.tallies import SessionActivity
 from surrogym_server.environment import definition as core
 from surrogym_server.errors import InvalidInput
-from surrogym_server.services.activity import SessionActivity
-from surrogym_server.services.sessions import Opening
 from surrogym_server.virtual import VirtualSettings
 from surrogym_shared import frames
 from surrogym_shared import wire as replies
@@ -50,7 +49,7 @@ def opening(request: replies.OpenSession) -> Opening:
     )
 
 
-def session_view(session: Session, idle_seconds: float) -> replies.SessionView:
+def session_view(session: SessionInfo, idle_seconds: float) -> replies.SessionView:
     return replies.SessionView(
         id=session.id,
         surrogate=session.surrogate,
@@ -70,8 +69,9 @@ def session_view(session: Session, idle_seconds: float) -> replies.SessionView:
     )
 
 
-def session_coordinates(session: Session) -> replies.SessionCoordinates:
-    return replies.SessionCoordinates(coordinates=session.lanes.q.tolist())
+def session_coordinates(coordinates: Array) -> replies.SessionCoordinates:
+    """Of coordinates (N, C)."""
+    return replies.SessionCoordinates(coordinates=coordinates.tolist())
 
 
 def session_activity(activity: SessionActivity) -> replies.SessionActivity:
@@ -112,36 +112,36 @@ def lane_mask(mask: list[bool] | None) -> NDArray[np.bool_] | None:
     return None if mask is None else np.array(mask, dtype=bool)
 
 
-def reset_reply(answer: Answer) -> dict[str, Any]:
+def reset_reply(reply: Reply) -> dict[str, Any]:
     """The fields of ``ResetReply``, unchecked: this and ``step_reply`` are on the path of every step."""
-    assert isinstance(answer.outcome, ResetResult)
-    result = answer.outcome
+    assert isinstance(reply.outcome, ResetResult)
+    result = reply.outcome
     return {
-        "seq": answer.seq,
+        "seq": reply.seq,
         "observation": result.observation.tolist(),
         "model_version": result.model_version.tolist(),
     }
 
 
-def step_reply(answer: Answer) -> dict[str, Any]:
+def step_reply(reply: Reply) -> dict[str, Any]:
     """The fields of ``StepReply``."""
-    assert isinstance(answer.outcome, tuple)
-    return _step_fields(answer.seq, answer.outcome[0])
+    assert isinstance(reply.outcome, tuple)
+    return _step_fields(reply.seq, reply.outcome[0])
 
 
-def rollout_steps(answer: Answer) -> Iterator[dict[str, Any]]:
+def rollout_steps(reply: Reply) -> Iterator[dict[str, Any]]:
     """The fields of the steps of ``RolloutReply``, one by one; they all carry the one seq of the request."""
-    assert not isinstance(answer.outcome, ResetResult)
-    steps = answer.outcome.steps() if isinstance(answer.outcome, PolicyRollout) else answer.outcome
-    return (_step_fields(answer.seq, step) for step in steps)
+    assert not isinstance(reply.outcome, ResetResult)
+    steps = reply.outcome.steps() if isinstance(reply.outcome, PolicyRollout) else reply.outcome
+    return (_step_fields(reply.seq, step) for step in steps)
 
 
-def rollout_actions(answer: Answer) -> dict[str, Any]:
+def rollout_actions(reply: Reply) -> dict[str, Any]:
     """The fields of ``RolloutReply`` that say what a policy did; none where no policy acted."""
-    if not isinstance(answer.outcome, PolicyRollout):
+    if not isinstance(reply.outcome, PolicyRollout):
         return {}
-    log = answer.outcome.log_probability
-    return {"action": answer.outcome.action.tolist()} | ({} if log is None else {"log_probability": log.tolist()})
+    log = reply.outcome.log_probability
+    return {"action": reply.outcome.action.tolist()} | ({} if log is None else {"log_probability": log.tolist()})
 
 
 def policy_run(request: replies.RolloutSession) -> PolicyRun:
@@ -174,7 +174,7 @@ def framed_policy_run(request: frames.PolicyRequest, shape: frames.Shape) -> Pol
     return PolicyRun(policy, request.steps, frames.noise_of(request), until)
 
 
-def session_shape(session: Session) -> frames.Shape:
+def session_shape(session: SessionInfo) -> frames.Shape:
     """What a session's frames leave out."""
     definition = session.definition
     return frames.Shape(
@@ -185,21 +185,21 @@ def session_shape(session: Session) -> frames.Shape:
     )
 
 
-def reset_frame(answer: Answer) -> frames.ResetReply:
-    assert isinstance(answer.outcome, ResetResult)
-    return frames.reset_reply(answer.seq, answer.outcome)
+def reset_frame(reply: Reply) -> frames.ResetReply:
+    assert isinstance(reply.outcome, ResetResult)
+    return frames.reset_reply(reply.seq, reply.outcome)
 
 
-def step_frame(answer: Answer) -> frames.StepReply:
-    assert isinstance(answer.outcome, tuple)
-    return frames.step_reply(answer.seq, answer.outcome[0])
+def step_frame(reply: Reply) -> frames.StepReply:
+    assert isinstance(reply.outcome, tuple)
+    return frames.step_reply(reply.seq, reply.outcome[0])
 
 
-def rollout_frame(answer: Answer) -> frames.RolloutReply | frames.PolicyReply:
-    assert not isinstance(answer.outcome, ResetResult)
-    if isinstance(answer.outcome, PolicyRollout):
-        return frames.policy_reply(answer.seq, answer.outcome)
-    return frames.rollout_reply(answer.seq, answer.outcome)
+def rollout_frame(reply: Reply) -> frames.RolloutReply | frames.PolicyReply:
+    assert not isinstance(reply.outcome, ResetResult)
+    if isinstance(reply.outcome, PolicyRollout):
+        return frames.policy_reply(reply.seq, reply.outcome)
+    return frames.rollout_reply(reply.seq, reply.outcome)
 
 
 def _step_fields(seq: int, step: StepResult) -> dict[str, Any]:

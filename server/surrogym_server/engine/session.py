@@ -153,7 +153,7 @@ def replay(session: Session, seq: int | None, request: Fingerprint) -> Answer | 
 
 def answered(session: Session, request: Fingerprint, outcome: Outcome) -> tuple[Session, Answer]:
     """The session with the outcome kept as its last answer."""
-    answer = quick(Answer, seq=session.seq + 1, request=request, outcome=outcome)
+    answer = Answer(session.seq + 1, request, outcome)
     return _with(session, answer=answer), answer
 
 

@@ -6,6 +6,7 @@ All methods but ``check_wanted`` belong to the event loop's thread.
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
@@ -23,6 +24,8 @@ from surrogym_server.engine.session import (
 )
 from surrogym_server.errors import DeadlineExceeded, Overloaded, SessionExpired, TooLarge, Unavailable, UnknownSession
 from surrogym_shared.port import PolicyRollout
+
+logger = logging.getLogger(__name__)
 
 # Work below this is done in the event loop: a hop to a thread and back costs about 70 us idle and several times
 # that on a busy machine, and nobody else notices a wait of two milliseconds.
@@ -144,10 +147,24 @@ class LiveSessions:
                 return check_opening(session, digest)
         return None
 
-    def prompt(self, id: str) -> bool:
-        """Whether ``advance`` would now take one step of a session without waiting for anything."""
+    def prompt(self, id: str, steps: int = 1) -> bool:
+        """Whether ``advance`` would now take so many steps of a session without waiting for anything."""
         live = self._live.get(id)
-        return live is not None and not live.requests and live.seconds_per_step < INLINE_SECONDS
+        if live is None or live.requests or self._requests >= self._limits.requests:
+            return False
+        return live.seconds_per_step * steps < INLINE_SECONDS
+
+    def advance_now(
+        self, id: str, seq: int | None, request: Fingerprint, work: Work, steps: int = 1, deadline: float | None = None
+    ) -> Answer:
+        """As ``advance``, in this call and this thread; only where ``prompt`` says so."""
+        live = self._get(id)
+        live.used = self.clock()
+        if kept := replay(live.session, seq, request):
+            return kept
+        if steps > 1:
+            self._check_memory(live.session.answer_bytes(steps))
+        return self._kept(live, request, self._done_now(live, work, steps, deadline))
 
     async def advance(
         self, id: str, seq: int | None, request: Fingerprint, work: Work, steps: int = 1, deadline: float | None = None
@@ -183,10 +200,7 @@ class LiveSessions:
                     return kept
                 if steps > 1:
                     self._check_memory(live.session.answer_bytes(steps))
-                session, outcome = await self._do(live, work, steps, deadline)
-                live.session, answer = answered(session, request, outcome)
-                live.used = self.clock()
-                return answer
+                return self._kept(live, request, await self._do(live, work, steps, deadline))
         finally:
             self._requests -= 1
             live.requests -= 1
@@ -224,6 +238,7 @@ class LiveSessions:
         for id in idle:
             del self._live[id]
             self._expired[id] = None
+            logger.info("session %s was idle and has expired", id)
         while len(self._expired) > REMEMBERED_EXPIRED:
             self._expired.popitem(last=False)
         return idle
@@ -245,19 +260,23 @@ class LiveSessions:
                 f"and {_mebibytes(nbytes)} more: close some, or try later"
             )
 
+    def _kept(self, live: _Live, request: Fingerprint, done: tuple[Session, Outcome]) -> Answer:
+        live.session, answer = answered(done[0], request, done[1])
+        live.used = self.clock()
+        return answer
+
     async def _do(self, live: _Live, work: Work, steps: int, deadline: float | None) -> tuple[Session, Outcome]:
         expected = live.seconds_per_step * steps
         if expected < INLINE_SECONDS:
-            self._check_deadline(deadline, expected)
-            done, seconds = _timed(work, live.session)
-        else:
-            threads = self._threads if steps == 1 else self._rollouts
-            done, seconds = await self._in_thread(threads, live.session, work, expected, deadline)
-        taken = len(done[1]) if isinstance(done[1], PolicyRollout) else steps  # which may have stopped early
-        each = seconds / taken
-        known = live.seconds_per_step if live.seconds_per_step < float("inf") else each
-        live.seconds_per_step = (1 - FORGETTING) * known + FORGETTING * each
-        return done
+            return self._done_now(live, work, steps, deadline)
+        threads = self._threads if steps == 1 else self._rollouts
+        done, seconds = await self._in_thread(threads, live.session, work, expected, deadline)
+        return _learned(live, done, seconds, steps)
+
+    def _done_now(self, live: _Live, work: Work, steps: int, deadline: float | None) -> tuple[Session, Outcome]:
+        self._check_deadline(deadline, live.seconds_per_step * steps)
+        done, seconds = _timed(work, live.session)
+        return _learned(live, done, seconds, steps)
 
     async def _in_thread(
         self, threads: Threads, session: Session, work: Work, expected: float, deadline: float | None
@@ -280,6 +299,15 @@ class LiveSessions:
             raise DeadlineExceeded(
                 f"expected an answer within {1e3 * max(left, 0):.0f} ms, but it would take {1e3 * seconds:.0f} ms"
             )
+
+
+def _learned(live: _Live, done: tuple[Session, Outcome], seconds: float, steps: int) -> tuple[Session, Outcome]:
+    """What was done, once the session's time of a step is known better."""
+    taken = len(done[1]) if isinstance(done[1], PolicyRollout) else steps  # which may have stopped early
+    each = seconds / taken
+    known = live.seconds_per_step if live.seconds_per_step < float("inf") else each
+    live.seconds_per_step = (1 - FORGETTING) * known + FORGETTING * each
+    return done
 
 
 def _mebibytes(nbytes: int) -> str:

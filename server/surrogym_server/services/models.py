@@ -57,6 +57,12 @@ def load_model(storage: Storage, definitions: Definitions, surrogate: int, versi
         raise Damaged(f"model {version} of {name!r} can't be read: {error}") from error
 
 
+def stored_tolerances(storage: Storage, surrogate: int, version: int) -> tuple[float, ...]:
+    """Tolerance of each output, (O,), that a stored model of a surrogate's id was judged by. Raises ``UnknownModel``
+    or ``UnknownSurrogate``."""
+    return tuple(storage.models.get(storage.surrogates.name_of(surrogate), version).tolerances)
+
+
 def stored_model(storage: Storage, name: str, version: int) -> bytes:
     """A stored model as a file.
 

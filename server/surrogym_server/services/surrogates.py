@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import textwrap
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -13,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_server.engine.models import ModelCache
-from surrogym_server.engine.sessions import LiveSessions
+from surrogym_server.engine.port import SessionEngine
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput, NoModel, SpecConflict
 from surrogym_server.services.activity import Samplers
@@ -63,8 +61,7 @@ class SurrogateService:
         define: Define,
         complete: Complete,
         plan: Plan,
-        models: ModelCache,
-        live: LiveSessions,
+        engine: SessionEngine,
         notices: Notices,
         samplers: Samplers,
     ) -> None:
@@ -75,15 +72,15 @@ class SurrogateService:
             define: the definition of a new spec; raises ``InvalidSpec`` where it asks for what is not installed.
             complete: a spec with every field that this program knows, as JSON; an older one lacked some.
             plan: the first queries under a budget: (state, coordinates (m, C), action (m, F), rollouts (T, F) each).
-            models, live, notices, samplers: of this process.
+            engine: has their sessions.
+            notices, samplers: of this process.
         """
         self._storage = storage
         self._definitions = definitions
         self._define = define
         self._complete = complete
         self._plan = plan
-        self._models = models
-        self._live = live
+        self._engine = engine
         self._notices = notices
         self._samplers = samplers
 
@@ -120,9 +117,9 @@ class SurrogateService:
 
     def list(self, after: int, limit: int) -> list[Listed]:
         """Up to ``limit`` surrogates with an id above ``after``, oldest first."""
-        alive, sessions = self._samplers.by_surrogate(), Counter(session.surrogate for session in self._live)
+        alive, sessions = self._samplers.by_surrogate(), self._engine.counts().sessions
         return [
-            Listed(summary, tuple(alive.get(summary.name, ())), sessions[summary.name])
+            Listed(summary, tuple(alive.get(summary.name, ())), sessions.get(summary.name, 0))
             for summary in self._storage.surrogates.summaries(after, limit)
         ]
 
@@ -152,8 +149,7 @@ class SurrogateService:
         """Remove a surrogate with its samples, models and sessions; raises ``UnknownSurrogate``."""
         surrogate = await asyncio.to_thread(lambda: self._storage.surrogates.get(name).id)
         await asyncio.to_thread(self._storage.surrogates.delete, name)
-        self._live.close_all_of(surrogate)
-        self._models.forget(surrogate)
+        await self._engine.forget(surrogate)
         self._notices.post(name)
 
     def _status(self, record: SurrogateRecord) -> SurrogateStatus:
@@ -169,7 +165,7 @@ class SurrogateService:
             model=model,
             budget_left=self._storage.designs.left(name),
             samplers=tuple(self._samplers.by_surrogate().get(name, ())),
-            sessions=sum(session.surrogate == name for session in self._live),
+            sessions=self._engine.counts().sessions.get(name, 0),
         )
 
 

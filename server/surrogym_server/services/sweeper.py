@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections.abc import Awaitable, Callable
+from functools import partial
 
-from surrogym_server.engine.models import ModelCache
-from surrogym_server.engine.sessions import LiveSessions
+from surrogym_server.engine.port import SessionEngine
 from surrogym_server.errors import SurrogymError
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.storage.port import Storage
@@ -18,12 +19,9 @@ ORPHAN_SECONDS = 3_600.0  # before files that nothing leads to are removed; an u
 
 
 class Sweeper:
-    def __init__(
-        self, storage: Storage, live: LiveSessions, models: ModelCache, seconds: float, metrics: ProcessMetrics
-    ) -> None:
+    def __init__(self, storage: Storage, engine: SessionEngine, seconds: float, metrics: ProcessMetrics) -> None:
         self._storage = storage
-        self._live = live
-        self._models = models
+        self._engine = engine
         self._seconds = seconds
         self._metrics = metrics
         self._looked_at_files = -ORPHAN_SECONDS
@@ -37,14 +35,16 @@ class Sweeper:
     async def sweep(self) -> None:
         """Sweep once. A lease that ends here leaves its query to the next sampler, or sets it aside; a session whose
         surrogate another server has deleted ends."""
-        for id in self._live.sweep():
-            self._metrics.expired_sessions += 1
-            logger.info("session %s was idle and has expired", id)
+        await self._try(self._engine.sweep)
+        await self._try(self._sweep_leases)
+        await self._try(partial(asyncio.to_thread, self._sweep_files))
+
+    async def _sweep_leases(self) -> None:
+        self._metrics.expired_leases += await asyncio.to_thread(self._storage.queries.sweep_expired)
+
+    async def _try(self, sweep: Callable[[], Awaitable[None]]) -> None:
         try:
-            await asyncio.to_thread(self._sweep_files)
-            self._metrics.expired_leases += await asyncio.to_thread(self._storage.queries.sweep_expired)
-            for surrogate in await asyncio.to_thread(self._models.look):
-                self._live.close_all_of(surrogate)
+            await sweep()
         except SurrogymError as error:
             logger.warning("a sweep was cut short, the next one follows: %s", error)
         except Exception:  # leases must go on to end, whatever one sweep meets

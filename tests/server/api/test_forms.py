@@ -14,8 +14,8 @@ from support.acting import assert_same_rollout, random_policy
 from surrogym_client.transport.step_codecs import BinaryForm, JsonForm
 from surrogym_server import convert
 from surrogym_server.api import forms
-from surrogym_server.engine.session import Answer, Fingerprint
-from surrogym_server.services.sessions import SessionService
+from surrogym_server.engine.port import SessionEngine
+from surrogym_server.engine.requests import Advance, PolicySteps, Reply, Rollout
 from surrogym_shared import frames, wire
 from surrogym_shared.acting import PolicyRun
 from surrogym_shared.port import PolicyRollout, StepResult
@@ -40,12 +40,25 @@ def step(number: int) -> StepResult:
 class Prepared:
     """Answers a rollout of T steps with as many, all different."""
 
-    async def rollout(self, id: str, seq: int | None, actions: np.ndarray) -> Answer:
-        return Answer(7, Fingerprint(digest=id), tuple(step(number) for number in range(len(actions))))
+    async def advance(self, request: Advance) -> Reply:
+        if isinstance(request, Rollout):
+            return Reply(7, tuple(step(number) for number in range(len(request.actions))))
+        assert isinstance(request, PolicySteps)
+        steps = request.run.steps
+        results = [step(number) for number in range(steps)]
+        return Reply(7, PolicyRollout.of(results, np.ones((steps, 2, 1)), None))
 
-    async def rollout_policy(self, id: str, seq: int | None, run: PolicyRun) -> Answer:
-        results = [step(number) for number in range(run.steps)]
-        return Answer(7, Fingerprint(digest=id), PolicyRollout.of(results, np.ones((run.steps, 2, 1)), None))
+
+ENGINE = cast(SessionEngine, Prepared())
+
+
+def in_json(content: bytes) -> bytes:
+    request = forms.request_in_json("rollout", "abc", content, None)
+    return asyncio.run(forms.carried_out(ENGINE, request, forms.AS_JSON))
+
+
+def in_frame(frame: frames.Request) -> bytes:
+    return asyncio.run(forms.carried_out(ENGINE, forms.request_in_frame(frame, "abc", SHAPE), forms.AS_FRAME))
 
 
 @pytest.fixture
@@ -62,9 +75,9 @@ def writers(monkeypatch: pytest.MonkeyPatch) -> set[threading.Thread]:
 
 @pytest.mark.parametrize("steps", [1, forms.SHORT_ROLLOUT, forms.SHORT_ROLLOUT + 1, 200])
 def test_a_long_reply_is_written_beside_the_event_loop(steps: int, writers: set[threading.Thread]):
-    sessions, actions = cast(SessionService, Prepared()), np.zeros((steps, 2, 1))
-    as_json = asyncio.run(forms.rollout_json(sessions, "abc", msgspec.json.encode({"actions": actions.tolist()})))
-    as_frame = asyncio.run(forms.carry_out(sessions, "abc", SHAPE, frames.rollout_request(None, actions)))
+    actions = np.zeros((steps, 2, 1))
+    as_json = in_json(msgspec.json.encode({"actions": actions.tolist()}))
+    as_frame = in_frame(frames.rollout_request(None, actions))
     assert (threading.main_thread() in writers) == (steps <= forms.SHORT_ROLLOUT), "nobody else is answered meanwhile"
     reply, frame = wire.RolloutReply.model_validate_json(as_json), frames.read_reply(as_frame)
     assert isinstance(frame, frames.RolloutReply)
@@ -78,10 +91,9 @@ def test_a_long_reply_is_written_beside_the_event_loop(steps: int, writers: set[
 
 @pytest.mark.parametrize("steps", [1, forms.SHORT_ROLLOUT + 1])
 def test_a_reply_to_a_policy_says_the_same_in_both_forms(steps: int, writers: set[threading.Thread]):
-    sessions, run = cast(SessionService, Prepared()), PolicyRun(random_policy((3, 4, 1)), steps)
-    as_json = asyncio.run(forms.rollout_json(sessions, "abc", JsonForm().policy(1, run, SHAPE)))
-    request = frames.policy_request(None, run.policy, steps, None, None)
-    as_frame = asyncio.run(forms.carry_out(sessions, "abc", SHAPE, request))
+    run = PolicyRun(random_policy((3, 4, 1)), steps)
+    as_json = in_json(JsonForm().policy(1, run, SHAPE))
+    as_frame = in_frame(frames.policy_request(None, run.policy, steps, None, None))
     assert (threading.main_thread() in writers) == (steps <= forms.SHORT_ROLLOUT)
     assert wire.RolloutReply.model_validate_json(as_json).action == [[[1.0], [1.0]]] * steps
     (seq, ours), (_, theirs) = JsonForm().read_policy(as_json, SHAPE), BinaryForm().read_policy(as_frame, SHAPE)

@@ -193,8 +193,11 @@ def test_a_client_that_sends_ahead_leaves_others_their_turns():
     action = SimpleNamespace(size=1)
     definition = SimpleNamespace(observation_names=("x",), action=action, outputs=("x", "reward"))
     session = SimpleNamespace(definition=definition, settings=SimpleNamespace(num_envs=1))
-    sessions = SimpleNamespace(get=lambda _: session, within=lambda _: None)
-    services = SimpleNamespace(sessions=sessions)
+
+    async def describe(_: str) -> Any:
+        return session
+
+    services = SimpleNamespace(engine=SimpleNamespace(describe=describe))
     app = SimpleNamespace(state=SimpleNamespace(gate=Gate({})))
     scope = {"state": {"services": services}, "app": app, "path_params": {"id": "s"}, "headers": []}
     messages = iter([{"type": "websocket.connect"}, *[{"type": "websocket.receive", "text": "x"}] * waiting])

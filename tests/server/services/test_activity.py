@@ -1,14 +1,8 @@
-"""What people see of sessions: sums that agree with the steps, whatever the number of lanes and of repeats."""
+"""Which samplers are at work."""
 
 from __future__ import annotations
 
-import numpy as np
-import pytest
-
-from surrogym_server.engine.session import Answer
-from surrogym_server.services import activity
-from surrogym_server.services.activity import Samplers, Tally
-from surrogym_shared.port import PolicyRollout, StepResult
+from surrogym_server.services.activity import Samplers
 
 
 class Clock:
@@ -16,69 +10,6 @@ class Clock:
 
     def __call__(self) -> float:
         return self.now
-
-
-def result(reward: list[float], ended: list[bool], penalty: float = 0.5) -> StepResult:
-    lanes = len(reward)
-    none = np.zeros(lanes, dtype=bool)
-    return StepResult(
-        observation=np.zeros((lanes, 1)),
-        reward=np.array(reward),
-        terminated=np.array(ended),
-        truncated=none,
-        final_lanes=np.zeros(0, dtype=int),
-        final_observation=np.zeros((0, 1)),
-        model_version=np.ones(lanes, dtype=int),
-        reward_mean=np.array(reward) + penalty,
-        deviation=None,
-    )
-
-
-def answer(seq: int, *results: StepResult) -> Answer:
-    return Answer(seq, "", results)
-
-
-@pytest.mark.parametrize("gathered", [1, 10**6])
-def test_returns_are_sums_between_ends(gathered: int, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(activity, "FOLD_LANE_STEPS", gathered)
-    tally = Tally(Clock())
-    tally.stepped(answer(2, result([1, 10], [False, False])))
-    tally.stepped(answer(3, result([2, 20], [True, False]), result([4, 40], [False, True])))
-    tally.stepped(answer(3, result([9, 9], [True, True])))  # a repeat
-    tally.stepped(answer(4, result([8, 80], [True, False])))
-    read = tally.read(None)  # type: ignore[arg-type]
-    assert (read.steps, read.episodes) == (8, 3)
-    assert [episode.reward for episode in read.recent] == [3, 70, 12]
-    assert [episode.penalty for episode in read.recent] == [1.0, 1.5, 1.0]
-
-
-def test_the_steps_of_a_policy_count_as_single_steps():
-    several, one = Tally(Clock()), Tally(Clock())
-    steps = [result([1, 10], [False, False]), result([2, 20], [True, False]), result([4, 40], [False, True])]
-    one.stepped(answer(2, *steps))
-    several.stepped(Answer(2, "", PolicyRollout.of(steps, np.zeros((3, 2, 1)), None)))
-    for tally in (several, one):
-        tally.stepped(answer(3, result([8, 80], [True, False])))
-    assert several.read(None) == one.read(None)  # type: ignore[arg-type]
-
-
-def test_a_reset_drops_what_did_not_end():
-    tally = Tally(Clock())
-    tally.stepped(answer(2, result([1, 10], [False, False])))
-    tally.reset(np.array([True, False]))
-    tally.stepped(answer(4, result([2, 20], [True, True])))
-    assert [episode.reward for episode in tally.read(None).recent] == [2, 30]  # type: ignore[arg-type]
-
-
-def test_the_rate_is_right_from_the_start_and_falls_in_silence():
-    clock = Clock()
-    tally = Tally(clock)
-    for seq in range(2, 102):
-        clock.now += 0.01
-        tally.stepped(answer(seq, result([0.0], [False])))
-    assert tally.read(None).steps_per_second == pytest.approx(100, rel=0.1)  # type: ignore[arg-type]
-    clock.now += 60
-    assert tally.read(None).steps_per_second < 1  # type: ignore[arg-type]
 
 
 def test_a_sampler_that_falls_silent_is_gone():

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from surrogym_server.engine.local import LocalEngine
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.engine.sessions import Limits, LiveSessions, Threads
+from surrogym_server.engine.sessions import Limits
 from surrogym_server.errors import Unavailable
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.sweeper import Sweeper
@@ -25,15 +25,15 @@ def test_a_sweep_that_fails_is_followed_by_the_next(storage: Storage, monkeypatc
 
     async def run() -> int:
         metrics = ProcessMetrics()
-        with ThreadPoolExecutor(1) as threads:
-            live = LiveSessions(Threads(threads, 1), Threads(threads, 1), limits=Limits(), idle_seconds=60.0)
-            models = ModelCache(lambda *_: pytest.fail("nothing is in use"), storage.models.newest)
-            sweeper = asyncio.create_task(Sweeper(storage, live, models, 0.001, metrics).run())
-            while met:
-                await asyncio.sleep(0.001)
-            while not metrics.expired_leases and not sweeper.done():
-                await asyncio.sleep(0.001)
-            sweeper.cancel()
+        models = ModelCache(lambda *_: pytest.fail("nothing is in use"), storage.models.newest)
+        engine = LocalEngine(models, lambda *_: (), limits=Limits(), max_lanes=1, idle_seconds=60.0)
+        sweeper = asyncio.create_task(Sweeper(storage, engine, 0.001, metrics).run())
+        while met:
+            await asyncio.sleep(0.001)
+        while not metrics.expired_leases and not sweeper.done():
+            await asyncio.sleep(0.001)
+        sweeper.cancel()
+        await engine.stop()
         return metrics.expired_leases
 
     monkeypatch.setattr(storage.queries, "sweep_expired", sweep_expired)

@@ -1,0 +1,175 @@
+"""What the sessions of an engine have done, for people to look at. Written in the event loop's thread.
+
+Shapes: N lanes, T steps.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_server.engine.requests import Reply, SessionInfo
+from surrogym_shared.port import PolicyRollout, ResetResult, StepResult
+
+Clock = Callable[[], float]
+
+RATE_SECONDS = 10.0  # steps per second are an exponential average over about so long
+KEPT_EPISODES = 100
+FOLD_STEPS = 32  # as many are gathered before they are summed: the path of a step is short
+FOLD_LANE_STEPS = 16_384  # or as many of all lanes
+BUCKETS = (1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 60.0)
+
+
+@dataclass
+class Durations:
+    """A histogram of seconds; observing costs a look into a table."""
+
+    sum: float = 0.0
+    _counts: list[int] = field(default_factory=lambda: [0] * (len(BUCKETS) + 1))
+
+    def observe(self, seconds: float) -> None:
+        self._counts[bisect_left(BUCKETS, seconds)] += 1
+        self.sum += seconds
+
+    def cumulative(self) -> Iterator[tuple[str, int]]:
+        """(upper bound, how many lasted at most so long), the last bound infinite."""
+        total = 0
+        for bound, count in zip((*map(str, BUCKETS), "+Inf"), self._counts, strict=True):
+            total += count
+            yield bound, total
+
+    def __len__(self) -> int:
+        return sum(self._counts)
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One that ended. ``reward`` is the imagined return, ``penalty`` what was taken off it for its deviations."""
+
+    reward: float
+    penalty: float
+
+
+@dataclass(frozen=True)
+class SessionActivity:
+    """A session and what it did since this process knows it."""
+
+    session: SessionInfo
+    steps: int  # of all lanes
+    steps_per_second: float
+    episodes: int
+    recent: tuple[Episode, ...]  # the last ones, oldest first
+    idle_seconds: float  # since its last step
+
+
+class Tally:
+    """Sums of one session's steps."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._since = self._last = clock()
+        self._decayed = 0.0
+        self._seq = 0
+        self._pending: list[StepResult | PolicyRollout] = []
+        self._unfolded = 0  # steps in them
+        self._sums: NDArray[np.float64] | None = None  # (2, N) reward and penalty of the running episodes
+        self._steps = 0
+        self._episodes = 0
+        self._recent: deque[Episode] = deque(maxlen=KEPT_EPISODES)
+
+    def stepped(self, answer: Reply) -> None:
+        """Take note of an answer; one that was given before counts once."""
+        if answer.seq <= self._seq or isinstance(answer.outcome, ResetResult):
+            return
+        self._seq = answer.seq
+        results = (answer.outcome,) if isinstance(answer.outcome, PolicyRollout) else answer.outcome
+        now, taken, lanes = self._clock(), len(answer.outcome), results[0].reward.shape[-1]
+        self._steps += taken * lanes
+        self._decayed = self._decayed * math.exp((self._last - now) / RATE_SECONDS) + taken * lanes
+        self._last = now
+        self._pending.extend(results)
+        self._unfolded += taken
+        if self._unfolded >= FOLD_STEPS or self._unfolded * lanes >= FOLD_LANE_STEPS:
+            self._fold()
+
+    def reset(self, mask: NDArray[np.bool_] | None) -> None:
+        """Episodes of the lanes of the mask (N,) ended without an end: their returns count for nothing."""
+        self._fold()
+        if self._sums is not None:
+            self._sums[:, slice(None) if mask is None else mask] = 0.0
+
+    def read(self, session: SessionInfo) -> SessionActivity:
+        self._fold()
+        now = self._clock()
+        seconds = RATE_SECONDS * -math.expm1((self._since - now) / RATE_SECONDS)
+        decayed = self._decayed * math.exp((self._last - now) / RATE_SECONDS)
+        return SessionActivity(
+            session=session,
+            steps=self._steps,
+            steps_per_second=decayed / seconds if seconds > 0 else 0.0,
+            episodes=self._episodes,
+            recent=tuple(self._recent),
+            idle_seconds=now - self._last,
+        )
+
+    def _fold(self) -> None:
+        if not self._pending:
+            return
+        reward = np.concatenate([np.atleast_2d(result.reward) for result in self._pending])
+        penalty = np.concatenate([np.atleast_2d(result.reward_mean) for result in self._pending]) - reward
+        ended = np.concatenate([np.atleast_2d(result.terminated | result.truncated) for result in self._pending])
+        self._pending.clear()
+        self._unfolded = 0
+        gains = np.stack([reward, penalty], 1)  # (T, 2, N)
+        sums = np.zeros(gains.shape[1:]) if self._sums is None else self._sums
+        begin = 0
+        for step in np.flatnonzero(ended.any(1)).tolist():
+            sums = sums + gains[begin : step + 1].sum(0)
+            lanes = ended[step]
+            self._episodes += int(lanes.sum())
+            self._recent.extend(Episode(*map(float, column)) for column in sums[:, lanes].T)
+            sums[:, lanes] = 0.0
+            begin = step + 1
+        self._sums = sums + gains[begin:].sum(0)
+
+
+class Tallies:
+    """A tally for each session that is alive."""
+
+    def __init__(self, clock: Clock = time.monotonic) -> None:
+        self._clock = clock
+        self._tallies: dict[str, Tally] = {}
+
+    def of(self, id: str) -> Tally:
+        """The tally of a session; a new one where it has none."""
+        tally = self._tallies.get(id)
+        if tally is None:
+            tally = self._tallies[id] = Tally(self._clock)
+        return tally
+
+    def read(self, alive: Iterable[SessionInfo]) -> list[SessionActivity]:
+        return [self.of(session.id).read(session) for session in alive]
+
+    def forget_all_but(self, alive: Iterable[str]) -> None:
+        """Keep the tallies of these sessions alone, by their ids."""
+        ids = set(alive)
+        self._tallies = {id: tally for id, tally in self._tallies.items() if id in ids}
+
+
+@dataclass(frozen=True)
+class Counts:
+    """What an engine holds now, and what it has done since its start."""
+
+    sessions: Mapping[str, int]  # open ones by the name of their surrogate
+    lanes: int  # of all of them
+    requests: int  # at work or waiting
+    steps: Durations  # requests that step, their waiting and computing included
+    lane_steps: int  # virtual environment steps
+    expired: int  # sessions that were idle for too long
