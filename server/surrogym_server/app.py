@@ -28,7 +28,6 @@ from surrogym_server.api import (
     samples,
     service,
     sessions,
-    steps,
     surrogates,
 )
 from surrogym_server.api.auth import Gate
@@ -36,6 +35,8 @@ from surrogym_server.api.caller import fingerprint
 from surrogym_server.api.guards import BodyLimit, KnownHosts, OwnPages
 from surrogym_server.api.observe import Observed
 from surrogym_server.api.state import Services
+from surrogym_server.api.stepping.routes import StepDoor
+from surrogym_server.api.stepping.routes import router as stepping
 from surrogym_server.api.turns import Turns
 from surrogym_server.convert import definition_from_spec, stored_definition
 from surrogym_server.convert.stored import read_stored
@@ -134,13 +135,13 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     app.state.metrics = ProcessMetrics()
     problems.install(app)
     openapi.install(app)
-    app.add_middleware(steps.StepDoor)
+    app.add_middleware(StepDoor)
     app.add_middleware(BodyLimit, max_together=settings.max_bodies_bytes)
     app.add_middleware(OwnPages, public_url=settings.public_url)
     if settings.loopback and not settings.tokens:
         app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", *settings.host_names}))
     app.add_middleware(Observed, metrics=app.state.metrics)
-    app.router.routes.extend(steps.router.routes)  # tried first, and directly: an included router is another search
+    app.router.routes.extend(stepping.routes)  # tried first, and directly: an included router is another search
     for room in (sessions, service, metrics, surrogates, queries, samples, models, policies, events):
         app.include_router(room.router)
     _add_dashboard(app)

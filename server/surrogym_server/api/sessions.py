@@ -1,4 +1,4 @@
-"""Routes of sessions, from their opening to their end; ``api.steps`` is what happens in between."""
+"""Routes of sessions, from their opening to their end; ``api.stepping`` is what happens in between."""
 
 from __future__ import annotations
 

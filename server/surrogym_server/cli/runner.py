@@ -18,8 +18,9 @@ import uvicorn
 from fastapi import FastAPI
 
 from surrogym_server import logs
+from surrogym_server.api.stepping.messages import prompt
 from surrogym_server.app import create_app, say_goodbye
-from surrogym_server.cli.connections import connections_within, patient, prompt
+from surrogym_server.cli.connections import connections_within, patient
 from surrogym_server.errors import InvalidInput
 from surrogym_server.settings import Settings
 

@@ -11,12 +11,13 @@ from fastapi.routing import APIRoute
 
 from support.hostile import connected, read_all, resident_mib
 from support.server import ServerProcess, running_server
-from surrogym_server.api import events, metrics, models, queries, samples, service, sessions, steps, surrogates
+from surrogym_server.api import events, metrics, models, queries, samples, service, sessions, surrogates
 from surrogym_server.api.door import DEFAULT_JSON_BYTES, Door, door_of
+from surrogym_server.api.stepping import routes
 from surrogym_shared.codes import Code, Problem
 
 JSON = "application/json"
-ROOMS = (sessions, service, metrics, surrogates, queries, samples, models, events, steps)
+ROOMS = (sessions, service, metrics, surrogates, queries, samples, models, events, routes)
 ROUTES = {
     f"{min(route.methods)} {route.path}": door_of(route)
     for room in ROOMS

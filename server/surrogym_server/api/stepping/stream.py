@@ -20,8 +20,8 @@ from starlette.types import Receive, Scope, Send
 from surrogym_server import convert
 from surrogym_server.api.auth import Gate, bearer_token
 from surrogym_server.api.deadline import seconds_left
-from surrogym_server.api.forms import AS_FRAME, carried_out, request_in_frame
 from surrogym_server.api.problems import problem_of, response_of
+from surrogym_server.api.stepping.forms import AS_FRAME, carried_out, request_in_frame
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.errors import SurrogymError
 from surrogym_shared import frames

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -14,18 +15,40 @@ from starlette.routing import WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from surrogym_server import convert
-from surrogym_server.api import examples, forms
+from surrogym_server.api import examples
 from surrogym_server.api.auth import TRAIN
-from surrogym_server.api.body import BINARY, LeanRoute, described
+from surrogym_server.api.body import BINARY, described
 from surrogym_server.api.deadline import PARAMETER, seconds_left
-from surrogym_server.api.door import MEDIA_TYPE, json_up_to
+from surrogym_server.api.door import MEDIA_TYPE, Door, door_of, json_up_to
 from surrogym_server.api.json_body import JSON, take_turn
 from surrogym_server.api.problems import answer_to, documented
-from surrogym_server.api.stream import StepStream
+from surrogym_server.api.stepping import forms
+from surrogym_server.api.stepping.stream import StepStream
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import Advance
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import ResetReply, ResetSession, RolloutReply, RolloutSession, StepReply, StepSession
+
+
+class LeanRoute(APIRoute):
+    """A route on the path of every step: FastAPI describes it, and does not stand between it and the wire.
+
+    Its endpoint takes an id and the request.
+    """
+
+    def __init__(self, path: str, endpoint: Callable[..., Awaitable[Response]], **options: Any) -> None:
+        super().__init__(path, endpoint, **options)
+        self.app = _lean(door_of(self), endpoint)
+
+
+def _lean(door: Door, endpoint: Callable[..., Awaitable[Response]]) -> ASGIApp:
+    async def app(scope: Scope, receive: Receive, send: Send) -> None:
+        door.admit(scope)
+        response = await endpoint(scope["path_params"]["id"], Request(scope, receive))
+        await response(scope, receive, send)
+
+    return app
+
 
 router = APIRouter(prefix="/v1/sessions/{id}", tags=["sessions"], route_class=LeanRoute)
 

@@ -13,7 +13,7 @@ import pytest
 from support.acting import assert_same_rollout, random_policy
 from surrogym_client.transport.step_codecs import BinaryForm, JsonForm
 from surrogym_server import convert
-from surrogym_server.api import forms
+from surrogym_server.api.stepping import forms
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import Advance, PolicySteps, Reply, Rollout
 from surrogym_shared import frames, wire

@@ -1,0 +1,136 @@
+"""uvicorn's WebSocket for the stream: messages answered where they arrive, and limits of those that arrive in part."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from uvicorn.protocols.utils import ClientDisconnected
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.frames import CloseCode
+from websockets.protocol import State
+
+from surrogym_server.api.stepping.stream import EXTENSION, Prompt
+from surrogym_shared.messages import MASKED, WHOLE_BINARY, Extent, FrameSplitter, apply_mask, header
+
+MAX_FRAMES = 256  # of a WebSocket in one read, and fragments of one message
+
+
+class Unfinished:
+    """Bytes of messages that have begun and not ended, of all streams together."""
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+        self.bytes = 0
+
+
+def prompt(seconds: float, most_together: int) -> type[WebSocketsSansIOProtocol]:
+    """uvicorn's WebSocket, with a limit of seconds for a message to arrive whole, and of bytes of unfinished messages
+    in all streams together."""
+    unfinished = Unfinished(most_together)
+
+    class Bounded(PromptMessages):
+        _together, _seconds = unfinished, seconds
+
+    return Bounded
+
+
+class PromptMessages(WebSocketsSansIOProtocol):
+    """uvicorn's WebSocket, which offers the app to answer a message where it arrives.
+
+    The way of ASGI wakes a task through a queue, and back, for each message. That takes as long as all else a small
+    step needs. What is no whole binary message, and what the app does not answer at once, goes that way all the same;
+    so does everything while the app is busy, and so the order of messages is kept. The library gets whole frames alone.
+    """
+
+    _together = Unfinished(2**28)
+    _seconds = 30.0
+    _answer: Prompt | None = None
+    _oversized = False  # a frame that the library is to refuse; what follows belongs to it
+    _waiting = False  # the app has asked for the next message
+    _counted = 0  # of ``_together``
+    _timer: asyncio.TimerHandle | None = None
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self._frames = FrameSplitter(self.config.ws_max_size, MAX_FRAMES)
+
+    def handle_connect(self, event: Any) -> None:
+        super().handle_connect(event)
+        if hasattr(self, "scope"):
+            offers: dict[str, Any] = self.scope["extensions"]
+            offers[EXTENSION] = self._take
+
+    def data_received(self, data: bytes) -> None:
+        if not self.handshake_initiated or self._oversized:  # the handshake comes whole, from the HTTP protocol
+            super().data_received(data)
+            return
+        whole = self._frames.split(data)
+        if len(whole) > MAX_FRAMES or len(self.frames) > MAX_FRAMES:
+            self._end(f"expected at most {MAX_FRAMES} frames at once and in one message, got more")
+            return
+        for frame, extent in whole:
+            self._oversized = extent is None
+            if len(whole) > 1 or extent is None or not self._answered(self._answer, frame, extent):
+                super().data_received(frame)
+        self._count(self._frames.held + sum(map(len, self.frames)))
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._count(0)
+        super().connection_lost(exc)
+
+    def send_receive_event_to_app(self) -> None:
+        if self.curr_msg_data_type == "text":  # refused by the app, and uvicorn logs an error for what is no UTF-8
+            self.frames = [b"".join(self.frames).decode(errors="replace").encode()]
+        super().send_receive_event_to_app()
+
+    async def receive(self) -> Any:
+        self._waiting = True
+        try:
+            return await super().receive()
+        finally:
+            self._waiting = False
+
+    async def send(self, message: Any) -> None:
+        if self.close_sent:  # for a frame that is none, while the app answered the message before it
+            raise ClientDisconnected
+        await super().send(message)
+        self.handshake_complete |= self.close_sent  # by a refusal; uvicorn would call it none, and log an error
+
+    def _take(self, answer: Prompt) -> None:
+        self._answer = answer
+
+    def _answered(self, answer: Prompt | None, frame: bytes, extent: Extent) -> bool:
+        free = self._waiting and self.queue.empty() and not self.frames and self.writable.is_set()
+        if answer is None or not free or frame[0] != WHOLE_BINARY or not frame[1] & MASKED:
+            return False
+        message = apply_mask(frame[extent.payload :], frame[extent.key : extent.payload])
+        if self.close_sent or (reply := answer(message)) is None:
+            return False
+        self.transport.write(b"".join((header(len(reply)), reply)))
+        return True
+
+    def _count(self, unfinished: int) -> None:
+        """Note how many bytes of an unfinished message are held, and end the connection where that is too much."""
+        if unfinished == self._counted:
+            return
+        self._together.bytes += unfinished - self._counted
+        self._counted = unfinished
+        if self._timer is not None and not unfinished:
+            self._timer.cancel()
+            self._timer = None
+        elif self._timer is None and unfinished:
+            late = f"expected a whole message within {self._seconds:g} s"
+            self._timer = self.loop.call_later(self._seconds, self._end, late)
+        if self._together.bytes > self._together.most:
+            self._end(f"expected unfinished messages of at most {self._together.most} bytes in all streams, got more")
+
+    def _end(self, reason: str) -> None:
+        """Close the connection because of what came."""
+        if self.close_sent or self.transport.is_closing():
+            return
+        if self.conn.state is State.OPEN:
+            self.conn.send_close(CloseCode.POLICY_VIOLATION, reason)
+            self.handle_parser_exception()
+        else:
+            self.transport.close()
