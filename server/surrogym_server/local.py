@@ -18,7 +18,7 @@ from surrogym_server.errors import InvalidInput, UnknownModel, UnknownSession
 from surrogym_server.models.files import from_bytes
 from surrogym_server.models.port import DynamicsModel
 from surrogym_shared.acting import ActingPolicy, NoiseKey, PolicyRun
-from surrogym_shared.port import Bools, Floats, Ints, PolicyRollout, ResetResult, StepResult
+from surrogym_shared.port import Bools, Floats, Ints, PolicyRollout, ResetResult, StepResult, quick
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import SurrogateFile
 from surrogym_shared.wire import OpenSession, SessionView, SubmittedOccupancy
@@ -102,7 +102,8 @@ class LocalSurrogate:
     def step(
         self, session: str, action: Floats | Ints, *, mask: Bools | None = None, deviations: bool = False
     ) -> StepResult:
-        outcome = self._advance(Step(session, None, np.asarray(action), mask, deviations))
+        asked = quick(Step, session=session, seq=None, action=action, mask=mask, deviations=deviations, within=None)
+        outcome = self._advance(asked)
         assert isinstance(outcome, tuple)
         return outcome[0]
 

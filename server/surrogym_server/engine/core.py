@@ -160,7 +160,8 @@ def carried_out(
             stepped, result = _stepped(session, u, request.mask, request.deviations, models, interrupts)
             return stepped, (result,)
         case Reset():
-            return reset_session(session, request.seed, request.mask, _latest(session, models))
+            latest = models.latest(session.surrogate_id) if session.model == "latest" else session.model
+            return reset_session(session, request.seed, request.mask, latest)
         case Rollout():
             return roll(session, request.actions, partial(_next_step, models, wanted, interrupts))
         case PolicySteps():
@@ -193,23 +194,18 @@ def _next_step(
 def _stepped(
     session: Session, u: Array, mask: Bools | None, deviations: bool, models: Models, interrupts: bool
 ) -> tuple[Session, StepResult]:
-    model_of = partial(_model_of, models, session)
+    surrogate, device = session.surrogate_id, session.definition.device
+    latest = models.latest(surrogate) if session.model == "latest" else session.model
     try:
-        return step_session(session, u, mask, deviations, model_of, _latest(session, models))
+        return step_session(
+            session, u, mask, deviations, lambda version: models.get(surrogate, version, device), latest
+        )
     except SurrogymError:
         raise
     except BaseException as error:  # of a family's code; written out, as ``plugin_calls`` costs each step more
         if isinstance(error, KeyboardInterrupt) and not interrupts:
             raise
         raise failure_of(session.definition, error) from error
-
-
-def _model_of(models: Models, session: Session, version: int) -> DynamicsModel:
-    return models.get(session.surrogate_id, version, session.definition.device)
-
-
-def _latest(session: Session, models: Models) -> int:
-    return models.latest(session.surrogate_id) if session.model == "latest" else session.model
 
 
 def _columns(action: Array, dimensions: int) -> Array:

@@ -75,7 +75,7 @@ def _require_counts(rows: Array, counts: tuple[int, ...]) -> None:
 
 def _in_box(action: ActionDefinition, rows: Array) -> Array:
     low, high = action.limits
-    if ((rows >= low) & (rows <= high)).all():  # so they are finite
+    if ((rows >= low) & (rows <= high)).all():  # limits are finite, so these are as well
         return rows
     _require_finite(rows)
     slack = FLOAT32_SLACK * (high - low)  # a policy's float32 bound may round to just outside
