@@ -99,6 +99,9 @@ class SeqConflict(Conflict):
         super().__init__(message)
         self.expected = expected
 
+    def __reduce__(self) -> tuple[type[SeqConflict], tuple[str, int]]:
+        return type(self), (str(self), self.expected)
+
 
 class ForeignLease(Conflict):
     """The lease token was never given out for this query."""
