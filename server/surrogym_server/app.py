@@ -44,7 +44,7 @@ from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_q
 from surrogym_server.engine.fits import Fits
 from surrogym_server.engine.local import LocalEngine
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.engine.port import SessionEngine
+from surrogym_server.engine.port import Compute, SessionEngine
 from surrogym_server.engine.sessions import MEBIBYTE, Limits
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
@@ -99,7 +99,7 @@ class _Process:
     definitions: Definitions
     models: ModelCache
     engine: SessionEngine
-    fits: Fits
+    fits: Compute
     notices: Notices
     metrics: ProcessMetrics
 
@@ -206,7 +206,7 @@ def _build_process(settings: Settings, design: DesignPort, storage: Storage, met
         idle_seconds=settings.session_idle_seconds,
         device=torch.device(settings.device),
     )
-    return _Process(storage, definitions, models, engine, Fits(design.run), Notices(), metrics)
+    return _Process(storage, definitions, models, engine, Fits(design.run, settings.fit_workers), Notices(), metrics)
 
 
 def _build_services(settings: Settings, design: DesignPort, process: _Process) -> Services:
@@ -222,6 +222,7 @@ def _build_services(settings: Settings, design: DesignPort, process: _Process) -
         threads=settings.threads,
         look_seconds=settings.sweep_seconds,
         fit_seconds=settings.fit_seconds,
+        fit_workers=settings.fit_workers,
     )
     return Services(
         surrogates=SurrogateService(

@@ -50,6 +50,7 @@ class Settings(BaseModel):
     threads: Annotated[int, Field(ge=1, le=1024, description="of one torch operation")] = 1
     session_idle_seconds: Annotated[float, Field(gt=0)] = 3_600.0
     fit_seconds: Annotated[float, Field(gt=0, description="of one fit; one that takes longer is ended")] = 3_600.0
+    fit_workers: Annotated[int, Field(ge=1, le=256, description="fits at once, each in a process")] = 1
     max_body_bytes: Annotated[int, Field(ge=1_024)] = 32 * 1024 * 1024
     max_bodies_bytes: Annotated[int, Field(ge=1_024, description="of all requests at once")] = 256 * 1024 * 1024
     max_connections: Annotated[int, Field(ge=1)] = 16_384

@@ -42,6 +42,9 @@ SessionIdleSeconds = Annotated[
 FitSeconds = Annotated[
     float | None, typer.Option(help="Time after which a fit is ended, and has failed. [default: 3600]")
 ]
+FitWorkers = Annotated[
+    int | None, typer.Option(help="Fits of different surrogates at once, each in a process. [default: 1]")
+]
 LogLevel = Annotated[str | None, typer.Option(help="critical, error, warning, info or debug. [default: info]")]
 LogFormat = Annotated[str | None, typer.Option(help="text, or json: one object a line. [default: text]")]
 ReadyFile = Annotated[Path | None, typer.Option(help="File to write the URL to, once the server accepts requests.")]
@@ -74,6 +77,7 @@ def serve(
     threads: Threads = None,
     session_idle_seconds: SessionIdleSeconds = None,
     fit_seconds: FitSeconds = None,
+    fit_workers: FitWorkers = None,
     log_level: LogLevel = None,
     log_format: LogFormat = None,
     ready_file: ReadyFile = None,

@@ -17,6 +17,7 @@ from multiprocessing.process import BaseProcess
 from threading import Lock, Thread
 
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
+from surrogym_server.engine.port import Compute
 from surrogym_server.errors import ChoiceFailed, PluginFailed, SurrogymError, Unavailable
 from surrogym_server.plugins import in_one_line
 
@@ -33,11 +34,17 @@ class _Failure:
     details: str  # the traceback, of what nobody raised on purpose
 
 
-class Fits:
-    """A process for each fit that runs, and one that waits for the next. They end with this one, however it ends."""
+class Fits(Compute):
+    """A process for each fit that runs. They end with this one, however it ends.
 
-    def __init__(self, function: Function = run_design_job) -> None:
+    Args:
+        function: what does a job.
+        kept: how many processes wait for the next jobs when theirs are done.
+    """
+
+    def __init__(self, function: Function = run_design_job, kept: int = 1) -> None:
         self._function = function
+        self._kept = kept
         self._idle: list[_Process] = []
         self._busy: list[_Process] = []
 
@@ -46,13 +53,7 @@ class Fits:
         self._idle.append(_Process())
 
     async def run(self, job: DesignJob) -> DesignResult:
-        """Do a job; a process that died is replaced and the job done once more. Cancelling ends its process.
-
-        Raises:
-            Unavailable: the process died twice.
-            PluginFailed: the job raised, whatever it was; notes have the traceback of what nobody raised on purpose.
-            ChoiceFailed: the job did.
-        """
+        """Do a job; a process that died is replaced and the job done once more. Raises as ``Compute.run``."""
         for _ in range(2):
             process = self._idle.pop() if self._idle else _Process()
             self._busy.append(process)
@@ -78,9 +79,9 @@ class Fits:
         self._idle = []
 
     def _give_back(self, process: _Process, whole: bool) -> None:
-        """Keep a process for the next fit; end it where another waits already, or in the middle of a job."""
+        """Keep a process for the next fit; end it where enough wait already, or in the middle of a job."""
         self._busy.remove(process)
-        if whole and not self._idle:
+        if whole and len(self._idle) < self._kept:
             self._idle.append(process)
         else:
             process.close()

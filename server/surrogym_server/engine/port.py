@@ -1,4 +1,6 @@
-"""SessionEngine: where live sessions are. Requests and replies are data; the engine owns everything between them.
+"""SessionEngine: where live sessions are. Compute: where rounds of designs are computed.
+
+Requests and replies are data; an engine owns everything between them.
 
 The laws that stand in the docstrings are functions of ``surrogym_server.testing``.
 """
@@ -7,6 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
+from surrogym_server.engine.design_job import DesignJob, DesignResult
 from surrogym_server.engine.requests import (
     Advance,
     Array,
@@ -123,3 +126,30 @@ class SessionEngine(ABC):
             Damaged: these are not the bytes that were saved.
             TooLarge, Overloaded: it does not fit in.
         """
+
+
+class Compute(ABC):
+    """Where rounds of designs are computed, apart from sessions.
+
+    Laws: a result is that of ``run_design_job``, bit for bit. Jobs that are run at the same time do not wait for each
+    other. Whatever a job raises comes back as words, and ends nothing else. Cancelling ends the job, whatever it is
+    doing, and no other one.
+    """
+
+    @abstractmethod
+    def start(self) -> None:
+        """Get ready before the first job comes."""
+
+    @abstractmethod
+    async def run(self, job: DesignJob) -> DesignResult:
+        """Do a job.
+
+        Raises:
+            Unavailable: it was lost and can't be done now: a process or machine that died.
+            PluginFailed: the job raised, whatever it was; notes have the traceback of what nobody raised on purpose.
+            ChoiceFailed: the job did.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """End all jobs; harmless when they have ended. In a thread."""

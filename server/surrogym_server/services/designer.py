@@ -6,12 +6,12 @@ import asyncio
 import logging
 import time
 from contextlib import suppress
-from typing import Protocol
 
 import numpy as np
 
 from surrogym_server.engine.design_job import DesignJob, DesignResult
 from surrogym_server.engine.models import ModelCache
+from surrogym_server.engine.port import Compute
 from surrogym_server.errors import (
     ChoiceFailed,
     Damaged,
@@ -47,31 +47,24 @@ MOST_PASSED = 3  # fits that others pass: each is a process
 PAUSE_SECONDS = 1.0  # between looks at whether a fit is still wanted
 
 
-class FitRunner(Protocol):
-    """Where jobs are done; ``engine.fits.Fits`` is one."""
-
-    async def run(self, job: DesignJob) -> DesignResult:
-        """The result of a job. Cancelling ends the job, whatever it is doing."""
-
-
 class _Turn:
-    """One fit at a time; one that takes long lets others pass, as long as there are few such."""
+    """A few fits at a time; one that takes long lets others pass, as long as there are few such."""
 
-    def __init__(self, one: asyncio.Semaphore, passed: asyncio.Semaphore) -> None:
-        self._one, self._passed, self._held = one, passed, one
+    def __init__(self, usual: asyncio.Semaphore, passed: asyncio.Semaphore) -> None:
+        self._usual, self._passed, self._held = usual, passed, usual
 
     async def __aenter__(self) -> _Turn:
-        await self._one.acquire()
+        await self._usual.acquire()
         return self
 
     async def __aexit__(self, *_: object) -> None:
         self._held.release()
 
     async def let_others_pass(self) -> None:
-        if self._held is self._one and not self._passed.locked():
+        if self._held is self._usual and not self._passed.locked():
             await self._passed.acquire()
             self._held = self._passed
-            self._one.release()
+            self._usual.release()
 
 
 class Designer:
@@ -79,7 +72,7 @@ class Designer:
         self,
         storage: Storage,
         definitions: Definitions,
-        fits: FitRunner,
+        fits: Compute,
         models: ModelCache,
         notices: Notices,
         metrics: ProcessMetrics,
@@ -88,6 +81,7 @@ class Designer:
         threads: int,
         look_seconds: float,
         fit_seconds: float,
+        fit_workers: int = 1,
     ) -> None:
         """
         Args:
@@ -101,6 +95,7 @@ class Designer:
             threads: of torch in a fit.
             look_seconds: how often to look for what no notice told.
             fit_seconds: a fit that takes longer is ended, and has failed.
+            fit_workers: how many fits are done at once, beside those that take long and are passed.
         """
         self._storage = storage
         self._definitions = definitions
@@ -112,7 +107,7 @@ class Designer:
         self._threads = threads
         self._look_seconds = look_seconds
         self._fit_seconds = fit_seconds
-        self._one, self._passed = asyncio.Semaphore(1), asyncio.Semaphore(MOST_PASSED)
+        self._usual, self._passed = asyncio.Semaphore(fit_workers), asyncio.Semaphore(MOST_PASSED)
         self._tasks: dict[str, asyncio.Task[None]] = {}  # of the surrogates that are fitted, or wait for their turn
         self._unavailable: dict[str, int] = {}  # fits in a row that had no process, or no storage, by surrogate
 
@@ -148,7 +143,7 @@ class Designer:
     async def _fit_in_turn(self, name: str) -> None:
         """Whatever comes of it ends this fit alone."""
         try:
-            async with _Turn(self._one, self._passed) as turn:
+            async with _Turn(self._usual, self._passed) as turn:
                 await self._fit(name, turn)
         except Damaged as error:
             logger.warning("the design of %s waits: %s", name, error)

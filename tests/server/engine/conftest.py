@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,25 +40,33 @@ def fitted(definition: EnvironmentDefinition) -> Fitted:
     return fit
 
 
+@pytest.fixture
+def job(definition: EnvironmentDefinition) -> DesignJob:
+    """A round of a real design, with what it needs to choose queries."""
+    return replace(_job(definition, 8), budget=10)
+
+
 def _design(definition: EnvironmentDefinition, samples: int) -> DesignResult:
+    return run_design_job(_job(definition, samples))
+
+
+def _job(definition: EnvironmentDefinition, samples: int) -> DesignJob:
     rng = np.random.default_rng(samples)
     q = rng.uniform([-3, -7], [3, 7], (samples, 2))
     u = rng.uniform(-2, 2, (samples, 1))
     steps = [pendulum.real_step(list(at), list(action)) for at, action in zip(q, u, strict=True)]
     threads = torch.get_num_threads()
-    return run_design_job(
-        DesignJob(
-            definition=definition,
-            coordinates=q,
-            action=u,
-            next_coordinates=np.array([step["next_coordinates"] for step in steps]),
-            reward=np.array([step["reward"] for step in steps]),
-            terminated=np.zeros(samples, dtype=bool),
-            state={},
-            budget=samples,
-            target=0.999,
-            threads=threads,
-        )
+    return DesignJob(
+        definition=definition,
+        coordinates=q,
+        action=u,
+        next_coordinates=np.array([step["next_coordinates"] for step in steps]),
+        reward=np.array([step["reward"] for step in steps]),
+        terminated=np.zeros(samples, dtype=bool),
+        state={},
+        budget=samples,
+        target=0.999,
+        threads=threads,
     )
 
 

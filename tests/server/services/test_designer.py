@@ -73,7 +73,7 @@ def cache(storage: Storage, definitions: Definitions) -> ModelCache:
 def designer(storage: Storage, definitions: Definitions, cache: ModelCache, runner: Runner):
     """Makes a designer of the running event loop."""
 
-    def make(fit_seconds: float = 3600) -> Designer:
+    def make(fit_seconds: float = 3600, fit_workers: int = 1) -> Designer:
         return Designer(
             storage,
             definitions,
@@ -85,6 +85,7 @@ def designer(storage: Storage, definitions: Definitions, cache: ModelCache, runn
             threads=1,
             look_seconds=0.05,
             fit_seconds=fit_seconds,
+            fit_workers=fit_workers,
         )
 
     return make
@@ -298,6 +299,43 @@ def test_a_fit_that_takes_long_is_told_and_passed(answered: Storage, designer, r
     assert runner.ended == 1
     assert answered.designs.due() == [NAME]
     assert f"the fit of {NAME} has been running for 0 s, and is ended at 3600 s" in caplog.text
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_as_many_fits_run_at_once_as_are_allowed(answered: Storage, designer, runner: Runner, workers: int):
+    teach_another(answered, budget=29)
+    runner.hang = True
+
+    async def run() -> None:
+        task = asyncio.create_task(designer(fit_workers=workers).run())
+        async with asyncio.timeout(60):
+            while len(runner.jobs) < workers:
+                await asyncio.sleep(0.01)
+        await asyncio.sleep(0.2)  # several looks
+        assert len(runner.jobs) == workers
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    asyncio.run(run())
+    assert runner.ended == workers
+
+
+def test_a_surrogate_that_becomes_due_during_a_fit_is_fitted_beside_it(answered: Storage, designer, runner: Runner):
+    runner.hang_at_budget = pendulum.BUDGET
+
+    async def run() -> None:
+        task = asyncio.create_task(designer(fit_workers=2).run())
+        async with asyncio.timeout(60):
+            while not runner.jobs:
+                await asyncio.sleep(0.01)
+            await asyncio.to_thread(teach_another, answered, budget=29)
+            while answered.surrogates.get("another").phase != "sampling":
+                await asyncio.sleep(0.01)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    asyncio.run(run())
+    assert runner.ended == 1, "the first one runs all the time"
 
 
 def teach_another(storage: Storage, budget: int) -> None:

@@ -1,0 +1,17 @@
+"""The processes of this machine keep the laws of what computes rounds of designs."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from surrogym_server.engine.design_job import DesignJob
+from surrogym_server.engine.fits import Fits
+from surrogym_server.testing import LAWS_OF_COMPUTE, ComputeCase
+
+
+@pytest.mark.parametrize("law", LAWS_OF_COMPUTE, ids=lambda law: law.__name__)
+def test_processes_of_this_machine_keep_the_laws(law, job: DesignJob, tmp_path: Path):
+    asyncio.run(law(ComputeCase(Fits, job, tmp_path)))
