@@ -39,9 +39,10 @@ imports: .venv/dev  ## Check which room imports which
 unit: .venv/dev postgresql chromium  ## The tests alone (ARGS="-k pendulum")
 	$(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
 
-test-all: test .venv-extras  ## make test, every command of the docs, and trainers and trackers with packages of their own
+test-all: test .venv-extras .venv-adapters  ## make test, every command of the docs, and trainers and trackers with packages of their own
 	$(BIN)/pytest -m long --numprocesses $(WORKERS) --dist loadfile
 	DOCS=full $(BIN)/pytest -m "" --durations 0 tests/docs tests/examples
+	.venv-adapters/bin/python -m pytest -m "" tests/original/test_adapters.py tests/original/test_describing.py
 
 docs: .venv/dev  ## Build the site into build/docs; warnings are errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
@@ -93,7 +94,7 @@ screenshots: .venv/dev chromium  ## Pictures of the page for the docs, from a li
 	$(BIN)/python tests/dashboard/screenshots.py
 
 clean:  ## Remove the virtual environment, caches and builds; run folders stay
-	rm -rf .venv .venv-extras build dist .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-extras .venv-adapters build dist .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
 	find client server shared tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:  ## This list
@@ -119,6 +120,13 @@ help:  ## This list
 	@$(PYTHON) -m venv .venv-extras
 	@.venv-extras/bin/python -m pip install -qq --disable-pip-version-check --constraint constraints-extras.txt \
 	    --editable ".[train,torchrl,rllib,tianshou,contrib,trackers]"
+	@touch $@
+
+.venv-adapters: pyproject.toml constraints-adapters.txt | .venv/bin/python
+	@echo "installing dm_control, Gymnasium-Robotics and pc-gym into .venv-adapters"
+	@$(PYTHON) -m venv .venv-adapters
+	@.venv-adapters/bin/python -m pip install -qq --disable-pip-version-check --no-compile \
+	    --constraint constraints-adapters.txt --editable ".[server,train,adapters]" pytest pytest-timeout hypothesis
 	@touch $@
 
 .venv/dev: $(PINS) | .venv/bin/python

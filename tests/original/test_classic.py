@@ -51,7 +51,7 @@ def test_step_from_follows_the_environments_own_trajectory(environments, name):
     for _ in range(60):
         before = wrapped(spec, np.array(real.state, dtype=float))
         action = random_action(spec, rng)
-        observation, reward, terminated, _, _ = real.step(native_action(spec, action))
+        observation, reward, terminated, _, _ = real.step(native_action(spec.action, action))
         step = environment.step_from(before, action)
         after = wrapped(spec, np.array(real.state, dtype=float))
         np.testing.assert_allclose(turned(spec, step.next_coordinates - after), 0, atol=1e-6)

@@ -81,7 +81,8 @@ def test_ones_own_environment_is_loaded_by_name(own_module):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("Nowhere-v3", "no adapter knows the environment 'Nowhere-v3': expected one of Pendulum-v1"),
+        ("Nowhere-v3", "Nowhere-v3 can't be made: Environment .Nowhere. doesn't exist"),
+        ("nowhere", "no adapter knows the environment 'nowhere': expected one of Pendulum-v1"),
         ("own_cart:Missing", "expected package.module:factory, got 'own_cart:Missing'"),
         ("no_such_module:x", "No module named 'no_such_module'"),
         (":x", "expected package.module:factory, got ':x'"),
@@ -99,4 +100,13 @@ def test_a_servers_specification_can_not_name_a_module():
     assert is_known("Hopper-v5")
     assert not is_known("own_cart:Cart")
     assert not is_known("own_cart:Env-v0")
+    assert not is_known("pcgym:plant.json")
+    assert not is_known("dm_control:../x-y")
+    assert is_known("dm_control:cartpole-swingup")
     assert not is_known("a robot")
+
+
+def test_an_environment_without_a_specification_names_the_command_that_writes_one():
+    pytest.importorskip("mujoco")
+    with pytest.raises(UnknownEnvironment, match=r"Hopper-v5 has no built-in specification .*surrogym describe Hopper"):
+        original.make("Hopper-v5")

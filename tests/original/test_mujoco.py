@@ -6,15 +6,11 @@ import pytest
 
 from surrogym_client import original
 from surrogym_client.original import terms
-from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
-from surrogym_client.original.recognise import recognise
 from surrogym_shared.spec import limits
 
 pytest.importorskip("mujoco")
 pytest.importorskip("imageio")
-
-SPEEDS = {"slider_velocity": (-3, 3), "hinge_velocity": (-6, 6)}
 
 
 def random_place(spec, rng):
@@ -30,8 +26,8 @@ def test_declared_observation_is_the_environments_own(name):
     rng = np.random.default_rng(0)
     for _ in range(30):
         place = random_place(spec, rng)
-        environment._joints.write(environment._columns, place)
-        shown = environment._env._get_obs()
+        environment.place(place)
+        shown = environment.simulator.observe()
         declared = terms.observe(spec, place[None])[0]
         if "constraint" in spec.observation_names:
             shown = shown[:-1] if abs(place[0]) > 0.85 else shown
@@ -58,8 +54,7 @@ def test_declared_termination_is_the_environments_own(name):
 def test_step_from_follows_the_environments_own_trajectory(name):
     environment = original.make(name)
     spec = environment.spec()
-    joints = environment._joints
-    columns = joints.columns(spec.coordinate_names)
+    columns = environment.simulator.columns(spec.coordinate_names)
     real = gymnasium.make(name).unwrapped
     real.reset(seed=1)
     rng = np.random.default_rng(1)
@@ -71,40 +66,3 @@ def test_step_from_follows_the_environments_own_trajectory(name):
         np.testing.assert_allclose(step.next_coordinates, real.state_vector()[columns], atol=1e-7)
         assert step.reward == pytest.approx(reward, abs=1e-7)
         assert step.terminated == terminated
-
-
-def test_a_known_observation_is_recognised_without_a_step():
-    spec = recognise("InvertedPendulum-v5", SPEEDS)
-    declared = SPECIFICATIONS["InvertedPendulum-v5"]()
-    places = np.random.default_rng(0).uniform(-0.2, 0.2, (5, 4))
-    np.testing.assert_allclose(terms.observe(spec, places), terms.observe(declared, places), atol=1e-9)
-    assert spec.time_limit == 1000
-
-
-def test_a_recognised_specification_makes_an_environment():
-    spec = recognise("InvertedPendulum-v5", SPEEDS)
-    step = original.make("InvertedPendulum-v5", spec=spec).step_from(np.zeros(4), np.array([1.0]))
-    assert step.next_coordinates[0] > 0
-
-
-def test_what_terms_can_not_express_is_refused():
-    wide = dict.fromkeys(("slider_velocity", "hinge_velocity", "hinge2_velocity"), (-20.0, 20.0))
-    with pytest.raises(UnknownEnvironment, match="are no sums of 1, q, sin and cos"):
-        recognise("InvertedDoublePendulum-v5", {"hinge": (-1, 1), "hinge2": (-1, 1), **wide})
-
-
-def test_missing_ranges_and_unknown_joints_are_named():
-    with pytest.raises(UnknownEnvironment, match=r"ranges lack \['slider_velocity', 'hinge_velocity'\]"):
-        recognise("InvertedPendulum-v5", {})
-    with pytest.raises(UnknownEnvironment, match=r"coordinates \['elbow'\] are no joints"):
-        recognise("InvertedPendulum-v5", {"elbow": (-1, 1)})
-
-
-def test_free_joints_are_refused():
-    with pytest.raises(UnknownEnvironment, match="free and ball joints"):
-        recognise("Ant-v5", {})
-
-
-def test_an_undescribed_environment_asks_for_a_specification():
-    with pytest.raises(UnknownEnvironment, match="Hopper-v5 has no built-in specification"):
-        original.make("Hopper-v5")

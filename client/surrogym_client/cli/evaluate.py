@@ -182,13 +182,13 @@ def _opener(env: str | None, given: EnvironmentSpec | None, card: PolicyCard, *,
     """Return what opens an episode. A card is believed for Gymnasium's own ids alone, never for a module."""
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.original.episodes import open_episode
-    from surrogym_client.original.loading import is_known, make
+    from surrogym_client.original.loading import is_known, is_own, make
 
     noted = card.spec
     name = env or (noted.environment if noted is not None else None)
     if name is None or (env is None and not is_known(name)):
         raise CommandError(f"expected --env with the original environment, got none (noted beside the policy: {name})")
-    if ":" in name:
+    if is_own(name):
         bins = _bins(noted) if given is None else None
         return lambda: open_episode(name, given, lambda: make(name, spec=given, bins=bins))
     if given is None and noted is not None and noted.environment == name and is_known(name):

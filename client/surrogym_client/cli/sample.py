@@ -101,7 +101,7 @@ def command(
 def _factory(env: str | None, given: EnvironmentSpec | None, asked: EnvironmentSpec) -> Factory:
     """How to make the environment; a server's word is taken for Gymnasium's own ids alone, never for a module."""
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.original.loading import is_known, make
+    from surrogym_client.original.loading import is_known, is_own, make
 
     if env is None and not is_known(asked.environment):
         raise CommandError(
@@ -109,7 +109,7 @@ def _factory(env: str | None, given: EnvironmentSpec | None, asked: EnvironmentS
             "expected --env package.module:factory"
         )
     name = env or asked.environment
-    own = ":" in name and given is None
+    own = is_own(name) and given is None
     return partial(make, name) if own else partial(make, name, spec=given or asked)
 
 

@@ -14,7 +14,6 @@ import numpy as np
 from surrogym_client.original.classic import TASKS
 from surrogym_client.original.errors import NotPerturbable, NotSettable, StepFailed
 from surrogym_client.original.gymnasium import native_action, task_for, wrapped
-from surrogym_client.original.mujoco import Joints, is_known, open_mujoco
 from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
 from surrogym_client.original.protocol import (
     Array,
@@ -26,6 +25,7 @@ from surrogym_client.original.protocol import (
     runs_in_parallel,
 )
 from surrogym_client.original.rollouts import answering
+from surrogym_client.original.simulator import Simulated
 from surrogym_client.original.terms import observe
 from surrogym_shared.spec import EnvironmentSpec, Fixed, Normal, Uniform, limits
 
@@ -116,7 +116,7 @@ class GymnasiumEpisode(Episode):
         return Moment(self._shown(coordinates), 0.0, False, coordinates)
 
     def step(self, action: Array) -> Moment:
-        observation, reward, terminated, _, _ = self._env.step(native_action(self.spec, action))
+        observation, reward, terminated, _, _ = self._env.step(native_action(self.spec.action, action))
         return self._moment(observation, float(reward), terminated=bool(terminated))
 
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
@@ -134,27 +134,45 @@ class GymnasiumEpisode(Episode):
         return Moment(shown, reward, terminated, coordinates)
 
 
-class MujocoEpisode(GymnasiumEpisode):
-    """The same for MuJoCo; perturbed are the masses of all bodies."""
+class SimulatedEpisode(Episode):
+    """An episode of a simulator that an adapter opened; perturbed are the masses of all bodies.
 
-    def _open(self) -> Any:
-        env = open_mujoco(self.spec.environment)
-        self._joints = Joints(env)
-        self._columns = self._joints.columns(self.spec.coordinate_names)
-        return env
+    Its observation is the environment's own where the built-in specification shows the same.
+    """
 
-    def _read_physics(self) -> Any:
-        return self._env.model.body_mass.copy()
+    parallel = True
 
-    def _read(self) -> Array:
-        return self._joints.read(self._columns)
+    def __init__(self, environment: Simulated) -> None:
+        super().__init__(environment.spec())
+        self._environment = environment
+        self._own_observation = _shows_the_same(self.spec)
 
-    def _write(self, coordinates: Array) -> None:
-        self._joints.write(self._columns, coordinates)
+    def reset(self, seed: int) -> Moment:
+        observation = self._environment.simulator.reset(seed)
+        coordinates = self._environment.coordinates()
+        return Moment(self._of(observation, coordinates), 0.0, False, coordinates)
+
+    def place(self, coordinates: Array) -> Moment:
+        if not self._environment.simulator.settable:
+            raise NotSettable(f"this environment can't be set to {coordinates.tolist()}: it can only be reset")
+        self._environment.simulator.reset(0)
+        self._environment.place(coordinates)
+        return Moment(self._shown(coordinates), 0.0, False, coordinates)
+
+    def step(self, action: Array) -> Moment:
+        step = self._environment.act(action)
+        reached = np.asarray(step.next_coordinates)
+        shown = self._of(np.asarray(step.next_observation), reached)
+        return Moment(shown, step.reward, step.terminated, reached, step.truncated)
 
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
-        for body, mass in enumerate(self._physics):
-            self._env.model.body_mass[body] = mass * _factor(rng, sigma)
+        self._environment.simulator.perturb(rng, sigma)
+
+    def close(self) -> None:
+        self._environment.close()
+
+    def _of(self, observation: Array, coordinates: Array) -> Array:
+        return observation if self._own_observation else self._shown(coordinates)
 
 
 class OwnEpisode(Episode):
@@ -228,9 +246,10 @@ def open_episode(name: str, spec: EnvironmentSpec | None, factory: Factory) -> E
     """An episode of the environment called ``name``; ``factory`` makes it where no adapter knows the name."""
     if name in TASKS:
         return GymnasiumEpisode(spec or factory().spec())
-    if is_known(name):
-        return MujocoEpisode(spec or factory().spec())
-    environment = answering(factory())
+    made = factory()
+    if isinstance(made, Simulated):
+        return SimulatedEpisode(made)
+    environment = answering(made)
     if isinstance(environment, OriginalEnvironment):
         return SteppedEpisode(environment)
     return RolloutEpisode(environment)

@@ -9,6 +9,7 @@ import numpy as np
 from surrogym_client.original.classic import PAPER_TASKS, TASKS, Task
 from surrogym_client.original.protocol import Array, RealStep
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_shared.spec.actions import Action
 
 
 def task_for(environment: str, preset: str) -> Task:
@@ -51,7 +52,7 @@ class GymnasiumEnvironment:
     def act(self, action: Array) -> RealStep:
         """Apply action (F,) where the environment stands."""
         achieved = wrapped(self._spec, self._task.read(self._env))
-        native = native_action(self._spec, action)
+        native = native_action(self._spec.action, action)
         observation, reward, terminated, truncated, _ = self._env.step(native)
         return RealStep(
             coordinates=achieved,
@@ -67,12 +68,12 @@ class GymnasiumEnvironment:
         self._env.close()
 
 
-def native_action(spec: EnvironmentSpec, action: Array) -> Any:
+def native_action(space: Action, action: Array) -> Any:
     """What the environment's own ``step`` takes for an action (F,): an int, or an array."""
-    if isinstance(spec.action, BoxAction):
+    if isinstance(space, BoxAction):
         return np.asarray(action, dtype=np.float32)
     numbers = np.asarray(action, dtype=np.int64)
-    return int(numbers[0]) if spec.action.kind == "discrete" else numbers
+    return int(numbers[0]) if space.kind == "discrete" else numbers
 
 
 def wrapped(spec: EnvironmentSpec, coordinates: Array) -> Array:

@@ -1,4 +1,4 @@
-"""From a name to an original environment: a Gymnasium id, or ``package.module:factory`` for one's own."""
+"""From a name to an original environment: one that an adapter opens, or ``package.module:factory`` for one's own."""
 
 from __future__ import annotations
 
@@ -9,9 +9,14 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Literal
 
+from surrogym_client.original.adapters import adapter_of, is_trusted, open_simulator
+from surrogym_client.original.classic import TASKS
 from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.gymnasium import GymnasiumEnvironment, task_for
+from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
 from surrogym_client.original.protocol import LONGEST_EPISODE, Environment
 from surrogym_client.original.rollouts import answering
+from surrogym_client.original.simulator import Simulated
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 
 Preset = Literal["default", "paper"]
@@ -36,8 +41,8 @@ def make(
     """Build an original environment.
 
     Args:
-        name: a Gymnasium id with a built-in adapter, or ``package.module:factory``.
-        spec: a specification that replaces the adapter's own.
+        name: a Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL``, or ``package.module:factory``.
+        spec: a specification that replaces the adapter's own; most names have none until ``describe`` writes one.
         preset, budget, initial, target, acquisition, seed: choices of the design; None keeps the specification's.
         bins: offer a continuous action to policies as so many discrete values a dimension.
         teleport: False asks for rollouts from resets, as if no state could be set.
@@ -54,24 +59,60 @@ def make(
     asked = {"budget": budget, "initial": initial, "target": target, "acquisition": acquisition, "seed": seed}
     chosen = {key: value for key, value in {"preset": preset, **asked}.items() if value is not None}
     choose = partial(with_choices, design=chosen, bins=bins, teleport=teleport, max_rollout=max_rollout)
-    if ":" in name:
+    if is_own(name):
         return _own(load_factory(name)(), spec, choose)
     return _known(name, spec, choose, preset or "default")
 
 
-def is_known(name: str) -> bool:
-    """Whether a built-in adapter knows this Gymnasium id; only such names are taken from a server."""
-    from surrogym_client.original import mujoco
-    from surrogym_client.original.classic import TASKS
+def is_own(name: str) -> bool:
+    """Whether a name is ``package.module:factory``, and of no adapter."""
+    return ":" in name and adapter_of(name) is None
 
-    return name in TASKS or mujoco.is_known(name)
+
+def is_known(name: str) -> bool:
+    """Whether a server's word is enough for this name: an adapter knows it, and it can open nothing of one's own."""
+    import gymnasium
+
+    entry = gymnasium.registry.get(name)
+    its_own = entry is not None and str(entry.entry_point).startswith("gymnasium.envs.mujoco.")
+    return name in TASKS or its_own or is_trusted(name)
+
+
+def has_specification(name: str) -> bool:
+    """Whether an environment brings its own specification: a built-in one, or that of its class."""
+    return name in TASKS or name in SPECIFICATIONS or adapter_of(name) is None
+
+
+def specification(name: str) -> EnvironmentSpec:
+    """The built-in specification of a name.
+
+    Raises:
+        UnknownEnvironment: there is none.
+    """
+    if name in SPECIFICATIONS:
+        return SPECIFICATIONS[name]()
+    known = ", ".join((*TASKS, *SPECIFICATIONS))
+    if adapter_of(name) is None:
+        raise UnknownEnvironment(
+            f"no adapter knows the environment {name!r}: expected one of {known}, another Gymnasium id, "
+            "dm_control:DOMAIN-TASK, pcgym:MODEL, or package.module:factory"
+        )
+    open_simulator(name).close()
+    raise UnknownEnvironment(
+        f"{name} has no built-in specification (these have one: {known}): surrogym describe {name} > env.json writes "
+        "one, and --spec env.json uses it"
+    )
 
 
 def own_time_limit(name: str) -> int:
-    """The time limit of a Gymnasium id in steps, as its registration has it; ``LONGEST_EPISODE`` without one."""
+    """The time limit of a known name in steps, as its own registration has it; ``LONGEST_EPISODE`` without one."""
     import gymnasium
 
-    return gymnasium.spec(name).max_episode_steps or LONGEST_EPISODE
+    if name in gymnasium.registry:
+        return gymnasium.spec(name).max_episode_steps or LONGEST_EPISODE
+    simulator = open_simulator(name)
+    simulator.close()
+    return simulator.time_limit or LONGEST_EPISODE
 
 
 def with_choices(
@@ -114,25 +155,14 @@ def load_factory(name: str) -> Any:
 
 
 def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str) -> Environment:
-    from surrogym_client.original import mujoco
-    from surrogym_client.original.classic import TASKS
-    from surrogym_client.original.gymnasium import GymnasiumEnvironment, task_for
-    from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
-
     if spec is not None and spec.environment not in ("", name):
         raise UnknownEnvironment(f"expected a specification of {name}, got one of {spec.environment}")
     if name in TASKS:
         spec = spec and spec.model_copy(update={"environment": name})
         base = spec or task_for(name, preset).spec()
         return GymnasiumEnvironment(choose(base))
-    if mujoco.is_known(name):
-        base = spec or mujoco.specification(name)
-        return mujoco.MujocoEnvironment(name, choose(base))
-    known = ", ".join((*TASKS, *SPECIFICATIONS))
-    raise UnknownEnvironment(
-        f"no adapter knows the environment {name!r}: expected one of {known}, "
-        "a MuJoCo id together with a specification, or package.module:factory"
-    )
+    base = choose(spec or specification(name))
+    return Simulated(open_simulator(name), base)
 
 
 class _Respecified:

@@ -11,10 +11,10 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_client.original.adapters.gymnasium_ids import settable
 from surrogym_client.original.classic import TASKS
 from surrogym_client.original.errors import NotRenderable
-from surrogym_client.original.loading import is_known, load_factory
-from surrogym_client.original.mujoco import Joints
+from surrogym_client.original.loading import is_known, is_own, load_factory
 from surrogym_client.original.protocol import Array, Native
 from surrogym_shared.spec import EnvironmentSpec
 
@@ -64,10 +64,10 @@ def renderer_of(spec: EnvironmentSpec, original: str | None = None) -> Renderer:
     Raises:
         NotRenderable: it has none, or what that needs is not installed.
     """
-    if original is not None and ":" in original:
+    if original is not None and is_own(original):
         return _Own(original)
     name = original or spec.environment
-    if not is_known(name):
+    if not _is_gymnasiums(name):
         raise NotRenderable(
             f"expected original='package.module:factory' of the environment to show, got none (its name: {name!r})"
         )
@@ -77,10 +77,17 @@ def renderer_of(spec: EnvironmentSpec, original: str | None = None) -> Renderer:
 def can_be_drawn(spec: EnvironmentSpec, original: str | None = None) -> bool:
     """Whether ``renderer_of`` has a renderer here: a built-in adapter's, with what it imports installed, or one that a
     person names. Finding out imports nothing."""
-    if original is not None and ":" in original:
+    if original is not None and is_own(original):
         return True
     name = original or spec.environment
-    return is_known(name) and all(find_spec(module) is not None for module, _ in _drawn_with(name))
+    return _is_gymnasiums(name) and all(find_spec(module) is not None for module, _ in _drawn_with(name))
+
+
+def _is_gymnasiums(name: str) -> bool:
+    """Whether a server's word is enough for this name, and Gymnasium itself draws it."""
+    import gymnasium
+
+    return is_known(name) and name in gymnasium.registry
 
 
 def _drawn_with(name: str) -> list[tuple[str, str]]:
@@ -119,16 +126,16 @@ class _Native:
         try:
             self._env: Native = gymnasium.make(name, render_mode="rgb_array").unwrapped
             self._env.reset(seed=0)
-            self._joints = None if name in TASKS else Joints(self._env)
         except (ImportError, gymnasium.error.Error) as error:
             raise self._unavailable(error) from error
+        self._simulator = None if name in TASKS else settable(name, self._env)
         self.frames_per_second = int(self._env.metadata.get("render_fps", FRAMES_PER_SECOND))
 
     def draw(self, coordinates: Array) -> Picture:
-        if self._joints is None:
+        if self._simulator is None:
             TASKS[self._name].write(self._env, coordinates)
         else:
-            self._joints.write(self._joints.columns(self._spec.coordinate_names), coordinates)
+            self._simulator.place(self._simulator.columns(self._spec.coordinate_names), coordinates)
         try:
             frame: Any = self._env.render()
         except Exception as error:  # a display, a driver or a library is missing: each says so by an error of its own

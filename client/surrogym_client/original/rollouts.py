@@ -54,7 +54,7 @@ class FromReset:
         if self._at is None:
             raise StepFailed("expected an action in a running episode, got one after its end or before a reset")
         before, self._at = self._at, None
-        native = native_action(self._spec, action)
+        native = native_action(self._spec.action, action)
         observation, reward, terminated, truncated, _ = self._environment.step(native)
         reached = self._read(observation)
         if not (terminated or truncated):

@@ -12,6 +12,9 @@ EXTRAS = {  # their packages
     "render": ("moviepy", "pygame"),
     "trackers": ("mlflow", "wandb"),
     "mujoco": ("mujoco", "imageio"),
+    "dm-control": ("dm_control",),
+    "robotics": ("gymnasium_robotics",),
+    "pcgym": ("pcgym",),
 }
 START_SERVER = "start one with surrogym serve, or name another by --server or SURROGYM_URL"
 GIVE_TOKEN = "give a token of this server by SURROGYM_TOKEN or --token-file"

@@ -1,0 +1,72 @@
+"""Simulators by name: any Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL`` or ``pcgym:FILE.json``.
+
+Each adapter opens a simulator; what it needs is an extra of its own, imported when a name asks for it.
+"""
+
+from __future__ import annotations
+
+import re
+from importlib import import_module
+from typing import NamedTuple
+
+from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.simulator import Simulator
+
+GYMNASIUM_ID = re.compile(r"(?:[A-Za-z_][\w.]*:)?[\w./-]+-v\d+")  # package:Id-v0 is Gymnasium's own spelling
+
+
+class Adapter(NamedTuple):
+    """Where an adapter is, the names that it opens, and those that may also come from a server: the packages' own."""
+
+    module: str
+    names: re.Pattern[str]
+    trusted: re.Pattern[str]
+    extra: str  # that brings what it imports
+
+
+NEVER = re.compile(r"(?!)")
+ADAPTERS = (
+    Adapter(
+        "surrogym_client.original.adapters.dm_control",
+        re.compile(r"dm_control:.*"),
+        re.compile(r"dm_control:[a-z0-9_]+-[a-z0-9_]+"),
+        "dm-control",
+    ),
+    Adapter("surrogym_client.original.adapters.pcgym", re.compile(r"pcgym:.*"), re.compile(r"pcgym:cstr"), "pcgym"),
+    Adapter(
+        "surrogym_client.original.adapters.gymnasium_ids",
+        re.compile(r"gymnasium_robotics:.*"),
+        re.compile(r"gymnasium_robotics:[\w-]+-v\d+"),
+        "robotics",
+    ),
+    Adapter("surrogym_client.original.adapters.gymnasium_ids", GYMNASIUM_ID, NEVER, "mujoco"),
+)
+
+
+def adapter_of(name: str) -> Adapter | None:
+    """The adapter that opens a name; None for ``package.module:factory`` and what is no name of an environment."""
+    return next((adapter for adapter in ADAPTERS if adapter.names.fullmatch(name)), None)
+
+
+def is_trusted(name: str) -> bool:
+    """Whether a server's word is enough for a name: it can open nothing but what a known package brings."""
+    return any(adapter.trusted.fullmatch(name) for adapter in ADAPTERS)
+
+
+def open_simulator(name: str) -> Simulator:
+    """Open the simulator of a name.
+
+    Raises:
+        UnknownEnvironment: no adapter knows the name, its package is not installed, or it can't be used.
+    """
+    adapter = adapter_of(name)
+    if adapter is None:
+        raise UnknownEnvironment(
+            f"no adapter knows the environment {name!r}: expected a Gymnasium id such as Pendulum-v1, package:Id-v0, "
+            "dm_control:DOMAIN-TASK, pcgym:MODEL, or package.module:factory"
+        )
+    try:
+        opened: Simulator = import_module(adapter.module).open_simulator(name)
+    except ImportError as error:
+        raise UnknownEnvironment(f"{name} can't be made: {error} (pip install 'surrogym[{adapter.extra}]')") from error
+    return opened

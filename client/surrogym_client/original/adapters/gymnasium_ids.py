@@ -1,0 +1,176 @@
+"""Gymnasium environments by id. The state is MuJoCo's, or an attribute ``state``; what has neither can only be reset.
+
+The goal of a goal environment (Gymnasium-Robotics) is a part of the state, in its attribute ``goal``.
+"""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import numpy as np
+
+from surrogym_client.original.adapters.parts import OfParts, action_of, flat
+from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.gymnasium import native_action
+from surrogym_client.original.protocol import Array
+from surrogym_client.original.simulator import Simulator, Taken, Variable
+from surrogym_client.original.state_parts import (
+    Attribute,
+    DrawnIntoModel,
+    MujocoState,
+    StatePart,
+    drawable,
+    drawn_between,
+    holds_numbers,
+)
+
+SYMBOLS = ("Discrete", "MultiDiscrete", "MultiBinary", "Text", "Graph", "Sequence")  # spaces without numbers
+RESETS = 4  # that are compared for what they draw into a model
+
+
+def open_simulator(name: str) -> Simulator:
+    """Open a Gymnasium environment.
+
+    Raises:
+        UnknownEnvironment: it can't be made, or its spaces can't be used.
+    """
+    env = make(name)
+    if type(env.observation_space).__name__ in SYMBOLS:
+        raise UnknownEnvironment(
+            f"{name} shows {env.observation_space}, one of several symbols: expected numbers that change gradually"
+        )
+    limit = env.spec.max_episode_steps
+    wrapped = getattr(env.spec, "additional_wrappers", ())  # these may change what is shown and paid
+    simulator = None if wrapped else settable(name, env.unwrapped, limit)
+    return simulator or ResetOnly(name, env, limit)
+
+
+def settable(name: str, env: Any, limit: int | None = None) -> GymnasiumSimulator | None:
+    """An unwrapped environment that can be set to a state; None where its state can't be read."""
+    if hasattr(env, "model") and hasattr(env, "data"):
+        return GymnasiumSimulator(name, env, _mujoco(env), env.model, env.data, limit=limit)
+    if holds_numbers(env, "state"):
+        return GymnasiumSimulator(name, env, [Attribute(env, "state")], limit=limit)
+    return None
+
+
+def make(name: str) -> Any:
+    """The environment after a first reset.
+
+    Raises:
+        UnknownEnvironment: it can't be made.
+    """
+    import gymnasium
+
+    try:
+        env: Any = gymnasium.make(name, disable_env_checker=True)
+    except (ImportError, gymnasium.error.Error) as error:
+        raise UnknownEnvironment(f"{name} can't be made: {error} {_way_out(name)}") from error
+    env.reset(seed=0)
+    return env
+
+
+def _way_out(name: str) -> str:
+    import gymnasium
+
+    package = name.partition(":")[0]
+    if package == "gymnasium_robotics":
+        return "(pip install 'surrogym[robotics]')"
+    entry = gymnasium.registry.get(name)
+    if entry is not None and str(entry.entry_point).startswith("gymnasium.envs.mujoco"):
+        return "(pip install 'surrogym[mujoco]')"
+    return "(an id of another package is written package:Id-v0)"
+
+
+class GymnasiumSimulator(OfParts):
+    """One that can be set to a state; without wrappers, so without a time limit of its own."""
+
+    def __init__(
+        self,
+        name: str,
+        env: Any,
+        parts: list[StatePart],
+        model: Any = None,
+        data: Any = None,
+        *,
+        limit: int | None = None,
+    ) -> None:
+        super().__init__(parts, model, data)
+        self._name, self._env = name, env
+        self.action = action_of(name, env.action_space)
+        self.time_limit = limit
+        self.shows = hasattr(env, "_get_obs") and not _needs_arguments(env._get_obs)
+        if model is not None and hasattr(env, "init_qpos"):
+            start = [np.ravel(env.init_qpos), np.ravel(env.init_qvel)]
+            self.rest[: sum(map(len, start))] = np.concatenate(start)
+        self.reset(0)
+
+    def reset(self, seed: int | None) -> Array:
+        self._last = flat(self._name, self._env.reset(seed=seed)[0])
+        return self._last
+
+    def step(self, action: Array) -> Taken:
+        observation, reward, terminated, truncated, _ = self._env.step(native_action(self.action, action))
+        self._last = flat(self._name, observation)
+        return Taken(self._last, float(reward), bool(terminated), bool(truncated))
+
+    def observe(self) -> Array:
+        return flat(self._name, self._env._get_obs()) if self.shows else self._last
+
+    def close(self) -> None:
+        self._env.close()
+
+
+class ResetOnly(Simulator):
+    """One whose state can't be read: what it shows is taken for its state, and it can only be reset."""
+
+    settable = False
+    shows = False
+
+    def __init__(self, name: str, env: Any, limit: int | None) -> None:
+        self._name, self._env = name, env
+        self.action = action_of(name, env.action_space)
+        self.time_limit = limit
+        self._last = self.reset(0)
+        self.rest = self._last
+        self.variables = tuple(Variable(f"o{i}") for i in range(len(self._last)))
+
+    def reset(self, seed: int | None) -> Array:
+        self._last = flat(self._name, self._env.reset(seed=seed)[0])
+        return self._last
+
+    def step(self, action: Array) -> Taken:
+        observation, reward, terminated, truncated, _ = self._env.step(native_action(self.action, action))
+        self._last = flat(self._name, observation)
+        return Taken(self._last, float(reward), bool(terminated), bool(truncated))
+
+    def read(self) -> Array:
+        return self._last
+
+    def write(self, state: Array) -> None:
+        raise UnknownEnvironment(f"{self._name} can't be set to {state.tolist()}: its state can't be read")
+
+    def observe(self) -> Array:
+        return self._last
+
+    def close(self) -> None:
+        self._env.close()
+
+
+def _mujoco(env: Any) -> list[StatePart]:
+    seen = []
+    for seed in range(RESETS):
+        env.reset(seed=seed)
+        seen.append(drawable(env.model))
+    env.reset(seed=0)
+    parts: list[StatePart] = [MujocoState(env.model, env.data)]
+    if holds_numbers(env, "goal"):
+        parts.append(Attribute(env, "goal", "held"))
+    places = drawn_between(seen)
+    return [*parts, DrawnIntoModel(env.model, places)] if places else parts
+
+
+def _needs_arguments(function: Any) -> bool:
+    parameters = inspect.signature(function).parameters.values()
+    return any(p.default is p.empty and p.kind is not p.VAR_POSITIONAL for p in parameters)

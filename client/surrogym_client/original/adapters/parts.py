@@ -1,0 +1,80 @@
+"""A simulator whose state is made of parts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.protocol import Array
+from surrogym_client.original.simulator import Simulator
+from surrogym_client.original.state_parts import StatePart
+from surrogym_shared.spec import BoxAction, DiscreteAction, MultiDiscreteAction
+from surrogym_shared.spec.actions import Action
+
+SMALLEST_FACTOR = 0.05  # a mass stays positive, however large the perturbation
+
+
+class OfParts(Simulator):
+    """The part that is written last comes first: what it derives, MuJoCo's kinematics, reads the others."""
+
+    def __init__(self, parts: Sequence[StatePart], model: Any = None, data: Any = None) -> None:
+        self._parts = tuple(parts)
+        self._model, self._data = model, data
+        self._masses = None if model is None else np.array(model.body_mass)
+        self.variables = tuple(variable for part in parts for variable in part.variables)
+        self.rest = self.read()
+
+    def read(self) -> Array:
+        return np.concatenate([part.read() for part in self._parts])
+
+    def write(self, state: Array) -> None:
+        ends = np.cumsum([len(part.variables) for part in self._parts])[:-1]
+        for part, values in reversed(list(zip(self._parts, np.split(state, ends), strict=True))):
+            part.write(values)
+
+    def touches(self) -> bool:
+        return self._data is not None and int(self._data.ncon) > 0
+
+    def perturb(self, rng: np.random.Generator, sigma: float) -> None:
+        if self._model is None or self._masses is None:
+            super().perturb(rng, sigma)
+            return
+        for body, mass in enumerate(self._masses):
+            self._model.body_mass[body] = mass * max(SMALLEST_FACTOR, 1.0 + sigma * float(rng.standard_normal()))
+
+
+def action_of(name: str, space: Any) -> Action:
+    """The action of a Gymnasium space.
+
+    Raises:
+        UnknownEnvironment: a space, or bounds, that no specification can express.
+    """
+    kind = type(space).__name__
+    if kind == "Box" and len(space.shape) == 1 and np.isfinite([space.low, space.high]).all():
+        return BoxAction(low=tuple(map(float, space.low)), high=tuple(map(float, space.high)))
+    if kind == "Discrete" and int(space.start) == 0:
+        return DiscreteAction(n=int(space.n))
+    if kind == "MultiDiscrete" and len(space.shape) == 1:
+        return MultiDiscreteAction(nvec=tuple(map(int, space.nvec)))
+    raise UnknownEnvironment(
+        f"{name} has the action space {space}: expected a Box with one row of finite bounds, Discrete from 0, or "
+        "MultiDiscrete; wrap it in a class of your own (docs/how-to/own-environment.md)"
+    )
+
+
+def flat(name: str, observation: Any) -> Array:
+    """An observation as one row of numbers (D,); the entries of a dictionary in the order of their names.
+
+    Raises:
+        UnknownEnvironment: it holds an image, or something that is no number.
+    """
+    entries = [observation[key] for key in sorted(observation)] if isinstance(observation, dict) else [observation]
+    arrays = [np.asarray(entry) for entry in entries]
+    if any(a.ndim > 1 or a.dtype.kind not in "fiub" for a in arrays):
+        raise UnknownEnvironment(
+            f"{name} shows images, or entries that are no numbers: expected a row of numbers, or a dictionary of rows"
+        )
+    return np.concatenate([a.astype(np.float64).ravel() for a in arrays])

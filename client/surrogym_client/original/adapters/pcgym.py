@@ -1,0 +1,146 @@
+"""Process control by pc-gym: ``pcgym:cstr``, its documented stirred tank, or ``pcgym:FILE.json`` with its parameters.
+
+The state is the attribute ``state``. Setpoints and disturbances follow a schedule in an episode; where a state is set,
+they stay as they are set.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surrogym_client.original.adapters.parts import OfParts, action_of
+from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.gymnasium import native_action
+from surrogym_client.original.protocol import Array
+from surrogym_client.original.simulator import Simulator, Taken, Variable
+
+STIRRED_TANK: dict[str, Any] = {  # the quick start of pc-gym 0.1.8
+    "model": "cstr",
+    "N": 100,
+    "tsim": 25,
+    "SP": {"Ca": [0.85] * 50 + [0.9] * 50},
+    "a_space": {"low": [295.0], "high": [302.0]},
+    "o_space": {"low": [0.7, 300.0, 0.8], "high": [1.0, 350.0, 0.9]},
+    "x0": [0.8, 330.0, 0.8],
+}
+ARRAYS = ("a_space", "o_space", "disturbance_bounds", "a_space_act")
+REFUSED = {
+    "a_delta": "actions as changes, whose sum is no part of its state",
+    "uncertainty_percentages": "parameters drawn by a generator that can't be seeded",
+    "noise": "noise of a generator that can't be seeded",
+}
+
+
+def open_simulator(name: str) -> Simulator:
+    """Open a process.
+
+    Raises:
+        UnknownEnvironment: no such parameters, or ones that can't be used here.
+        ImportError: pc-gym is not installed.
+    """
+    parameters = parameters_of(name.partition(":")[2])
+    from pcgym import make_env
+
+    try:
+        return Process(name, make_env(parameters))
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise UnknownEnvironment(
+            f"pc-gym refuses the parameters of {name}: {type(error).__name__}: {error}; its documentation names what "
+            "make_env needs"
+        ) from error
+
+
+def parameters_of(which: str) -> dict[str, Any]:
+    """What ``pcgym.make_env`` takes, of ``cstr`` or of a JSON file.
+
+    Raises:
+        UnknownEnvironment: neither, or the file asks for what can't be used here.
+    """
+    given = STIRRED_TANK if which == "cstr" else _read(which)
+    for key, why in REFUSED.items():
+        if given.get(key):
+            raise UnknownEnvironment(f"pcgym:{which} asks for {key}, {why}: leave it out of the parameters")
+    spaces = {key: {end: np.array(v, dtype=float) for end, v in given[key].items()} for key in ARRAYS if key in given}
+    return {**given, **spaces, "x0": np.array(given["x0"], dtype=float)}
+
+
+def _read(which: str) -> dict[str, Any]:
+    path = Path(which)
+    if path.suffix != ".json" or not path.is_file():
+        raise UnknownEnvironment(
+            f"expected pcgym:cstr, or pcgym:FILE.json with what pcgym.make_env takes, got 'pcgym:{which}'"
+        )
+    try:
+        given = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise UnknownEnvironment(f"{path} is no JSON: {error}") from error
+    if not isinstance(given, dict) or "x0" not in given:
+        raise UnknownEnvironment(f"{path}: expected an object with model, N, tsim, SP, a_space, o_space and x0")
+    return given
+
+
+class Process(OfParts):
+    """One process. Its observation is its state in the units of the process."""
+
+    def __init__(self, name: str, env: Any) -> None:
+        self._name, self._env = name, env
+        env.reset()
+        self._schedule = (env.SP, getattr(env, "disturbances", {}))
+        super().__init__([_State(env)])
+        self.action = action_of(name, env.action_space)
+        self.time_limit = int(env.N) - 1  # its episodes end one step before their number of samples
+
+    def reset(self, seed: int | None) -> Array:
+        del seed  # nothing is drawn
+        self._env.SP, disturbances = self._schedule
+        if disturbances:
+            self._env.disturbances = disturbances
+        self._env.reset()
+        return self.observe()
+
+    def step(self, action: Array) -> Taken:
+        _, reward, over, _, _ = self._env.step(native_action(self.action, action).astype(np.float64))
+        timed_out = self._env.t >= self._env.N - 1
+        return Taken(self.observe(), float(np.sum(reward)), bool(over) and not timed_out, bool(over) and timed_out)
+
+    def observe(self) -> Array:
+        return self.read()
+
+    def close(self) -> None:
+        self._env.close()
+
+
+class _State:
+    """The process's states, its setpoints, and its disturbances."""
+
+    def __init__(self, env: Any) -> None:
+        self._env = env
+        self._setpoints = list(env.SP)
+        self._disturbances = [
+            k for k in env.model.info()["disturbances"] or () if k in getattr(env, "disturbances", {})
+        ]
+        spaces = [env.env_params[key] for key in ("o_space", "disturbance_bounds") if key in env.env_params]
+        low, high = (np.concatenate([space[end] for space in spaces]) for end in ("low", "high"))
+        states = list(env.model.info()["states"])
+        names = [*states, *(f"{k}_setpoint" for k in self._setpoints), *self._disturbances]
+        self.variables = tuple(
+            Variable(name, "other" if name in states else "held", float(a), float(b))
+            for name, a, b in zip(names, low, high, strict=False)
+        )
+
+    def read(self) -> Array:
+        return np.array(self._env.state, dtype=np.float64)
+
+    def write(self, values: Array) -> None:
+        env = self._env
+        env.state, env.t, env.done = values.copy(), 0, False
+        at = env.Nx_oracle
+        env.SP = {k: [v] * env.N for k, v in zip(self._setpoints, values[at:], strict=False)}
+        at += len(self._setpoints)
+        if self._disturbances:
+            held = zip(self._disturbances, values[at:], strict=True)
+            env.disturbances = {k: np.full(env.N + 1, v) for k, v in held}

@@ -1,0 +1,183 @@
+"""What an adapter gives of a simulator, and the original environment that it makes with a specification.
+
+Shapes: V variables of the state, C coordinates, D entries of the simulator's own observation, F action entries.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from surrogym_client.original.errors import NotPerturbable, UnknownEnvironment
+from surrogym_client.original.gymnasium import native_action, wrapped
+from surrogym_client.original.protocol import Array, RealStep
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.spec.actions import Action
+
+Motion = Literal["slide", "turn", "speed", "held", "other"]
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One number of a simulator's state.
+
+    ``motion``: ``slide`` along a line, ``turn`` about an axis, ``speed``, ``held`` through an episode (a goal, a
+    setpoint), or ``other``. ``low`` and ``high`` are the simulator's own limits, None where it has none.
+    """
+
+    name: str
+    motion: Motion = "other"
+    low: float | None = None
+    high: float | None = None
+    driven: bool = False
+
+    @property
+    def limited(self) -> bool:
+        return self.low is not None and self.high is not None
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What one step of a simulator gave; ``observation`` is its own, (D,)."""
+
+    observation: Array
+    reward: float
+    terminated: bool
+    truncated: bool
+
+
+class Simulator(ABC):
+    """One open simulator, after a first reset.
+
+    Attributes:
+        settable: whether its state can be written.
+        shows: whether ``observe`` reads the state as it is, and not what the last step or reset gave.
+        action: what can be done.
+        variables: the state's numbers, (V,).
+        rest: the state (V,) that a variable has where no coordinate says otherwise.
+        time_limit: steps of an episode; None without a limit.
+    """
+
+    settable = True
+    shows = True
+    action: Action
+    variables: tuple[Variable, ...]
+    rest: Array
+    time_limit: int | None = None
+
+    @abstractmethod
+    def reset(self, seed: int | None) -> Array:
+        """Begin an episode; the observation (D,)."""
+
+    @abstractmethod
+    def step(self, action: Array) -> Taken:
+        """Apply action (F,)."""
+
+    @abstractmethod
+    def read(self) -> Array:
+        """The state (V,)."""
+
+    @abstractmethod
+    def write(self, state: Array) -> None:
+        """Set the state (V,) and forget everything else of earlier steps."""
+
+    @abstractmethod
+    def observe(self) -> Array:
+        """The observation (D,) of the state as it is, without a step."""
+
+    def touches(self) -> bool:
+        """Whether bodies touch in the state as it is; False where the simulator knows of none."""
+        return False
+
+    def perturb(self, rng: np.random.Generator, sigma: float) -> None:
+        """Multiply the original masses by normal factors of mean 1 and deviation ``sigma``.
+
+        Raises:
+            NotPerturbable: the simulator's masses are unknown.
+        """
+        del rng, sigma
+        raise NotPerturbable("only MuJoCo models and classic control can be perturbed")
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release what the simulator holds."""
+
+    def columns(self, names: Sequence[str]) -> list[int]:
+        """Index into the state of each name.
+
+        Raises:
+            UnknownEnvironment: a name is no variable of the simulator.
+        """
+        known = [variable.name for variable in self.variables]
+        if unknown := [name for name in names if name not in known]:
+            raise UnknownEnvironment(f"coordinates {unknown} are no variables of the state: expected some of {known}")
+        return [known.index(name) for name in names]
+
+    def action_taken(self, action: Array) -> Array:
+        """The action (F,) as the simulator gets it: rounded to its own numbers."""
+        return np.atleast_1d(np.asarray(native_action(self.action, action), dtype=np.float64))
+
+    def place(self, columns: list[int], coordinates: Array) -> None:
+        """Set some variables to coordinates (C,), the others to rest."""
+        state = self.rest.copy()
+        state[columns] = coordinates
+        self.write(state)
+
+
+class Simulated:
+    """A simulator with a specification, whose coordinates are variables of the state by name. It can be set to given
+    coordinates, and reset."""
+
+    parallel = True
+
+    def __init__(self, simulator: Simulator, spec: EnvironmentSpec) -> None:
+        self.simulator = simulator
+        self._spec = spec
+        self._columns = simulator.columns(spec.coordinate_names)
+        if spec.query == "step" and not simulator.settable:
+            raise UnknownEnvironment(
+                f"{spec.environment} can't be set to a state, as its state can't be read: register it with "
+                "--no-teleport, or give a specification with query 'rollout'"
+            )
+
+    def spec(self) -> EnvironmentSpec:
+        return self._spec
+
+    def step_from(self, coordinates: Array, action: Array) -> RealStep:
+        """Set the state to coordinates (C,), apply action (F,)."""
+        self.place(coordinates)
+        return self.act(action)
+
+    def place(self, coordinates: Array) -> None:
+        """Set the state to coordinates (C,)."""
+        self.simulator.place(self._columns, coordinates)
+
+    def begin(self, seed: int | None = None) -> Array:
+        """Reset the simulator; the coordinates (C,) it starts at."""
+        self.simulator.reset(seed)
+        return self.coordinates()
+
+    def act(self, action: Array) -> RealStep:
+        """Apply action (F,) where the simulator stands."""
+        achieved = self.coordinates()
+        taken = self.simulator.step(action)
+        return RealStep(
+            coordinates=achieved,
+            action=self.simulator.action_taken(action),
+            next_coordinates=self.coordinates(),
+            reward=taken.reward,
+            terminated=taken.terminated,
+            truncated=taken.truncated,
+            next_observation=taken.observation,
+        )
+
+    def coordinates(self) -> Array:
+        """Where the simulator stands, (C,)."""
+        return wrapped(self._spec, self.simulator.read()[self._columns])
+
+    def close(self) -> None:
+        self.simulator.close()

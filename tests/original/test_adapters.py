@@ -1,0 +1,143 @@
+"""What an adapter opens stands where it was set, steps from there as it would by itself, and begins anew by its seed.
+
+The adapters of packages run where those are installed: make test-all has an environment for them.
+"""
+
+from __future__ import annotations
+
+import json
+from importlib.util import find_spec
+
+import gymnasium
+import numpy as np
+import pytest
+
+from support.simulators import CASES, Register, installed
+from surrogym_client.original.adapters import open_simulator
+from surrogym_client.original.adapters.pcgym import parameters_of
+from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.simulator import Simulator
+
+
+def random_action(simulator: Simulator, rng: np.random.Generator) -> np.ndarray:
+    return rng.uniform(simulator.action.low, simulator.action.high)  # type: ignore[union-attr]
+
+
+@pytest.mark.filterwarnings("ignore")  # of the packages themselves
+@pytest.mark.parametrize("name", CASES)
+def test_a_step_from_a_set_state_is_that_of_the_episode(name: str) -> None:
+    simulator, rng = open_simulator(name), np.random.default_rng(0)
+    simulator.reset(3)
+    for _ in range(5):
+        simulator.step(random_action(simulator, rng))
+    before, action = simulator.read(), random_action(simulator, rng)
+    taken, after = simulator.step(action), simulator.read()
+    for _ in range(3):
+        simulator.step(random_action(simulator, rng))
+    simulator.write(before)
+    np.testing.assert_allclose(simulator.read(), before, atol=1e-12)
+    again = simulator.step(action)
+    np.testing.assert_allclose(simulator.read(), after, atol=1e-9)
+    assert again.reward == pytest.approx(taken.reward, abs=1e-9)
+    assert np.abs(after - before).max() > 0
+    simulator.close()
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", CASES)
+def test_two_resets_with_one_seed_are_equal(name: str) -> None:
+    simulator = open_simulator(name)
+    simulator.reset(5)
+    first = simulator.read()
+    simulator.reset(6)
+    simulator.reset(5)
+    np.testing.assert_array_equal(simulator.read(), first)
+    simulator.close()
+
+
+@installed("dm_control")
+@pytest.mark.filterwarnings("ignore")
+def test_a_task_of_the_control_suite_steps_as_its_own_environment() -> None:
+    from dm_control import suite
+
+    ours = open_simulator("dm_control:cartpole-swingup")
+    theirs = suite.load("cartpole", "swingup", task_kwargs={"random": 7})
+    ours.reset(7)
+    theirs.reset()
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        action = random_action(ours, rng)
+        taken, step = ours.step(action), theirs.step(action)
+        shown = np.concatenate([np.ravel(entry) for entry in step.observation.values()])
+        np.testing.assert_allclose(taken.observation, shown, atol=1e-12)
+        assert taken.reward == pytest.approx(step.reward, abs=1e-12)
+    assert ours.time_limit == 1000
+
+
+@pytest.mark.parametrize("name", ["dm_control:cartpole-fly", "dm_control:nothing"])
+@installed("dm_control")
+def test_an_unknown_task_of_the_control_suite_is_named(name: str) -> None:
+    with pytest.raises(UnknownEnvironment, match="expected dm_control:DOMAIN-TASK, such as"):
+        open_simulator(name)
+
+
+@pytest.mark.parametrize(("name", "package"), [("dm_control:cartpole-swingup", "dm_control"), ("pcgym:cstr", "pcgym")])
+def test_a_package_that_is_missing_is_named_with_its_extra(name: str, package: str) -> None:
+    if find_spec(package):
+        pytest.skip(f"{package} is installed here")
+    extra = package.replace("_", "-")
+    with pytest.raises(UnknownEnvironment, match=rf"pip install 'surrogym\[{extra}\]'"):
+        open_simulator(name)
+
+
+def test_parameters_of_a_process_come_from_a_file(tmp_path) -> None:
+    file = tmp_path / "tank.json"
+    given = {"model": "cstr", "N": 10, "x0": [0.8, 330, 0.8], "a_space": {"low": [295], "high": [302]}}
+    file.write_text(json.dumps(given))
+    read = parameters_of(str(file))
+    assert read["a_space"]["high"].tolist() == [302.0]
+    assert read["x0"].tolist() == [0.8, 330.0, 0.8]
+    file.write_text(json.dumps(given | {"noise": True}))
+    with pytest.raises(UnknownEnvironment, match="asks for noise"):
+        parameters_of(str(file))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [("{", "is no JSON"), ("[]", "expected an object with model"), (None, "expected pcgym:cstr, or pcgym:FILE.json")],
+)
+def test_a_file_that_describes_no_process_is_refused(tmp_path, content: str | None, message: str) -> None:
+    file = tmp_path / "tank.json"
+    if content is not None:
+        file.write_text(content)
+    with pytest.raises(UnknownEnvironment, match=message):
+        parameters_of(str(file))
+
+
+def test_an_attribute_called_state_is_the_state(registered: Register) -> None:
+    simulator = open_simulator(registered("Spiral-v0"))
+    assert [variable.name for variable in simulator.variables] == ["state0", "state1"]
+    simulator.write(np.array([1.0, 0.0]))
+    simulator.step(np.array([0.0]))
+    np.testing.assert_allclose(simulator.read(), [0.9, 0.1])
+    assert simulator.time_limit == 30
+
+
+def test_a_state_that_can_not_be_read_leaves_only_resets(registered: Register) -> None:
+    simulator = open_simulator(registered("Hidden-v0", attribute="_hidden"))
+    assert not simulator.settable
+    with pytest.raises(UnknownEnvironment, match="its state can't be read"):
+        simulator.write(np.zeros(2))
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        ({"action_space": gymnasium.spaces.Box(-np.inf, np.inf, (1,))}, "expected a Box with one row of finite bounds"),
+        ({"action_space": gymnasium.spaces.MultiBinary(2)}, "expected a Box with one row of finite bounds"),
+        ({"observation_space": gymnasium.spaces.Discrete(4)}, "one of several symbols"),
+    ],
+)
+def test_spaces_that_no_specification_can_express_are_refused(registered: Register, space, message: str) -> None:
+    with pytest.raises(UnknownEnvironment, match=message):
+        open_simulator(registered("Odd-v0", space=space))
