@@ -73,6 +73,7 @@ OTHERWISE = {
     "docs/how-to/containers.md": "tests/docker reads it; no container engine is needed",
     "docs/how-to/plugins.md": "tests/plugins installs the package and compares its class with the page",
     "docs/how-to/logs.md": "tests/logs runs its commands",
+    "docs/how-to/environments-by-name.md": "tests/original and tests/cli/test_describe.py run its commands",
     "docs/how-to/trust.md": "tests/training/test_handover.py audits beside a sampler that stays",
     "docs/results/efficiency.md": "tests/cli runs its studies, in short",
     "docs/results/fresh-seeds.md": "tests/cli runs its studies, in short",

@@ -31,7 +31,7 @@ def commands(page: Path, program: str) -> Iterator[list[str]]:
     lines = re.findall(rf"^(?:\$ )?(?:\w+=\S+ )*({program} .*)$", shell, re.MULTILINE)
     inline = re.findall(rf"`({program} [^`]+)`", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE))
     for line in (*lines, *inline):
-        words = shlex.split(line, comments=True)
+        words = shlex.split(line.partition(" > ")[0], comments=True)
         yield words[1:-1] if words[-1] == "&" else words[1:]
 
 

@@ -13,6 +13,7 @@ from surrogym_client.cli.errors import sentence
 from surrogym_shared.terminal import say
 
 COMMANDS = (
+    "describe",
     "register",
     "sample",
     "train",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -177,7 +178,7 @@ def typed(context: typer.Context, without: Sequence[str] = ()) -> str:
 
 
 def read_spec(path: Path | None) -> EnvironmentSpec | None:
-    """A specification from its file.
+    """A specification from its file, or from what ``surrogym describe`` wrote.
 
     Raises:
         OSError: it can't be read.
@@ -190,10 +191,16 @@ def read_spec(path: Path | None) -> EnvironmentSpec | None:
     from surrogym_client.cli.errors import CommandError, invalid
     from surrogym_shared.spec import EnvironmentSpec
 
+    content = path.read_bytes()
     try:
-        return EnvironmentSpec.model_validate_json(path.read_bytes())
+        read = json.loads(content)
+        if isinstance(read, dict) and "specification" in read:
+            return EnvironmentSpec.model_validate_json(json.dumps(read["specification"]))
+        return EnvironmentSpec.model_validate_json(content)
     except ValidationError as error:
         raise CommandError(f"{path} is no specification: {invalid(error)}") from error
+    except ValueError as error:
+        raise CommandError(f"{path} is no specification: {error}") from error
 
 
 def read_tolerances(given: list[str]) -> dict[str, float]:

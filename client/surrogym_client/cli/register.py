@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -56,8 +57,16 @@ class DesignChoices:
 def command(
     context: typer.Context,
     environment: Annotated[
-        str | None, typer.Argument(help="Gymnasium id, or package.module:factory of one's own.")
+        str | None,
+        typer.Argument(
+            help="Gymnasium id, dm_control:DOMAIN-TASK, pcgym:MODEL, or package.module:factory of one's own. With "
+            "--env or FILE behind it, the surrogate's name."
+        ),
     ] = None,
+    file: Annotated[
+        Path | None, typer.Argument(help="Specification that surrogym describe wrote, the same as --spec.")
+    ] = None,
+    env: Annotated[str | None, typer.Option(help="The environment, where the first argument is a name.")] = None,
     name: Annotated[str | None, typer.Option(help="Name of the surrogate. [default: from the environment's]")] = None,
     spec: SpecFile = None,
     *,
@@ -72,9 +81,16 @@ def command(
 ) -> None:
     """Register an original environment. Samplers and trainers can then use it by name.
 
+    An environment without a built-in specification is described first, as surrogym describe does, which takes real
+    steps.
+
     Example: surrogym register Pendulum-v1 --name pendulum --budget 30
     """
-    chosen = _specification(environment, read_spec(spec), **vars(choices))
+    environment, name, spec = _sorted_out(environment, file, env, name, spec)
+    given, steps = read_spec(spec), 0
+    if given is None and environment is not None:
+        given, steps = _described(environment, quiet=output.quiet)
+    chosen = _specification(environment, given, **vars(choices))
     if tolerance:
         chosen = _with_tolerances(chosen, read_tolerances(tolerance))
     if print_spec:
@@ -82,7 +98,40 @@ def command(
         return
     with service.connect(context, wait, quiet=output.quiet) as api:
         view = api.create_surrogate(name or default_name(chosen.environment or environment or ""), chosen)
+        if steps:
+            api.report_steps(view.name, steps, note="description")
     output.give(view.model_dump(mode="json"), lambda: _words(view, environment or ""))
+
+
+def _sorted_out(
+    environment: str | None, file: Path | None, env: str | None, name: str | None, spec: Path | None
+) -> tuple[str | None, str | None, Path | None]:
+    """Environment, name and file of a specification, whichever way they were typed."""
+    from surrogym_client.cli.errors import CommandError
+
+    if file is not None:
+        if spec is not None:
+            raise CommandError(f"expected {file} or --spec {spec}, got both")
+        spec = file
+    if file is None and env is None:
+        return environment, name, spec
+    if environment is not None and name is not None:
+        raise CommandError(f"expected one name, got {environment!r} and --name {name!r}")
+    return env, environment or name, spec
+
+
+def _described(environment: str, *, quiet: bool) -> tuple[EnvironmentSpec | None, int]:
+    """A specification of an environment that has none, and the real steps that it took; None where it has one."""
+    from surrogym_client.original.describing import describe
+    from surrogym_client.original.loading import has_specification
+    from surrogym_shared.terminal import say
+
+    if has_specification(environment):
+        return None, 0
+    description = describe(environment)
+    for line in description.words():
+        say(line, quiet=quiet)
+    return description.spec, description.steps
 
 
 def default_name(environment: str) -> str:
@@ -121,7 +170,9 @@ def _with_tolerances(spec: EnvironmentSpec, tolerances: dict[str, float]) -> Env
 
 
 def _words(view: SurrogateView, environment: str) -> str:
-    own = f" --env {environment}" if ":" in environment else ""
+    from surrogym_client.original.loading import is_known
+
+    own = f" --env {environment}" if environment and not is_known(environment) else ""
     return (
         f"{view.name}: {view.environment or 'own environment'}, {len(view.spec.coordinates)} coordinates, "
         f"budget of {view.budget} real steps, target {view.target:g}; next: surrogym sample {view.name}{own}"

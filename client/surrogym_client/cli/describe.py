@@ -1,0 +1,39 @@
+"""``surrogym describe``: draft the specification of an environment that has a name."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from surrogym_client.cli.groups import add
+from surrogym_client.cli.options import Quiet
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    add(app, "describe", command)
+
+
+def command(
+    environment: Annotated[
+        str, typer.Argument(help="Gymnasium id, package:Id-v0, dm_control:DOMAIN-TASK, pcgym:MODEL or pcgym:FILE.json.")
+    ],
+    steps: Annotated[int, typer.Option(min=20, help="Real steps of its episodes; some more check the result.")] = 400,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random actions.")] = 0,
+    quiet: Quiet = False,
+) -> None:
+    """Draft a specification by random steps.
+
+    The file says in plain words what was found out, and asks for what can't be. The real steps are counted; they are in
+    no ledger, as no surrogate is registered yet.
+
+    Example: surrogym describe Swimmer-v5 > env.json
+    """
+    from surrogym_client.original.describing import describe
+    from surrogym_shared.terminal import say
+
+    description = describe(environment, steps, seed)
+    typer.echo(description.text())
+    for line in description.words():
+        say(line, quiet=quiet)

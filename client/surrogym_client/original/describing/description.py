@@ -1,0 +1,302 @@
+"""What was found of a simulator, as a specification; and what a person has to say."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from surrogym_client.original.adapters import open_simulator
+from surrogym_client.original.describing.exploring import RESETS, STEPS, Counted, Seen, explore
+from surrogym_client.original.describing.expressing import express, names_in, shown_by_itself
+from surrogym_client.original.describing.probing import EXACT, Probed, probe
+from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.protocol import Array
+from surrogym_client.original.simulator import Simulator, Variable
+from surrogym_client.original.state_parts import VELOCITY
+from surrogym_shared.spec import (
+    MAX_DIMENSIONS,
+    Coordinate,
+    EnvironmentSpec,
+    Fixed,
+    ObservationEntry,
+    Reward,
+    Term,
+    Uniform,
+    limits,
+)
+
+FASTER = 1.5  # times the largest speed that was seen: what a policy may reach
+MARGIN = 0.25  # of the range that was seen, on each side
+PLACES = 300  # where an observation is read, without a step
+UNKNOWN_SPEED = 1.0  # of what never moved, in the simulator's unit
+UNKNOWN_LIMIT = 200  # steps of an episode where the simulator says nothing
+
+
+@dataclass(frozen=True)
+class Description:
+    """A specification, and where it comes from."""
+
+    spec: EnvironmentSpec
+    found: tuple[str, ...]
+    asked: tuple[str, ...]
+    steps: int
+    resets: int
+
+    def words(self) -> list[str]:
+        """What it took, what was found and what is asked, a line each."""
+        took = f"{self.spec.environment}: described by {self.steps} real steps and {self.resets} resets"
+        return [took, *(f"  found: {line}" for line in self.found), *(f"  please say: {line}" for line in self.asked)]
+
+    def text(self) -> str:
+        """As a JSON file: what was found and what is asked in plain words, and the specification."""
+        return json.dumps(
+            {
+                "real_steps": self.steps,
+                "resets": self.resets,
+                "found": self.found,
+                "asked": self.asked,
+                "specification": self.spec.model_dump(mode="json"),
+            },
+            indent=2,
+        )
+
+
+def describe(name: str, steps: int = STEPS, seed: int = 0) -> Description:
+    """Find out what can be found of an environment that an adapter opens.
+
+    Args:
+        name: a Gymnasium id, ``dm_control:DOMAIN-TASK`` or ``pcgym:MODEL``.
+        steps: real steps of the episodes; some more check what was found.
+        seed: of the random actions.
+
+    Raises:
+        UnknownEnvironment: no adapter knows the name, or no specification can express the environment.
+    """
+    simulator = open_simulator(name)
+    try:
+        counted, rng = Counted(simulator), np.random.default_rng(seed)
+        seen = explore(counted, steps, rng)
+        probed = probe(counted, seen, rng) if simulator.settable else Probed(np.inf, 0.0, 0.0)
+        drafted = _Draft(name, simulator, seen, probed)
+        spec = drafted.spec(rng)
+        return Description(spec, drafted.found(spec, steps), drafted.asked(spec), counted.steps, counted.resets)
+    finally:
+        simulator.close()
+
+
+class _Draft:
+    """The specification of one simulator."""
+
+    def __init__(self, name: str, simulator: Simulator, seen: Seen, probed: Probed) -> None:
+        self._name, self._simulator, self._seen, self._probed = name, simulator, seen, probed
+        lived = ~seen.ended_at_once
+        self._all = np.concatenate([seen.starts, seen.states[lived], seen.next_states[lived]])
+        if not np.isfinite(self._all).all():
+            raise UnknownEnvironment(f"{name} reached states that are no finite numbers under random actions")
+        self._kept = self._chosen()
+        if len(self._kept) > MAX_DIMENSIONS:
+            raise UnknownEnvironment(
+                f"{name} has {len(self._kept)} moving variables: expected at most {MAX_DIMENSIONS}"
+            )
+
+    def spec(self, rng: np.random.Generator) -> EnvironmentSpec:
+        """The specification, its observation in terms of the coordinates."""
+        variables = [self._simulator.variables[i] for i in self._kept]
+        coordinates = tuple(self._coordinate(i) for i in self._kept)
+        frame = EnvironmentSpec(
+            environment=self._name,
+            coordinates=coordinates,
+            observation=(ObservationEntry(name="unknown", term=Term.constant(0)),),
+            action=self._simulator.action,
+            start={c.name: self._start(i, c) for i, c in zip(self._kept, coordinates, strict=True)},
+            termination="learned" if self._seen.terminated.any() else (),
+            time_limit=self._simulator.time_limit or UNKNOWN_LIMIT,
+            query="step" if self._probed.settable else "rollout",
+            reward=Reward(timing="auto"),
+        )
+        observation = self._observation(frame, variables, rng)
+        return EnvironmentSpec.model_validate({**frame.model_dump(), "observation": observation})
+
+    def found(self, spec: EnvironmentSpec, steps: int) -> tuple[str, ...]:
+        """What was found, in plain words."""
+        probed, kept = self._probed, set(spec.coordinate_names)
+        still = [v.name for v in self._simulator.variables if v.name not in kept | probed.shifts]
+        kinds = {kind: [c.name for c in spec.coordinates if c.kind == kind] for kind in ("angle", "constant")}
+        lines = [
+            f"{len(kept)} coordinates describe the state; {steps} random steps and {RESETS} resets showed their ranges",
+            _words_of_access(probed),
+        ]
+        if probed.shifts:
+            lines.append(f"a shift of {_listed(sorted(probed.shifts))} changes nothing: left out")
+        if kinds["angle"]:
+            lines.append(f"a whole turn of {_listed(kinds['angle'])} changes nothing: shown by cosine and sine")
+        if kinds["constant"]:
+            lines.append(f"{_listed(kinds['constant'])}: constant in an episode, and chosen anew for the next")
+        if still:
+            lines.append(f"never moved, or repeats another variable, and left out: {_listed(still)}")
+        if self._left_out:
+            lines.append(
+                f"entries {_listed([str(i) for i in self._left_out])} of the environment's own observation are no sums "
+                "of 1, q, sin and cos: the policy sees the coordinates in their place"
+            )
+        return tuple(lines)
+
+    def asked(self, spec: EnvironmentSpec) -> tuple[str, ...]:
+        """What a person has to say, in plain words."""
+        guessed = [
+            c.name
+            for i, c in zip(self._kept, spec.coordinates, strict=True)
+            if c.kind == "linear" and not self._simulator.variables[i].limited
+        ]
+        ended, lines = int(self._seen.terminated.sum()), list[str]()
+        if guessed:
+            lines.append(
+                f"sampling range of {_listed(guessed)}: is it as wide as a good policy goes? It is what random actions "
+                f"reached, speeds {FASTER:g} times as far; nothing outside is ever asked"
+            )
+        if self._unmoved:
+            lines.append(
+                f"{_listed(self._unmoved)}: no random action moved it. If nothing can, declare it constant and leave "
+                "its velocity out; otherwise give the range of its velocity"
+            )
+        if ended:
+            lines.append(
+                f"termination: {ended} of {len(self._seen.rewards)} steps ended an episode. It is learned; an "
+                "inequality that you know takes fewer real steps"
+            )
+        else:
+            lines.append("termination: no step ended an episode. If states end one, declare them")
+        if self._simulator.time_limit is None:
+            lines.append(f"time_limit: none is known; {UNKNOWN_LIMIT} steps are assumed")
+        lines.append("success: when does an episode count as solved? Without it, evaluations report returns alone")
+        lines.append("reward: it is learned; one that you know takes no real step (kind 'declared')")
+        return tuple(lines)
+
+    def _chosen(self) -> list[int]:
+        """Indices of the variables that become coordinates."""
+        kept: list[int] = []
+        for i, variable in enumerate(self._simulator.variables):
+            repeats = variable.motion == "held" and any(np.allclose(self._all[:, i], self._all[:, k]) for k in kept)
+            moves = np.ptp(self._all[:, i]) > 0 or variable.name in {f"{name}{VELOCITY}" for name in self._unmoved}
+            if moves and not repeats and variable.name not in self._probed.shifts:
+                kept.append(i)
+        return kept
+
+    @property
+    def _unmoved(self) -> list[str]:
+        """Joints that no random action moved, and that something may move: each reset put them elsewhere."""
+        moved = (self._seen.states != self._seen.next_states).any(0)
+        differs = np.ptp(self._seen.starts, axis=0) > 0
+        return [
+            v.name
+            for v, m, d in zip(self._simulator.variables, moved, differs, strict=True)
+            if v.motion in ("slide", "turn") and d and not m
+        ]
+
+    def _is_constant(self, index: int) -> bool:
+        """Whether a variable stays through every episode, and differs between them."""
+        variable, seen = self._simulator.variables[index], self._seen
+        if variable.motion in ("slide", "turn", "speed"):
+            return False
+        moved = (seen.states[:, index] != seen.next_states[:, index]).any()
+        return variable.motion == "held" or not moved
+
+    def _coordinate(self, index: int) -> Coordinate:
+        variable = self._simulator.variables[index]
+        if variable.name in self._probed.turns:
+            circle = Uniform(low=-math.pi, high=math.pi)
+            return Coordinate(name=variable.name, kind="angle", sampling=circle, unit="rad")
+        kind = "constant" if self._is_constant(index) else "linear"
+        low, high = self._range(index, constant=kind == "constant")
+        return Coordinate(name=variable.name, kind=kind, sampling=Uniform(low=low, high=high))
+
+    def _range(self, index: int, *, constant: bool) -> tuple[float, float]:
+        """The sampling range of a variable."""
+        variable, seen = self._simulator.variables[index], self._all[:, index]
+        low, high = float(seen.min()), float(seen.max())
+        if variable.motion == "speed":
+            fastest = FASTER * max(abs(low), abs(high)) or UNKNOWN_SPEED
+            return -fastest, fastest
+        pushed = variable.motion == "slide" and not variable.driven  # its limits may be far away
+        if variable.low is not None and variable.high is not None and not pushed:
+            return min(low, variable.low), max(high, variable.high)
+        if pushed and variable.limited:
+            near = self._seen.starts[:, index]
+            wider = float(np.ptp(near)) or MARGIN * (high - low)
+            return float(near.min()) - wider, float(near.max()) + wider
+        margin = (0.0 if constant else MARGIN) * (high - low)
+        return low - margin, high + margin
+
+    def _start(self, index: int, coordinate: Coordinate) -> Uniform | Fixed:
+        """Where resets lead, widened as the range of so many uniform draws is on average too narrow."""
+        if coordinate.kind == "constant" and self._simulator.variables[index].limited:
+            return Uniform(low=limits(coordinate.sampling)[0], high=limits(coordinate.sampling)[1])
+        starts = self._seen.starts[:, index]
+        low, high = float(starts.min()), float(starts.max())
+        if high - low <= 1e-12 * max(1.0, abs(low)):
+            return Fixed(value=low)
+        wider = (high - low) / (len(starts) - 1)
+        if coordinate.kind == "angle" and high - low + 2 * wider >= 2 * math.pi:
+            return Uniform(low=-math.pi, high=math.pi)
+        return Uniform(low=low - wider, high=high + wider)
+
+    def _observation(
+        self, frame: EnvironmentSpec, variables: Sequence[Variable], rng: np.random.Generator
+    ) -> list[ObservationEntry]:
+        places, observed = self._observed(frame, rng)
+        turning = [v.name for v in variables if v.motion == "turn"]
+        entries = express(frame, turning, places, observed)
+        angles = {c.name for c in frame.coordinates if c.kind == "angle"}
+        self._left_out = [i for i, e in enumerate(entries) if e is None and np.ptp(observed[:, i]) > 1e-6]
+        shown, raw = dict[str, ObservationEntry](), set[str]()
+        for entry in entries:
+            if entry is None:
+                continue
+            if jumps := angles & _raw(entry.term):
+                raw |= jumps
+            else:
+                shown.setdefault(entry.name, entry)
+        for name in frame.coordinate_names:
+            if name in raw or name not in {n for entry in shown.values() for n in names_in(entry.term)}:
+                shown |= {entry.name: entry for entry in shown_by_itself(name, angle=name in angles)}
+        return list(shown.values())
+
+    def _observed(self, frame: EnvironmentSpec, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Coordinates (n, C) and what the simulator shows there (n, D)."""
+        simulator = self._simulator
+        if not (simulator.shows and self._probed.settable):
+            return self._seen.next_states[:, self._kept], self._seen.observations
+        ranges = np.array([limits(c.sampling) for c in frame.coordinates])
+        places = rng.uniform(ranges[:, 0], ranges[:, 1], (PLACES, len(ranges)))
+        observed = []
+        for place in places:
+            simulator.place(self._kept, place)
+            place[:] = simulator.read()[self._kept]
+            observed.append(simulator.observe())
+        return places, np.stack(observed)
+
+
+def _raw(term: Term) -> set[str]:
+    """The coordinates that a term reads as they are; such a term jumps where an angle wraps."""
+    return {name for part in term.parts if part.function == "linear" for name in part.weights}
+
+
+def _words_of_access(probed: Probed) -> str:
+    if not np.isfinite(probed.set_error):
+        return "its state can't be read: it is taken for what it shows, and can only be reset"
+    if not probed.settable:
+        return (
+            f"a step from a state that was set differs from the same step of an episode by {probed.set_error:.2g} of "
+            "its range: something is remembered that can't be set, so it can only be reset"
+        )
+    noise = f"; two steps from one state differ by {probed.repeat_error:.2g}" if probed.noisy else ""
+    same = "that of an episode" if probed.set_error <= EXACT else f"that of an episode within {probed.set_error:.2g}"
+    return f"it can be set to any state: a step from there is {same}{noise}"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names)

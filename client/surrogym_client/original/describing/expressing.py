@@ -1,0 +1,91 @@
+"""Observation entries as sums of terms: found by least squares on 1, q, sin and cos of turning coordinates.
+
+Shapes: n places, C coordinates, D observation entries.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from surrogym_client.original.protocol import Array
+from surrogym_client.original.terms import evaluate
+from surrogym_shared.spec import EnvironmentSpec, ObservationEntry, Term
+
+TOLERANCE = 1e-7  # of an entry's own size
+FEW_TURNS = 4  # up to so many, sums of three of them are tried too
+CLIPPED = 0.02  # share of places at a limit that speaks for one
+
+
+def express(
+    frame: EnvironmentSpec, turning: Sequence[str], coordinates: Array, observed: Array
+) -> list[ObservationEntry | None]:
+    """The entries of an observation as terms of the coordinates; None for one that never changes, or can't be
+    expressed.
+
+    Args:
+        frame: a specification whose coordinates count, and nothing else.
+        turning: names of coordinates that enter by their sine and cosine.
+        coordinates: (n, C) places.
+        observed: (n, D) what is shown there.
+    """
+    basis = _basis(frame, turning)
+    design = np.stack([evaluate(frame, term, coordinates) for term in basis], axis=1)
+    found: list[ObservationEntry | None] = []
+    for index, entry in enumerate(observed.T):
+        tolerance = TOLERANCE * max(1.0, float(np.abs(entry).max()))
+        if np.ptp(entry) <= tolerance:
+            found.append(None)
+            continue
+        weights = np.linalg.lstsq(design, entry, rcond=None)[0]
+        exact = float(np.abs(design @ weights - entry).max()) <= tolerance
+        term = _sum(basis, weights) if exact else _clip_of(frame, coordinates, entry)
+        found.append(None if term is None else ObservationEntry(name=_name_of(term) or f"o{index}", term=term))
+    return found
+
+
+def shown_by_itself(name: str, *, angle: bool) -> list[ObservationEntry]:
+    """A coordinate as it is; an angle by its cosine and sine."""
+    if not angle:
+        return [ObservationEntry(name=name, term=Term.linear(**{name: 1.0}))]
+    pairs = (("cos", Term.cos(**{name: 1.0})), ("sin", Term.sin(**{name: 1.0})))
+    return [ObservationEntry(name=f"{function}_{name}"[:64], term=term) for function, term in pairs]
+
+
+def names_in(term: Term) -> set[str]:
+    """The coordinates that a term reads."""
+    return {name for part in term.parts for name in part.weights}
+
+
+def _basis(frame: EnvironmentSpec, turning: Sequence[str]) -> list[Term]:
+    linear = [Term.linear(**{name: 1.0}) for name in frame.coordinate_names]
+    most = 3 if len(turning) <= FEW_TURNS else 2
+    sums = [dict.fromkeys(chosen, 1.0) for n in range(1, most + 1) for chosen in itertools.combinations(turning, n)]
+    circular = [term for weights in sums for term in (Term.sin(**weights), Term.cos(**weights))]
+    return [Term.constant(1.0), *linear, *circular]
+
+
+def _sum(basis: Sequence[Term], weights: Array) -> Term | None:
+    kept = [(term, float(np.round(w, 9))) for term, w in zip(basis, weights, strict=True) if abs(w) > TOLERANCE]
+    parts = tuple(part for term, weight in kept for part in (weight * term).parts)
+    return Term(parts=parts) if 0 < len(parts) <= 64 else None
+
+
+def _clip_of(frame: EnvironmentSpec, coordinates: Array, entry: Array) -> Term | None:
+    """The coordinate that an entry shows up to limits, or None."""
+    low, high = float(entry.min()), float(entry.max())
+    for index, name in enumerate(frame.coordinate_names):
+        if np.allclose(np.clip(coordinates[:, index], low, high), entry, atol=TOLERANCE):
+            ends = [end if (entry == end).mean() > CLIPPED else None for end in (low, high)]
+            return Term.linear(**{name: 1.0}).clipped(*ends)
+    return None
+
+
+def _name_of(term: Term) -> str | None:
+    """The name of an entry that shows one coordinate, or its sine or cosine, as it is."""
+    if len(term.parts) != 1 or len(term.parts[0].weights) != 1 or term.parts[0].coefficient != 1.0:
+        return None
+    (name,) = term.parts[0].weights
+    return name if term.parts[0].function == "linear" else f"{term.parts[0].function}_{name}"[:64]

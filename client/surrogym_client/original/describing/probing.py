@@ -1,0 +1,113 @@
+"""Steps that are taken again, from states that were set: whether that is exact, and what makes no difference.
+
+Shapes: V variables of the state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from surrogym_client.original.describing.exploring import RESETS, Counted, Seen
+from surrogym_client.original.protocol import Array
+
+PLACES = 4  # at which each question is asked
+EXACT = 1e-6  # of what a variable moved in all
+SETTABLE = 1e-3  # of the same: the largest error of a state that counts as set
+FEW = 3.0  # times the noise of some steps: what that of one may be
+FARTHEST = 3.0  # that a position is shifted
+
+
+@dataclass(frozen=True)
+class Probed:
+    """What repeated steps said; errors are shares of what was seen of each variable, the largest of all.
+
+    Attributes:
+        set_error: between a step of an episode and the same step from a state that was set.
+        repeat_error: between two steps from the same state.
+        replay_error: between two episodes from one seed under the same actions.
+        shifts: positions whose shift changes nothing.
+        turns: angles whose whole turn changes nothing.
+    """
+
+    set_error: float
+    repeat_error: float
+    replay_error: float
+    shifts: frozenset[str] = frozenset()
+    turns: frozenset[str] = frozenset()
+
+    @property
+    def noisy(self) -> bool:
+        """Whether the environment is random: equal episodes differ, and not only steps from states that were set."""
+        return self.replay_error > EXACT
+
+    @property
+    def settable(self) -> bool:
+        """Whether a state that was set is the state. What two equal episodes don't explain was remembered."""
+        noise = FEW * max(self.replay_error, self.repeat_error) if self.noisy else 0.0
+        return self.set_error <= max(SETTABLE, noise)
+
+
+def probe(counted: Counted, seen: Seen, rng: np.random.Generator) -> Probed:
+    """Take some of the steps again."""
+    simulator, scale = counted.simulator, _scale(seen)
+    at = np.unique(np.linspace(0, len(seen.states) - 1, PLACES + 1).astype(int)[1:])
+    taken = [(seen.states[i], seen.actions[i], seen.next_states[i], float(seen.rewards[i])) for i in at]
+    first = [counted.step_from(state, action) for state, action, _, _ in taken]
+    again = [counted.step_from(state, action) for state, action, _, _ in taken]
+    set_error = max(
+        _error(reached, wanted, scale, got.reward, reward)
+        for (reached, got), (_, _, wanted, reward) in zip(first, taken, strict=True)
+    )
+    repeat_error = max(
+        _error(a, b, scale, one.reward, other.reward) for (a, one), (b, other) in zip(first, again, strict=True)
+    )
+    replay_error = _replayed(counted, seen, scale)
+    probed = Probed(set_error, repeat_error, replay_error)
+    if not probed.settable:
+        return probed
+    same = max(EXACT, FEW * repeat_error)
+
+    def changes_nothing(index: int, shift: float, *, seen_in_observation: bool) -> bool:
+        for (state, action, _, _), (reached, got) in zip(taken, first, strict=True):
+            moved = state.copy()
+            moved[index] += shift
+            there, step = counted.step_from(moved, action)
+            there[index] -= shift
+            differs = _error(there, reached, scale, step.reward, got.reward) > same
+            if differs or (seen_in_observation and not np.allclose(step.observation, got.observation, atol=1e-6)):
+                return False
+        return True
+
+    shifts, turns = set(), set()
+    for i, variable in enumerate(simulator.variables):
+        if variable.limited or not np.ptp(seen.next_states[:, i]):
+            continue
+        if variable.motion == "slide" and changes_nothing(i, float(rng.uniform(1, FARTHEST)), seen_in_observation=True):
+            shifts.add(variable.name)
+        if variable.motion == "turn" and changes_nothing(i, 2 * np.pi, seen_in_observation=False):
+            turns.add(variable.name)
+    return Probed(set_error, repeat_error, replay_error, frozenset(shifts), frozenset(turns))
+
+
+def _replayed(counted: Counted, seen: Seen, scale: Array) -> float:
+    """Begin the first episode again, with its seed and actions."""
+    counted.reset(RESETS)
+    rows = np.flatnonzero(seen.episodes == 0)[:PLACES]
+    errors = []
+    for i in rows:
+        taken = counted.step(seen.actions[i])
+        reached = counted.simulator.read()
+        errors.append(_error(reached, seen.next_states[i], scale, taken.reward, float(seen.rewards[i])))
+    return max(errors)
+
+
+def _scale(seen: Seen) -> Array:
+    """What each variable (V,) moved in all, and the reward behind them."""
+    moved = np.append(np.ptp(np.concatenate([seen.states, seen.next_states]), axis=0), np.ptp(seen.rewards))
+    return np.where(moved > 0, moved, 1.0)
+
+
+def _error(reached: Array, wanted: Array, scale: Array, reward: float, wanted_reward: float) -> float:
+    return float((np.abs(np.append(reached - wanted, reward - wanted_reward)) / scale).max())

@@ -1,0 +1,71 @@
+"""An environment that has a name is described, and registered with one command, whichever way it is typed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mujoco")
+pytest.importorskip("imageio")
+
+
+@pytest.fixture
+def described(surrogym, tmp_path: Path) -> Path:
+    said = surrogym("describe", "Swimmer-v5", "--steps", "60")
+    assert said.code == 0, said.err
+    file = tmp_path / "env.json"
+    file.write_text(said.out)
+    return file
+
+
+def test_the_file_is_on_standard_output_and_the_words_beside_it(surrogym) -> None:
+    said = surrogym("describe", "Swimmer-v5", "--steps", "60")
+    assert said.json["specification"]["environment"] == "Swimmer-v5"
+    assert f"Swimmer-v5: described by {said.json['real_steps']} real steps and" in said.err
+    assert "a shift of slider1, slider2 changes nothing" in said.err
+    assert "please say: success" in said.err
+
+
+def test_a_described_environment_is_registered_by_its_file_and_by_its_name(on_server, described: Path, name) -> None:
+    by_file = on_server("register", name, str(described), "--budget", "20", "--json")
+    assert by_file.code == 0, by_file.err
+    assert (by_file.json["name"], by_file.json["environment"]) == (name, "Swimmer-v5")
+    by_option = on_server(
+        "register", "Swimmer-v5", "--spec", str(described), "--name", name, "--budget", "20", "--json"
+    )
+    assert by_option.json["spec"] == by_file.json["spec"]
+
+
+def test_registering_by_name_alone_describes_and_enters_the_steps(on_server, name) -> None:
+    said = on_server("register", name, "--env", "Swimmer-v5")
+    assert said.code == 0, said.err
+    assert "described by" in said.err
+    steps = int(said.err.partition("described by ")[2].split()[0])
+    view = on_server("status", name, "--json").json
+    assert view["ledger"]["evaluation"] == steps >= 400
+
+
+def test_a_name_of_no_environment_is_one_sentence(surrogym) -> None:
+    said = surrogym("describe", "nowhere")
+    assert (said.code, said.out) == (1, "")
+    assert said.err.startswith("error: no adapter knows the environment 'nowhere': expected a Gymnasium id")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [("{", "env.json is no specification: "), (json.dumps({"specification": {}}), "is no specification: ")],
+)
+def test_a_file_that_holds_no_specification_is_refused(surrogym, tmp_path, content: str, message: str) -> None:
+    (tmp_path / "env.json").write_text(content)
+    said = surrogym("register", "swimmer", "env.json", "--print-spec")
+    assert said.code == 1
+    assert message in said.err
+
+
+def test_two_names_and_two_files_are_refused(surrogym, described: Path) -> None:
+    said = surrogym("register", "a", str(described), "--name", "b", "--print-spec")
+    assert "expected one name, got 'a' and --name 'b'" in said.err
+    said = surrogym("register", "a", str(described), "--spec", str(described), "--print-spec")
+    assert "got both" in said.err

@@ -1,0 +1,121 @@
+"""What ``describe`` finds of an environment is true of it, its steps are counted, and the rest is asked for."""
+
+from __future__ import annotations
+
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+
+from support.simulators import CASES, Register, installed
+from surrogym_client import original
+from surrogym_client.original import terms
+from surrogym_client.original.describing import Description, describe
+from surrogym_client.original.simulator import Simulated
+from surrogym_shared.spec import EnvironmentSpec, limits
+
+STEPS = 80
+
+
+def kinds(description: Description) -> dict[str, str]:
+    return {c.name: c.kind for c in description.spec.coordinates}
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", CASES)
+def test_a_described_environment_steps_from_its_coordinates_as_in_an_episode(name: str) -> None:
+    description = describe(name, STEPS)
+    environment = original.make(name, spec=description.spec)
+    assert isinstance(environment, Simulated)
+    spec, rng = environment.spec(), np.random.default_rng(0)
+    environment.begin(1)
+    for _ in range(3):
+        step = environment.act(rng.uniform(spec.action.low, spec.action.high))
+    again = environment.step_from(np.asarray(step.coordinates), np.asarray(step.action))
+    np.testing.assert_allclose(again.next_coordinates, step.next_coordinates, atol=1e-6)
+    assert again.reward == pytest.approx(step.reward, abs=1e-6)
+    environment.close()
+
+
+@installed("mujoco")
+def test_the_swimmer_needs_neither_its_place_nor_whole_turns() -> None:
+    found = describe("Swimmer-v5", STEPS)
+    assert "slider1" not in kinds(found)
+    assert kinds(found)["free_body_rot"] == "angle"
+    assert {"cos_free_body_rot", "sin_free_body_rot"} <= set(found.spec.observation_names)
+    assert found.spec.time_limit == 1000
+
+
+@installed("mujoco")
+def test_the_cheetah_keeps_its_height_and_not_its_place() -> None:
+    found = kinds(describe("HalfCheetah-v5", STEPS))
+    assert "rootx" not in found
+    assert found["rootz"] == "linear"
+
+
+@installed("mujoco")
+def test_the_described_observation_is_the_environments_own() -> None:
+    name = "Reacher-v5"
+    found = describe(name, STEPS)
+    environment = original.make(name, spec=found.spec)
+    names = list(found.spec.observation_names)
+    for seed in range(5):
+        shown = terms.observe(found.spec, environment.begin(seed)[None])[0]
+        own = environment.simulator.observe()  # cos, cos, sin, sin, target, speeds, to the target
+        ours = [shown[names.index(n)] for n in ("cos_joint0", "cos_joint1", "sin_joint0", "sin_joint1")]
+        np.testing.assert_allclose(ours, own[:4], atol=1e-9)
+        np.testing.assert_allclose(shown[[names.index("o8"), names.index("o9")]], own[8:10], atol=1e-9)
+
+
+@installed("mujoco")
+def test_what_terms_can_not_express_is_replaced_by_coordinates() -> None:
+    found = describe("Pusher-v5", STEPS)
+    assert any("no sums of 1, q, sin and cos" in line for line in found.found)
+    shown = {name for entry in found.spec.observation for part in entry.term.parts for name in part.weights}
+    assert shown == set(found.spec.coordinate_names)
+    assert any("obj_slidey, obj_slidex: no random action moved it" in line for line in found.asked)
+
+
+@installed("mujoco")
+def test_steps_that_ended_an_episode_make_termination_learned_and_asked_for() -> None:
+    found = describe("Hopper-v5", STEPS)
+    assert found.spec.termination == "learned"
+    assert any(line.startswith("termination:") for line in found.asked)
+
+
+@installed("pcgym")
+@pytest.mark.filterwarnings("ignore")
+def test_a_setpoint_is_constant_over_its_whole_range() -> None:
+    spec = describe("pcgym:cstr", STEPS).spec
+    setpoint = spec.coordinates[2]
+    assert (setpoint.name, setpoint.kind, limits(setpoint.sampling)) == ("Ca_setpoint", "constant", (0.8, 0.9))
+
+
+def test_every_step_is_counted(registered: Register) -> None:
+    name = registered("Spiral-v0")
+    taken: list[int] = []
+    made = gymnasium.registry[name].entry_point()
+    step = made.step
+    made.step = lambda action: (taken.append(1), step(action))[1]
+    gymnasium.registry[name].entry_point = lambda: made
+    assert describe(name, 50).steps == len(taken) > 50
+
+
+def test_an_environment_that_remembers_what_can_not_be_set_can_only_be_reset(registered: Register) -> None:
+    found = describe(registered("Worn-v0", wear=0.01), 60)
+    assert found.spec.query == "rollout"
+    assert any("something is remembered that can't be set" in line for line in found.found)
+
+
+def test_a_state_that_can_not_be_read_is_what_is_shown(registered: Register) -> None:
+    found = describe(registered("Hidden-v0", attribute="_hidden"), 60)
+    assert (found.spec.query, found.spec.coordinate_names) == ("rollout", ("o0", "o1"))
+
+
+def test_the_file_says_what_was_found_and_holds_the_specification(registered: Register) -> None:
+    found = describe(registered("Spiral-v0"), 60)
+    read = json.loads(found.text())
+    assert read["real_steps"] == found.steps
+    assert read["asked"] == list(found.asked)
+    assert EnvironmentSpec.model_validate_json(json.dumps(read["specification"])) == found.spec
