@@ -23,7 +23,9 @@ class Pendulum:
     def close(self):
         pass
 """
-EVERYTHING = {"python", "packages", "server", "ready", "token", "round trip", "environment", "step"}
+EVERYTHING = {"python", "packages", "server", "ready", "token", "round trip", "environment", "step"} | {
+    *("state", "resets", "memory", "mode")
+}
 
 
 def lines(said) -> dict[str, tuple[str, str]]:
@@ -42,6 +44,7 @@ def test_everything_in_place(on_server):
     assert {verdict for verdict, _ in lines(said).values()} == {"ok"}
     assert f"protocol {wire.PROTOCOL}" in lines(said)["server"][1]
     assert "coordinates (theta, speed)" in lines(said)["environment"][1]
+    assert lines(said)["mode"][1].startswith("set any state; this took ")
     assert on_server("doctor", "--quiet").out == ""
 
 
@@ -94,7 +97,7 @@ def test_an_environment_that_can_not_be_stepped_or_made(on_server, tmp_path):
     assert list(lines(said)) == ["step"]
     assert "expected (2,) for next_coordinates, got (1,)" in lines(said)["step"][1]
     missing = on_server("doctor", "--env", "Nowhere-v1", "--quiet")
-    assert "no adapter knows the environment 'Nowhere-v1'" in lines(missing)["environment"][1]
+    assert "Nowhere-v1 can't be made: Environment `Nowhere` doesn't exist" in lines(missing)["environment"][1]
 
 
 def test_an_extra_that_is_not_installed_is_named(on_server, monkeypatch):

@@ -17,6 +17,7 @@ from surrogym_client.cli.options import (
 
 if TYPE_CHECKING:
     from surrogym_client.diagnosis.doctor import Finding
+    from surrogym_shared.spec import EnvironmentSpec
 
 
 def register(app: typer.Typer) -> None:
@@ -27,7 +28,10 @@ def register(app: typer.Typer) -> None:
 def command(
     context: typer.Context,
     env: Annotated[
-        str | None, typer.Option(help="Also make this environment and take one real step: an id, or module:factory.")
+        str | None,
+        typer.Option(
+            help="Also make this environment, take some real steps, and say how to use it: a name, as for register."
+        ),
     ] = None,
     spec: SpecFile = None,
     step_limit: StepLimit = 30.0,
@@ -36,7 +40,8 @@ def command(
     output: Output,
 ) -> None:
     """Check versions, server, token, round trip, environment. One line each, with the way out
-    of what is wrong. Exit status 1 where anything is; with --quiet, problems alone are shown.
+    of what is wrong. With --env, states are set and read back, and steps and resets are repeated, to
+    say how exact the environment is. Exit status 1 where anything is; with --quiet, problems alone are shown.
 
     Example: surrogym doctor --env Pendulum-v1
     """
@@ -54,6 +59,9 @@ def command(
         if env is not None:
             from surrogym_client.original.loading import make
 
+            if given is None:
+                given, words = _described(env)
+                yield from words
             yield from environment(partial(make, env, spec=given), step_limit)
 
     found: list[Finding] = []
@@ -66,6 +74,25 @@ def command(
         give({"problems": problems, "findings": [asdict(finding) for finding in found]}, str, as_json=True)
     if problems:
         raise typer.Exit(1)
+
+
+def _described(env: str) -> tuple[EnvironmentSpec | None, list[Finding]]:
+    """The specification of an environment that brings none, found by real steps; nothing where it can't be opened."""
+    from surrogym_client.diagnosis.doctor import Finding
+    from surrogym_client.original.describing import describe
+    from surrogym_client.original.errors import OriginalError
+    from surrogym_client.original.loading import has_specification
+
+    if has_specification(env):
+        return None, []
+    try:
+        found = describe(env)
+    except OriginalError:
+        return None, []  # making it says the same
+    words = (
+        f"no built-in one; described by {found.steps} real steps and {found.resets} resets (surrogym describe {env})"
+    )
+    return found.spec, [Finding("spec", words)]
 
 
 def _line(finding: Finding) -> str:

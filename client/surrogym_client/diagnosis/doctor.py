@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from surrogym_client.diagnosis.access import EXACT, examine
 from surrogym_client.errors import ProblemError, ProtocolMismatch, Refused, ServerUnreachable, SurrogymClientError
 from surrogym_client.original.episodes import draw
 from surrogym_client.original.errors import OriginalError, StepFailed
@@ -93,15 +94,47 @@ def service(api: Api) -> Iterator[Finding]:
 
 
 def environment(factory: Factory, step_limit: float) -> Iterator[Finding]:
-    """The original environment: whether it can be made and takes a step; the step is real, and in no ledger."""
+    """The original environment: whether it can be made, takes a step, and can be set to a state. The steps are real,
+    and in no ledger."""
     try:
         with IsolatedEnvironment(factory, step_limit) as original:
             spec = original.spec()
             names = ", ".join(spec.coordinate_names)
             yield Finding("environment", f"coordinates ({names}), {spec.action.kind} action, {spec.query} queries")
-            yield _one_step(original, spec)
+            step = _one_step(original, spec)
+            yield step
+            if step.way_out is None:
+                yield from _access_of(original, spec)
     except OriginalError as error:
         yield Finding("environment", str(error), "see docs/how-to/own-environment.md for what an environment needs")
+
+
+def _access_of(original: IsolatedEnvironment, spec: EnvironmentSpec) -> Iterator[Finding]:
+    """How exact the environment is, and how it should be used."""
+    try:
+        access = examine(original, spec)
+    except StepFailed as error:
+        yield Finding("mode", str(error), "a sampler would fail in the same way: mend the environment first")
+        return
+    if access.set_error is not None:
+        read, again = _error(access.set_error), _error(access.repeat_error)
+        yield Finding("state", f"set and read back: {read}; two steps from one state: {again}")
+    if access.reset_error is not None:
+        same, alike = _error(access.reset_error), _error(access.replay_error)
+        yield Finding("resets", f"two with one seed: {same}; the same actions from there: {alike}")
+    if access.memory_error is not None:
+        yield Finding("memory", f"a step of an episode, and from its state set anew: {_error(access.memory_error)}")
+    taken = f"{access.mode}; this took {access.steps + 1} real steps and {access.resets + 1} resets at most"
+    wrong = spec.query == "step" and not access.can_set
+    way_out = "register it with --no-teleport; what it remembers must be a coordinate for more" if wrong else None
+    yield Finding("mode", taken, way_out)
+
+
+def _error(share: float | None) -> str:
+    """An error in words; shares are of the sampling range."""
+    if share is None:
+        return "not compared"
+    return "equal" if share <= EXACT else f"{100 * share:.2g} % of the range apart"
 
 
 def _access(api: Api) -> Finding:

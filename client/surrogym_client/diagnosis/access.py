@@ -1,0 +1,168 @@
+"""Whether an environment can be used as it is said to be: states are set and read back, steps and resets are repeated,
+and a step from a state that was set is held against the same step of an episode. Every real step is counted.
+
+Shapes: C coordinates, F action entries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from surrogym_client.original.episodes import draw
+from surrogym_client.original.errors import StepFailed
+from surrogym_client.original.isolated import IsolatedEnvironment
+from surrogym_client.original.protocol import Array, RealStep
+from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
+
+PLACES = 3  # states that are set, and steps of an episode
+EXACT = 1e-6  # of a range: rounding
+CLOSE = 1e-2  # of a range: the largest error with which a state counts as set
+FEW = 3.0  # times the noise of some steps: what that of one may be
+
+
+@dataclass(frozen=True)
+class Access:
+    """What repeated steps and resets said. Errors are shares of the sampling ranges, the largest of all; None where the
+    environment has no methods for it.
+
+    Attributes:
+        steps: real ones, taken.
+        resets: taken.
+        set_error: between the coordinates that were asked and those that were read back.
+        repeat_error: between two steps from one state.
+        reset_error: between two resets with one seed.
+        replay_error: between two episodes from one seed under the same actions.
+        memory_error: between a step of an episode and that step from its state, set anew.
+    """
+
+    steps: int
+    resets: int
+    set_error: float | None = None
+    repeat_error: float | None = None
+    reset_error: float | None = None
+    replay_error: float | None = None
+    memory_error: float | None = None
+
+    @property
+    def noise(self) -> float:
+        """The error of equal steps; 0 where none were compared."""
+        return max(self.repeat_error or 0.0, self.replay_error or 0.0)
+
+    @property
+    def can_set(self) -> bool:
+        """Whether a state that was set is the state."""
+        if self.set_error is None or self.set_error > CLOSE:
+            return False
+        random = self.replay_error is None or self.replay_error > EXACT
+        allowed = max(CLOSE, FEW * self.noise) if random else CLOSE
+        return self.memory_error is None or self.memory_error <= allowed
+
+    @property
+    def mode(self) -> str:
+        """How it should be used."""
+        return "set any state" if self.can_set else "reset only (--no-teleport)"
+
+
+def examine(environment: IsolatedEnvironment, spec: EnvironmentSpec) -> Access:
+    """Take some real steps again.
+
+    Raises:
+        StepFailed: a step failed that is no matter of the mode.
+    """
+    looking = _Looking(environment, spec)
+    if spec.query == "step":
+        looking.set_states()
+    looking.begin_again()
+    return looking.access()
+
+
+class _Looking:
+    """The looks at one environment."""
+
+    def __init__(self, environment: IsolatedEnvironment, spec: EnvironmentSpec) -> None:
+        self._environment, self._spec = environment, spec
+        self._rng = np.random.default_rng(0)
+        self._widths = np.array([np.ptp(limits(c.sampling)) for c in spec.coordinates])
+        self._steps = self._resets = 0
+        self._errors: dict[str, float] = {}
+
+    def access(self) -> Access:
+        """What was found."""
+        return Access(self._steps, self._resets, **self._errors)
+
+    def set_states(self) -> None:
+        """Set states and read them back; step twice from each."""
+        for _ in range(PLACES):
+            q, u = draw(self._spec, self._rng, wide=True), self._action()
+            first, again = self._step_from(q, u), self._step_from(q, u)
+            self._note("set_error", self._apart(first.coordinates, q))
+            self._note("repeat_error", self._between([first], [again]))
+
+    def begin_again(self) -> None:
+        """Reset twice with one seed and act alike; then set the last step's state and take it again."""
+        actions = [self._action() for _ in range(PLACES)]
+        try:
+            starts, episodes = zip(*(self._episode(actions) for _ in range(2)), strict=True)
+        except StepFailed:
+            if self._spec.query == "rollout":
+                raise
+            return  # it has no resets
+        self._note("reset_error", self._apart(starts[0], starts[1]))
+        self._note("replay_error", self._between(*episodes))
+        inside = [step for step in episodes[1] if self._is_inside(step)]
+        if self._spec.query == "step" and inside:
+            wanted = inside[-1]
+            again = self._step_from(np.asarray(wanted.coordinates), np.asarray(wanted.action))
+            self._note("memory_error", self._between([wanted], [again]))
+
+    def _episode(self, actions: Sequence[Array]) -> tuple[Array, list[RealStep]]:
+        start = self._environment.begin(0)
+        self._resets += 1
+        steps: list[RealStep] = []
+        for action in actions:
+            self._steps += 1
+            steps.append(self._environment.act(action))
+            if steps[-1].terminated or steps[-1].truncated:
+                break
+        return start, steps
+
+    def _step_from(self, coordinates: Array, action: Array) -> RealStep:
+        self._steps += 1
+        return self._environment.step_from(coordinates, action)
+
+    def _is_inside(self, step: RealStep) -> bool:
+        """Whether a step began where the specification allows a state to be set."""
+        ends = np.array([c.settable for c in self._spec.coordinates])
+        at = np.asarray(step.coordinates)
+        return bool(((at >= ends[:, 0]) & (at <= ends[:, 1])).all())
+
+    def _between(self, ones: Sequence[RealStep], others: Sequence[RealStep]) -> float:
+        """The largest difference of where steps led; of the rewards where these lead to the same place."""
+        if len(ones) != len(others):
+            return 1.0  # one episode ended earlier
+        apart = [self._apart(a.next_coordinates, b.next_coordinates) for a, b in zip(ones, others, strict=True)]
+        paid = [
+            abs(float(a.reward) - float(b.reward)) / max(1.0, abs(float(a.reward)))
+            for a, b in zip(ones, others, strict=True)
+        ]
+        return max([*apart, *paid])
+
+    def _apart(self, one: object, other: object) -> float:
+        difference = np.asarray(one, dtype=np.float64) - np.asarray(other, dtype=np.float64)
+        for i, coordinate in enumerate(self._spec.coordinates):
+            if coordinate.kind == "angle":
+                difference[i] = (difference[i] + np.pi) % (2 * np.pi) - np.pi
+        return float((np.abs(difference) / self._widths).max())
+
+    def _note(self, which: str, error: float) -> None:
+        self._errors[which] = max(self._errors.get(which, 0.0), error)
+
+    def _action(self) -> Array:
+        action = self._spec.action
+        if isinstance(action, BoxAction):
+            return self._rng.uniform(action.low, action.high)
+        counts = [action.n] if action.kind == "discrete" else action.nvec
+        return self._rng.integers(0, counts).astype(np.float64)

@@ -1,0 +1,99 @@
+"""What repeated steps and resets say of an environment, and how it should be used."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from surrogym_client.diagnosis.access import Access, examine
+from surrogym_client.original import RealStep
+from surrogym_client.original.isolated import IsolatedEnvironment
+from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
+
+RANGE = Uniform(low=-1, high=1)
+
+
+class Rail:
+    """A cart on a rail: ``coarse`` puts it elsewhere than asked, ``noise`` shakes it, ``inertia`` is remembered."""
+
+    def __init__(self, coarse=0.0, noise=0.0, inertia=0.0, resets=True, query="step"):
+        self._coarse, self._noise, self._inertia, self._query = coarse, noise, inertia, query
+        self._rng, self._moved, self._x = np.random.default_rng(), 0.0, 0.0
+        if not resets:
+            self.begin = self.act = None
+
+    def spec(self):
+        return EnvironmentSpec(
+            coordinates=(Coordinate(name="x", sampling=RANGE),),
+            observation=(ObservationEntry(name="x", term=Term.linear(x=1)),),
+            action=BoxAction(low=(-1,), high=(1,)),
+            start={"x": RANGE},
+            time_limit=20,
+            query=self._query,
+        )
+
+    def step_from(self, coordinates, action):
+        self._x, self._moved = float(coordinates[0]) + self._coarse, 0.0
+        return self.act_from(action)
+
+    def begin(self, seed=None):
+        self._x, self._moved = float(np.random.default_rng(seed).uniform(-0.5, 0.5)), 0.0
+        return np.array([self._x])
+
+    def act(self, action):
+        return self.act_from(action)
+
+    def act_from(self, action):
+        before = self._x
+        self._moved = 0.3 * float(action[0]) + self._inertia * self._moved + self._noise * self._rng.standard_normal()
+        self._x = float(np.clip(before + 0.1 * self._moved, -1, 1))
+        return RealStep([before], action, [self._x], -(before**2))
+
+    def close(self):
+        pass
+
+
+def looked_at(**options) -> Access:
+    factory = partial(Rail, **options)
+    with IsolatedEnvironment(factory) as environment:
+        return examine(environment, factory().spec())
+
+
+def test_an_exact_environment_is_set_to_any_state_and_its_steps_are_counted() -> None:
+    access = looked_at()
+    assert (access.set_error, access.repeat_error, access.reset_error, access.memory_error) == (0, 0, 0, 0)
+    assert access.mode == "set any state"
+    assert (access.steps, access.resets) == (2 * 3 + 2 * 3 + 1, 2)
+
+
+def test_one_that_is_not_where_it_was_put_can_only_be_reset() -> None:
+    access = looked_at(coarse=0.1)
+    assert access.set_error == pytest.approx(0.05)
+    assert access.mode == "reset only (--no-teleport)"
+
+
+def test_one_that_remembers_more_than_its_coordinates_can_only_be_reset() -> None:
+    access = looked_at(inertia=3.0)
+    assert access.set_error == access.repeat_error == 0
+    assert access.memory_error is not None
+    assert access.memory_error > 0.01
+    assert not access.can_set
+
+
+def test_noise_alone_does_not_forbid_to_set_a_state() -> None:
+    access = looked_at(noise=0.05)
+    assert access.noise > 0
+    assert access.can_set
+
+
+def test_one_without_resets_is_looked_at_by_its_states_alone() -> None:
+    access = looked_at(resets=False)
+    assert (access.reset_error, access.resets, access.can_set) == (None, 0, True)
+
+
+def test_one_that_can_only_be_reset_is_not_set() -> None:
+    access = looked_at(query="rollout")
+    assert (access.set_error, access.memory_error) == (None, None)
+    assert (access.reset_error, access.mode) == (0, "reset only (--no-teleport)")
