@@ -42,6 +42,10 @@ class OfLogs:
     budget: Annotated[
         int, typer.Option(min=0, help="Real steps that the design may take beyond the log; 0 without a machine.")
     ] = 0
+    picture: Annotated[
+        Path | None,
+        typer.Option("--picture", help="Of a log: draw where it has been into this file (.png, .svg or .pdf)."),
+    ] = None
     rejected: Annotated[
         Path | None,
         typer.Option("--rejected", help="Of a log: file for the rows that can't be used. [default: beside the log]"),
@@ -141,6 +145,8 @@ def _import_log(context: typer.Context, file: Path, log: OfLogs, wait: float, se
             token=token,
             progress=update,
         )
+    if log.picture is not None:
+        _draw(imported.log, log.picture)
     if log.draft is not None:
         log.draft.write_text(imported.log.spec.model_dump_json(indent=2) + "\n", encoding="utf-8")
     view = None
@@ -148,6 +154,17 @@ def _import_log(context: typer.Context, file: Path, log: OfLogs, wait: float, se
         view = _await_model(imported.surrogate, wait, service.server, token, quiet=output.quiet)
     again = _again(context, log)
     output.give(_as_json(imported, view), lambda: "\n".join(_words(file, imported, view, again)))
+
+
+def _draw(log: ReadLog, file: Path) -> None:
+    """Draw the coverage of a log. Raises ``CommandError`` for an unknown kind of picture."""
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.report.coverage import coverage_of
+    from surrogym_client.report.figures import draw_coverage
+
+    if file.suffix not in (".png", ".svg", ".pdf"):
+        raise CommandError(f"--picture: expected a name that ends in .png, .svg or .pdf, got {file.name!r}")
+    draw_coverage(coverage_of(log.spec, log.steps.q, log.steps.u)).savefig(file, dpi=150)
 
 
 def _again(context: typer.Context, log: OfLogs) -> str:
@@ -188,20 +205,31 @@ def _as_json(imported: Imported, view: SurrogateView | None) -> dict[str, Any]:
         "columns": log.roles.used,
         "ignored": log.ignored,
         "notes": list(log.notes),
+        "coverage": _covered(log),
         "spec": log.spec.model_dump(mode="json"),
         "view": None if view is None else view.model_dump(mode="json"),
     }
 
 
+def _covered(log: ReadLog) -> dict[str, float]:
+    """The share of cells that the log has been in, by pair of columns."""
+    from surrogym_client.report.coverage import coverage_of
+
+    coverage = coverage_of(log.spec, log.steps.q, log.steps.u)
+    return {" by ".join(coverage.names[i] for i in pair): coverage.share(pair) for pair in coverage.counts}
+
+
 def _words(file: Path, imported: Imported, view: SurrogateView | None, again: str) -> list[str]:
     from surrogym_client.logs.too_few import counted, has
+    from surrogym_client.report.coverage import coverage_of
 
     log = imported.log
     lines = [f"{file}: {counted(len(log.table), 'row')}, {counted(len(log.steps), 'step')}"]
     if log.steps.ends:
         where = "it ends an episode, or stands" if log.steps.ends == 1 else "they end an episode, or stand"
         lines.append(f"{has(log.steps.ends, 'row')} no next state: {where} before a gap")
-    lines += [*_columns(log), *_rejected(imported), *_specified(log.spec, log.notes)]
+    covered = coverage_of(log.spec, log.steps.q, log.steps.u).words()
+    lines += [*_columns(log), *_rejected(imported), *_specified(log.spec, log.notes), covered]
     name = imported.surrogate
     if name is None:
         return [*lines, f"nothing was stored; next: {again}"]

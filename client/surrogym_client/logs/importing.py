@@ -21,6 +21,7 @@ from surrogym_client.logs.rows import rows_of
 from surrogym_client.logs.table import Bools, Floats, Table
 from surrogym_client.logs.too_few import TooFewSteps, require_steps
 from surrogym_client.logs.transitions import Transitions, transitions_of
+from surrogym_client.logs.units import require_units
 from surrogym_client.original.terms import terminates
 from surrogym_client.transport.api import Api
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
@@ -117,7 +118,10 @@ def read_log(path: str | Path, options: Options | None = None) -> ReadLog:
     if options.spec is not None:
         roles = _of_spec(roles, options.spec)
     options.progress(0.1, f"checking {len(table)} rows")
-    steps = transitions_of(rows_of(table, roles, options.spec))
+    rows = rows_of(table, roles, options.spec)
+    if options.spec is not None:
+        require_units(rows.q, options.spec)
+    steps = transitions_of(rows)
     if options.spec is None:
         require_steps(table, steps, 2)
         drafted: Draft = draft(roles, steps, options.name or path.stem, options.budget)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from io import StringIO
 
 import matplotlib
+import numpy as np
 
 matplotlib.use("Agg")
 
@@ -14,11 +15,12 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from surrogym_client.report.coverage import Coverage, columns_shown
 from surrogym_client.report.maps import Cut, pairs
 from surrogym_shared.spec import Coordinate, limits
 from surrogym_shared.wire import ModelView, OutputFidelity, SampleView, SurrogateView
 
-COLOURS = {"initial": "#4c72b0", "adaptive": "#dd8452", "manual": "#55a868"}
+COLOURS = {"logged": "#8c8c8c", "initial": "#4c72b0", "adaptive": "#dd8452", "manual": "#55a868", "audit": "#c44e52"}
 WIDTH = 6.0  # inches
 SMALLEST = 1e-9  # of what is drawn on a logarithmic axis
 DECADES = 6  # of the index: what lies further below its highest value is nothing
@@ -66,6 +68,38 @@ def draw_samples(view: SurrogateView, samples: Sequence[SampleView]) -> Figure:
         if n == 0 and samples:
             figure.legend(loc="outside upper right")
     figure.suptitle(f"{view.name}: real steps of the design", x=0.02, ha="left")
+    return figure
+
+
+def draw_coverage(coverage: Coverage) -> Figure:
+    """How often a log was in each cell of two columns; where it never was is white."""
+    shown = columns_shown(coverage.names)
+    figure = Figure(figsize=(WIDTH, WIDTH), layout="constrained")
+    grid = figure.subplots(len(shown) - 1, len(shown) - 1, squeeze=False)
+    most = max(int(counts.max()) for counts in coverage.counts.values())
+    for row, j in enumerate(shown[1:]):
+        for column, i in enumerate(shown[:-1]):
+            axes = grid[row, column]
+            if column > row:
+                axes.axis("off")
+                continue
+            counts = coverage.counts[i, j].T
+            axes.imshow(
+                np.ma.masked_equal(counts, 0),
+                origin="lower",
+                extent=(*coverage.ends[i], *coverage.ends[j]),
+                aspect="auto",
+                cmap="Blues",
+                norm=LogNorm(0.3, max(most, 1)),
+            )
+            axes.tick_params(labelsize=6)
+            axes.set_title(f"{100 * coverage.share((i, j)):.0f} %", fontsize=7, pad=2)
+            axes.set(
+                xlabel=coverage.names[i] if row == len(shown) - 2 else "",
+                ylabel=coverage.names[j] if column == 0 else "",
+            )
+    left_out = len(coverage.names) - len(shown)
+    figure.suptitle("where the log has been" + (f"; {left_out} columns are not shown" if left_out else ""), fontsize=9)
     return figure
 
 

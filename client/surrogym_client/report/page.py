@@ -6,13 +6,16 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from html import escape
 
+import numpy as np
+
+from surrogym_client.report.coverage import coverage_of
 from surrogym_client.report.decision import decision
-from surrogym_client.report.figures import draw_fidelity, draw_maps, draw_samples, svg
+from surrogym_client.report.figures import draw_coverage, draw_fidelity, draw_maps, draw_samples, svg
 from surrogym_client.report.html import document, picture, rows, section, table
 from surrogym_client.report.known import Known
 from surrogym_client.report.maps import Cut
 from surrogym_client.runtime.versions import versions
-from surrogym_shared.wire import ModelView, SurrogateView
+from surrogym_shared.wire import ModelView, SampleView, SurrogateView
 
 FIDELITY = {
     "output": "name",
@@ -53,7 +56,7 @@ def _details(known: Known, cuts: Sequence[Cut]) -> list[str]:
         sections.append(_fidelity(view, models))
     if samples:
         figure = picture(svg(draw_samples(view, samples)), "Where the real steps began, two coordinates a picture")
-        sections.append(section("Samples", figure))
+        sections.append(section("Samples", figure + _covered(view, samples)))
     if cuts:
         sections.append(_maps(view, cuts))
     if models:
@@ -61,6 +64,17 @@ def _details(known: Known, cuts: Sequence[Cut]) -> list[str]:
     specification = escape(view.spec.model_dump_json(indent=2))
     sections.append(section("Specification", f"<details><summary>JSON</summary><pre>{specification}</pre></details>"))
     return sections
+
+
+def _covered(view: SurrogateView, samples: Sequence[SampleView]) -> str:
+    """Where the log has been; nothing without logged steps."""
+    logged = [sample for sample in samples if sample.purpose == "logged"]
+    if not logged:
+        return ""
+    q, u = np.array([sample.coordinates for sample in logged]), np.array([sample.action for sample in logged])
+    coverage = coverage_of(view.spec, q, u)
+    shown = picture(svg(draw_coverage(coverage)), "How often the log was in each cell of two columns")
+    return f"{shown}<p>{escape(coverage.words())}</p>"
 
 
 def _summary(view: SurrogateView) -> str:

@@ -1,0 +1,33 @@
+"""Columns in another unit than the specification has."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from surrogym_client.logs.errors import UnusableLog
+from surrogym_client.logs.table import Floats
+from surrogym_shared.spec import EnvironmentSpec, limits
+
+BEYOND = 20.0  # widths of its range from the middle, for the middle value of a column: no plant strays so far
+
+
+def require_units(q: Floats, spec: EnvironmentSpec) -> None:
+    """Refuse states q (n, C) whose columns are in other units than the coordinates.
+
+    Raises:
+        UnusableLog: the middle half of a column lies far beyond the range of its coordinate.
+    """
+    for index, coordinate in enumerate(spec.coordinates):
+        column = q[np.isfinite(q[:, index]), index]
+        if coordinate.kind == "angle" or not len(column):
+            continue
+        low, high = limits(coordinate.sampling)
+        first, last = np.quantile(column, [0.25, 0.75])
+        far = BEYOND * (high - low)
+        outside = first > high + far or last < low - far
+        wide = last - first > far
+        if outside or wide:
+            raise UnusableLog(
+                f"{coordinate.name}: half of the log lies between {first:.4g} and {last:.4g}, its range is "
+                f"{low:.4g} to {high:.4g}: is the column in another unit? Convert it, or name another column (--map)"
+            )

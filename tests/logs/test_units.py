@@ -1,0 +1,46 @@
+"""A column in another unit is named with the way out; a wide log, or a few wild rows, are not taken for one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from support import reactor
+from surrogym_client.logs import importing
+from surrogym_client.logs.errors import UnusableLog
+from surrogym_client.logs.units import require_units
+from surrogym_client.original.classic import pendulum
+
+
+def states(speed: np.ndarray) -> np.ndarray:
+    return np.stack([np.zeros_like(speed), speed], axis=1)
+
+
+@pytest.mark.parametrize("factor", [1_000.0, 1e5])
+def test_a_column_a_thousand_times_its_range_is_refused(factor: float) -> None:
+    speeds = states(factor * np.linspace(-8, 8, 50))
+    with pytest.raises(UnusableLog, match=r"speed: half of the log lies between .* is the column in another unit\?"):
+        require_units(speeds, pendulum())
+
+
+def test_a_column_with_another_zero_is_refused() -> None:
+    with pytest.raises(UnusableLog, match="speed"):
+        require_units(states(np.linspace(-8, 8, 50) + 1_000), pendulum())
+
+
+def test_a_few_wild_rows_and_missing_ones_are_no_other_unit() -> None:
+    speeds = np.linspace(-12, 12, 50)
+    speeds[:5], speeds[5:8] = 1e6, np.nan
+    require_units(states(speeds), pendulum())
+
+
+def test_a_log_in_another_unit_is_refused_as_it_is_read(tmp_path) -> None:
+    log = reactor.log(runs=3, length=20).write(tmp_path / "log.csv")
+    spec = importing.read_log(log).spec
+    small = spec.model_dump()
+    small["coordinates"][1]["sampling"] = {"kind": "uniform", "low": 0.30, "high": 0.34}  # kilokelvin
+    small["start"][small["coordinates"][1]["name"]] = {"kind": "fixed", "value": 0.3}
+    small["starts"] = []
+    options = importing.Options(spec=type(spec).model_validate(small))
+    with pytest.raises(UnusableLog, match="is the column in another unit"):
+        importing.read_log(log, options)
