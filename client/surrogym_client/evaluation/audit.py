@@ -116,7 +116,7 @@ def places(spec: EnvironmentSpec, q: Array, u: Array, count: int, rng: np.random
     count = min(count, len(settable))
     if not count:
         return settable
-    at = _scaled(spec, q[settable], u[settable])
+    at = on_one_scale(spec, q[settable], u[settable])
     drawn = rng.choice(len(settable), size=(count + 1) // 2, replace=False)
     chosen: list[int] = drawn.tolist()
     nearest = np.min([np.linalg.norm(at - at[i], axis=1) for i in chosen], axis=0)
@@ -137,13 +137,15 @@ def differences(spec: EnvironmentSpec, real: Array, predicted: Array) -> Array:
     return difference
 
 
-def _scaled(spec: EnvironmentSpec, q: Array, u: Array) -> Array:
+def on_one_scale(spec: EnvironmentSpec, q: Array, u: Array, first: int | None = None) -> Array:
+    """States q (m, C) and actions u (m, F) as points whose distances mean something: angles as cosine and sine, each
+    column over its deviation, or over that of the ``first`` rows."""
     columns = [u]
     for index, coordinate in enumerate(spec.coordinates):
         column = q[:, index : index + 1]
         columns += [np.cos(column), np.sin(column)] if coordinate.kind == "angle" else [column]
     at = np.concatenate(columns, 1)
-    spread = at.std(0)
+    spread = at[:first].std(0)
     scaled: Array = at / np.where(spread > 0, spread, 1.0)
     return scaled
 

@@ -1,0 +1,51 @@
+"""A policy that goes where a log has never been is found out, and one that keeps to the log is left alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surrogym_client.evaluation.outside import LITTLE, outside_of
+from surrogym_client.original.classic import pendulum
+
+
+def steps(speeds: tuple[float, float], rows: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    q = np.stack([rng.uniform(-np.pi, np.pi, rows), rng.uniform(*speeds, rows)], axis=1)
+    return q, rng.uniform(-2, 2, (rows, 1))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_way_within_the_log_is_inside(seed: int) -> None:
+    found = outside_of(pendulum(), *steps((-2, 2), 1_000, seed), *steps((-1.9, 1.9), 400, seed + 100))
+    assert found.share < 0.01
+    assert not found.much
+
+
+def test_a_way_of_other_speeds_is_outside_and_says_which() -> None:
+    found = outside_of(pendulum(), *steps((-2, 2), 1_000, 0), *steps((6, 8), 400, 1))
+    assert found.share == 1.0
+    assert found.much
+    assert found.name == "speed"
+    assert "100 % of the policy's steps lie where the log has never been, with speed between 6" in found.words()
+
+
+def test_a_hole_in_the_middle_of_a_log_is_outside_too() -> None:
+    low, high = steps((-8, -6), 500, 0), steps((6, 8), 500, 1)
+    log = tuple(np.concatenate(pair) for pair in zip(low, high, strict=True))
+    found = outside_of(pendulum(), *log, *steps((-0.5, 0.5), 400, 2))
+    assert found.much
+    assert found.name == ""
+
+
+def test_an_action_that_nobody_took_is_outside() -> None:
+    q, u = steps((-2, 2), 1_000, 0)
+    way_q, way_u = steps((-2, 2), 400, 1)
+    assert outside_of(pendulum(), q, 0.05 * u, way_q, 0.05 * way_u).share < LITTLE
+    assert outside_of(pendulum(), q, 0.05 * u, way_q, np.full_like(way_u, 2.0)).share > 0.9
+
+
+def test_an_angle_is_near_itself_after_a_turn() -> None:
+    q, u = steps((-2, 2), 1_000, 0)
+    way_q, way_u = steps((-2, 2), 400, 1)
+    assert outside_of(pendulum(), q, u, way_q + np.array([2 * np.pi, 0]), way_u).share < 0.01
