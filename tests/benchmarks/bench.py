@@ -25,6 +25,7 @@ PARTS = (
     "growth",
     "predict",
     "evidence",
+    "calibration",
     "lists",
     "attacks",
     "start",

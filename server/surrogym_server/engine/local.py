@@ -193,7 +193,9 @@ class LocalEngine(SessionEngine):
     def _expected_bytes(self, request: Open) -> int:
         surrogate, wanted = request.surrogate_id, request.opening.model
         model = self._models.get(surrogate, self._models.refresh(surrogate) if wanted == "latest" else wanted)
-        return expected_bytes(request.definition, request.opening.settings, function_draws(model).path_size)
+        settings = request.opening.settings
+        draws = function_draws(model, settings.functions)
+        return expected_bytes(request.definition, settings, draws.path_size)
 
     def _opened(self, request: Open, digest: str) -> Session:
         definition = request.definition.on(self._device)

@@ -16,6 +16,7 @@ beta      ``weights`` (n,)        (K + sigma_n^2 I)^-1 y
 """
 
 from surrogym_server.gp.fit import FitOptions, Fitted, fit, refine
+from surrogym_server.gp.hyperparameter_samples import hyperparameter_samples
 from surrogym_server.gp.joint import Joint
 from surrogym_server.gp.kernel import Hyperparameters, Reflection
 from surrogym_server.gp.pathwise import Pathwise
@@ -40,6 +41,7 @@ __all__ = [
     "condition_many",
     "condition_sparse",
     "fit",
+    "hyperparameter_samples",
     "refine",
     "spread",
 ]

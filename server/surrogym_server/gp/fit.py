@@ -161,6 +161,15 @@ class _Objective:
         self.default_start[-1] = math.log(1e-4)
         self.constant = 0.5 * n * math.log(2 * math.pi) + float(np.log(self.prior[:, 1]).sum())
 
+    def theta(self, hyper: Hyperparameters) -> Array:
+        """The free parameters of hyperparameters, within the bounds: what ``hyper`` turns back."""
+        variances = [hyper.signal_variance]
+        variances += [hyper.linear_variance] * self.options.linear
+        variances += [hyper.quadratic_variance] * self.options.quadratic
+        values = np.array([*hyper.lengthscale.tolist(), *variances, hyper.noise_variance])
+        clipped: Array = np.clip(np.log(values), self.lower, self.upper)
+        return clipped
+
     def hyper(self, theta: Array) -> Hyperparameters:
         lengthscale, signal, linear, quadratic, noise = self._values(theta)
         return Hyperparameters(torch.from_numpy(lengthscale), signal, linear, quadratic, noise, self.reflection)

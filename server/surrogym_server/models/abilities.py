@@ -60,6 +60,19 @@ class FunctionDraws(ABC):
         which the first ``path_size`` columns count."""
 
 
+class UncertainHyperparameters(ABC):
+    """Functions drawn as if the hyperparameters were uncertain too, which few samples leave them.
+
+    Fallback of ``virtual``: the functions of ``FunctionDraws``, which take one optimum of them for certain.
+    """
+
+    @property
+    @abstractmethod
+    def uncertain_functions(self) -> FunctionDraws:
+        """What draws them; the first call in a model's life may take as long as a fit of so few samples. Its compiled
+        steps, if any, are those of its own ``CompiledSteps``."""
+
+
 @dataclass(frozen=True)
 class LeaveOneOutErrors:
     """How one output, learned without each sample in turn, foretells it."""

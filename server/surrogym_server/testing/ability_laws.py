@@ -16,6 +16,7 @@ from surrogym_server.models.abilities import (
     Lookahead,
     PredictedSteps,
     RewardEdges,
+    UncertainHyperparameters,
     offers,
 )
 from surrogym_server.sampling.confidence import deviations
@@ -24,17 +25,23 @@ from surrogym_server.testing.cases import ModelCase, close
 DRAWS = 400
 
 
+def _draws(case: ModelCase) -> list[FunctionDraws]:
+    """What draws functions of the model, of one optimum of its hyperparameters and of uncertain ones."""
+    plain, uncertain = offers(case.model, FunctionDraws), offers(case.model, UncertainHyperparameters)
+    found = [] if plain is None else [plain]
+    return found if uncertain is None else [*found, uncertain.uncertain_functions]
+
+
 def a_drawn_function_is_one_function(case: ModelCase) -> None:
     """The same weights at the same point give the same step, whatever rows they stand in."""
-    if (able := offers(case.model, FunctionDraws)) is None:
-        return
-    noise = case.noise(3, able.path_size)
-    paths = able.draw(noise)
-    assert paths.shape == (3, able.path_size)
-    assert close(able.draw(noise[1:2])[0], paths[1])
-    q, u = case.points.q[:1].expand(4, -1), case.points.u[:1].expand(4, -1)
-    made = able.transition_along(paths[[0, 1, 0, 2]], q, u).q_next
-    assert close(made[0], made[2])
+    for able in _draws(case):
+        noise = case.noise(3, able.path_size)
+        paths = able.draw(noise)
+        assert paths.shape == (3, able.path_size)
+        assert close(able.draw(noise[1:2])[0], paths[1])
+        q, u = case.points.q[:1].expand(4, -1), case.points.u[:1].expand(4, -1)
+        made = able.transition_along(paths[[0, 1, 0, 2]], q, u).q_next
+        assert close(made[0], made[2])
 
 
 def drawn_functions_scatter_as_the_deviations_say(case: ModelCase) -> None:
@@ -50,7 +57,7 @@ def drawn_functions_scatter_as_the_deviations_say(case: ModelCase) -> None:
 
 def a_drawn_function_may_have_columns_beyond_its_own(case: ModelCase) -> None:
     """Those of a session whose lanes follow models of several sizes."""
-    if (able := offers(case.model, FunctionDraws)) is not None:
+    for able in _draws(case):
         paths = able.draw(case.noise(2, able.path_size))
         wider = torch.cat([paths, torch.zeros(2, 3, dtype=torch.float64)], 1)
         q, u = case.points.q[:2], case.points.u[:2]

@@ -41,10 +41,11 @@ def move_mean(
     *,
     process: Tensor | None = None,
     paths: Tensor | None = None,
+    functions: int | None = None,
 ) -> Moved:
     """AUR-D: q (N, C) under u (N, F) goes to the mean of the next state, or along each lane's own function, ``paths``
-    (N, W); ``process`` (N, M), standard normal, adds the learned noise."""
-    step = model.transition if paths is None else partial(function_draws(model).transition_along, paths)
+    (N, W), of so many ``functions`` that lanes share; ``process`` (N, M), standard normal, adds the learned noise."""
+    step = model.transition if paths is None else partial(function_draws(model, functions).transition_along, paths)
     transition = step(q, u, process=process, deviations=deviations, reward_deviation=deviations or penalty > 0)
     require_shapes(model, transition, q)
     over, spread = model.terminated(transition.q_next), transition.reward_deviation

@@ -216,6 +216,7 @@ def _move(
         deviations or settings.trust is not None,
         process=None if process is None else process[:, 0],
         paths=lanes.path if settings.variant == "pathwise" else None,
+        functions=settings.functions,
     )
 
 

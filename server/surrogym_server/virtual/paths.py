@@ -7,14 +7,20 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
-from surrogym_server.models.abilities import FunctionDraws, offers
+from surrogym_server.models.abilities import FunctionDraws, UncertainHyperparameters, offers
 from surrogym_server.models.port import DynamicsModel, Transition
 from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
 
 
-def function_draws(model: DynamicsModel) -> FunctionDraws:
-    """What draws functions of a model: itself, or the fallback for a family that draws none."""
+def function_draws(model: DynamicsModel, functions: int | None = None) -> FunctionDraws:
+    """What draws functions of a model: itself, or the fallback for a family that draws none.
+
+    Where lanes share a number of ``functions`` these stand for all that the samples allow, so that hyperparameters
+    count as uncertain.
+    """
+    if functions is not None and (able := offers(model, UncertainHyperparameters)) is not None:
+        return able.uncertain_functions
     return offers(model, FunctionDraws) or ConstantErrors(model)
 
 
@@ -64,7 +70,7 @@ def with_paths(model: DynamicsModel, lanes: LaneState, functions: int | None = N
     fresh = lanes.elapsed == 0
     if not bool(fresh.any()):
         return lanes
-    drawing, draws = lanes.take(fresh), function_draws(model)
+    drawing, draws = lanes.take(fresh), function_draws(model, functions)
     keyed = drawing if functions is None else replace(drawing, lane=drawing.lane % functions)
     noise = normal_noise(keyed, Purpose.PATH, 1, draws.path_size)[:, 0]
     drawn = replace(drawing, path=draws.draw(noise))

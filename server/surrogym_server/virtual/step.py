@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
-from surrogym_server.models.abilities import ArraySteps, CompiledSteps, FunctionDraws, offers
+from surrogym_server.models.abilities import ArraySteps, CompiledSteps, offers
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual import environment
 from surrogym_server.virtual.environment import Bools, Floats, LaneTransition, VirtualSettings
 from surrogym_server.virtual.lanes import LaneState
+from surrogym_server.virtual.paths import function_draws
 
 logger = logging.getLogger(__name__)
 
@@ -54,7 +55,8 @@ def _array_steps(model: DynamicsModel, settings: VirtualSettings) -> ArraySteps 
         return None
     if model.definition.outside_reward is not None:  # what is paid outside a log is known to the reference alone
         return None
-    if settings.variant == "pathwise" and offers(model, FunctionDraws) is None:
-        return None
-    able = offers(model, CompiledSteps)
-    return None if able is None else able.compiled()
+    if settings.variant != "pathwise":
+        able = offers(model, CompiledSteps)
+        return None if able is None else able.compiled()
+    draws = function_draws(model, settings.functions)
+    return draws.compiled() if isinstance(draws, CompiledSteps) else None

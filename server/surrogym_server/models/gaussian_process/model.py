@@ -26,6 +26,7 @@ from surrogym_server.models.abilities import (
     PathOutlook,
     PredictedSteps,
     RewardEdges,
+    UncertainHyperparameters,
 )
 from surrogym_server.models.gaussian_process.censoring import usable
 from surrogym_server.models.gaussian_process.prediction.description import describe, structure
@@ -38,8 +39,9 @@ from surrogym_server.models.gaussian_process.prediction.lookahead import (
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.predictor import Predictor
 from surrogym_server.models.gaussian_process.prediction.regions import Jump, Region
+from surrogym_server.models.gaussian_process.prediction.several import FunctionsOfSeveral, uncertain_outputs
 from surrogym_server.models.port import DynamicsModel, Transition
-from surrogym_server.tensors import CPU, cached
+from surrogym_server.tensors import CPU, cached, to_device
 from surrogym_shared import compiled
 
 COMPILED_SOLVES = 300  # points; the triangular solves of more are faster in a library of linear algebra
@@ -47,7 +49,15 @@ COMPILED_SOLVES = 300  # points; the triangular solves of more are faster in a l
 
 @dataclass(frozen=True)
 class GaussianProcessModel(
-    DynamicsModel, FunctionDraws, LeaveOneOut, LearnedNoise, Lookahead, RewardEdges, Differentiable, CompiledSteps
+    DynamicsModel,
+    FunctionDraws,
+    UncertainHyperparameters,
+    LeaveOneOut,
+    LearnedNoise,
+    Lookahead,
+    RewardEdges,
+    Differentiable,
+    CompiledSteps,
 ):
     """One process for each output; regions for what ends an episode, and for where the reward jumps."""
 
@@ -125,6 +135,10 @@ class GaussianProcessModel(
         return self._predictor.transition(q, u, None, process, paths, deviations, reward_deviation)
 
     @property
+    def uncertain_functions(self) -> FunctionDraws:
+        return self._uncertain_functions
+
+    @property
     def noise_deviations(self) -> tuple[float, ...]:
         return tuple(output.noise_deviation for output in self.outputs)
 
@@ -185,6 +199,15 @@ class GaussianProcessModel(
         from surrogym_server.models.gaussian_process.prediction.compiled.step import StepsOfModel
 
         return StepsOfModel.of(self._predictor, self.ending)
+
+    @cached
+    def _uncertain_functions(self) -> FunctionDraws:
+        here = to_device(self, CPU)
+        models = [
+            to_device(replace(here, transitions=tuple(outputs[:-1]), reward=outputs[-1]), self.definition.device)
+            for outputs in uncertain_outputs(here.outputs)
+        ]
+        return FunctionsOfSeveral(tuple(models)) if models else self
 
     @cached
     def _predictor(self) -> Predictor:

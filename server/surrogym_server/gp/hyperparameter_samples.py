@@ -1,0 +1,76 @@
+"""Samples from the posterior of hyperparameters, where few points leave them uncertain.
+
+The prior of theta, the logarithms, is normal, so that elliptical slice sampling needs no step size: it turns theta
+around the prior's mean, in the plane through theta and a fresh draw of the prior, until the evidence is above a level.
+
+Reference: Murray, Adams, MacKay, "Elliptical slice sampling", AISTATS 2010, figure 2.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_server.gp.fit import FitOptions, _blas, _Objective
+from surrogym_server.gp.kernel import Hyperparameters
+from surrogym_server.gp.posterior import Posterior
+
+BURN_IN, THINNING = 30, 10  # updates before the first sample, and from each sample to the next
+NARROWEST = 1e-6  # radians; theta stays where it is when no other angle is left
+
+Array = NDArray[np.float64]
+
+
+def hyperparameter_samples(posterior: Posterior, count: int, seed: int) -> tuple[Hyperparameters, ...]:
+    """``count`` hyperparameters as likely as the points of a posterior make them. A pure function of its arguments.
+
+    Args:
+        posterior: an exact one, whose own hyperparameters are where the chain begins.
+        count: how many.
+        seed: of the chain.
+    """
+    hyper = posterior.hyper
+    options = FitOptions(linear=hyper.linear_variance > 0, quadratic=hyper.quadratic_variance > 0)
+    evidence = _Objective(posterior.x, posterior.y, options, hyper.reflection)
+    chain = _Chain(evidence, np.random.default_rng(seed))
+    theta, found = evidence.theta(hyper), []
+    with _blas().limit(limits=1):
+        level = chain.log_likelihood(theta)
+        for update in range(1, BURN_IN + THINNING * count + 1):
+            theta, level = chain.update(theta, level)
+            if update > BURN_IN and (update - BURN_IN) % THINNING == 0:
+                found.append(evidence.hyper(theta))
+    return tuple(found)
+
+
+class _Chain:
+    """Updates of theta that leave its posterior as it is."""
+
+    def __init__(self, evidence: _Objective, rng: np.random.Generator) -> None:
+        self._evidence, self._rng = evidence, rng
+        self._mean, self._deviation = evidence.prior.T
+
+    def log_likelihood(self, theta: Array) -> float:
+        """Log evidence without the prior; -inf beyond the bounds of a fit."""
+        if (theta < self._evidence.lower).any() or (theta > self._evidence.upper).any():
+            return -math.inf
+        negative, _ = self._evidence(theta)
+        z = (theta - self._mean) / self._deviation
+        return 0.5 * float(z @ z) - negative
+
+    def update(self, theta: Array, level: float) -> tuple[Array, float]:
+        """The next theta, and its log likelihood."""
+        rng, around = self._rng, theta - self._mean
+        other = self._deviation * rng.standard_normal(len(theta))
+        least = level + math.log(1 - rng.random())
+        angle = rng.uniform(0, 2 * math.pi)
+        low, high = angle - 2 * math.pi, angle
+        while high - low > NARROWEST:
+            turned = self._mean + around * math.cos(angle) + other * math.sin(angle)
+            if (found := self.log_likelihood(turned)) > least:
+                return turned, found
+            low, high = (angle, high) if angle < 0 else (low, angle)
+            angle = rng.uniform(low, high)
+        return theta, level

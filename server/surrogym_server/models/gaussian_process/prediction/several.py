@@ -1,0 +1,164 @@
+"""Functions of several models of the same samples, each with hyperparameters of its own.
+
+One optimum of the hyperparameters takes a length scale for certain that five samples can't know. So a function is drawn
+in two steps: one of the models, each as likely, and a function of its processes. A drawn function is the number of its
+model, and the weights that model draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.errors import NumericalFailure
+from surrogym_server.gp import Hyperparameters, Posterior, condition, hyperparameter_samples
+from surrogym_server.models.abilities import ArraySteps, ArrayTransition, CompiledSteps, FunctionDraws
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
+from surrogym_server.models.port import Transition
+
+MODELS = 8
+MOST_POINTS = 60  # of a process whose hyperparameters are sampled; those of more are known well enough
+
+Floats = NDArray[np.float64]
+
+
+def uncertain_outputs(outputs: Sequence[OutputModel]) -> list[list[OutputModel]]:
+    """The outputs (O,) ``MODELS`` times over, on the CPU, their processes with sampled hyperparameters where few points
+    leave these uncertain. None at all where no output has so few."""
+    if not any(_uncertain(output) for output in outputs):
+        return []
+    columns = [_sampled(output, seed) for seed, output in enumerate(outputs)]
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _uncertain(output: OutputModel) -> bool:
+    posterior = output.posterior
+    return posterior is not None and posterior.sparse is None and len(posterior.y) <= MOST_POINTS
+
+
+def _sampled(output: OutputModel, seed: int) -> list[OutputModel]:
+    posterior = output.posterior
+    if posterior is None or not _uncertain(output):
+        return [output] * MODELS
+    hypers = hyperparameter_samples(posterior, MODELS, seed)
+    return [replace(output, posterior=_conditioned(posterior, hyper)) for hyper in hypers]
+
+
+def _conditioned(posterior: Posterior, hyper: Hyperparameters) -> Posterior:
+    """The process with other hyperparameters; as it is where these can't be factored."""
+    try:
+        return condition(hyper, posterior.x, posterior.y)
+    except NumericalFailure:
+        return posterior
+
+
+@dataclass(frozen=True)
+class FunctionsOfSeveral(FunctionDraws, CompiledSteps):
+    """Functions of several models, whose draws all take as many numbers."""
+
+    models: tuple[FunctionDraws, ...]
+
+    @property
+    def path_size(self) -> int:
+        return 1 + self.models[0].path_size
+
+    def draw(self, noise: Tensor) -> Tensor:
+        count = len(self.models)
+        number = (count * torch.special.ndtr(noise[:, 0])).long().clamp_max(count - 1)
+        paths = torch.empty_like(noise)
+        paths[:, 0] = number
+        for index, rows in _members(number, count):
+            paths[rows, 1:] = self.models[index].draw(noise[rows, 1:])
+        return paths
+
+    def transition_along(
+        self,
+        paths: Tensor,
+        q: Tensor,
+        u: Tensor,
+        *,
+        process: Tensor | None = None,
+        deviations: bool = False,
+        reward_deviation: bool = False,
+    ) -> Transition:
+        parts, places = [], []
+        for index, rows in _members(paths[:, 0].long(), len(self.models)):
+            places.append(rows)
+            parts.append(
+                self.models[index].transition_along(
+                    paths[rows, 1:],
+                    q[rows],
+                    u[rows],
+                    process=None if process is None else process[rows],
+                    deviations=deviations,
+                    reward_deviation=reward_deviation,
+                )
+            )
+        order = torch.argsort(torch.cat(places))
+        return Transition(
+            torch.cat([part.q_next for part in parts])[order],
+            torch.cat([part.reward for part in parts])[order],
+            _joined([part.deviation for part in parts], order),
+            _joined([part.reward_deviation for part in parts], order),
+        )
+
+    def compiled(self) -> ArraySteps | None:
+        steps = [model.compiled() if isinstance(model, CompiledSteps) else None for model in self.models]
+        able = tuple(step for step in steps if step is not None)
+        return StepsOfSeveral(able[0].definition, able) if len(able) == len(steps) else None
+
+    def compiled_pays(self, *, deviations: bool) -> bool:
+        first = self.models[0]
+        return isinstance(first, CompiledSteps) and first.compiled_pays(deviations=deviations)
+
+
+@dataclass(frozen=True, eq=False)
+class StepsOfSeveral(ArraySteps):
+    """The compiled steps of several models, along functions alone."""
+
+    definition: EnvironmentDefinition
+    models: tuple[ArraySteps, ...]
+
+    def __call__(
+        self,
+        q: Floats,
+        u: Floats,
+        *,
+        process: Floats | None,
+        paths: Floats | None,
+        deviations: bool,
+        reward_deviation: bool,
+    ) -> ArrayTransition:
+        assert paths is not None
+        outputs = len(self.definition.outputs)
+        all_ = ArrayTransition(np.empty_like(q), np.empty(len(q)), np.empty((len(q), outputs)), np.empty(len(q), bool))
+        for index, rows in _members(torch.from_numpy(paths[:, 0]).long(), len(self.models)):
+            which = rows.numpy()
+            moved = self.models[index](
+                q[which],
+                u[which],
+                process=None if process is None else process[which],
+                paths=np.ascontiguousarray(paths[which, 1:]),
+                deviations=deviations,
+                reward_deviation=reward_deviation,
+            )
+            for whole, part in zip(vars(all_).values(), vars(moved).values(), strict=True):
+                whole[which] = part
+        return all_
+
+
+def _members(number: Tensor, count: int) -> list[tuple[int, Tensor]]:
+    """Which rows (m,) belong to each of ``count`` models; those without any are left out."""
+    rows = [(index, (number == index).nonzero()[:, 0]) for index in range(count)]
+    return [(index, which) for index, which in rows if len(which)]
+
+
+def _joined(parts: Sequence[Tensor | None], order: Tensor) -> Tensor | None:
+    known = [part for part in parts if part is not None]
+    return torch.cat(known)[order] if known else None

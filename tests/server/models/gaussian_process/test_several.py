@@ -1,0 +1,87 @@
+"""Functions that lanes share have uncertain hyperparameters where samples are few; nothing else changes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from support.models import gaussian_processes
+from support.real_steps import random_steps
+from surrogym_client.original.classic import pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.models.abilities import CompiledSteps, FunctionDraws
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.prediction.several import MODELS, MOST_POINTS, FunctionsOfSeveral
+
+ROWS = 24
+
+
+@pytest.fixture(scope="module")
+def model() -> GaussianProcessModel:
+    return gaussian_processes(definition_from_spec(pendulum()), random_steps(pendulum(), 6, seed=3))
+
+
+@pytest.fixture(scope="module")
+def points() -> tuple[torch.Tensor, torch.Tensor]:
+    rng = np.random.default_rng(0)
+    return torch.from_numpy(rng.uniform(-3, 3, (ROWS, 2))), torch.from_numpy(rng.uniform(-2, 2, (ROWS, 1)))
+
+
+def drawn(draws: FunctionDraws, count: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(0)
+    return draws.draw(torch.randn(count, draws.path_size, generator=generator, dtype=torch.float64))
+
+
+def test_each_row_follows_the_model_that_its_draw_names(model, points):
+    several = model.uncertain_functions
+    assert isinstance(several, FunctionsOfSeveral)
+    paths = drawn(several, ROWS)
+    moved = several.transition_along(paths, *points, deviations=True, reward_deviation=True)
+    assert len(paths[:, 0].unique()) > 2
+    for row in range(0, ROWS, 5):
+        at = slice(row, row + 1)
+        one = several.models[int(paths[row, 0])].transition_along(
+            paths[at, 1:], points[0][at], points[1][at], deviations=True, reward_deviation=True
+        )
+        for name in ("q_next", "reward", "deviation", "reward_deviation"):
+            torch.testing.assert_close(getattr(moved, name)[at], getattr(one, name), rtol=1e-9, atol=1e-9)
+
+
+def test_compiled_steps_follow_the_same_functions(model, points):
+    several = model.uncertain_functions
+    assert isinstance(several, CompiledSteps)
+    steps = several.compiled()
+    if steps is None:
+        pytest.skip("steps can't be compiled here")
+    paths = drawn(several, ROWS)
+    arrays = [tensor.numpy() for tensor in points]
+    moved = steps(*arrays, process=None, paths=paths.numpy(), deviations=False, reward_deviation=False)
+    reference = several.transition_along(paths, *points)
+    np.testing.assert_allclose(moved.q_next, reference.q_next, atol=1e-8)
+    np.testing.assert_allclose(moved.reward, reference.reward, atol=1e-8)
+
+
+def test_functions_differ_more_than_those_of_one_optimum(model, points):
+    """Six samples of a pendulum: the deviation over functions, as a median over points."""
+    spreads = []
+    for draws in (model, model.uncertain_functions):
+        paths = drawn(draws, 256)
+        rewards = [
+            draws.transition_along(paths, *(t[i : i + 1].expand(256, -1) for t in points)).reward for i in range(8)
+        ]
+        spreads.append(float(torch.stack(rewards).std(1).median()))
+    assert spreads[1] > 1.2 * spreads[0]
+
+
+def test_many_samples_leave_the_functions_as_they_are():
+    samples = random_steps(pendulum(), 2 * MOST_POINTS, seed=0)
+    known = gaussian_processes(definition_from_spec(pendulum()), samples)
+    assert known.uncertain_functions is known
+
+
+def test_hyperparameters_are_sampled_once(model):
+    several = model.uncertain_functions
+    assert several is model.uncertain_functions
+    assert isinstance(several, FunctionsOfSeveral)
+    assert len(several.models) == MODELS
