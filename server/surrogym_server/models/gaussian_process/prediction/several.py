@@ -130,6 +130,7 @@ class StepsOfSeveral(ArraySteps):
         q: Floats,
         u: Floats,
         *,
+        noise: Floats | None,
         process: Floats | None,
         paths: Floats | None,
         deviations: bool,
@@ -143,6 +144,7 @@ class StepsOfSeveral(ArraySteps):
             moved = self.models[index](
                 q[which],
                 u[which],
+                noise=None if noise is None else noise[which],
                 process=None if process is None else process[which],
                 paths=np.ascontiguousarray(paths[which, 1:]),
                 deviations=deviations,
