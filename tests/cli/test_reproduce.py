@@ -33,6 +33,18 @@ def test_what_is_done_is_not_run_again(surrogym, tmp_path):
     assert [found["mean"] for found in said.json["rows"]] == [-150.0]
 
 
+def test_the_study_of_trust_runs_the_unseen_tasks(surrogym, tmp_path):
+    made = Cell(DemoSettings("kinetics", seed=7, pictures=False))
+    row = Row(
+        **{**vars(ROW), "task": "kinetics", "seed": 7, "budget": made.key[2], "specification": made.specification}
+    )
+    write_rows(tmp_path / "out" / "rows.csv", [row])
+    said = surrogym("reproduce", "trust", "--tasks=kinetics", "--seeds=1", "--first-seed=7", "--out=out", "--json")
+    assert said.code == 0
+    assert "1 runs, 1 of them done already" in said.err
+    assert "unknown task 'x': expected all, unseen, or some of" in surrogym("reproduce", "trust", "--tasks=x").err
+
+
 def test_rows_of_several_sittings_become_one_table(surrogym, tmp_path):
     write_rows(tmp_path / "night.csv", [ROW])
     oracle = Row("pendulum", "oracle", 0, 14, 0, 0, 300_000, mean=-170.0, min=-300.0, seconds=9.0)

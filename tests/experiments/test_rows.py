@@ -1,11 +1,12 @@
 """Rows survive the file, and merge without losing a seed or hiding an error."""
 
+import csv
 from dataclasses import replace
 
 import pytest
 
 from support.metrics import METRICS
-from surrogym_client.experiments.reproduce.rows import Row, UnusableRows, merge, read_rows, row_of, write_rows
+from surrogym_client.experiments.reproduce.rows import LATER, Row, UnusableRows, merge, read_rows, row_of, write_rows
 
 ROW = Row("pendulum", "default", 0, 14, 4, 5, 9, mean=-150.123, success=0.97, reached=True, phase="ready")
 
@@ -14,14 +15,30 @@ def test_a_row_says_what_the_run_gave():
     row = row_of(METRICS)
     assert row.key == ("pendulum", "default", 14, 3)
     assert (row.real_steps, row.failures, row.also_success, row.seconds) == (9, 7, 0.9, 50.0)
+    assert (row.promise, row.promise_low, row.promise_high) == (-144.0, -160.0, -130.0)
+    assert (row.trusted, row.audit_steps) == (True, 8)
+    assert row_of({**METRICS, "promise": None, "trusted": None}).trusted is None, "learned without a surrogate"
     assert row_of({**METRICS, "also": None, "success_rate": None}).failures is None
 
 
 def test_rows_survive_the_file(tmp_path):
-    rows = [ROW, Row("cartpole", "paper", 1, 8, error="exit code 1: no, nothing")]
+    rows = [
+        replace(ROW, trusted=False, promise=-150.0),
+        Row("cartpole", "paper", 1, 8, error="exit code 1: no, nothing"),
+    ]
     write_rows(tmp_path / "rows.csv", rows)
     assert read_rows(tmp_path / "rows.csv") == rows
     assert read_rows(tmp_path / "none.csv") == []
+
+
+def test_a_file_from_before_promises_is_read(tmp_path):
+    path = tmp_path / "rows.csv"
+    write_rows(path, [ROW])
+    with path.open(newline="") as file:
+        lines = list(csv.reader(file))
+    kept = [i for i, name in enumerate(lines[0]) if name not in LATER]
+    path.write_text("\n".join(",".join(line[i] for i in kept) for line in lines) + "\n")
+    assert read_rows(path) == [ROW]
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,10 @@
 """The statistics are those they say they are."""
 
 import numpy as np
+import pytest
+import scipy.stats
 
-from surrogym_client.experiments.reproduce.statistics import bootstrap_interval, difference_interval
+from surrogym_client.experiments.reproduce.statistics import bootstrap_interval, difference_interval, exact_interval
 
 
 def test_the_interval_covers_the_truth_about_as_often_as_it_says():
@@ -27,3 +29,9 @@ def test_a_few_terrible_seeds_show_in_the_interval():
     low, high = bootstrap_interval(np.array([-150.0] * 6 + [-1500.0] * 4))
     assert low < -900
     assert high == -150.0
+
+
+@pytest.mark.parametrize(("count", "of"), [(0, 10), (10, 10), (9, 10), (1, 100), (45, 50)])
+def test_the_exact_interval_is_that_of_scipy(count, of):
+    expected = scipy.stats.binomtest(count, of).proportion_ci(method="exact")
+    assert exact_interval(count, of) == pytest.approx((expected.low, expected.high), abs=1e-9)

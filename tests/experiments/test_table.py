@@ -113,3 +113,17 @@ def test_tables_and_pictures_go_between_the_marks_of_a_page(tmp_path):
     page.write_text("no marks")
     with pytest.raises(NoSuchPlace, match="<!-- efficiency: begin -->"):
         update(page, DEFAULT, tmp_path)
+
+
+def test_promises_are_counted_where_there_are_some():
+    kept = replace(ROW, promise=-150.0, promise_low=-155.0, promise_high=-145.0, trusted=True, audit_steps=8)
+    rows = [
+        kept,
+        replace(kept, seed=1, mean=-160.0, audit_steps=16),
+        replace(kept, seed=2, trusted=False),
+        replace(kept, task="cartpole", budget=8),
+    ]
+    text = report(rows)
+    assert line(text, "pendulum", "3", "8 to 16", "3", "2").endswith("| 1 of 2 (1 to 99 %) |")
+    assert line(text, "all", "4", "8 to 16", "4", "3", "3 of 4 (19 to 99 %)")
+    assert "Promises" not in report([ROW])

@@ -10,13 +10,13 @@ import typer
 
 from surrogym_client.cli.options import ExitWithParent, Quiet, require_known
 from surrogym_client.experiments.arms import ARMS
-from surrogym_client.experiments.tasks import TASKS
+from surrogym_client.experiments.tasks import EVERY_TASK
 
 if TYPE_CHECKING:
     Task = str
     ArmName = str
 else:
-    Task, ArmName = Literal[tuple(TASKS)], Literal[tuple(ARMS)]
+    Task, ArmName = Literal[tuple(EVERY_TASK)], Literal[tuple(ARMS)]
 
 
 def register(app: typer.Typer) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from surrogym_client.experiments.arms import ARMS, Arm
-from surrogym_client.experiments.tasks import TASKS, DemoTask, design_budget, queries_a_round
+from surrogym_client.experiments.tasks import EVERY_TASK, DemoTask, design_budget, queries_a_round
 from surrogym_client.original import make
 from surrogym_client.original.loading import with_choices
 from surrogym_client.training.settings import SUGGESTED_STEPS, TrainSettings, prolongs
@@ -31,7 +31,7 @@ class DemoSettings:
 
     @property
     def demo_task(self) -> DemoTask:
-        return TASKS[self.task]
+        return EVERY_TASK[self.task]
 
     @property
     def way(self) -> Arm:

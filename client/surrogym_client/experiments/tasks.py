@@ -83,6 +83,25 @@ TASKS = {
     "reacher": DemoTask("Reacher-v5", budget=100, target=Target("mean -6", mean=-6)),
 }
 
+# Ten tasks of the study of trust. Nobody tunes the method on them. Targets: four fifths of the way from no action to a
+# policy that CMA-ES learned on the task itself (tests/benchmarks/unseen_targets.py).
+UNSEEN = {
+    name: DemoTask(f"surrogym_client.experiments.unseen.tasks:{kind}", budget, Target(f"mean {mean:g}", mean=mean))
+    for name, kind, budget, mean in (
+        ("narrow-plane", "NarrowPlane", 100, 67),
+        ("narrow-arm", "NarrowArm", 150, 70),
+        ("kinetics", "Kinetics", 100, -97),
+        ("stick-slip", "StickSlip", 60, -5.3),
+        ("process-noise", "NoisyPendulum", 100, -380),
+        ("sensor-noise", "NoisySensors", 100, -30),
+        ("contact", "Contact", 100, -34),
+        ("fast-and-slow", "FastAndSlow", 60, -30),
+        ("spring-chain", "SpringChain", 150, -51),
+        ("reset-only", "ResetOnly", 150, -19),
+    )
+}
+EVERY_TASK = TASKS | UNSEEN
+
 
 def design_budget(budget: int) -> int:
     """What the design may spend before the first policy: two fifths, and not too few to begin with."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import typer
 
-from surrogym_client.cli.reproduce import efficiency, paper, table
+from surrogym_client.cli.reproduce import efficiency, paper, table, trust
 
-STUDIES = (efficiency, paper, table)
+STUDIES = (efficiency, paper, trust, table)
 
 
 def register(app: typer.Typer) -> None:

@@ -55,6 +55,13 @@ def command(
 
     Example: surrogym reproduce efficiency --tasks pendulum,acrobot --arms default,latin_hypercube --seeds 5
     """
+    numbers = range(first_seed, first_seed + seeds)
+    chosen = {"shares": _shares(shares), "steps": steps, "episodes": episodes, "algorithm": algorithm}
+    run_study(_wanted(tasks, arms, numbers, chosen), out, jobs, again=again, as_json=as_json, quiet=quiet)
+
+
+def run_study(wanted: Sequence[Cell], out: Path, jobs: int, *, again: bool, as_json: bool, quiet: bool) -> None:
+    """Run what has no row yet, or all ``again``, and present the rows. Raises ``CommandError`` if a run ends badly."""
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.cli.reproduce.table import present
     from surrogym_client.experiments.reproduce.cells import done_already, run_cells
@@ -62,9 +69,6 @@ def command(
     from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_shared.terminal import on_interrupt, progress, say
 
-    numbers = range(first_seed, first_seed + seeds)
-    chosen = {"shares": _shares(shares), "steps": steps, "episodes": episodes, "algorithm": algorithm}
-    wanted = _wanted(tasks, arms, numbers, chosen)
     rows = read_rows(out / "rows.csv")
     todo = wanted if again else [cell for cell in wanted if not done_already(cell, rows)]
     say(f"{len(wanted)} runs, {len(wanted) - len(todo)} of them done already", quiet=quiet)
@@ -88,15 +92,16 @@ def _wanted(tasks: str, arms: str, seeds: Sequence[int], chosen: dict[str, Any])
     from surrogym_client.experiments.reproduce.cells import cells, study
     from surrogym_client.experiments.tasks import TASKS
 
-    named = _chosen("task", tasks, TASKS)
+    named = names_of("task", tasks, TASKS)
     if chosen["algorithm"] is not None:
         require_known(chosen["algorithm"])
     if arms == STUDY:
         return list(study(named, seeds, **chosen))
-    return list(cells(named, _chosen("arm", arms, ARMS, STUDY), seeds, **chosen))
+    return list(cells(named, names_of("arm", arms, ARMS, STUDY), seeds, **chosen))
 
 
-def _chosen(what: str, given: str, known: Iterable[str], *words: str) -> list[str]:
+def names_of(what: str, given: str, known: Iterable[str], *words: str) -> list[str]:
+    """The names given with commas between, or all known. Raises ``CommandError`` for an unknown one."""
     from surrogym_client.cli.errors import CommandError
 
     if given == "all":

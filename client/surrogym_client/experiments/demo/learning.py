@@ -29,6 +29,7 @@ from surrogym_client.transport.connection import Retries
 from surrogym_shared.terminal import progress, say
 from surrogym_shared.wire import SurrogateView
 
+LEDGER = ("initial", "adaptive", "total", "unresolved", "audit")
 PATIENCE_SECONDS = 3_600.0
 REPORT = "report.html"  # in the run folder
 LOOK_SECONDS = 1.0  # a look costs the server a little of what the trainer wants
@@ -39,7 +40,7 @@ class Learned:
     """A policy, and what it took. ``confidence_index``, ``fidelity`` and ``phase`` are of the surrogate, if any."""
 
     policy: Path
-    real_queries: dict[str, int]  # initial, adaptive, total, unresolved
+    real_queries: dict[str, int]  # initial, adaptive, total of these, unresolved, and of audits
     seconds: dict[str, float]
     confidence_index: float | None = None
     fidelity: dict[str, Any] | None = None
@@ -70,7 +71,7 @@ class SurrogateRun:
         ledger, fidelity = view.ledger, view.fidelity
         return Learned(
             policy=self._policy,
-            real_queries={name: getattr(ledger, name) for name in ("initial", "adaptive", "total", "unresolved")},
+            real_queries={name: getattr(ledger, name) for name in LEDGER},
             seconds=self._seconds,
             confidence_index=None if fidelity is None else fidelity.confidence_index,
             fidelity=None if fidelity is None else fidelity.model_dump(mode="json"),
@@ -123,7 +124,9 @@ class SurrogateRun:
     def _employ_sampler(self) -> None:
         say(f"live server, with a page to look at: {self._api.url}  (run folder: {self._folder})", quiet=self._quiet)
         self._api.create_surrogate(self._settings.task, self._settings.spec())
-        self._children.start("sampler", "surrogym_client", ["sample", *self._common])
+        named = self._settings.demo_task.environment
+        own = ["--env", named] if ":" in named else []  # a server's word is not taken for a module
+        self._children.start("sampler", "surrogym_client", ["sample", *self._common, *own])
 
     def _employ_trainer(self) -> Child:
         steps, queries = self._settings.virtual_steps, queries_a_round(self._settings.real_steps)

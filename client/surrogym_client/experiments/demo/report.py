@@ -109,9 +109,9 @@ def _training(card: PolicyCard) -> dict[str, Any]:
 
 
 def _also(metrics: dict[str, Any]) -> list[tuple[str, str]]:
-    from surrogym_client.experiments.tasks import TASKS
+    from surrogym_client.experiments.tasks import EVERY_TASK
 
-    also, starts = metrics["also"], TASKS[metrics["task"]].also
+    also, starts = metrics["also"], EVERY_TASK[metrics["task"]].also
     if also is None or starts is None:
         return []
     return [(starts.words, f"mean {_number(also['mean'])}, success {_share(also['success_rate'])}")]
@@ -131,7 +131,7 @@ def _promise(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     if promise is None:
         return []
     low, median, high = (_number(promise[name]) for name in ("low", "median", "high"))
-    steps = 0 if audit is None else audit["steps"]
+    steps = metrics["real_queries"].get("audit", 0 if audit is None else audit["steps"])
     return [
         ("promise", f"{median}, between {low} and {high} with 90 % chance; {steps} more real steps of audit"),
         ("trusted", f"{'yes' if metrics['trusted'] else 'no'}: {metrics['reason']}"),

@@ -21,7 +21,7 @@ import numpy as np
 from surrogym_client.experiments.arms import ARMS
 from surrogym_client.experiments.reproduce.rows import Key, Row, merge, row_of, write_rows
 from surrogym_client.experiments.settings import DemoSettings, fingerprint
-from surrogym_client.experiments.tasks import TASKS
+from surrogym_client.experiments.tasks import EVERY_TASK
 from surrogym_client.runtime.versions import commit, machine
 
 COMPARED = ("pendulum", "cartpole", "mountaincar", "swingup")  # tasks that a study runs every arm on
@@ -98,7 +98,7 @@ def cells(
         algorithm: name of a policy search; None takes the command's.
     """
     for seed, task, arm, share in product(seeds, tasks, arms, shares):
-        budget = None if share == 1 else max(2, round(share * TASKS[task].budget))
+        budget = None if share == 1 else max(2, round(share * EVERY_TASK[task].budget))
         yield Cell(DemoSettings(task, seed, arm, budget, steps, episodes, pictures=False, algorithm=algorithm))
 
 

@@ -46,6 +46,11 @@ class Row:
     also_success: float | None = None
     reached: bool = False  # the task's target
     imagined: float | None = None
+    promise: float | None = None  # median; None where the policy was handed over without one
+    promise_low: float | None = None  # 5 % quantile
+    promise_high: float | None = None  # 95 % quantile
+    trusted: bool | None = None
+    audit_steps: int | None = None  # real steps beyond ``real_steps``; 0 without an audit
     virtual_steps: int | None = None
     phase: str = ""
     confidence_index: float | None = None
@@ -63,12 +68,13 @@ class Row:
 
 
 COLUMNS = tuple(field.name for field in fields(Row))
+LATER = ("promise", "promise_low", "promise_high", "trusted", "audit_steps")  # columns that older files lack
 
 
 def row_of(metrics: dict[str, Any]) -> Row:
     """The row of a run, from the metrics of its demo."""
     real, returns, also = metrics["real_queries"], metrics["real_return"], metrics["also"]
-    success = metrics["success_rate"]
+    success, promise = metrics["success_rate"], metrics.get("promise")
     return Row(
         **{name: metrics[name] for name in ("task", "arm", "seed", "budget", "reached", "virtual_steps")},
         **{name: metrics[name] for name in ("confidence_index", "commit", "specification", "configuration", "machine")},
@@ -82,6 +88,11 @@ def row_of(metrics: dict[str, Any]) -> Row:
         also_min=also and also["min"],
         also_success=also and also["success_rate"],
         imagined=metrics["imagined_return"],
+        promise=promise and promise["median"],
+        promise_low=promise and promise["low"],
+        promise_high=promise and promise["high"],
+        trusted=metrics.get("trusted"),
+        audit_steps=real.get("audit"),
         phase=metrics["phase"] or "",
         seconds=metrics["seconds"]["total"],
     )
@@ -97,12 +108,13 @@ def read_rows(path: Path) -> list[Row]:
         return []
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
-        if tuple(reader.fieldnames or ()) != COLUMNS:
+        given = tuple(reader.fieldnames or ())
+        if given != COLUMNS and given != tuple(name for name in COLUMNS if name not in LATER):
             raise UnusableRows(f"{path}: expected the columns {', '.join(COLUMNS)}, got {reader.fieldnames}")
         rows = []
         for number, line in enumerate(reader, start=2):
             try:
-                rows.append(Row(**{name: _read(kind, line[name]) for name, kind in _kinds().items()}))
+                rows.append(Row(**{name: _read(kind, line.get(name, "")) for name, kind in _kinds().items()}))
             except (ValueError, TypeError) as error:
                 raise UnusableRows(f"{path}, line {number}: {error}") from error
         return rows
@@ -136,7 +148,7 @@ def _read(kind: Any, text: str) -> Any:
     options = get_args(kind) or (kind,)
     if text == "" and type(None) in options:
         return None
-    if kind is bool:
+    if options[0] is bool:
         return {"yes": True, "no": False}[text] if text in ("yes", "no") else _refuse(text)
     return options[0](text)
 

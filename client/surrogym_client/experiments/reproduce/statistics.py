@@ -5,6 +5,9 @@ R. Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical P
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from math import comb
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +17,7 @@ Array = NDArray[np.float64]
 
 RESAMPLES = 2_000
 PERCENTILES = (2.5, 97.5)
+TAIL, HALVINGS = 0.025, 50
 
 
 def bootstrap_interval(values: Array) -> tuple[float, float]:
@@ -25,6 +29,26 @@ def difference_interval(first: Array, second: Array) -> tuple[float, float]:
     """The same for the interquartile mean of first (n,) minus that of second (m,), resampled independently."""
     rng = np.random.default_rng(0)
     return _interval(_resampled(first, rng) - _resampled(second, rng))
+
+
+def exact_interval(count: int, of: int) -> tuple[float, float]:
+    """95 % interval of a share that was ``count`` of ``of`` (Clopper and Pearson 1934)."""
+
+    def at_least(share: float, k: int) -> float:
+        return sum(comb(of, i) * share**i * (1 - share) ** (of - i) for i in range(k, of + 1))
+
+    low = 0.0 if count == 0 else _root(lambda share: at_least(share, count) - TAIL)
+    high = 1.0 if count == of else _root(lambda share: at_least(share, count + 1) - (1 - TAIL))
+    return low, high
+
+
+def _root(rising: Callable[[float], float]) -> float:
+    """Where a function that rises over [0, 1] is 0, by halving."""
+    low, high = 0.0, 1.0
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if rising(middle) < 0 else (low, middle)
+    return (low + high) / 2
 
 
 def _resampled(values: Array, rng: np.random.Generator) -> Array:

@@ -11,14 +11,19 @@ from numpy.typing import NDArray
 from surrogym_client.evaluation.evaluator import interquartile_mean
 from surrogym_client.experiments.arms import ARMS
 from surrogym_client.experiments.reproduce.rows import Row
-from surrogym_client.experiments.reproduce.statistics import bootstrap_interval, difference_interval
-from surrogym_client.experiments.tasks import TASKS, queries_a_round
+from surrogym_client.experiments.reproduce.statistics import bootstrap_interval, difference_interval, exact_interval
+from surrogym_client.experiments.tasks import EVERY_TASK, queries_a_round
 
 Group = tuple[str, str, int]
 HEADING = (
     *("task", "arm", "seeds", "real steps", "real return", "worst seed", "worst episode"),
     *("success", "other starts", "imagined", "target reached", "virtual steps", "seconds"),
 )
+TRUST_HEADING = (
+    *("task", "runs", "steps of audits", "reached their target", "trusted", "of those that reached it"),
+    "real return above the promise's 5 % quantile, of the trusted",
+)
+TRUST_NOTES = "Promises and audits of the default arm, with exact 95 % intervals of shares:\n"
 FEW = 3  # seeds; fewer have no interval worth the name
 CONTRASTS = (  # what a pair of arms tells, at the same budget
     ("adaptive queries", "no_loop", "latin_hypercube"),
@@ -53,6 +58,8 @@ def report(rows: Sequence[Row]) -> str:
             "Difference of interquartile means, first arm minus second, with a 95 % bootstrap interval:\n",
             pairs,
         ]
+    if trusted := trust(grouped(rows)):
+        parts += [TRUST_NOTES, trusted]
     return "\n".join([*parts, _origin(rows)])
 
 
@@ -60,11 +67,11 @@ def headline(rows: Sequence[Row]) -> str:
     """A line for each task: what the default reached with the task's whole budget; empty where it was not run."""
     lines = [("task", "real steps", "target for each seed", "reached", "mean of the worst seed")]
     for (task, arm, budget), of in grouped(rows).items():
-        if arm == "default" and budget == TASKS[task].budget:
+        if arm == "default" and budget == EVERY_TASK[task].budget:
             means, steps = column(of, "mean"), column(of, "real_steps")
             worst = _number(means.min()) if len(means) else "-"
             spent = _spread(steps) if len(steps) else "-"
-            lines.append((task, spent, TASKS[task].target.words, _reached(of), worst))
+            lines.append((task, spent, EVERY_TASK[task].target.words, _reached(of), worst))
     return markdown(lines) if len(lines) > 1 else ""
 
 
@@ -86,7 +93,7 @@ def contrasts(rows: Sequence[Row]) -> str:
                 low, high = difference_interval(*means)
                 lines.append(
                     (
-                        task if budget == TASKS[task].budget else f"{task}, budget {budget}",
+                        task if budget == EVERY_TASK[task].budget else f"{task}, budget {budget}",
                         asked,
                         f"{first}, {second}",
                         f"{len(means[0])}, {len(means[1])}",
@@ -98,20 +105,55 @@ def contrasts(rows: Sequence[Row]) -> str:
     return markdown(lines) if len(lines) > 1 else ""
 
 
+def trust(groups: dict[Group, list[Row]]) -> str:
+    """A line for each task and budget of the default arm with promises, and one for all; empty where there is none."""
+    promised = {
+        task if budget == EVERY_TASK[task].budget else f"{task}, budget {budget}": found
+        for (task, arm, budget), rows in groups.items()
+        if arm == "default" and (found := [row for row in rows if row.promise is not None])
+    }
+    lines = [TRUST_HEADING, *(_trust_line(name, rows) for name, rows in promised.items())]
+    if len(promised) > 1:
+        lines.append(_trust_line("all", [row for rows in promised.values() for row in rows]))
+    return markdown(lines) if promised else ""
+
+
+def _trust_line(name: str, rows: Sequence[Row]) -> Sequence[str]:
+    trusted, reached = [row for row in rows if row.trusted], [row for row in rows if row.reached]
+    kept = sum(row.mean is not None and row.promise_low is not None and row.mean >= row.promise_low for row in trusted)
+    return (
+        *(name, str(len(rows)), _range([row.audit_steps for row in rows])),
+        *(str(len(reached)), str(len(trusted)), _of(sum(bool(row.trusted) for row in reached), len(reached))),
+        _of(kept, len(trusted)),
+    )
+
+
+def _of(count: int, of: int) -> str:
+    if not of:
+        return "-"
+    low, high = exact_interval(count, of)
+    return f"{count} of {of} ({100 * low:.0f} to {100 * high:.0f} %)"
+
+
+def _range(values: Sequence[int | None]) -> str:
+    known = sorted(value for value in values if value is not None)
+    return "-" if not known else f"{known[0]} to {known[-1]}" if known[0] < known[-1] else str(known[0])
+
+
 def grouped(rows: Sequence[Row]) -> dict[Group, list[Row]]:
     """Rows by task, arm and budget; tasks and arms in their order here, seeds ascending."""
-    tasks, arms = list(TASKS), list(ARMS)
+    tasks, arms = list(EVERY_TASK), list(ARMS)
 
     def place(row: Row) -> tuple[int, int, int, int]:
         return tasks.index(row.task), row.budget, arms.index(row.arm), row.seed
 
-    ordered = sorted((row for row in rows if row.task in TASKS and row.arm in ARMS), key=place)
+    ordered = sorted((row for row in rows if row.task in EVERY_TASK and row.arm in ARMS), key=place)
     return {key: list(of) for key, of in groupby(ordered, key=lambda row: (row.task, row.arm, row.budget))}
 
 
 def tasks_with_results(rows: Sequence[Row]) -> list[str]:
     """Tasks of which at least one run has a return, in their order."""
-    return [task for task in TASKS if any(row.task == task and row.mean is not None for row in rows)]
+    return [task for task in EVERY_TASK if any(row.task == task and row.mean is not None for row in rows)]
 
 
 def column(rows: Sequence[Row], name: str) -> NDArray[np.float64]:
@@ -127,7 +169,7 @@ def markdown(lines: Sequence[Sequence[str]]) -> str:
 
 def _line(group: Group, rows: Sequence[Row]) -> Sequence[str]:
     task, arm, budget = group
-    name = arm if budget == TASKS[task].budget else f"{arm}, budget {budget}"
+    name = arm if budget == EVERY_TASK[task].budget else f"{arm}, budget {budget}"
     crashed = sum(bool(row.error) for row in rows)
     seeds = f"{len(rows)}, {crashed} ended badly" if crashed else str(len(rows))
     means = column(rows, "mean")
