@@ -26,6 +26,25 @@ def test_at_most_one_in_fifty_right_models_fails():
     assert failed <= 20
 
 
+def noisy(bias: float, seed: int) -> Compared:
+    """Eight steps of two outputs with noise of 1 and a tolerance of 0.2; the first is off by ``bias``."""
+    errors = np.random.default_rng(seed).normal(0, 1.0, (8, 2)) + np.array([bias, 0.0])
+    names, expected = ["v", "x"], np.full(2, np.hypot(1.0, 0.2))
+    return Compared(names, errors, np.full((8, 2), 0.05), expected, noise=np.ones(2))
+
+
+def test_noise_alone_is_rarely_a_fault():
+    failed = sum(not judge(noisy(0.0, seed), PROMISE, PROMISE, UNTRAINED).passed for seed in range(1_000))
+    assert failed <= 30
+
+
+def test_an_error_that_every_step_shares_is_found_under_noise():
+    audits = [judge(noisy(1.7, seed), PROMISE, PROMISE, UNTRAINED) for seed in range(100)]
+    assert sum(not audit.passed for audit in audits) >= 80
+    said = {fault for audit in audits for fault in audit.faults}
+    assert any(fault.startswith("v: errors of 1.") and fault.endswith("which is no noise") for fault in said)
+
+
 @pytest.mark.parametrize("factor", [3.0, 10.0])
 def test_errors_beyond_what_the_model_claims_fail(factor: float):
     errors = factor * np.random.default_rng(0).normal(0, np.hypot(1.0, 0.5), (8, 2))

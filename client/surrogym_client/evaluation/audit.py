@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import sqrt
 from statistics import NormalDist
 
@@ -35,6 +35,7 @@ class Compared:
             larger, which holds the noise; for the reward at least what matters for the return.
         misplaced: steps whose ending was predicted wrongly.
         length: steps of an episode, on average; 0 where that is not known.
+        noise: (O,) deviation of the noise of a single step, which ``expected`` holds too; none where it is empty.
     """
 
     names: Sequence[str]
@@ -43,6 +44,7 @@ class Compared:
     expected: Array
     misplaced: int = 0
     length: float = 0.0
+    noise: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def claimed(self) -> Array:
@@ -50,13 +52,28 @@ class Compared:
         scale: Array = np.sqrt(self.deviations**2 + self.expected**2)
         return scale
 
+    def biased(self) -> Bools:
+        """Whether the mean error of an output, (O,), is beyond what noise, deviations and tolerance explain.
+
+        Noise hides an error in each step, and not in their mean. Deviations of neighbouring states are those of one
+        function, and don't become less in a mean.
+        """
+        n, count = self.errors.shape
+        if not len(self.noise):
+            return np.zeros(count, dtype=bool)
+        z = NormalDist().inv_cdf(1 - ALARM / (2 * count))
+        own = np.sqrt(np.maximum(self.expected**2 - self.noise**2, 0))
+        spread = np.sqrt(self.noise**2 / n + (self.deviations**2).mean(0))
+        found: Bools = (self.noise > 0) & (np.abs(self.errors.mean(0)) > own + z * spread)
+        return found
+
 
 def judge(compared: Compared, before: Promise, after: Promise, floor: float | None) -> Audit:
     """Hold real steps against the model, and the promise after them against the one before.
 
     An output is at fault where the sum of squared errors, each over its claimed deviation, is larger than chance
-    explains: beyond the 1 % quantile of the chi-squared distribution, shared between the outputs. Errors within
-    the tolerance are never a fault.
+    explains: beyond the 1 % quantile of the chi-squared distribution, shared between the outputs. A noisy output is at
+    fault where its mean error is, too. Errors within the tolerance are never a fault.
 
     Args:
         compared: the real steps.
@@ -72,6 +89,10 @@ def judge(compared: Compared, before: Promise, after: Promise, floor: float | No
         f"{name}: errors of {actual[i]:.3g}, where the model expected {claimed[i]:.3g}"
         for i, name in enumerate(compared.names)
         if sums[i] > limit
+    ]
+    faults += [
+        f"{compared.names[i]}: errors of {compared.errors[:, i].mean():.3g} on average, which is no noise"
+        for i in np.flatnonzero(compared.biased() & (sums <= limit)).tolist()
     ]
     if compared.misplaced >= MISPLACED_ENDS:
         faults.append(f"{compared.misplaced} of {n} steps ended, or did not end, against the prediction")

@@ -188,6 +188,7 @@ def compared(
         errors=np.stack([columns[claim.name] for claim in claims], 1),
         deviations=deviations,
         expected=np.array([_expected(claim, matters if claim.name == "reward" else 0.0) for claim in claims]),
+        noise=np.array([claim.noise for claim in claims]),
         misplaced=int((ended != np.array(predicted.terminated)).sum()),
     )
 
