@@ -169,9 +169,13 @@ def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum
     assert (card["surrogate"], card["seed"]) == (pendulum, 3)
     assert 0 < card["virtual_steps"] == trained.json["virtual_steps"] <= 2000
     assert trained.json["version"] == 1
-    evaluated = on_server("evaluate", "policy.zip", "--episodes", "3", "--compare", "zero", "--json", "--quiet")
+    evaluated = on_server(
+        "evaluate", "policy.zip", "--episodes", "3", "--compare", "zero", "--where", "--json", "--quiet"
+    )
     assert evaluated.code == 0, evaluated.err
     assert (evaluated.json["version"], evaluated.json["steps"], evaluated.json["without"]["steps"]) == (1, 600, 600)
+    assert evaluated.json["disagreements"]["compared"] == 400
+    assert [episode["seed"] for episode in evaluated.json["disagreements"]["episodes"]] == [10_000, 10_001, 10_002]
     assert len(evaluated.json["per_episode"]) == 3
     with Api(server_process.url) as api:
         assert api.surrogate(pendulum).ledger.evaluation == 1200

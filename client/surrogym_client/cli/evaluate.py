@@ -77,6 +77,12 @@ def command(
     *,
     episodes: Episodes,
     reading: PolicyReading,
+    where: Annotated[
+        bool,
+        typer.Option(
+            "--where", help="Say at which states real steps differ from the model. [default: if the promise was missed]"
+        ),
+    ] = False,
     surrogate: Annotated[
         str | None, typer.Option(help="Enter the real steps into this surrogate's ledger. [default: as noted]")
     ] = None,
@@ -93,10 +99,12 @@ def command(
 ) -> None:
     """Run real episodes with a policy and count successes. The real steps go to the surrogate's ledger.
 
-    The server keeps the policy and the episodes. While it is away, they wait beside the policy.
+    The server keeps the policy and the episodes. While it is away, they wait beside the policy. Where the mean return
+    leaves the interval of the promise, the steps are held against the model, to say at which states the two disagree.
 
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 100
     """
+    from surrogym_client.cli.disagreement import differ_from, disagreements_as_json, disagreements_in_words, left
     from surrogym_client.policies.card import card_path, read_card
     from surrogym_shared.terminal import give
 
@@ -118,11 +126,21 @@ def command(
         _keep(policy, reports, settings)
         version = push_or_say(service.server, service.token_for(context), policy, ledger, quiet=output.quiet)
     promise = card.promise if settings.declared and settings.episodes >= FEWEST_TO_JUDGE else None
-    judged = {"promise_kept": _kept(promise, result), "version": version}
+    differ = None
+    if where or left(promise, result):
+        differ = differ_from(ledger, service.server, service.token_for(context), result, quiet=output.quiet)
+    judged = {
+        "promise_kept": _kept(promise, result),
+        "version": version,
+        "disagreements": None if differ is None else disagreements_as_json(differ, settings.first_seed),
+    }
     summary = {"policy": str(policy), **_settings(settings), **result.summary(), **judged}
     if compare is not None:
         summary["without"] = {"actions": compare, **without.summary()}
-    give(summary, lambda: _words(reports, promise), as_json=output.as_json)  # with --quiet too: it was asked for
+    more = [] if differ is None else disagreements_in_words(differ, card.spec, settings.first_seed)
+    give(
+        summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json
+    )  # asked for: --quiet too
 
 
 def _baseline(opener: Callable[[], Episode], compare: Compare) -> Predict:

@@ -62,6 +62,7 @@ class Trace:
     coordinates: Array  # (T + 1, C)
     action: Array  # (T, F)
     reward: Array  # (T,)
+    terminated: bool = False  # at its last step
 
 
 @dataclass(frozen=True)
@@ -276,7 +277,9 @@ def _account(tallies: Sequence[_Tally]) -> Evaluation:
         returns=np.array([t.total for t in tallies]),
         lengths=np.array([t.length for t in tallies], dtype=np.int64),
         success=None if criterion is None else np.array([_succeeds(criterion, t) for t in tallies]),
-        traces=tuple(Trace(np.stack(t.path), np.stack(t.actions), np.array(t.rewards)) for t in tallies),
+        traces=tuple(
+            Trace(np.stack(t.path), np.stack(t.actions), np.array(t.rewards), t.moment.terminated) for t in tallies
+        ),
     )
 
 

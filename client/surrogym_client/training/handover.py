@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.environments.lanes import Lanes, session_request
-from surrogym_client.evaluation.audit import AUDIT_STEPS, Compared, differences, earned, judge, places
+from surrogym_client.evaluation.audit import AUDIT_STEPS, earned, judge, places
+from surrogym_client.evaluation.comparing import compared
 from surrogym_client.evaluation.imagined import WHOLE
+from surrogym_client.evaluation.outside import Outside, outside_of
 from surrogym_client.evaluation.promise import promise_of
 from surrogym_client.original.actions import decode_actions
 from surrogym_client.original.protocol import LONGEST_EPISODE
@@ -21,11 +23,11 @@ from surrogym_client.surrogates.phases import COMPLETED
 from surrogym_client.surrogates.waiting import NobodyAnswers, wait_for_answers, wait_for_design
 from surrogym_client.transport.api import Api
 from surrogym_shared.port import SurrogatePort
-from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire import OutputFidelity, SampleView, SurrogateView
+from surrogym_shared.wire import SurrogateView
 
 MATTERS = 0.02  # of what a policy earns: errors of rewards that add up to less in an episode are no fault
 WAY_LANES = 16  # episodes whose states an audit chooses from
+MOST_OF_A_WAY = 200  # steps of an episode that are held against a log
 WIDE = 0.5  # of what a policy earns beyond an untrained one: a promise with a wider lower half is no promise
 NO_SAMPLER = "no sampler is connected"
 
@@ -37,13 +39,13 @@ class Handover:
     """A policy's promise, and what speaks for it.
 
     Attributes:
-        promise: of the latest model.
+        promise: of the latest model; None where the policy goes where a log has never been: no model knows it.
         audit: real steps on the policy's way; None without one.
         trusted: whether the promise is to be trusted.
         reason: why, or why not, in one sentence.
     """
 
-    promise: Promise
+    promise: Promise | None
     audit: Audit | None
     trusted: bool
     reason: str
@@ -90,6 +92,8 @@ def hand_over(
         SurrogymClientError: the server refused.
     """
     before = subject.promise()
+    if (left := _left_the_log(subject)) is not None and left.much:
+        return Handover(None, None, False, f"{left.words()}: nothing can be promised of it")
     if audit is None or (why := _not_possible(subject)) is not None:
         view = subject.api.surrogate(subject.name)
         return _without(view, before, subject.floor, "asked for none" if audit is None else str(why))
@@ -101,6 +105,17 @@ def hand_over(
         return _without(subject.api.surrogate(subject.name), before, subject.floor, "none of its queries was answered")
     trusted, reason = _verdict(found, subject.floor)
     return Handover(found.after, found, trusted, reason)
+
+
+def _left_the_log(subject: Subject) -> Outside | None:
+    """How much of a policy's way lies outside of the log that its model is of; None for a model of anything else."""
+    view, spec = subject.api.surrogate(subject.name), subject.port.spec()
+    if view.phase != "from_log" or view.samplers:
+        return None
+    logged = [sample for sample in subject.api.samples(subject.name) if sample.purpose == "logged"]
+    q, u = np.array([sample.coordinates for sample in logged]), np.array([sample.action for sample in logged])
+    way_q, way_u = way_of(subject, WAY_LANES, min(spec.time_limit or MOST_OF_A_WAY, MOST_OF_A_WAY))
+    return outside_of(spec, q, u, way_q, way_u)
 
 
 def take(
@@ -164,38 +179,6 @@ def way_of(subject: Subject, episodes: int, steps: int) -> tuple[Array, Array]:
     finally:
         lanes.close()
     return np.concatenate(states), np.concatenate(actions)
-
-
-def compared(
-    api: Api, spec: EnvironmentSpec, view: SurrogateView, samples: Sequence[SampleView], matters: float = 0.0
-) -> Compared:
-    """Real steps beside what the model of ``view``, which had not seen them, predicts. Errors of the reward count from
-    ``matters`` on."""
-    q, u = [sample.coordinates for sample in samples], [sample.action for sample in samples]
-    predicted = api.predict(view.name, q, u, model=view.model_version)
-    uncertain = api.query_uncertainty(view.name, q, u, model=view.model_version)
-    moved = differences(
-        spec, np.array([sample.next_coordinates for sample in samples]), np.array(predicted.next_coordinates)
-    )
-    rewards = np.array([sample.reward for sample in samples]) - np.array(predicted.reward)
-    columns = {coordinate.name: moved[:, i] for i, coordinate in enumerate(spec.coordinates)} | {"reward": rewards}
-    assert view.fidelity is not None
-    claims = [output for output in view.fidelity.outputs if output.name in columns]
-    deviations = np.array(uncertain.deviation)[:, [uncertain.outputs.index(claim.name) for claim in claims]]
-    ended = np.array([sample.terminated for sample in samples])
-    return Compared(
-        names=[claim.name for claim in claims],
-        errors=np.stack([columns[claim.name] for claim in claims], 1),
-        deviations=deviations,
-        expected=np.array([_expected(claim, matters if claim.name == "reward" else 0.0) for claim in claims]),
-        noise=np.array([claim.noise for claim in claims]),
-        misplaced=int((ended != np.array(predicted.terminated)).sum()),
-    )
-
-
-def _expected(claim: OutputFidelity, matters: float) -> float:
-    """The error of an output that is no fault: within its tolerance, as left-out samples show it, or without effect."""
-    return max(claim.tolerance, claim.leave_one_out_error or 0.0, matters)
 
 
 def _not_possible(subject: Subject) -> str | None:

@@ -29,6 +29,8 @@ def words_of_result(
 def words_of_handover(handover: Handover) -> str:
     """The promise of a policy, and whether to trust it, on a line of its own."""
     promise, trusted = handover.promise, "trusted" if handover.trusted else "not trusted"
+    if promise is None:
+        return f"no promise, {trusted}: {handover.reason}"
     return (
         f"promise{', with the audit learned' if handover.audit else ''}: mean return {promise.median:.4g}, "
         f"between {promise.low:.4g} and {promise.high:.4g} with 90 % chance; "

@@ -1,0 +1,155 @@
+"""Real steps beside what a model predicts of them, and the steps at which the two disagree.
+
+Shapes: n steps, O outputs, C coordinates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import sqrt
+from typing import Any, Protocol
+
+import numpy as np
+
+from surrogym_client.evaluation.audit import ALARM, Compared, chi_squared, differences
+from surrogym_client.evaluation.evaluator import Trace
+from surrogym_client.transport.api import Api
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import OutputFidelity, SurrogateView
+
+MOST = 400  # real steps that are held against the model
+SHOWN = 3  # of the worst steps, and of the worst episodes
+
+
+class Step(Protocol):
+    """One real step: of a sample, or of an episode."""
+
+    @property
+    def coordinates(self) -> Any: ...
+    @property
+    def action(self) -> Any: ...
+    @property
+    def next_coordinates(self) -> Any: ...
+    @property
+    def reward(self) -> float: ...
+    @property
+    def terminated(self) -> bool: ...
+
+
+def compared(
+    api: Api, spec: EnvironmentSpec, view: SurrogateView, samples: Sequence[Step], matters: float = 0.0
+) -> Compared:
+    """Real steps beside what the model of ``view``, which had not seen them, predicts. Errors of the reward count from
+    ``matters`` on."""
+    q, u = [list(sample.coordinates) for sample in samples], [list(sample.action) for sample in samples]
+    predicted = api.predict(view.name, q, u, model=view.model_version)
+    uncertain = api.query_uncertainty(view.name, q, u, model=view.model_version)
+    moved = differences(
+        spec, np.array([sample.next_coordinates for sample in samples]), np.array(predicted.next_coordinates)
+    )
+    rewards = np.array([sample.reward for sample in samples]) - np.array(predicted.reward)
+    columns = {coordinate.name: moved[:, i] for i, coordinate in enumerate(spec.coordinates)} | {"reward": rewards}
+    assert view.fidelity is not None
+    claims = [output for output in view.fidelity.outputs if output.name in columns]
+    deviations = np.array(uncertain.deviation)[:, [uncertain.outputs.index(claim.name) for claim in claims]]
+    ended = np.array([sample.terminated for sample in samples])
+    return Compared(
+        names=[claim.name for claim in claims],
+        errors=np.stack([columns[claim.name] for claim in claims], 1),
+        deviations=deviations,
+        expected=np.array([_expected(claim, matters if claim.name == "reward" else 0.0) for claim in claims]),
+        noise=np.array([claim.noise for claim in claims]),
+        misplaced=int((ended != np.array(predicted.terminated)).sum()),
+    )
+
+
+def _expected(claim: OutputFidelity, matters: float) -> float:
+    """The error of an output that is no fault: within its tolerance, as left-out samples show it, or without effect."""
+    return max(claim.tolerance, claim.leave_one_out_error or 0.0, matters)
+
+
+@dataclass(frozen=True)
+class StepOfEpisode:
+    """One real step, and where it is: the number of its episode, and its own there, from 0."""
+
+    episode: int
+    number: int
+    coordinates: tuple[float, ...]
+    action: tuple[float, ...]
+    next_coordinates: tuple[float, ...]
+    reward: float
+    terminated: bool
+
+
+def steps_of(traces: Sequence[Trace]) -> list[StepOfEpisode]:
+    """The steps of episodes, at most ``MOST`` of them, evenly spaced."""
+    places = [(episode, t) for episode, trace in enumerate(traces) for t in range(len(trace.reward))]
+    kept = np.unique(np.linspace(0, len(places) - 1, min(len(places), MOST)).astype(int))
+    return [_step(traces[episode], episode, t) for episode, t in (places[i] for i in kept)]
+
+
+def _step(trace: Trace, episode: int, t: int) -> StepOfEpisode:
+    last = t == len(trace.reward) - 1
+    return StepOfEpisode(
+        episode=episode,
+        number=t,
+        coordinates=tuple(map(float, trace.coordinates[t])),
+        action=tuple(map(float, trace.action[t])),
+        next_coordinates=tuple(map(float, trace.coordinates[t + 1])),
+        reward=float(trace.reward[t]),
+        terminated=last and trace.terminated,
+    )
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """A real step that the model excludes: the output that is worst, its error, and the error that was claimed."""
+
+    step: StepOfEpisode
+    output: str
+    error: float
+    claimed: float
+
+
+@dataclass(frozen=True)
+class Disagreements:
+    """What real episodes say of the model.
+
+    Attributes:
+        compared: real steps that were compared.
+        found: those beyond what the model claims, the worst first.
+        missing: real less predicted reward over the compared steps of each episode, by its number.
+    """
+
+    compared: int
+    found: tuple[Disagreement, ...]
+    missing: dict[int, float]
+
+    def by_episode(self) -> dict[int, int]:
+        """How many steps of each episode the model excludes, the most first."""
+        counts: dict[int, int] = {}
+        for one in self.found:
+            counts[one.step.episode] = counts.get(one.step.episode, 0) + 1
+        return dict(sorted(counts.items(), key=lambda item: -item[1]))
+
+
+def disagreements(steps: Sequence[StepOfEpisode], beside: Compared) -> Disagreements:
+    """The steps whose error is larger than chance explains, at 1 % for all of them together."""
+    n, count = beside.errors.shape
+    limit = sqrt(chi_squared(1, ALARM / (n * count)))
+    ratio = np.abs(beside.errors) / beside.claimed
+    worst = ratio.argmax(1)
+    order = [i for i in np.argsort(-ratio.max(1)).tolist() if ratio[i].max() > limit]
+    found = tuple(
+        Disagreement(
+            steps[i], beside.names[worst[i]], float(beside.errors[i, worst[i]]), float(beside.claimed[i, worst[i]])
+        )
+        for i in order
+    )
+    missing: dict[int, float] = {}
+    if "reward" in beside.names:
+        errors = beside.errors[:, list(beside.names).index("reward")]
+        for step, error in zip(steps, errors.tolist(), strict=True):
+            missing[step.episode] = missing.get(step.episode, 0.0) + error
+    return Disagreements(n, found, missing)

@@ -1,0 +1,65 @@
+"""Real episodes held against a model: a right model is left alone, and a wrong one is found where it is wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from support.moody import SPEC
+from surrogym_client.cli.disagreement import disagreements_as_json, disagreements_in_words
+from surrogym_client.evaluation.audit import Compared
+from surrogym_client.evaluation.comparing import MOST, Disagreements, disagreements, steps_of
+from surrogym_client.evaluation.evaluator import Trace
+
+NAMES = ("x", "reward")
+
+
+def episodes(count: int, length: int) -> list[Trace]:
+    rng = np.random.default_rng(0)
+    return [
+        Trace(rng.normal(size=(length + 1, 1)), rng.normal(size=(length, 1)), rng.normal(size=length), terminated=True)
+        for _ in range(count)
+    ]
+
+
+def held(traces: list[Trace], errors: np.ndarray) -> Disagreements:
+    steps = steps_of(traces)
+    beside = Compared(NAMES, errors[: len(steps)], np.full((len(steps), 2), 0.05), np.array([0.0, 0.0]))
+    return disagreements(steps, beside)
+
+
+def test_every_step_of_few_is_compared_and_many_are_thinned() -> None:
+    few = steps_of(episodes(2, 10))
+    assert [(step.episode, step.number) for step in few] == [(e, t) for e in range(2) for t in range(10)]
+    assert [step.terminated for step in few] == ([False] * 9 + [True]) * 2
+    many = steps_of(episodes(10, 300))
+    assert len(many) == MOST
+    assert {step.episode for step in many} == set(range(10))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_errors_as_the_model_claims_are_no_disagreement(seed: int) -> None:
+    errors = np.random.default_rng(seed).normal(scale=0.05, size=(MOST, 2))
+    assert len(held(episodes(4, 100), errors).found) <= 1
+
+
+def test_a_wrong_step_is_found_with_its_episode_state_and_output() -> None:
+    traces, errors = episodes(2, 10), np.zeros((20, 2))
+    errors[13] = (0.0, -1.5)
+    errors[15] = (0.9, 0.0)
+    found = held(traces, errors)
+    assert [(one.step.episode, one.step.number, one.output) for one in found.found] == [(1, 3, "reward"), (1, 5, "x")]
+    assert found.by_episode() == {1: 2}
+    assert found.missing == {0: 0.0, 1: -1.5}
+    lines = disagreements_in_words(found, SPEC, 10_000)
+    assert lines[0] == "2 of 20 real steps differ from the model by more than it claims"
+    assert lines[1].startswith("  episode of seed 10001: 2 such steps; its compared steps paid -1.5 ")
+    assert f"seed 10001, step 3, at x {traces[1].coordinates[3, 0]:.4g}: reward is -1.5 beside" in lines[2]
+    assert disagreements_as_json(found, 10_000)["steps"][0]["seed"] == 10_001
+
+
+def test_a_model_that_is_right_is_said_to_be() -> None:
+    found = held(episodes(2, 10), np.zeros((20, 2)))
+    assert disagreements_in_words(found, SPEC, 0) == [
+        "none of 20 real steps differs from the model by more than it claims"
+    ]
