@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+import surrogym
 from support.simulators import CASES, Register, installed
 from surrogym_client import original
 from surrogym_client.original import terms
@@ -36,6 +37,16 @@ def test_a_described_environment_steps_from_its_coordinates_as_in_an_episode(nam
     np.testing.assert_allclose(again.next_coordinates, step.next_coordinates, atol=1e-6)
     assert again.reward == pytest.approx(step.reward, abs=1e-6)
     environment.close()
+
+
+@installed("mujoco")
+def test_a_design_takes_the_steps_of_a_described_environment() -> None:
+    machine = original.make("Swimmer-v5", spec=describe("Swimmer-v5", STEPS).spec, budget=4, initial=4)
+    design = surrogym.Design(machine.spec())
+    while (query := design.ask()) is not None:
+        design.tell(query, machine.step_from(np.array(query.coordinates), np.array(query.action)))
+    assert (design.steps, design.phase) == (4, "over_budget")
+    machine.close()
 
 
 @installed("mujoco")

@@ -14,7 +14,6 @@ import numpy as np
 from surrogym_client.original.classic import TASKS
 from surrogym_client.original.errors import NotPerturbable, NotSettable, StepFailed
 from surrogym_client.original.gymnasium import native_action, task_for, wrapped
-from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
 from surrogym_client.original.protocol import (
     Array,
     Environment,
@@ -145,12 +144,12 @@ class SimulatedEpisode(Episode):
     def __init__(self, environment: Simulated) -> None:
         super().__init__(environment.spec())
         self._environment = environment
-        self._own_observation = _shows_the_same(self.spec)
 
     def reset(self, seed: int) -> Moment:
         observation = self._environment.simulator.reset(seed)
         coordinates = self._environment.coordinates()
-        return Moment(self._of(observation, coordinates), 0.0, False, coordinates)
+        shown = observation if self._environment.shows_own else self._shown(coordinates)
+        return Moment(shown, 0.0, False, coordinates)
 
     def place(self, coordinates: Array) -> Moment:
         if not self._environment.simulator.settable:
@@ -162,7 +161,7 @@ class SimulatedEpisode(Episode):
     def step(self, action: Array) -> Moment:
         step = self._environment.act(action)
         reached = np.asarray(step.next_coordinates)
-        shown = self._of(np.asarray(step.next_observation), reached)
+        shown = self._shown(reached) if step.next_observation is None else np.asarray(step.next_observation)
         return Moment(shown, step.reward, step.terminated, reached, step.truncated)
 
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
@@ -170,9 +169,6 @@ class SimulatedEpisode(Episode):
 
     def close(self) -> None:
         self._environment.close()
-
-    def _of(self, observation: Array, coordinates: Array) -> Array:
-        return observation if self._own_observation else self._shown(coordinates)
 
 
 class OwnEpisode(Episode):
@@ -293,5 +289,4 @@ def _factor(rng: np.random.Generator, sigma: float) -> float:
 
 def _shows_the_same(spec: EnvironmentSpec) -> bool:
     """Whether the specification's observation is the environment's own, entry by entry."""
-    builtin = TASKS[spec.environment].spec if spec.environment in TASKS else SPECIFICATIONS.get(spec.environment)
-    return builtin is not None and builtin().observation == spec.observation
+    return spec.environment in TASKS and TASKS[spec.environment].spec().observation == spec.observation

@@ -162,7 +162,8 @@ def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str)
         base = spec or task_for(name, preset).spec()
         return GymnasiumEnvironment(choose(base))
     base = choose(spec or specification(name))
-    return Simulated(open_simulator(name), base)
+    own = name in SPECIFICATIONS and SPECIFICATIONS[name]().observation == base.observation
+    return Simulated(open_simulator(name), base, shows_own=own)
 
 
 class _Respecified:

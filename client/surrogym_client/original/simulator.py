@@ -130,12 +130,13 @@ class Simulator(ABC):
 
 class Simulated:
     """A simulator with a specification, whose coordinates are variables of the state by name. It can be set to given
-    coordinates, and reset."""
+    coordinates, and reset. ``shows_own``: whether the specification's observation is the simulator's own."""
 
     parallel = True
 
-    def __init__(self, simulator: Simulator, spec: EnvironmentSpec) -> None:
+    def __init__(self, simulator: Simulator, spec: EnvironmentSpec, *, shows_own: bool = False) -> None:
         self.simulator = simulator
+        self.shows_own = shows_own
         self._spec = spec
         self._columns = simulator.columns(spec.coordinate_names)
         if spec.query == "step" and not simulator.settable:
@@ -172,7 +173,7 @@ class Simulated:
             reward=taken.reward,
             terminated=taken.terminated,
             truncated=taken.truncated,
-            next_observation=taken.observation,
+            next_observation=taken.observation if self.shows_own else None,
         )
 
     def coordinates(self) -> Array:
