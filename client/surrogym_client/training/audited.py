@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from surrogym_client.evaluation.audit import AUDIT_STEPS
 from surrogym_client.policies.files import load_policy
 from surrogym_client.surrogates.waiting import wait_for_design
+from surrogym_client.training.candidates import Candidates
 from surrogym_client.training.closed_loop import ClosedLoop, LoopSettings, visit
 from surrogym_client.training.handover import AuditSettings, Handover, Subject, hand_over
 from surrogym_client.training.search import search_for
@@ -55,6 +56,7 @@ class AuditedTraining:
     audit: AuditSettings | None = None
     progress: Callable[[TrainProgress], None] | None = None
     waiting: Callable[[SurrogateView], None] | None = None
+    candidates: Candidates = field(default_factory=Candidates, init=False)
 
     def train(self) -> tuple[TrainResult, Handover]:
         """Train, audit, and train on where that fails.
@@ -65,6 +67,7 @@ class AuditedTraining:
             ValueError, SurrogymClientError: as ``train``.
         """
         result = self._first()
+        self.candidates.keep(result)
         try:
             for number in range(1, MOST_AUDITS + 1):
                 taken = self.api.surrogate(self.name).ledger.total
@@ -85,7 +88,12 @@ class AuditedTraining:
         loop = ClosedLoop(
             self.api, self.name, self.port, self.out, self.settings, self.rounds, self.progress, self.waiting
         )
-        return loop.train()
+        loop.candidates = self.candidates
+        return self._best(loop.train())
+
+    def _best(self, result: TrainResult) -> TrainResult:
+        """The policy to hand over: what the model of all real steps so far holds for the best."""
+        return self.candidates.best(self.port, result, self._chosen)
 
     @property
     def _chosen(self) -> TrainSettings:
@@ -115,7 +123,8 @@ class AuditedTraining:
         now = self._chosen
         if search_for(self.settings).resumable:
             now = replace(now, start_from=self.out, trust_policy=False)
-        return _joined(result, train(self.port, self.out, now, self.progress))
+        after = train(self.port, self.out, now, self.progress)
+        return self._best(_joined(result, after))
 
 
 def _joined(before: TrainResult, after: TrainResult) -> TrainResult:

@@ -9,6 +9,7 @@ from typing import Any
 
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.surrogates.waiting import wait_for_design
+from surrogym_client.training.candidates import Candidates
 from surrogym_client.training.search import is_prolonged, planned_steps, search_for
 from surrogym_client.training.settings import (
     SUGGESTED_STEPS,
@@ -58,6 +59,7 @@ class ClosedLoop:
         progress: called after every rollout, with steps summed over the rounds.
         waiting: called with every look at a round's queries, while a sampler answers them.
         trained: the trainings so far.
+        candidates: the policies that they left.
     """
 
     api: Api
@@ -69,6 +71,7 @@ class ClosedLoop:
     progress: Callable[[TrainProgress], None] | None = None
     waiting: Callable[[SurrogateView], None] | None = None
     trained: list[TrainResult] = field(default_factory=list, init=False)
+    candidates: Candidates = field(default_factory=Candidates)
     _visited: int = field(default=0, init=False)  # virtual steps beside the trainings
     _known: list[float | None] = field(default_factory=list, init=False)  # confidence where each round's policy went
     _region_known: bool = field(default=False, init=False)
@@ -149,6 +152,7 @@ class ClosedLoop:
         known = self._known[-1] if self._known else None
         progress = _shifted(self.progress, self._steps + self._visited, whole, known)
         self.trained.append(train(self.port, self.out, now, progress))
+        self.candidates.keep(self.trained[-1])
 
 
 def _for_use(view: SurrogateView, settings: TrainSettings, *, region_known: bool) -> TrainSettings:

@@ -92,17 +92,14 @@ def hand_over(
         SurrogymClientError: the server refused.
     """
     before = subject.promise()
-    if (left := _left_the_log(subject)) is not None and left.much:
-        return Handover(None, None, False, f"{left.words()}: nothing can be promised of it")
     if audit is None or (why := _not_possible(subject)) is not None:
-        view = subject.api.surrogate(subject.name)
-        return _without(view, before, subject.floor, "asked for none" if audit is None else str(why))
+        return _unaudited(subject, before, "asked for none" if audit is None else str(why))
     try:
         found = take(subject, audit, before, progress)
     except NobodyAnswers:
-        return _without(subject.api.surrogate(subject.name), before, subject.floor, NO_SAMPLER)
+        return _unaudited(subject, before, NO_SAMPLER)
     if found is None:
-        return _without(subject.api.surrogate(subject.name), before, subject.floor, "none of its queries was answered")
+        return _unaudited(subject, before, "none of its queries was answered")
     trusted, reason = _verdict(found, subject.floor)
     return Handover(found.after, found, trusted, reason)
 
@@ -110,7 +107,7 @@ def hand_over(
 def _left_the_log(subject: Subject) -> Outside | None:
     """How much of a policy's way lies outside of the log that its model is of; None for a model of anything else."""
     view, spec = subject.api.surrogate(subject.name), subject.port.spec()
-    if view.phase != "from_log" or view.samplers:
+    if view.phase != "from_log":
         return None
     logged = [sample for sample in subject.api.samples(subject.name) if sample.purpose == "logged"]
     q, u = np.array([sample.coordinates for sample in logged]), np.array([sample.action for sample in logged])
@@ -197,6 +194,13 @@ def _verdict(audit: Audit, floor: float | None) -> tuple[bool, str]:
     if (wide := _too_wide(audit.after, floor)) is not None:
         return False, wide
     return True, f"{audit.steps} real steps on the policy's way agree with the model"
+
+
+def _unaudited(subject: Subject, promise: Promise, why: str) -> Handover:
+    """A handover that no real step speaks for."""
+    if (left := _left_the_log(subject)) is not None and left.much:
+        return Handover(None, None, False, f"{left.words()}: nothing can be promised of it")
+    return _without(subject.api.surrogate(subject.name), promise, subject.floor, why)
 
 
 def _without(view: SurrogateView, promise: Promise, floor: float | None, why: str) -> Handover:

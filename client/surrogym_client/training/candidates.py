@@ -1,0 +1,58 @@
+"""The policies that a training had: none is handed over that the latest model holds for worse than an earlier one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from surrogym_client.evaluation.imagined import imagined_returns
+from surrogym_client.policies.files import load_policy
+from surrogym_client.policies.predict import Predict
+from surrogym_client.training.settings import TrainResult, TrainSettings
+from surrogym_shared.port import SurrogatePort
+
+EPISODES = 128  # of each policy, from the same starts
+CLEARLY = 2.0  # standard errors of a mean difference: less may be chance
+
+
+@dataclass
+class Candidates:
+    """What each training left at the end, with its file. Real steps between two trainings change the model, and what
+    an earlier model held for the better policy can be the worse one."""
+
+    load: Callable[[Path, str], Predict] = load_policy
+    _kept: list[tuple[TrainResult, bytes]] = field(default_factory=list)
+
+    def keep(self, result: TrainResult) -> None:
+        """Remember a policy before the next training overwrites its file."""
+        self._kept.append((result, Path(result.path).read_bytes()))
+
+    def best(self, port: SurrogatePort, latest: TrainResult, settings: TrainSettings) -> TrainResult:
+        """The latest result, or an earlier one whose policy clearly earns more in the model as it is now; its file is
+        then in its place again."""
+        others = [(result, content) for result, content in self._kept if content != Path(latest.path).read_bytes()]
+        if not others:
+            return latest
+        path, current = Path(latest.path), Path(latest.path).read_bytes()
+        earned = self._earned(port, latest, settings)
+        found, kept, gain = latest, current, 0.0
+        try:
+            for result, content in others:
+                path.write_bytes(content)
+                more = self._earned(port, result, settings) - earned
+                error = float(more.std(ddof=1)) / np.sqrt(len(more))
+                if float(more.mean()) > max(gain, CLEARLY * error):
+                    found, kept, gain = result, content, float(more.mean())
+        finally:
+            path.write_bytes(kept)
+        if found is latest:
+            return latest
+        took = {name: getattr(latest, name) for name in ("virtual_steps", "seconds", "lost_episodes")}
+        return replace(found, **took, visited_confidence=latest.visited_confidence)
+
+    def _earned(self, port: SurrogatePort, result: TrainResult, settings: TrainSettings) -> np.ndarray:
+        predict = self.load(Path(result.path), result.algorithm)
+        return imagined_returns(port, predict, EPISODES, settings.seed, **settings.judging)

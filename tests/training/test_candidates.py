@@ -1,0 +1,77 @@
+"""What is handed over is never clearly worse, in the model of all real steps, than a policy that the training had."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.moody import SPEC, Line
+from surrogym_client.original.episodes import SteppedEpisode
+from surrogym_client.original.port import OriginalPort
+from surrogym_client.policies.predict import Predict
+from surrogym_client.training.candidates import Candidates
+from surrogym_client.training.settings import TrainResult, TrainSettings
+
+POLICIES = {
+    b"to the middle": lambda o: -np.clip(10 * o[:, :1], -1, 1),
+    b"slowly to the middle": lambda o: -np.clip(o[:, :1], -1, 1) / 2,
+    b"away": lambda o: np.where(o[:, :1] > 0, 1.0, -1.0),
+}
+
+
+class Lines(Line):
+    parallel = True
+
+
+def load(path: Path, algorithm: str) -> Predict:
+    return POLICIES[path.read_bytes()]
+
+
+@pytest.fixture
+def port() -> OriginalPort:
+    """The model of all real steps, which is right: the environment itself."""
+    return OriginalPort(SPEC, lambda: SteppedEpisode(Lines()))
+
+
+def trained(path: Path, policy: bytes, steps: int) -> TrainResult:
+    path.write_bytes(policy)
+    return TrainResult(path, "fastppo", steps, 1.0, None, 0, {})
+
+
+@pytest.mark.parametrize("later", [b"slowly to the middle", b"away"])
+def test_a_later_policy_that_is_worse_gives_way_to_an_earlier_one(port, tmp_path: Path, later: bytes) -> None:
+    candidates, path = Candidates(load), tmp_path / "policy.zip"
+    candidates.keep(trained(path, b"away", 100))
+    candidates.keep(trained(path, b"to the middle", 200))
+    latest = replace(trained(path, later, 300), lost_episodes=2)
+    best = candidates.best(port, latest, TrainSettings())
+    assert path.read_bytes() == b"to the middle"
+    assert (best.virtual_steps, best.lost_episodes) == (300, 2), "all that was spent"
+
+
+def test_a_later_policy_that_is_better_stays(port, tmp_path: Path) -> None:
+    candidates, path = Candidates(load), tmp_path / "policy.zip"
+    candidates.keep(trained(path, b"away", 100))
+    latest = trained(path, b"to the middle", 200)
+    assert candidates.best(port, latest, TrainSettings()) is latest
+    assert path.read_bytes() == b"to the middle"
+
+
+def test_the_same_policy_is_not_compared_with_itself(port, tmp_path: Path) -> None:
+    candidates, path = Candidates(load), tmp_path / "policy.zip"
+    latest = trained(path, b"away", 100)
+    candidates.keep(latest)
+    assert candidates.best(port, latest, TrainSettings()) is latest
+    assert port.steps == 0
+
+
+def test_a_policy_that_can_not_be_read_leaves_the_latest_in_place(port, tmp_path: Path) -> None:
+    candidates, path = Candidates(load), tmp_path / "policy.zip"
+    candidates.keep(trained(path, b"broken", 100))
+    latest = trained(path, b"to the middle", 200)
+    with pytest.raises(KeyError):
+        candidates.best(port, latest, TrainSettings())
+    assert path.read_bytes() == b"to the middle"
