@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import surrogym
-from support.simulators import CASES, Register, installed
+from support.simulators import CASES, Register, Spiral, installed
 from surrogym_client import original
 from surrogym_client.original import terms
 from surrogym_client.original.describing import Description, describe
@@ -122,6 +122,16 @@ def test_an_environment_that_remembers_what_can_not_be_set_can_only_be_reset(reg
 def test_a_state_that_can_not_be_read_is_what_is_shown(registered: Register) -> None:
     found = describe(registered("Hidden-v0", attribute="_hidden"), 60)
     assert (found.spec.query, found.spec.coordinate_names) == ("rollout", ("o0", "o1"))
+
+
+def test_a_reward_that_is_mostly_the_same_is_asked_for(registered: Register) -> None:
+    def step(self, action):
+        shown, reward, *rest = Spiral.step(self, action)
+        return shown, float(reward > -0.01), *rest
+
+    found = describe(registered("Sparse-v0", space={"step": step}), 60)
+    assert any("random steps paid exactly 0. A design of few real steps may meet" in line for line in found.asked)
+    assert not any("paid exactly" in line for line in describe(registered("Spiral-v0"), 60).asked)
 
 
 def test_the_file_says_what_was_found_and_holds_the_specification(registered: Register) -> None:

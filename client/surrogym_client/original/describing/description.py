@@ -31,6 +31,7 @@ from surrogym_shared.spec import (
 
 FASTER = 1.5  # times the largest speed that was seen: what a policy may reach
 MARGIN = 0.25  # of the range that was seen, on each side
+MOSTLY = 0.5  # of all steps that were paid the same: such a reward is met by luck
 PLACES = 300  # where an observation is read, without a step
 UNKNOWN_SPEED = 1.0  # of what never moved, in the simulator's unit
 UNKNOWN_LIMIT = 200  # steps of an episode where the simulator says nothing
@@ -173,8 +174,18 @@ class _Draft:
         if self._simulator.time_limit is None:
             lines.append(f"time_limit: none is known; {UNKNOWN_LIMIT} steps are assumed")
         lines.append("success: when does an episode count as solved? Without it, evaluations report returns alone")
-        lines.append("reward: it is learned; one that you know takes no real step (kind 'declared')")
+        lines.append(self._asked_of_reward())
         return tuple(lines)
+
+    def _asked_of_reward(self) -> str:
+        values, counts = np.unique(self._seen.rewards, return_counts=True)
+        usual, often = float(values[counts.argmax()]), int(counts.max())
+        if often < MOSTLY * counts.sum():
+            return "reward: it is learned; one that you know takes no real step (kind 'declared')"
+        return (
+            f"reward: {often} of {counts.sum()} random steps paid exactly {usual:g}. A design of few real steps may "
+            "meet nothing else, and then takes it for constant: declare it (kind 'declared'), or raise --initial"
+        )
 
     def _chosen(self) -> list[int]:
         """Indices of the variables that become coordinates."""
