@@ -45,7 +45,7 @@ def test_a_surrogate_is_shown_whole_and_without_a_complaint(
     expect(page.locator(".facts")).to_contain_text("12 real steps")
     assert page.locator("#learning canvas").count() == 2  # one axis of values each
     expect(page.locator("#learning .u-legend").last).to_contain_text(
-        re.compile(r"speed: *\S+")
+        re.compile(r"speed\S+reward\S")
     )  # values without a mouse
     expect(page.locator("#queue tbody tr")).to_have_count(12)
     page.locator(".model summary").first.click()

@@ -87,8 +87,9 @@ def test_the_better_of_two_surrogates_is_named_with_its_interval(url: str, open_
 def test_a_surrogate_without_a_policy_or_a_model_says_how_to_get_one(url: str, open_page: Open):
     page = open_page(f"{url}/#/s/bare")
     expect(page.locator("#policies")).to_contain_text("No policy is stored. surrogym train bare")
-    for empty in ("learning", "maps", "probe"):
-        expect(page.locator(f"#{empty}")).to_be_hidden()
+    for empty in ("#learning", ".maps", "#probe .rolled"):
+        expect(page.locator(empty)).to_be_hidden()
+    expect(page.get_by_role("button", name="Ask for this real step")).to_be_visible()
     assert serious(page) == []
 
 

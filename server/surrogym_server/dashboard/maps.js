@@ -103,7 +103,7 @@ export function maps(name, spec, controls) {
 
   return {
     parts: [
-      h("div", { class: "picks" }, x.label, y.label, h("label", { class: "pick" }, "of", output)),
+      h("div", { class: "picks cuts" }, x.label, y.label, h("label", { class: "pick" }, "of", output)),
       h("p", { class: "key" },
         ["initial", "adaptive", "manual"].map((purpose) => h("span", { class: `mark ${purpose}` }, purpose)),
         h("label", { class: "pick" }, marks, "show them"), many,

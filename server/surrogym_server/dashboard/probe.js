@@ -68,9 +68,9 @@ export function probe(name, spec, controls, { onepisodes, ask }) {
       trouble,
       h("div", { class: "probe" }, answer,
         ask && h("button", { type: "button", class: "main", onclick: () => ask(point) }, "Ask for this real step")),
-      h("h3", {}, "An episode from there"),
-      h("div", { class: "picks" }, h("label", { class: "pick" }, "steps", steps), h("label", { class: "pick" }, "with", how)),
-      episode, charts.place,
+      h("div", { class: "rolled" }, h("h3", {}, "An episode from there"),
+        h("div", { class: "picks" }, h("label", { class: "pick" }, "steps", steps), h("label", { class: "pick" }, "with", how)),
+        episode, charts.place),
     ],
     moved: run,
     show({ fidelity, version }) {

@@ -13,7 +13,6 @@ import { probe } from "/page/probe.js";
 import { ledgerTable, modelTable, queueTable, sessionTable } from "/page/tables.js";
 
 const PAGE = 10_000;
-const OF_MODELS = ["learning", "maps", "probe"]; // parts that are empty before the first model
 const LINKS = [["policies", "Policies"], ["learning", "Learning"], ["maps", "Maps"], ["probe", "Probe"], ["queue", "Queue"], ["sessions", "Sessions"], ["ledger", "Ledger"], ["models", "Models"], ["actions", "Steer"]];
 
 export function surrogateView(main, name, context) {
@@ -57,7 +56,7 @@ export function surrogateView(main, name, context) {
     refresh,
     fail,
     repaint: () => parts?.repaint(),
-    close: () => { closed = true; parts?.close(); },
+    close: () => { closed = true; main.classList.remove("unmodelled"); parts?.close(); },
   };
 }
 
@@ -96,7 +95,6 @@ function build(main, name, spec, context) {
     section("probe", "Probe", "What the model says of one step from the point above, with its standard deviations.", probing.parts),
     queue.element, sessions.element, h("div", { class: "two" }, ledger.element, steer.element), versions.element);
 
-  const parted = OF_MODELS.map((id) => [document.getElementById(id), main.querySelector(`.jumps a[href="#${id}"]`)]).flat();
   let found = null;
   let looked = null;
   async function look(now) {
@@ -115,7 +113,7 @@ function build(main, name, spec, context) {
       const { created_at, spec: _, ...rest } = now;
       render.title(rest);
       render.facts({ now: rest, found });
-      for (const part of parted) part.hidden = !now.fidelity;
+      main.classList.toggle("unmodelled", !now.fidelity);
       if (models && models.length) curves.show(models);
       stored.show(policies);
       if (models) versions.show(models);
