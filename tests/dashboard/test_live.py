@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
+from support.browser import serious
 from support.server import RestartingServer
 from surrogym_client.original.classic import pendulum
 from surrogym_client.original.gymnasium import GymnasiumEnvironment
@@ -40,6 +41,7 @@ def test_the_page_follows_real_steps_and_a_server_that_goes_and_comes_back(
     page = open_page(server.url)
     unlock(page)
     expect(page.locator("main")).to_contain_text("No surrogate yet")
+    assert serious(page) == []
     expect(page.locator("main pre")).to_contain_text(f"export SURROGYM_URL={server.url}")
     with Api(server.url, token=TOKEN) as api:
         spec = pendulum()
@@ -60,6 +62,7 @@ def test_the_page_follows_real_steps_and_a_server_that_goes_and_comes_back(
     server.stop(signal.SIGKILL)
     expect(page.locator("#gone")).to_be_visible()
     expect(cost).to_contain_text("real steps")  # what it showed stays
+    assert [fault for fault in serious(page) if "color-contrast" not in fault] == []  # what is old is pale on purpose
     server.start()
     expect(page.locator("#connection")).to_have_attribute("data-state", "live")
     expect(page.locator("#gone")).to_be_hidden()
@@ -69,6 +72,8 @@ def test_the_page_follows_real_steps_and_a_server_that_goes_and_comes_back(
 def unlock(page: Page) -> None:
     """Give a wrong token, and then the right one."""
     field = page.get_by_label("Token", exact=True)
+    expect(field).to_be_visible()
+    assert serious(page) == []
     field.fill("not-the-token")
     field.press("Enter")
     expect(page.get_by_role("alert").filter(has_text="refused")).to_be_visible()

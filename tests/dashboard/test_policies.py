@@ -7,16 +7,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page, expect
 
+from support.browser import serious
 from support.policies import store
 from support.server import ServerProcess
 from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
 
 Open = Callable[..., Page]
-SERIOUS = ("serious", "critical")
 
 
 @pytest.fixture(scope="module")
@@ -32,12 +31,6 @@ def url(pendulum_server: ServerProcess) -> Iterator[str]:
         yield pendulum_server.url
         for name in ("worse", "better", "bare"):
             api.delete_surrogate(name)
-
-
-def serious(page: Page) -> list[str]:
-    """What axe finds that keeps somebody from using the page."""
-    found = Axe().run(page).response["violations"]
-    return [f"{one['id']}: {one['nodes'][0]['html'][:200]}" for one in found if one["impact"] in SERIOUS]
 
 
 def test_promise_and_real_return_stand_beside_each_other(url: str, open_page: Open, complaints: list[str]):

@@ -32,13 +32,24 @@ export function surrogateView(main, name, context) {
     }
   }
 
+  async function policiesNow(now, first) {
+    const reply = await call("GET", `${url}/policies`);
+    if (first && !closed) parts?.show({ now, samples, policies: reply.policies });
+    return reply;
+  }
+
   async function refresh() {
     const now = await call("GET", url);
+    if (closed) return;
+    const first = !parts;
+    if (first) {
+      parts = build(main, name, now.spec, context);
+      parts.show({ now, samples }); // many samples and models take longer than a person wants to wait for the rest
+    }
     const newSamples = samples.length !== now.samples && allSamples();
     const newModels = version !== now.model_version && call("GET", `${url}/models`).then((reply) => { models = reply.models; });
-    const [queries, sessions, stored] = await Promise.all([call("GET", `${url}/queries`), call("GET", `${url}/sessions`), call("GET", `${url}/policies`), newSamples, newModels]);
+    const [queries, sessions, stored] = await Promise.all([call("GET", `${url}/queries`), call("GET", `${url}/sessions`), policiesNow(now, first), newSamples, newModels]);
     if (closed) return;
-    parts ??= build(main, name, now.spec, context);
     parts.show({ now, samples, models: newModels && models, queries: queries.queries, sessions: sessions.sessions, policies: stored.policies });
     version = now.model_version;
   }
@@ -115,14 +126,14 @@ function build(main, name, spec, context) {
       render.facts({ now: rest, found });
       main.classList.toggle("unmodelled", !now.fidelity);
       if (models && models.length) curves.show(models);
-      stored.show(policies);
+      if (policies) stored.show(policies);
       if (models) versions.show(models);
       const point = { samples, fidelity: now.fidelity, version: now.model_version };
       map.show(point);
       probing.show(point);
-      queue.show(queries);
+      if (queries) queue.show(queries);
       ledger.show(now.ledger);
-      sessions.show(open);
+      if (open) sessions.show(open);
       steer.show(now);
       look(rest);
     },
