@@ -38,6 +38,7 @@ from surrogym_server.api.state import Services
 from surrogym_server.api.stepping.routes import StepDoor
 from surrogym_server.api.stepping.routes import router as stepping
 from surrogym_server.api.turns import Turns
+from surrogym_server.cluster import pool
 from surrogym_server.convert import definition_from_spec, stored_definition
 from surrogym_server.convert.stored import read_stored
 from surrogym_server.engine.design_job import DesignJob, DesignResult, initial_queries, run_design_job
@@ -108,17 +109,19 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     """The server as an ASGI app. Its database is open from here to the end of its lifespan.
 
     Raises:
-        InvalidInput: the address of the database can't be used, or the device is not there.
-        Unavailable: the database is taken, or does not answer.
+        InvalidInput: the address of the database can't be used, the device is not there, or the cluster is not, or is
+            another one than is expected.
+        Unavailable: the database is taken, or does not answer; or the cluster's session hosts do not.
     """
     _check_device(settings.device)
+    engine = pool.connect(settings) if settings.engine == "ray" else None
     keep_private(settings)
     storage = open_storage(settings.database_url, settings.synchronous, settings.files)
     app = FastAPI(
         title="Surrogym",
         version=version("surrogym"),
         description=DESCRIPTION,
-        lifespan=lambda app: _lifespan(app, settings, storage, design),
+        lifespan=lambda app: _lifespan(app, settings, storage, design, engine),
         docs_url=None,
         redoc_url=None,
         openapi_url=None,
@@ -161,10 +164,12 @@ def say_goodbye(app: FastAPI) -> None:
 
 
 @asynccontextmanager
-async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: DesignPort) -> AsyncIterator[State]:
+async def _lifespan(
+    app: FastAPI, settings: Settings, storage: Storage, design: DesignPort, engine: SessionEngine | None
+) -> AsyncIterator[State]:
     torch.set_num_threads(settings.threads)
     threadpool_limits(settings.threads, user_api="blas")  # of NumPy, in which policies act
-    process = _build_process(settings, design, storage, app.state.metrics)
+    process = _build_process(settings, design, storage, app.state.metrics, engine)
     app.state.notices = process.notices
     services = _build_services(settings, design, process)
     sweeper = Sweeper(storage, process.engine, settings.sweep_seconds, process.metrics)
@@ -188,17 +193,20 @@ async def _lifespan(app: FastAPI, settings: Settings, storage: Storage, design: 
         await asyncio.gather(*tasks, return_exceptions=True)
         await process.engine.stop()
         await asyncio.to_thread(process.fits.close)
-        logger.info("sessions saved: %d", await services.sessions.save())
+        if not process.engine.lasting:
+            logger.info("sessions saved: %d", await services.sessions.save())
         storage.close()
 
 
-def _build_process(settings: Settings, design: DesignPort, storage: Storage, metrics: ProcessMetrics) -> _Process:
+def _build_process(
+    settings: Settings, design: DesignPort, storage: Storage, metrics: ProcessMetrics, engine: SessionEngine | None
+) -> _Process:
     definitions = Definitions(storage, _stored_definition)
     models = ModelCache(
         load=lambda surrogate, version: load_model(storage, definitions, surrogate, version),
         newest=storage.models.newest,
     )
-    engine = LocalEngine(
+    engine = engine or LocalEngine(
         models,
         lambda surrogate, version: stored_tolerances(storage, surrogate, version),
         limits=Limits(settings.max_sessions, settings.max_sessions_mib * MEBIBYTE, settings.max_waiting),

@@ -48,6 +48,9 @@ class Settings(BaseModel):
     tls_key: FilePath | None = Field(default=None, description="its private key, as PEM")
     device: Annotated[Literal["cpu", "cuda"], Field(description="what steps sessions; fits use the CPU")] = "cpu"
     threads: Annotated[int, Field(ge=1, le=1024, description="of one torch operation")] = 1
+    engine: Annotated[Literal["local", "ray"], Field(description="where sessions are")] = "local"
+    ray_address: Annotated[str, Field(min_length=1, description="of the cluster; auto finds it")] = "auto"
+    ray_hosts: Annotated[int, Field(ge=1, le=1_000, description="processes that hold sessions, each with a CPU")] = 2
     session_idle_seconds: Annotated[float, Field(gt=0)] = 3_600.0
     fit_seconds: Annotated[float, Field(gt=0, description="of one fit; one that takes longer is ended")] = 3_600.0
     fit_workers: Annotated[int, Field(ge=1, le=256, description="fits at once, each in a process")] = 1

@@ -42,6 +42,15 @@ SessionIdleSeconds = Annotated[
 FitSeconds = Annotated[
     float | None, typer.Option(help="Time after which a fit is ended, and has failed. [default: 3600]")
 ]
+Engine = Annotated[
+    str | None, typer.Option(help="Where sessions are: local, in this process, or ray, in a cluster. [default: local]")
+]
+RayAddress = Annotated[
+    str | None, typer.Option(help="Ray cluster; auto finds the one that this machine belongs to. [default: auto]")
+]
+RayHosts = Annotated[
+    int | None, typer.Option(help="Processes of the cluster that hold sessions, each with a CPU. [default: 2]")
+]
 FitWorkers = Annotated[
     int | None, typer.Option(help="Fits of different surrogates at once, each in a process. [default: 1]")
 ]
@@ -78,6 +87,9 @@ def serve(
     session_idle_seconds: SessionIdleSeconds = None,
     fit_seconds: FitSeconds = None,
     fit_workers: FitWorkers = None,
+    engine: Engine = None,
+    ray_address: RayAddress = None,
+    ray_hosts: RayHosts = None,
     log_level: LogLevel = None,
     log_format: LogFormat = None,
     ready_file: ReadyFile = None,

@@ -61,7 +61,7 @@ def check_size(settings: VirtualSettings, max_lanes: int) -> None:
 
 
 def opened(
-    request: Open, definition: EnvironmentDefinition, model: DynamicsModel, version: int, digest: str
+    request: Open, definition: EnvironmentDefinition, model: DynamicsModel, version: int, digest: str, place: str = ""
 ) -> Session:
     """A new session, stepped in the fastest form that its model has.
 
@@ -71,11 +71,12 @@ def opened(
         model: the version that the session begins with, on the same device.
         version: of the model.
         digest: of the opening.
+        place: ending of the session's id.
     """
     opening = request.opening
     settings = _limited(resolved(opening, definition), request.rewards, model)
     return open_session(
-        secrets.token_urlsafe(SESSION_ID_BYTES),
+        secrets.token_urlsafe(SESSION_ID_BYTES) + place,
         request.surrogate,
         definition,
         in_fastest_form(settings, model),

@@ -58,6 +58,7 @@ class LocalEngine(SessionEngine):
         max_lanes: of one session.
         idle_seconds: a session that is not used for so long expires.
         device: where sessions are stepped; what comes in and goes out is not on it.
+        place: ending of the ids of its sessions, where engines in several processes have to be told apart.
     """
 
     def __init__(
@@ -69,12 +70,14 @@ class LocalEngine(SessionEngine):
         max_lanes: int,
         idle_seconds: float,
         device: torch.device = CPU,
+        place: str = "",
     ) -> None:
         self.idle_seconds = idle_seconds
         self._models = models
         self._tolerances = tolerances
         self._max_lanes = max_lanes
         self._device = device
+        self._place = place
         self._threads = (
             ThreadPoolExecutor(STEP_THREADS, thread_name_prefix="step"),
             ThreadPoolExecutor(ROLLOUT_THREADS, thread_name_prefix="rollout"),
@@ -203,7 +206,7 @@ class LocalEngine(SessionEngine):
         version = latest if request.opening.model == "latest" else request.opening.model
         model = self._models.get(request.surrogate_id, version, self._device)
         self._compiling.wait()
-        return opened(request, definition, model, version, digest)
+        return opened(request, definition, model, version, digest, self._place)
 
     def _visited(self, session: Session, states: Array) -> Visited:
         surrogate = session.surrogate_id

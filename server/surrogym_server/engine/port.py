@@ -35,6 +35,7 @@ class SessionEngine(ABC):
     """
 
     idle_seconds: float  # a session that is not used for so long expires
+    lasting: bool = False  # whether sessions live on when this process ends, and other processes find them
 
     @abstractmethod
     async def open(self, request: Open) -> SessionInfo:
@@ -114,7 +115,7 @@ class SessionEngine(ABC):
 
     @abstractmethod
     async def save(self) -> list[Saved]:
-        """All sessions as bytes, after ``stop``."""
+        """All sessions as bytes; usually after ``stop``."""
 
     @abstractmethod
     async def restore(self, request: Restore) -> None:

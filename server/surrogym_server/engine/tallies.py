@@ -45,6 +45,13 @@ class Durations:
             total += count
             yield bound, total
 
+    @classmethod
+    def together(cls, parts: Iterable[Durations]) -> Durations:
+        """Of several processes."""
+        parts = list(parts)
+        columns = zip(*(part._counts for part in parts), strict=True)
+        return cls(sum(part.sum for part in parts), [sum(column) for column in columns]) if parts else cls()
+
     def __len__(self) -> int:
         return sum(self._counts)
 

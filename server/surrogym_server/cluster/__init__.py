@@ -1,0 +1,1 @@
+"""Sessions in a Ray cluster: a fixed pool of processes, each with a ``LocalEngine``, behind ``SessionEngine``."""

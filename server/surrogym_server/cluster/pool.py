@@ -1,0 +1,137 @@
+"""The pool of session hosts in a cluster: found, or started by the first front server that comes."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Sequence
+from dataclasses import fields
+from importlib.util import find_spec
+from typing import Any
+
+import sqlalchemy as sa
+
+from surrogym_server.cluster.host import HostSettings, SessionHost, versions
+from surrogym_server.engine.port import SessionEngine
+from surrogym_server.errors import InvalidInput, Unavailable
+from surrogym_server.settings import Settings
+
+NAMESPACE = "surrogym"
+STARTING_SECONDS, KNOCKING_SECONDS = 180.0, 10.0
+
+
+def check(settings: Settings) -> None:
+    """Raise ``InvalidInput`` where this process can't serve sessions of a cluster."""
+    if find_spec("ray") is None:
+        raise InvalidInput("engine ray: expected the package ray, got none: pip install 'surrogym[ray]'")
+    if settings.database_url.startswith("sqlite"):
+        raise InvalidInput(
+            "engine ray: expected a PostgreSQL database, which all machines reach, got a SQLite file: --database "
+            "postgresql+psycopg://user@host/name"
+        )
+
+
+def connect(settings: Settings) -> SessionEngine:
+    """The engine of the cluster at ``ray_address``, once all hosts are ready.
+
+    Raises:
+        InvalidInput: as ``check``; no cluster there; or one of other versions or other settings.
+        Unavailable: the hosts do not become ready.
+    """
+    check(settings)
+    import ray
+
+    _knock(settings.ray_address)
+    quiet: dict[str, Any] = {"log_to_driver": False, "configure_logging": False}
+    try:
+        ray.init(settings.ray_address, namespace=NAMESPACE, ignore_reinit_error=True, **quiet)
+    except ConnectionError as error:
+        raise InvalidInput(
+            f"engine ray: expected a cluster at {settings.ray_address!r}, got none: ray start --head begins one"
+        ) from error
+    except RuntimeError as error:  # Ray compares its own version and Python's
+        said = " ".join(str(error).split())
+        if "ersion mismatch" in said:
+            raise InvalidInput(f"engine ray: expected a cluster of the same versions: {said}") from error
+        raise Unavailable(f"engine ray: the cluster can't be used: {said}") from error
+    return _of_hosts(HostSettings.of(settings))
+
+
+def _knock(address: str) -> None:
+    """Raise ``InvalidInput`` where nobody listens: Ray would try for minutes, and then end this process."""
+    if address == "auto":
+        return
+    host, _, port = address.rpartition(":")
+    if not (host and port.isascii() and port.isdigit()) or "/" in host:
+        raise InvalidInput(f"setting ray_address: expected auto or host:port, got {address!r}")
+    try:
+        socket.create_connection((host, int(port)), KNOCKING_SECONDS).close()
+    except (OSError, OverflowError) as error:
+        raise InvalidInput(f"engine ray: expected a cluster at {address!r}, got none: {error}") from error
+
+
+def _of_hosts(wanted: HostSettings) -> SessionEngine:
+    from surrogym_server.cluster.engine import RayEngine
+
+    pool = pool_name(wanted.database)
+    first = _host(pool, 0, wanted)
+    _require_same(wanted, _about([first], wanted))  # before any other is started
+    hosts = [first, *(_host(pool, number, wanted) for number in range(1, wanted.hosts))]
+    _require_same(wanted, _about(hosts, wanted))
+    return RayEngine(hosts, wanted.idle_seconds)
+
+
+def _about(hosts: Sequence[Any], wanted: HostSettings) -> list[tuple[HostSettings, dict[str, str]]]:
+    import ray
+
+    try:
+        found: list[tuple[HostSettings, dict[str, str]]] = ray.get(
+            [host.about.remote() for host in hosts], timeout=STARTING_SECONDS
+        )
+    except ray.exceptions.GetTimeoutError as error:
+        raise Unavailable(
+            f"engine ray: expected {wanted.hosts} session hosts within {STARTING_SECONDS:g} s, got fewer: each takes "
+            "one of the cluster's CPUs"
+        ) from error
+    except ray.exceptions.RayError as error:
+        last = str(error).strip().splitlines()[-1]
+        raise Unavailable(f"engine ray: a session host can't start: {last.strip()}") from error
+    return found
+
+
+def pool_name(database: str) -> str:
+    """Name of the pool of a database, the same whatever the password."""
+    url = sa.make_url(database)
+    return f"{url.host or url.query.get('host', '')}:{url.port or ''}/{url.database}"
+
+
+def _host(pool: str, number: int, settings: HostSettings) -> Any:
+    import ray
+
+    options: dict[str, Any] = {
+        "name": f"session host {number} of {pool}",
+        "lifetime": "detached",  # it outlives the front server that was first
+        "get_if_exists": True,
+        "max_restarts": -1,
+        "num_cpus": 1,
+        "num_gpus": 1 if settings.device == "cuda" else 0,
+        "max_concurrency": max(settings.limits.requests, 100) + 100,
+    }
+    return ray.remote(SessionHost).options(**options).remote(settings, number)
+
+
+def _require_same(wanted: HostSettings, found: Sequence[tuple[HostSettings, dict[str, str]]]) -> None:
+    mine = versions()
+    for settings, running in found:
+        for name, theirs in running.items():
+            if theirs != mine.get(name):
+                raise InvalidInput(
+                    f"engine ray: expected {name} {theirs}, which the session hosts run, got {name} {mine.get(name)}"
+                )
+        for field in fields(HostSettings):
+            theirs, ours = getattr(settings, field.name), getattr(wanted, field.name)
+            if theirs != ours:
+                told = f"{theirs}, got {ours}" if field.repr else "another one"
+                raise InvalidInput(
+                    f"engine ray: expected the settings of the session hosts, which have {field.name} {told}; ray stop "
+                    "ends them"
+                )
