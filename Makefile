@@ -15,7 +15,7 @@ PINS := pyproject.toml constraints.txt
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: demo install test audit test-all docs docs-serve format-check lint types imports unit chaos bench bench-memory acquisition compare format postgresql chromium screenshots clean help
+.PHONY: demo install test audit test-all docs docs-serve format-check lint types imports unit chaos bench bench-memory acquisition audit-power compare format postgresql chromium screenshots clean help
 
 demo: .venv/demo  ## Solve Pendulum with server, sampler and trainer on this machine (ARGS="--seed 1")
 	@exec $(BIN)/surrogym demo pendulum $(ARGS)
@@ -64,6 +64,9 @@ bench-memory: .venv/dev  ## Resident memory of a server with 64 sessions of 256 
 
 acquisition: .venv/dev  ## Adaptive queries beside a Latin hypercube, by model error (ARGS="--tasks pendulum --seeds 10")
 	$(BIN)/python tests/benchmarks/acquisition.py $(ARGS)
+
+audit-power: .venv/dev  ## Do audits find 100 wrong models, and leave 100 right ones alone? (ARGS="--right 2 --wrong 1")
+	$(BIN)/python tests/benchmarks/audit_power.py $(ARGS)
 
 compare: .venv/dev  ## Behaviour and speed of two commits, side by side (ARGS="BEFORE AFTER")
 	$(BIN)/python tests/benchmarks/compare_commits.py $(ARGS)

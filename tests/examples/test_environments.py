@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from support.examples import EXAMPLES, cells, run, surrogym
 from support.server import ServerProcess
+from surrogym_client.original import OriginalEnvironment, make
 from surrogym_client.transport import Api
 
 ENVIRONMENT_LINES = 60  # of one's own environment, without blank ones
@@ -48,6 +50,18 @@ def test_the_robot_that_can_be_set_to_no_state_is_sampled(server: ServerProcess,
         server, tmp_path, "sample", "joint", "--env", "robot:Joint", "--until-done", "--json", ROBOT_PERIOD="0"
     )
     assert 12 <= json.loads(report)["steps"] <= 14
+
+
+@pytest.mark.parametrize("name", ["bump:Bump", "noisy_mass:NoisyMass"])
+def test_environments_of_the_decisions_take_a_step(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    environment = make(name)
+    assert isinstance(environment, OriginalEnvironment)
+    spec = environment.spec()
+    q, u = np.full(len(spec.coordinates), 0.5), np.ones(spec.action.size)
+    first, second = (np.asarray(environment.step_from(q, u).next_coordinates) for _ in range(2))
+    assert np.abs(first - q).max() > 0.02
+    assert (first == second).all() == (name == "bump:Bump"), "noise alone differs"
 
 
 def test_the_notebook_runs_from_its_first_cell_to_its_last(server: ServerProcess, tmp_path: Path) -> None:
