@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from surrogym_client.evaluation.evaluator import EvaluationSettings, evaluate
+from surrogym_client.experiments.demo.judging import episodes_of
 from surrogym_client.experiments.settings import DemoSettings
 from surrogym_client.experiments.tasks import TASKS, UNSEEN
 from surrogym_client.experiments.unseen.machine import Machine
@@ -74,3 +76,13 @@ def test_what_can_only_be_reset_repeats_a_seeded_episode():
         machine.begin(5)
         ways.append([machine.act(np.array([0.3])).next_coordinates for _ in range(4)])
     np.testing.assert_array_equal(*ways)
+
+
+@pytest.mark.parametrize("task", UNSEEN)
+def test_an_episode_of_each_can_be_evaluated(task):
+    settings = DemoSettings(task, episodes=2)
+    idle = evaluate(
+        lambda o: np.zeros((len(o), settings.spec().action.size)), episodes_of(settings), EvaluationSettings(episodes=2)
+    )
+    assert len(np.unique(idle.returns)) == 2, "each has a start of its own"
+    assert (idle.lengths == settings.spec().time_limit).all()
