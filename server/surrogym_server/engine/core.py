@@ -155,11 +155,11 @@ def carried_out(
         TooLarge: a rollout of too many steps in all lanes.
         PluginFailed: the code of the model's family failed.
     """
+    if isinstance(request, Step):  # first, and by a call that costs less than a pattern: nearly all requests are steps
+        u = policy_actions(session.definition.action, request.action, session.settings.num_envs)
+        stepped, result = _stepped(session, u, request.mask, request.deviations, models, interrupts)
+        return stepped, (result,)
     match request:
-        case Step():
-            u = policy_actions(session.definition.action, request.action, session.settings.num_envs)
-            stepped, result = _stepped(session, u, request.mask, request.deviations, models, interrupts)
-            return stepped, (result,)
         case Reset():
             latest = models.latest(session.surrogate_id) if session.model == "latest" else session.model
             return reset_session(session, request.seed, request.mask, latest)

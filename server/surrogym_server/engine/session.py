@@ -178,12 +178,14 @@ def step_session(
 
     Every lane steps under its own version; one whose episode ended and began anew goes on under ``latest``.
     """
-    _check_mask(mask, session.settings.num_envs)
+    if mask is not None:
+        _check_mask(mask, session.settings.num_envs)
     lanes, transition = _step_versions(session, action, mask, deviations, model_of)
-    transition = within(session.settings.reward_limits, transition)
+    if session.settings.reward_limits is not None:
+        transition = within(session.settings.reward_limits, transition)
     versions = np.where(transition.reset_lanes, latest, session.versions)
-    session = _visited(_with(session, lanes=lanes, versions=versions), mask)
-    return session, _result(transition, versions)
+    session = _with(session, lanes=lanes, versions=versions)
+    return session if session.visited is None else _visited(session, mask), _result(transition, versions)
 
 
 def _step_versions(
@@ -258,8 +260,8 @@ def _visited(session: Session, chosen: Bools | None) -> Session:
     return replace(session, visited=session.visited.visit(states if chosen is None else states[chosen]))
 
 
-def _check_mask(mask: Bools | None, num_envs: int) -> None:
-    if mask is not None and mask.shape != (num_envs,):
+def _check_mask(mask: Bools, num_envs: int) -> None:
+    if mask.shape != (num_envs,):
         raise InvalidInput(f"mask: expected {num_envs} entries, one a lane, got {len(mask)}")
 
 
