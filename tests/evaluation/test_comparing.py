@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from support.moody import SPEC
-from surrogym_client.cli.disagreement import disagreements_as_json, disagreements_in_words
+from surrogym_client.cli.disagreement import Differing
 from surrogym_client.evaluation.audit import Compared
 from surrogym_client.evaluation.comparing import MOST, Disagreements, disagreements, steps_of
 from surrogym_client.evaluation.evaluator import Trace
@@ -51,15 +51,13 @@ def test_a_wrong_step_is_found_with_its_episode_state_and_output() -> None:
     assert [(one.step.episode, one.step.number, one.output) for one in found.found] == [(1, 3, "reward"), (1, 5, "x")]
     assert found.by_episode() == {1: 2}
     assert found.missing == {0: 0.0, 1: -1.5}
-    lines = disagreements_in_words(found, SPEC, 10_000)
+    lines = Differing(found, 10_000).in_words(SPEC)
     assert lines[0] == "2 of 20 real steps differ from the model by more than it claims"
     assert lines[1].startswith("  episode of seed 10001: 2 such steps; its compared steps paid -1.5 ")
     assert f"seed 10001, step 3, at x {traces[1].coordinates[3, 0]:.4g}: reward is -1.5 beside" in lines[2]
-    assert disagreements_as_json(found, 10_000)["steps"][0]["seed"] == 10_001
+    assert Differing(found, 10_000).as_json()["steps"][0]["seed"] == 10_001
 
 
 def test_a_model_that_is_right_is_said_to_be() -> None:
     found = held(episodes(2, 10), np.zeros((20, 2)))
-    assert disagreements_in_words(found, SPEC, 0) == [
-        "none of 20 real steps differs from the model by more than it claims"
-    ]
+    assert Differing(found, 0).in_words(SPEC) == ["none of 20 real steps differs from the model by more than it claims"]

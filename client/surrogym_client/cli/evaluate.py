@@ -14,7 +14,7 @@ from surrogym_client.cli.options import SpecFile, read_spec
 from surrogym_client.cli.pushing import push_or_say
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, Progress
     from surrogym_client.original.episodes import Episode
@@ -104,7 +104,7 @@ def command(
 
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 100
     """
-    from surrogym_client.cli.disagreement import differ_from, disagreements_as_json, disagreements_in_words, left
+    from surrogym_client.cli.disagreement import differ_from, left
     from surrogym_client.policies.card import card_path, read_card
     from surrogym_shared.terminal import give
 
@@ -113,34 +113,56 @@ def command(
     ledger = _ledger(surrogate, service.server, card, card_path(policy), quiet=output.quiet)
     enter = partial(_enter, ledger, service.server, service.token_for(context), quiet=output.quiet)
     run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
-    result = run(lambda: reading.load(policy, card), what=str(policy))
-    note = f"{settings.episodes} episodes from seed {settings.first_seed}"
-    enter(result.steps, settings.episodes, note)
-    reports: list[tuple[Controller, Evaluation]] = [("policy", result)]
-    if compare is not None:
-        without = run(lambda: _baseline(opener, compare), what=f"{compare} actions")
-        enter(without.steps, settings.episodes, f"{note}, {compare} actions")
-        reports.append((compare, without))
+    reports = _reports(_controllers(policy, card, reading, opener, compare), run, enter, settings, policy)
+    result = reports[0][1]
     version = None
     if push and ledger is not None:
         _keep(policy, reports, settings)
         version = push_or_say(service.server, service.token_for(context), policy, ledger, quiet=output.quiet)
     promise = card.promise if settings.declared and settings.episodes >= FEWEST_TO_JUDGE else None
-    differ = None
+    found, token = None, service.token_for(context)
     if where or left(promise, result):
-        differ = differ_from(ledger, service.server, service.token_for(context), result, quiet=output.quiet)
-    judged = {
-        "promise_kept": _kept(promise, result),
-        "version": version,
-        "disagreements": None if differ is None else disagreements_as_json(differ, settings.first_seed),
-    }
-    summary = {"policy": str(policy), **_settings(settings), **result.summary(), **judged}
+        found = differ_from(ledger, service.server, token, result, settings.first_seed, quiet=output.quiet)
+    judged = {"promise_kept": _kept(promise, result), "version": version, "disagreements": found and found.as_json()}
+    summary = {"policy": str(policy), **_settings(settings), **_summary(reports), **judged}
+    more = [] if found is None else found.in_words(card.spec)
+    give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
+
+
+def _summary(reports: Sequence[tuple[Controller, Evaluation]]) -> dict[str, Any]:
+    """The policy's episodes as JSON, and those without it where they were compared."""
+    summary = reports[0][1].summary()
+    for actions, without in reports[1:]:
+        summary["without"] = {"actions": actions, **without.summary()}
+    return summary
+
+
+def _controllers(
+    policy: Path, card: PolicyCard, reading: PolicyReading, opener: Callable[[], Episode], compare: Compare | None
+) -> dict[Controller, Callable[[], Predict]]:
+    """What acts in the episodes, each loaded when its turn comes."""
+    controllers: dict[Controller, Callable[[], Predict]] = {"policy": lambda: reading.load(policy, card)}
     if compare is not None:
-        summary["without"] = {"actions": compare, **without.summary()}
-    more = [] if differ is None else disagreements_in_words(differ, card.spec, settings.first_seed)
-    give(
-        summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json
-    )  # asked for: --quiet too
+        controllers[compare] = lambda: _baseline(opener, compare)
+    return controllers
+
+
+def _reports(
+    controllers: Mapping[Controller, Callable[[], Predict]],
+    run: Callable[..., Evaluation],
+    enter: Callable[[int, int, str], None],
+    settings: EvaluationSettings,
+    policy: Path,
+) -> list[tuple[Controller, Evaluation]]:
+    """Run the episodes of each controller, and enter their real steps."""
+    reports: list[tuple[Controller, Evaluation]] = []
+    for controller, load in controllers.items():
+        actions = "" if controller == "policy" else f"{controller} actions"
+        result = run(load, what=actions or str(policy))
+        note = f"{settings.episodes} episodes from seed {settings.first_seed}"
+        enter(result.steps, settings.episodes, f"{note}, {actions}" if actions else note)
+        reports.append((controller, result))
+    return reports
 
 
 def _baseline(opener: Callable[[], Episode], compare: Compare) -> Predict:
