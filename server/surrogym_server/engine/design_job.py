@@ -29,8 +29,8 @@ from surrogym_server.sampling.design import (
     initial_design,
     initial_rollouts,
     judge_model,
-    usual_tolerances,
 )
+from surrogym_server.sampling.tolerances import usual_tolerances
 
 Array = NDArray[np.float64]
 Verdict = Literal["continue", "ready", "over_budget", "from_log"]

@@ -8,7 +8,8 @@ from typing import Any
 
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
-from surrogym_server.sampling.design import monte_carlo, usual_tolerances
+from surrogym_server.sampling.design import monte_carlo
+from surrogym_server.sampling.tolerances import usual_tolerances
 
 
 def fidelity_fields(

@@ -8,13 +8,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
-from surrogym_server.environment.samples import Samples, increments
+from surrogym_server.environment.samples import Samples
 from surrogym_server.models.guard import learn, plugin_calls, require_deviations
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.acquisition import acquisition_of
@@ -25,10 +24,10 @@ from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
 from surrogym_server.sampling.noise import SLACK, established_noise, to_repeat, widened
 from surrogym_server.sampling.rollouts import Aim, first_rollouts, plan_round
+from surrogym_server.sampling.tolerances import Usual, frozen_tolerances
 
 Verdict = Literal["continue", "ready", "over_budget", "from_log"]
 SHORTEST_ROUND = 4  # real steps
-TOLERANCE = 0.05  # of the output's deviation over the initial design
 WARM = "thetas"  # in stored states, as it was called when it was always hyperparameters
 FEW_POINTS = 500  # more of them leave no gap worth a comparison of all pairs, whose memory grows with their square
 
@@ -38,18 +37,21 @@ class DesignState:
     """What one round leaves for the next; JSON-able."""
 
     round: int = 0
-    usual: tuple[float, ...] = ()  # tolerances, per output, where nobody set one; frozen after the first round
+    usual: tuple[float, ...] = ()  # tolerances, per output, where nobody set one; see ``tolerances``
     warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # what the fit leaves for the next one
     ended_with: tuple[float, ...] = ()  # steps of the budget, budget, target and tolerances, where the design ended
+    ranges: tuple[float, ...] = ()  # of the targets that each tolerance was taken from
 
     def to_json(self) -> dict[str, Any]:
         warm = {key: array.tolist() for key, array in self.warm.items()}
-        return {"round": self.round, "usual": list(self.usual), WARM: warm, "ended_with": list(self.ended_with)}
+        ended, ranges = list(self.ended_with), list(self.ranges)
+        return {"round": self.round, "usual": list(self.usual), "ranges": ranges, WARM: warm, "ended_with": ended}
 
     @classmethod
     def from_json(cls, state: dict[str, Any]) -> DesignState:
         warm = {key: np.array(array) for key, array in state.get(WARM, {}).items()}
-        return cls(state.get("round", 0), tuple(state.get("usual", ())), warm, tuple(state.get("ended_with", ())))
+        usual, ended, ranges = (tuple(state.get(name, ())) for name in ("usual", "ended_with", "ranges"))
+        return cls(state.get("round", 0), usual, warm, ended, ranges)
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,8 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         ChoiceFailed: the acquisition broke its laws.
     """
     learned = learn(definition, samples, state.warm)
-    usual = state.usual or usual_tolerances(definition, sizes_of(definition, samples))
+    frozen = frozen_tolerances(definition, samples, Usual(state.usual, state.ranges))
+    usual = frozen.tolerances
     judged = judge_model(learned.model, samples, usual, request, state.round)
     confidences, tolerances, verdict = judged.confidences, judged.tolerances, judged.verdict
     now = (
@@ -136,7 +139,7 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     if verdict == "continue" and not len(chosen) and not rollouts:
         verdict = "over_budget"  # the rest of the budget is pending, or nothing distinct is left to ask
     ended = now if verdict != "continue" and not len(chosen) and not rollouts else ()
-    new_state = DesignState(state.round + 1, usual, learned.warm, ended)
+    new_state = DesignState(state.round + 1, usual, learned.warm, ended, frozen.ranges)
     return Decision(learned.model, confidences, tolerances, new_state, verdict, chosen.q, chosen.u, rollouts)
 
 
@@ -176,18 +179,6 @@ def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
     """The Monte Carlo set of eq. 8, the same in every round: coordinates (m, C), actions (m, F)."""
     rng = _rng(definition, "monte carlo")
     return going_on(definition, *random_points(definition, definition.design.monte_carlo, rng), rng)
-
-
-def sizes_of(definition: EnvironmentDefinition, samples: Samples) -> list[float]:
-    """Size of each output (O,): its deviation over the samples at hand, or that of its mean, if it never varied."""
-    targets = torch.cat([increments(definition, samples), samples.reward[:, None]], -1)
-    spread, mean = targets.std(0, correction=0), targets.mean(0).abs()
-    return torch.where(spread > 0, spread, torch.where(mean > 0, mean, 1.0)).tolist()
-
-
-def usual_tolerances(definition: EnvironmentDefinition, sizes: Sequence[float]) -> tuple[float, ...]:
-    """Tolerance of each output, of sizes (O,), that nobody set: 5 % of its size, or as printed 1 in its unit."""
-    return tuple(1.0 if definition.design.tolerance == "raw" else TOLERANCE * size for size in sizes)
 
 
 def judge(

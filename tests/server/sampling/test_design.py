@@ -25,9 +25,8 @@ from surrogym_server.sampling.design import (
     initial_design,
     judge,
     monte_carlo,
-    sizes_of,
-    usual_tolerances,
 )
+from surrogym_server.sampling.tolerances import sizes_of, usual_tolerances
 from surrogym_shared.spec import Design, EnvironmentSpec
 
 NEVER = DesignState(1, (1e-12,) * 3)  # tolerances that no model reaches

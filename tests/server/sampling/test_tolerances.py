@@ -1,0 +1,65 @@
+"""Tolerances that nobody set: frozen, but for those of samples that met nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from support.plane import drifting, plane
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.sampling.tolerances import FLOOR, TOLERANCE, Usual, frozen_tolerances, sizes_of, usual_tolerances
+from surrogym_shared.spec import Design
+
+DEFINITION = definition_from_spec(plane())
+NOTHING_MET = drifting(lambda q, _: (-800 * q.square().sum(-1)).exp() * 1e-100, 5)
+PAID = drifting(lambda q, _: (-q.square().sum(-1)).exp(), 6)
+
+
+def frozen(samples, before=None):
+    return frozen_tolerances(DEFINITION, samples, before or Usual())
+
+
+def test_tolerance_of_what_met_nothing_is_taken_again_when_something_is_paid():
+    first = frozen(NOTHING_MET)
+    assert first.tolerances[-1] < 1e-100
+    second = frozen(PAID, first)
+    assert second.tolerances[-1] == pytest.approx(TOLERANCE * float(PAID.reward.std(correction=0)))
+    assert second.tolerances[:-1] == first.tolerances[:-1]
+
+
+def test_tolerance_that_fits_is_frozen():
+    first = frozen(PAID)
+    paid_more = replace(PAID, reward=100 * PAID.reward)
+    assert frozen(paid_more, first) == first
+
+
+def test_tolerance_of_a_constant_reward_is_taken_again_once_it_varies():
+    constant = replace(PAID, reward=torch.ones(6, dtype=torch.float64))
+    first = frozen(constant)
+    assert first.tolerances[-1] == TOLERANCE
+    assert frozen(replace(PAID, reward=1 + 1e-3 * PAID.reward), first).tolerances[-1] < 1e-4
+
+
+def test_reward_of_an_ending_does_not_change_a_tolerance():
+    first = frozen(NOTHING_MET)
+    ended = replace(NOTHING_MET, reward=NOTHING_MET.reward.clone(), terminated=NOTHING_MET.terminated.clone())
+    ended.reward[0], ended.terminated[0] = 1.0, True
+    assert frozen(ended, first) == first
+
+
+def test_state_without_ranges_keeps_its_tolerances():
+    assert frozen(PAID, Usual((1e-12,) * 3)) == Usual((1e-12,) * 3)
+
+
+def test_increments_of_rounding_get_the_floor_of_their_range():
+    still = replace(PAID, q_next=PAID.q * (1 + 3e-16))
+    tolerance = usual_tolerances(DEFINITION, sizes_of(DEFINITION, still))
+    assert min(tolerance[:2]) == pytest.approx(TOLERANCE * FLOOR / 3**0.5)
+
+
+def test_raw_tolerances_are_one_whatever_was_met():
+    raw = definition_from_spec(plane().model_copy(update={"design": Design(tolerance="raw")}))
+    first = frozen_tolerances(raw, NOTHING_MET, Usual())
+    assert frozen_tolerances(raw, PAID, first).tolerances == (1.0, 1.0, 1.0)
