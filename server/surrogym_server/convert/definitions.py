@@ -117,6 +117,7 @@ def _model(design: wire.Design) -> Choice:
         preset: dict[str, float | bool | str] = {
             "kernel": kernel,
             "reward_jumps": not paper,
+            "reward_peaks": not paper,
             "symmetry": design.symmetry,
         }
         choice = Choice(choice.name, tuple({**preset, **dict(choice.settings)}.items()))

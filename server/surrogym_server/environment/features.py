@@ -16,7 +16,7 @@ from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.points import Points
 
 State = Literal["cos_sin", "wrapped", "both", "observation", "none"]
-Encoding = Literal["value", "one_hot"]  # of discrete actions
+Encoding = Literal["value", "one_hot", "none"]  # of actions; one-hot of discrete ones
 Parity = Literal["", "odd", "even"]
 Drift = tuple[tuple[float, ...], ...]  # weights (C,) of q for each angle
 
@@ -27,10 +27,11 @@ class FeatureMap:
 
     ``state``: angles as cos and sin, as the wrapped angle, or both; or the observation: as it is in the paper,
     standardised elsewhere; or none of coordinates and action, but the lead alone.
-    ``action``: discrete actions as evenly spaced values, or one-hot. ``lead``: the predicted, clipped next value of
-    saturating coordinates is an input as well, so that what follows from it (an angle from its speed) sees no kink.
-    ``after``: the state that the step led to is shown, not the one it began in; only for the reward. ``drift``: weights
-    (C,) of q for each angle; cos and sin of where the angle turns to by them are inputs as well. ``parity``: what the
+    ``action``: discrete actions as evenly spaced values, or one-hot, or no action at all. ``lead``: the predicted,
+    clipped next value of saturating coordinates is an input as well, so that what follows from it (an angle from its
+    speed) sees no kink. ``after``: the state that the step led to is shown, not the one it began in; only for the
+    reward. ``drift``: weights (C,) of q for each angle; cos and sin of where the angle turns to by them are inputs as
+    well. ``parity``: what the
     output does when every coordinate and the action change their sign: nothing in particular, or it does so too
     (odd), or it stays (even).
     """
@@ -168,7 +169,7 @@ def _of_point(definition: EnvironmentDefinition, feature_map: FeatureMap) -> lis
     for index, weights in zip(definition.angles, feature_map.drift, strict=False):
         turned = tuple(w + (i == index) for i, w in enumerate(weights))
         made += [Feature("turned_cos", index, weights=turned), Feature("turned_sin", index, weights=turned)]
-    for entry in range(definition.action.size):
+    for entry in range(definition.action.size if feature_map.action != "none" else 0):
         made += _of_action(definition, feature_map, entry)
     return made
 

@@ -45,6 +45,7 @@ class FitOptions:
     linear_prior: tuple[float, float] = (0.0, 2.0)
     quadratic_prior: tuple[float, float] = (-2.0, 2.0)
     noise_prior: tuple[float, float] = (math.log(1e-7), 6.0)
+    noise_floor: float = NOISE_FLOOR
     max_iterations: int = 100
 
 
@@ -156,7 +157,7 @@ class _Objective:
         size = len(self.prior)
         self.lower, self.upper = np.full(size, math.log(1e-8)), np.full(size, math.log(1e4))
         self.lower[:d], self.upper[:d] = math.log(0.02), math.log(1e3)
-        self.lower[-1], self.upper[-1] = math.log(NOISE_FLOOR), math.log(2.0)
+        self.lower[-1], self.upper[-1] = math.log(options.noise_floor), math.log(2.0)
         self.default_start = self.prior[:, 0].copy()
         self.default_start[-1] = math.log(1e-4)
         self.constant = 0.5 * n * math.log(2 * math.pi) + float(np.log(self.prior[:, 1]).sum())

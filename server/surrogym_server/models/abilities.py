@@ -188,6 +188,23 @@ class RewardEdges(ABC):
         """For each edge the chance that the model errs about the side of steps from q (m, C) to q_next (m, C), (m,)."""
 
 
+class RewardPeaks(ABC):
+    """Rewards that are next to nothing nearly everywhere, learned so that where they are highest can be looked for.
+
+    Fallback of ``sampling``: no query is spent on looking.
+    """
+
+    @property
+    @abstractmethod
+    def reward_hides(self) -> bool:
+        """Whether the reward is learned so, here."""
+
+    @abstractmethod
+    def promise(self, q: Tensor, u: Tensor) -> Tensor:
+        """How high the reward of steps from q (m, C) under u (m, F) may be, given what is not known, (m,): in any unit
+        that keeps the order, and tells points apart that are paid next to nothing."""
+
+
 Floats = NDArray[np.float64]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -50,6 +50,14 @@ def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, r
     reads = acquisition_of(model.definition.design.acquisition).reads_probability
     log_p = input_probability(model, points, states) if reads else points.q.new_zeros(len(points))
     return Candidates(points, log_p, reference, weights / weights.sum())
+
+
+def with_more(candidates: Candidates, points: Points) -> tuple[Candidates, Tensor]:
+    """Candidates with k more points to choose from, each as likely as the likeliest of them; and which they are,
+    (m + k,) bool."""
+    log_p = torch.cat([candidates.log_p, candidates.log_p.max().expand(len(points))])
+    joined = Points.joined([candidates.points, points])
+    return replace(candidates, points=joined, log_p=log_p), torch.arange(len(joined)) >= len(candidates.points)
 
 
 def input_probability(model: DynamicsModel, points: Points, states: Tensor | None) -> Tensor:

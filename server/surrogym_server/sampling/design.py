@@ -18,11 +18,12 @@ from surrogym_server.models.guard import learn, plugin_calls, require_deviations
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.batch import choose
-from surrogym_server.sampling.candidates import Candidates, candidates_of
+from surrogym_server.sampling.candidates import Candidates, candidates_of, with_more
 from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
 from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
 from surrogym_server.sampling.noise import SLACK, established_noise, to_repeat, widened
+from surrogym_server.sampling.peaks import highest
 from surrogym_server.sampling.rollouts import Aim, first_rollouts, plan_round
 from surrogym_server.sampling.tolerances import Usual, frozen_tolerances
 
@@ -151,7 +152,7 @@ class Judged:
     tolerances: tuple[float, ...]  # per output
     verdict: Verdict
     candidates: Candidates  # m
-    reserved: Tensor | None  # (m,) bool: which of them are to be asked first; see ``endings``
+    reserved: Tensor | None  # (m,) bool: which of them are to be asked first; see ``endings`` and ``peaks``
 
 
 def judge_model(
@@ -171,6 +172,13 @@ def judge_model(
     candidates = candidates_of(model, points, request.states, _rng(definition, f"visited {round_}"))
     reserved = ending(model, samples, candidates.points)
     settled = reserved is None or not definition.learns_termination
+    peak = None
+    if definition.design.stopping == "tested_confidence":
+        peak = highest(model, samples, candidates.points, tolerances[-1], _rng(definition, f"peak {round_}"))
+    if peak is not None:
+        settled = False
+        if reserved is None or round_ % 2:  # both are asked in turn
+            candidates, reserved = with_more(candidates, peak)
     verdict = judge(definition, confidences, tolerances, len(samples), request, settled)
     return Judged(confidences, tolerances, verdict, candidates, reserved)
 

@@ -14,7 +14,7 @@ import torch
 from support.models import gaussian_processes
 from support.real_steps import random_steps
 from surrogym_client.original.classic import acrobot, cartpole, pendulum
-from surrogym_client.original.swingup import swing_up
+from surrogym_client.original.swingup import swing_up, swing_up_narrow
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.errors import NotReset
 from surrogym_server.models.gaussian_process import model as gaussian_process_model
@@ -58,6 +58,7 @@ ENVIRONMENTS: dict[str, Callable[[], EnvironmentSpec]] = {
     "cart-pole": cartpole,
     "acrobot": acrobot,
     "swing-up": swing_up,
+    "narrow swing-up": swing_up_narrow,
     "paper": lambda: paper(pendulum()),
     "learned ending": lambda: cartpole().model_copy(update={"termination": "learned"}),
 }

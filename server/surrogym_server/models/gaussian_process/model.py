@@ -26,6 +26,7 @@ from surrogym_server.models.abilities import (
     PathOutlook,
     PredictedSteps,
     RewardEdges,
+    RewardPeaks,
     UncertainHyperparameters,
 )
 from surrogym_server.models.gaussian_process.censoring import usable
@@ -56,6 +57,7 @@ class GaussianProcessModel(
     LearnedNoise,
     Lookahead,
     RewardEdges,
+    RewardPeaks,
     Differentiable,
     CompiledSteps,
 ):
@@ -98,7 +100,7 @@ class GaussianProcessModel(
 
     @cached
     def scales(self) -> Tensor:
-        return torch.tensor([o.scale for o in self.outputs], dtype=torch.float64, device=self.definition.device)
+        return torch.tensor([o.size for o in self.outputs], dtype=torch.float64, device=self.definition.device)
 
     @property
     def structures(self) -> tuple[str, ...]:
@@ -178,6 +180,16 @@ class GaussianProcessModel(
         for jump in self.jumps:
             inside = jump.region.probability(state)
             yield inside.minimum(1 - inside)
+
+    @property
+    def reward_hides(self) -> bool:
+        return self.reward.warp is not None and self.reward.warp.sign > 0
+
+    def promise(self, q: Tensor, u: Tensor) -> Tensor:
+        """Mean and one deviation of the reward's targets."""
+        steps = PredictedSteps(q, u, self._predictor.transition(q, u, None, None, None, False, False).q_next)
+        mean, deviation = self.reward.target(process_inputs(self.definition, self.reward, steps))
+        return mean + deviation
 
     def compiled(self) -> ArraySteps | None:
         return self._compiled

@@ -15,15 +15,18 @@ class Settings:
         kernel: of every process; ``composite`` adds a linear part, and for the reward a quadratic one.
         reward_jumps: whether the reward may jump where a learned region begins.
         symmetry: ``auto`` compares feature maps that are their own mirror image with the others, ``none`` does not.
+        reward_peaks: whether the reward may be learned by its logarithm, where it is next to nothing nearly everywhere.
     """
 
     kernel: str = "composite"
     reward_jumps: bool = True
     symmetry: str = "auto"
+    reward_peaks: bool = True
 
     def __post_init__(self) -> None:
         for name, known in CHOICES.items():
             if (given := getattr(self, name)) not in known:
                 raise ValueError(f"expected {name} to be one of {', '.join(known)}, got {given!r}")
-        if not isinstance(self.reward_jumps, bool):
-            raise ValueError(f"expected reward_jumps to be true or false, got {self.reward_jumps!r}")
+        for name in ("reward_jumps", "reward_peaks"):
+            if not isinstance(given := getattr(self, name), bool):
+                raise ValueError(f"expected {name} to be true or false, got {given!r}")

@@ -28,9 +28,9 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 from surrogym_server.models.gaussian_process.prediction.regions import TERMINATION
 from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel
 
-FORMAT = 3
+FORMAT = 4
 JUMP = "jump"  # before the names of its arrays
-READABLE = (1, 2, 3)  # 1: a reward's timing was the definition's alone; 2: no drift
+READABLE = (1, 2, 3, 4)  # 1: a reward's timing was the definition's alone; 2: no drift; 3: no warp
 
 
 class GaussianProcessCodec(ModelCodec):

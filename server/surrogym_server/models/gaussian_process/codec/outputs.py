@@ -10,12 +10,13 @@ from typing import Any, get_args
 import torch
 from torch import Tensor
 
-from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
 from surrogym_server.environment.features import Encoding, FeatureMap, Parity, State, encode
 from surrogym_server.errors import InvalidInput
 from surrogym_server.gp import Hyperparameters, LeftOut, Posterior, Sparse
 from surrogym_server.models.gaussian_process.feature_maps import reflection
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
+from surrogym_server.models.gaussian_process.prediction.warp import Warp
 
 KNOWN_MAPS = frozenset(
     FeatureMap(state, action, lead, after, parity=parity)
@@ -39,6 +40,7 @@ def output_tensors(output: OutputModel, prefix: str) -> dict[str, Tensor]:
 def require_output(definition: EnvironmentDefinition, output: OutputModel) -> None:
     """Raises InvalidInput: arrays of other shapes than the environment's, or numbers that no process has."""
     _require_drift(definition, output)
+    _require_warp(output)
     _require_shapes(definition, output)
     _require_numbers(output)
 
@@ -53,6 +55,7 @@ def output_header(output: OutputModel) -> dict[str, Any]:
         "left_out": output.left_out,
         "scores": output.scores,
         "posterior": None,
+        "warp": None if output.warp is None else asdict(output.warp),
     }
     if (posterior := output.posterior) is not None:
         hyper = posterior.hyper
@@ -94,7 +97,12 @@ def read_output(
         posterior = Posterior(hyper, x, y, factor, weights, jitter, sparse)
     scores = tuple((name, score) for name, score in entry["scores"])
     centre, scale = float(entry["centre"]), float(entry["scale"])
-    return OutputModel(str(entry["name"]), feature_map, posterior, centre, scale, int(entry["left_out"]), scores)
+    name, left_out, warp = str(entry["name"]), int(entry["left_out"]), _warp(entry.get("warp"))
+    return OutputModel(name, feature_map, posterior, centre, scale, left_out, scores, warp)
+
+
+def _warp(entry: dict[str, Any] | None) -> Warp | None:
+    return None if entry is None else Warp(*(float(entry[name]) for name in ("base", "sign", "size")))
 
 
 def _sparse(entry: dict[str, Any] | None) -> Sparse | None:
@@ -117,6 +125,14 @@ def _require_drift(definition: EnvironmentDefinition, output: OutputModel) -> No
     shape = (len(definition.angles), len(definition.coordinates))
     if len(drift) != shape[0] or any(len(row) != shape[1] or not all(map(math.isfinite, row)) for row in drift):
         raise InvalidInput(f"output {output.name!r}: expected a drift of shape {shape}, finite, got {drift}")
+
+
+def _require_warp(output: OutputModel) -> None:
+    """Of the reward alone, and of a process."""
+    if output.warp is None:
+        return
+    if output.name != REWARD or output.posterior is None or not output.warp.finite:
+        raise InvalidInput(f"output {output.name!r}: expected a warp of a learned reward, finite, got {output.warp}")
 
 
 def _require_numbers(output: OutputModel) -> None:

@@ -19,9 +19,12 @@ from surrogym_server.models.port import Warm
 
 # Log odds of maps before any data. A map that reads the lead fits no better where nothing was cut, and alone is right
 # where something is; few samples look like noise over the lead alone; and what is seen of one side alone says nothing
-# of the other, mirrored or not.
-LEAD_ODDS, ALONE_ODDS, PARITY_ODDS = 3.0, -6.0, -3.0
+# of the other, mirrored or not. What pays in one place alone seldom asks for the action as well.
+LEAD_ODDS, ALONE_ODDS, PARITY_ODDS, PLACE_ODDS = 3.0, -6.0, -3.0, 3.0
 CONSTANT = 1e-9  # an output whose deviation is below this share of its own size never varied
+SMALLEST = 1e-100  # deviation of an output: what is less has squares that are no numbers
+PEAK = "reward peak"  # the logarithm of a reward
+PEAK_NOISE = 1e-10  # of the variance of logarithms, at least: theirs is hundreds, and 1 % of a reward must be told
 
 
 @dataclass
@@ -46,7 +49,7 @@ class OutputLearner:
         compared on the same points.
         """
         centre, scale = float(target[keep].mean()), float(target[keep].std(correction=0))
-        if scale <= CONSTANT * abs(centre):
+        if scale <= max(CONSTANT * abs(centre), SMALLEST):
             return OutputModel(name, next(iter(inputs)), None, centre, 1.0, int((~keep).sum()))
         around = {m: 0.0 if m.parity == "odd" else centre for m in inputs}
         fits = {m: self._fit(name, m, x[keep], (target[keep] - around[m]) / scale) for m, x in inputs.items()}
@@ -83,9 +86,12 @@ class OutputLearner:
         """Dynamics tend to be near linear, costs to be quadratic."""
         if self.settings.kernel == "squared_exponential":
             return FitOptions(linear=False)
+        if name == PEAK:
+            return FitOptions(quadratic=True, noise_floor=PEAK_NOISE)
         return FitOptions(quadratic=name == REWARD)
 
 
 def _odds(feature_map: FeatureMap) -> float:
     alone = feature_map.state == "none"
-    return LEAD_ODDS * feature_map.lead + ALONE_ODDS * alone + PARITY_ODDS * bool(feature_map.parity)
+    odds = LEAD_ODDS * feature_map.lead + ALONE_ODDS * alone + PARITY_ODDS * bool(feature_map.parity)
+    return odds + PLACE_ODDS * (feature_map.action == "none")

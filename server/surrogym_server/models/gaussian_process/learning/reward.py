@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
+from torch import Tensor
 
 from surrogym_server.environment.declared_reward import DeclaredReward
-from surrogym_server.environment.definition import REWARD
+from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
 from surrogym_server.environment.features import FeatureMap, encode
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.gaussian_process.feature_maps import reward_candidates
 from surrogym_server.models.gaussian_process.learning.jumps import with_jumps
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
+from surrogym_server.models.gaussian_process.learning.peaks import with_peak
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.regions import Jump, jumped
 
@@ -29,7 +33,9 @@ def learn_reward(learner: OutputLearner, samples: Samples) -> tuple[OutputModel,
     going = ~samples.terminated if int((~samples.terminated).sum()) >= FEW else torch.ones_like(samples.terminated)
     output = learner.output(REWARD, samples.reward, inputs, going, going)
     jumps: tuple[Jump, ...] = ()
-    if learner.settings.reward_jumps:
+    if learner.settings.reward_peaks:
+        output = with_peak(learner, samples.reward, inputs | _without_action(definition, samples), going, output)
+    if learner.settings.reward_jumps and output.warp is None:
         output, jumps = with_jumps(learner, samples, inputs, going, output)
     ended = ~going
     if not bool(ended.any()):
@@ -37,6 +43,14 @@ def learn_reward(learner: OutputLearner, samples: Samples) -> tuple[OutputModel,
     state = samples.q_next if output.feature_map.after else samples.q
     bonus = (samples.reward - output.mean(inputs[output.feature_map]) - jumped(jumps, state)[0])[ended]
     return output, float(bonus.mean()), jumps
+
+
+def _without_action(definition: EnvironmentDefinition, samples: Samples) -> dict[FeatureMap, Tensor]:
+    """Inputs of the state alone: what is paid in one place seldom depends on the action."""
+    maps = {replace(m, action="none") for m in reward_candidates(definition) if not m.parity}
+    return {
+        m: encode(definition, m, samples.q_next if m.after else samples.q, samples.u) for m in sorted(maps, key=str)
+    }
 
 
 def _declared(known: DeclaredReward, samples: Samples) -> OutputModel:

@@ -19,6 +19,8 @@ def describe(output: OutputModel) -> dict[str, Any]:
         "left_out": output.left_out,
         "scores": dict(output.scores),
     }
+    if output.warp is not None:
+        described["learned"] = str(output.warp)
     if output.posterior is not None:
         hyper = output.posterior.hyper
         described |= {
@@ -45,4 +47,5 @@ def structure(output: OutputModel) -> str:
     """Kernel and inputs of an output, in a few words."""
     if output.posterior is None:
         return "constant"
-    return f"{output.posterior.hyper.kernel} on {output.feature_map}"
+    learned = "" if output.warp is None else f"{output.warp}: "
+    return f"{learned}{output.posterior.hyper.kernel} on {output.feature_map}"

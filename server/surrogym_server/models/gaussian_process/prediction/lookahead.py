@@ -27,6 +27,7 @@ from surrogym_server.models.abilities import OutputOutlook, PathOutlook, Predict
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
 BLOCK = 4_000_000  # numbers in a matrix of covariances at once
+SMALLEST = 1e-300  # slope: none at all
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class ProcessOutlook(OutputOutlook):
     learns: Tensor  # (m,) bool
     shared: Tensor  # (r, m) covariance of reference and candidates, standardised: kept, so that it is taken once
     scale: float
+    slope: Tensor | None = None  # (m + r,) of a warped output over its targets
 
     @classmethod
     def of(cls, output: OutputModel, x: Tensor, learns: Tensor, spans: tuple[int, int]) -> ProcessOutlook:
@@ -46,14 +48,22 @@ class ProcessOutlook(OutputOutlook):
         for index in range(spans[1], len(x)):
             joint = joint.observe(index) if learns[index] else joint
         shared = joint.between(slice(*spans), slice(spans[0]))
-        return cls(joint, learns[: spans[0]], shared, output.scale)
+        return cls(joint, learns[: spans[0]], shared, output.scale, slope_at(output, x[: spans[1]]))
 
     @property
     def deviation(self) -> Tensor:
-        return self.scale * self.joint.variance[: len(self.learns)].sqrt()
+        count = len(self.learns)
+        deviation = self.scale * self.joint.variance[:count].sqrt()
+        return deviation if self.slope is None else deviation * self.slope[:count]
 
     def reduction(self, weights: Tensor) -> Tensor:
-        """sum_r w_r k(x_r, x)^2 / (k(x, x) + sigma_n^2), Cohn (NIPS 1993), in closed form for a Gaussian process."""
+        """sum_r w_r k(x_r, x)^2 / (k(x, x) + sigma_n^2), Cohn (NIPS 1993), in closed form for a Gaussian process.
+
+        Of a warped output each reference point counts by its slope, in shares of the steepest: only the order counts.
+        """
+        if self.slope is not None:
+            steep = self.slope[len(self.learns) :]
+            weights = weights * (steep / steep.max().clamp_min(SMALLEST)).square()
         spread = self.joint.variance[: len(self.learns)] + self.joint.noise
         return self.scale**2 * (weights @ self.shared.square()) / spread
 
@@ -81,6 +91,8 @@ class ProcessAlongPaths(PathOutlook):
         output = self.output
         assert output.posterior is not None
         room = max(1, BLOCK // (self.x.shape[1] * (self.x.shape[1] + len(output.posterior.y))))
+        if (slope := slope_at(output, self.x.flatten(0, 1))) is not None:
+            weight = weight * slope.reshape(weight.shape)
         blocks = zip(torch.split(self.x, room), torch.split(weight, room), strict=True)
         ratio = (output.scale / tolerance) ** 2
         return torch.cat([_log_determinants(ratio * output.posterior.joint_covariance(b), w) for b, w in blocks])
@@ -90,6 +102,11 @@ def process_inputs(definition: EnvironmentDefinition, output: OutputModel, steps
     """What one output's process reads along steps (..., C): (..., d)."""
     state = steps.q_next if output.feature_map.after else steps.q
     return encode(definition, output.feature_map, state, steps.u, steps.q_next[..., leading(definition)])
+
+
+def slope_at(output: OutputModel, x: Tensor) -> Tensor | None:
+    """How far a warped output moves with its targets at inputs x (m, d), (m,); None without a warp."""
+    return None if output.warp is None else output.warp.slope(*output.target(x))
 
 
 def as_if_answered(output: OutputModel, x: Tensor) -> OutputModel:

@@ -10,13 +10,15 @@ from torch import Tensor
 from surrogym_server.environment.features import FeatureMap
 from surrogym_server.gp import Posterior
 from surrogym_server.models.abilities import LeaveOneOutErrors
+from surrogym_server.models.gaussian_process.prediction.warp import Warp
 
 
 @dataclass(frozen=True)
 class OutputModel:
     """The process of one output, and the scaling of its targets: y = (target - centre) / scale.
 
-    ``posterior`` is None for an output that never varied: its mean is ``centre`` and its deviation 0.
+    ``posterior`` is None for an output that never varied: its mean is ``centre`` and its deviation 0. With a ``warp``
+    the targets are what it is taken of, and means, deviations and errors are in the output's unit all the same.
     """
 
     name: str
@@ -26,28 +28,59 @@ class OutputModel:
     scale: float
     left_out: int = 0  # samples left out because they ended at a bound
     scores: tuple[tuple[str, float], ...] = ()  # evidence of every feature map compared
+    warp: Warp | None = None
 
     def mean(self, x: Tensor) -> Tensor:
         """Posterior mean at features x (m, d), in the output's unit, (m,)."""
         if self.posterior is None:
             return x.new_full(x.shape[:-1], self.centre)
-        return self.centre + self.scale * self.posterior.mean(x)
+        mean = self.centre + self.scale * self.posterior.mean(x)
+        return mean if self.warp is None else self.warp.value(mean)
 
     def mean_and_deviation(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Posterior mean and latent deviation at x (m, d), in the output's unit, (m,) each."""
+        return paid(self.warp, *self.target(x))
+
+    def target(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Posterior mean and latent deviation at x (m, d), in the targets' unit, (m,) each."""
         if self.posterior is None:
             return x.new_full(x.shape[:-1], self.centre), x.new_zeros(x.shape[:-1])
         mean, variance = self.posterior.mean_and_variance(x)
         return self.centre + self.scale * mean, self.scale * variance.sqrt()
 
     @property
+    def size(self) -> float:
+        """Deviation of the output over the samples, in its unit; 1 for one that never varied."""
+        return self.scale if self.warp is None else self.warp.size
+
+    @property
     def noise_deviation(self) -> float:
-        """Deviation of the learned noise, in the output's unit."""
-        return 0.0 if self.posterior is None else self.scale * math.sqrt(self.posterior.hyper.noise_variance)
+        """Deviation of the learned noise, in the output's unit; of a warped one where it is as large as its size."""
+        if self.posterior is None:
+            return 0.0
+        noise = self.scale * math.sqrt(self.posterior.hyper.noise_variance)
+        return noise if self.warp is None else noise * self.warp.size
 
     def leave_one_out(self) -> LeaveOneOutErrors:
         """How the process without each sample in turn foretells it. One that never varied makes no error."""
         if self.posterior is None:
             return LeaveOneOutErrors(0.0, 1.0, 1.0)
         found = self.posterior.left_out
-        return LeaveOneOutErrors(self.scale * found.error, found.within_one, found.within_two)
+        error = self.scale * found.error
+        if self.warp is not None:
+            error = self._left_out_warped(self.warp, error)
+        return LeaveOneOutErrors(error, found.within_one, found.within_two)
+
+    def _left_out_warped(self, warp: Warp, error: float) -> float:
+        """Root mean square of what rewards are foretold wrong by, given that of their targets."""
+        assert self.posterior is not None
+        if self.posterior.sparse is not None:
+            return error * warp.size
+        mean, _ = self.posterior.leave_one_out()
+        foretold, seen = (warp.value(self.centre + self.scale * y) for y in (mean, self.posterior.y))
+        return float((foretold - seen).square().mean().sqrt())
+
+
+def paid(warp: Warp | None, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and deviation (m,) of an output, given those of its targets."""
+    return (mean, deviation) if warp is None else (warp.value(mean), warp.deviation(mean, deviation))

@@ -54,7 +54,7 @@ class Predictor:
             q_next,
             reward,
             spread[:, list(self._columns)] if deviations else None,
-            (spread[:, -1].square() + edges).sqrt() if reward_deviation else None,
+            self._reward_spread(mean[:, -1], spread[:, -1], edges) if reward_deviation else None,
         )
 
     def means(self, q: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -104,12 +104,20 @@ class Predictor:
         """Rewards (m,) of steps from q (m, C) under u (m, F) to q_next (m, C), the process' mean and what jumps and a
         declared reward add, and the variance (m,) of where the jumps are, 0 without any."""
         state = q_next if self.reward.feature_map.after else q
+        if self.reward.warp is not None:
+            mean = self.reward.warp.value(mean)
         if (known := self.definition.declared_reward) is not None:
             mean = mean + known(state, u)
         if not self.jumps:
             return mean, 0.0
         added, variance = jumped(self.jumps, state)
         return mean + added, variance
+
+    def _reward_spread(self, mean: Tensor, spread: Tensor, edges: Tensor | float) -> Tensor:
+        """Deviation (m,) of the reward, given mean and deviation (m,) of its process and the variance of its edges."""
+        if self.reward.warp is not None:
+            spread = self.reward.warp.deviation(mean, spread)
+        return (spread.square() + edges).sqrt()
 
     def _in_columns(self, noise: Tensor | None) -> Tensor | None:
         if noise is None:

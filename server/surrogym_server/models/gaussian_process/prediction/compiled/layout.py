@@ -21,7 +21,8 @@ NONE = -1  # in place of a place
     CONDITIONS,
     JUMPS,
     ENDING,
+    WARP,
     HAS_STAGE,
-) = range(19)
+) = range(20)
 ENTRIES = HAS_STAGE + 3  # one for each stage
 BLOCK = 32  # lanes computed at once: what is held of them stays in the first cache

@@ -42,10 +42,12 @@ from surrogym_server.models.gaussian_process.prediction.compiled.layout import (
     PROCESSES,
     READS_AFTER,
     RULES,
+    WARP,
     WIDTH,
 )
 from surrogym_server.models.gaussian_process.prediction.predictor import Predictor
 from surrogym_server.models.gaussian_process.prediction.regions import Region
+from surrogym_server.models.gaussian_process.prediction.warp import LARGEST
 from surrogym_shared.compiled.jit import entry, inlined
 
 Floats = NDArray[np.float64]
@@ -79,6 +81,8 @@ def tables_of(predictor: Predictor, ending: Region | None) -> Tables:
     head[INVERSE] = add_inverse(tables, predictor._inverse)
     head[MOVES_OBSERVATION] = definition.moves_observation
     head[READS_AFTER] = predictor.reward.feature_map.after
+    if (warp := predictor.reward.warp) is not None:
+        head[WARP] = tables.add([[warp.base, warp.sign]])
     if definition.declared_reward is not None:
         head[DECLARED] = add_reward(tables, definition.declared_reward)
     if definition.termination_groups:
@@ -197,6 +201,15 @@ def _arrive(numbers: Floats, places: Ints, head: Floats, raw: Floats, mean: Floa
 
 
 @inlined
+def _unwarp(warp: Floats, mean: Floats, spread: Floats) -> None:
+    """Turn means and deviations (B,) of a warped reward's targets into those of the reward, as ``Warp`` does."""
+    for b in range(len(mean)):
+        y, s = mean[b], spread[b]
+        spread[b] = 0.5 * (math.exp(min(y + s, LARGEST)) - math.exp(min(y - s, LARGEST)))
+        mean[b] = warp[0, 0] + warp[0, 1] * math.exp(min(y, LARGEST))
+
+
+@inlined
 def _ended(numbers: Floats, places: Ints, head: Floats, arrived: Floats) -> Bools:
     """Whether episodes end at coordinates (C, B) as declared, (B,)."""
     over = np.zeros(arrived.shape[1], dtype=np.bool_)
@@ -266,6 +279,8 @@ def step(
                 _predict_stage(
                     numbers, places, head, stage, x, kick, shake, drawn, deviations, reward_deviation, mean, spread
                 )
+        if head[0, WARP] != NONE:
+            _unwarp(matrix(numbers, places, int(head[0, WARP])), mean[columns - 1], spread[len(spread) - 1])
         if head[0, DECLARED] != NONE:
             state, pushed = raw[:size], raw[size : size + actions]
             add_declared(numbers, places, int(head[0, DECLARED]), state, pushed, mean[columns - 1])

@@ -1,0 +1,159 @@
+"""Learning a reward that hides: many of its samples are next to nothing beside the best, as a peak is elsewhere.
+
+Their logarithms are learned instead, where this is the better account of the samples. A process of the values has
+nothing to go by but the few that were paid, and takes what it never met for flat.
+
+Samples that were paid exactly nothing say that the logarithm is below what the others were paid. They stand with what
+these foretell of them, or with the least of these, whichever is less (regression imputation of censored values), and
+have a say in the hyperparameters only where they contradict the others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import REWARD
+from surrogym_server.environment.features import FeatureMap
+from surrogym_server.gp import condition_many
+from surrogym_server.models.gaussian_process.learning.output_learner import PEAK, OutputLearner
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
+from surrogym_server.models.gaussian_process.prediction.warp import Warp
+
+FAINT = 0.1  # share of the samples that were paid anything: the largest of these faint ones is compared with the best
+SPREAD = 3.0  # decades between the two where a peak is looked for; squares in one dimension spread as far at 6 % ...
+DECADES = 10.0  # ... and where nothing else spreads so far, neither noise nor rounding
+REFITS = 3  # with samples that contradict the fit before
+BELOW = 10.0  # nats: how far below the few that were paid anything those stand that were not, before they are foretold
+FEWEST = 3  # samples that were paid anything, before others are foretold from them
+EPS = 4 * torch.finfo(torch.float64).eps  # of the base: what is closer to it is the base
+RESOLUTION = 1e-3  # of the largest: how closely accounts of the samples are compared
+GAIN = 3.0  # nats by which structure in the logarithms must win where the spread leaves doubt
+
+
+def hides(reward: Tensor) -> bool:
+    """Whether many of the rewards (n,) are next to nothing beside one of them, or all are nothing."""
+    return bool((reward == 0).all()) or any(True for _ in _bases(reward))
+
+
+def with_peak(
+    learner: OutputLearner, reward: Tensor, inputs: Mapping[FeatureMap, Tensor], going: Tensor, plain: OutputModel
+) -> OutputModel:
+    """The reward by its logarithm, from the samples ``going`` (n,), where that accounts for them better; else
+    ``plain``."""
+    accounts = [_learned(learner, reward, inputs, going, *base) for base in _bases(reward[going])]
+    better = [found for found in accounts if _better(found, plain, reward, inputs, going)]
+    return max(better, key=lambda found: _agreement(found, reward, inputs, going), default=plain)
+
+
+def _bases(reward: Tensor) -> Iterator[tuple[float, float]]:
+    """Base and sign of what may be peaks of rewards (n,): above or below 0, or the middle one of them."""
+    middle = float(reward.median())
+    for base in dict.fromkeys((0.0, middle)):
+        for sign in (1.0, -1.0):
+            height = _heights(reward, base, sign)
+            if float(height.min()) >= 0 and (_spread(height) >= SPREAD or _trace(height, base)):
+                yield base, sign
+
+
+def _heights(reward: Tensor, base: float, sign: float) -> Tensor:
+    """Rewards (n,) above their base; 0 where that is rounding."""
+    height = sign * (reward - base)
+    return torch.where(height.abs() <= EPS * abs(base), 0.0, height)
+
+
+def _trace(height: Tensor, base: float) -> bool:
+    """Whether heights (n,) are the trace of something alone: above 0 in few places, and beside the base nothing that a
+    trainer could tell, which computes in float32."""
+    known, highest = torch.finfo(torch.float32), float(height.max())
+    return 0 < highest < max(known.eps * abs(base), known.tiny) and float(height.median()) == 0
+
+
+def _spread(height: Tensor) -> float:
+    """Decades between the largest and the faint of those that were paid anything, of heights (n,)."""
+    paid = height[height > 0]
+    if len(paid) < 2:
+        return 0.0
+    faint = paid.sort().values[math.ceil(FAINT * len(paid)) - 1]
+    return math.log10(float(paid.max())) - math.log10(float(faint))
+
+
+def _learned(
+    learner: OutputLearner,
+    reward: Tensor,
+    inputs: Mapping[FeatureMap, Tensor],
+    going: Tensor,
+    base: float,
+    sign: float,
+) -> OutputModel:
+    """A process of the logarithms: fitted to the samples that were paid anything, and to those paid nothing that would
+    contradict it; conditioned on all."""
+    height = _heights(reward, base, sign)
+    paid = going & (height > 0)
+    nothing, few = going & ~paid, int(paid.sum()) < FEWEST
+    least = float(height[paid].min().log()) - few * BELOW
+    target = torch.where(paid, height.log(), least)
+    told = going if few else paid
+    output = learner.output(PEAK, target, inputs, told, told)
+    for _ in range(REFITS):
+        against = nothing & ~told & (output.mean(inputs[output.feature_map]) > least)
+        if not bool(against.any()):
+            break
+        told = told | against
+        output = learner.output(PEAK, target, inputs, told, told)
+    if output.posterior is not None and bool((going & ~told).any()):
+        x = inputs[output.feature_map]
+        y = (torch.where(nothing, output.mean(x).clamp_max(least), target) - output.centre) / output.scale
+        posterior = condition_many([output.posterior.hyper], x[going], y[going])
+        output = replace(output, posterior=posterior, left_out=int((~going).sum()))
+    size = max(float(reward[going].std(correction=0)), torch.finfo(torch.float64).tiny)
+    return replace(output, name=REWARD, warp=Warp(base, sign, size))
+
+
+def _better(
+    found: OutputModel, plain: OutputModel, reward: Tensor, inputs: Mapping[FeatureMap, Tensor], going: Tensor
+) -> bool:
+    """Whether logarithms account for the samples better than their values do."""
+    if found.posterior is None:
+        return False
+    if plain.posterior is None:
+        return True
+    assert found.warp is not None
+    height = _heights(reward[going], found.warp.base, found.warp.sign)
+    if _trace(height, found.warp.base) or _spread(height) >= DECADES:
+        return True
+    return _structure(found) >= GAIN and _agreement(found, reward, inputs, going) >= _agreement(
+        plain, reward, inputs, going
+    )
+
+
+def _structure(output: OutputModel) -> float:
+    """Log odds of the process against targets that have nothing to do with their inputs."""
+    assert output.posterior is not None
+    count = len(output.posterior.y)
+    return dict(output.scores)[str(output.feature_map)] + 0.5 * count * (1 + math.log(2 * math.pi))
+
+
+def _agreement(output: OutputModel, reward: Tensor, inputs: Mapping[FeatureMap, Tensor], going: Tensor) -> float:
+    """Log probability of every sample, foretold from all others, to ``RESOLUTION`` of the largest."""
+    posterior, warp = output.posterior, output.warp
+    assert posterior is not None
+    if posterior.sparse is None:
+        mean, variance = posterior.leave_one_out()
+    else:  # one point of thousands hardly counts
+        mean, latent = posterior.mean_and_variance(inputs[output.feature_map][going])
+        variance = latent + posterior.hyper.noise_variance
+    centre, spread = output.centre + output.scale * mean, output.scale * variance.sqrt()
+    seen = reward[going]
+    base = 0.0 if warp is None else warp.base
+    width = RESOLUTION * float((seen - base).abs().max())
+    low, high = seen - width, seen + width
+    if warp is not None:
+        ends = [(warp.sign * (end - warp.base)).clamp_min(0).log() for end in (low, high)]
+        low, high = ends if warp.sign > 0 else ends[::-1]
+    share = torch.special.ndtr((high - centre) / spread) - torch.special.ndtr((low - centre) / spread)
+    return float(share.clamp_min(1 / (len(seen) + 2) ** 2).log().sum())

@@ -1,0 +1,109 @@
+"""The look for where a reward that hides is highest: optimism over what is not known of it.
+
+A reward that pays in one place alone is known nearly everywhere, and there it does not matter. So the index says
+little, and the place that counts lies between the points of any set that is spread over the range. It is searched for:
+the highest promise (``RewardPeaks.promise``) is climbed from the best candidates, and asked for until it has been met
+and what it pays is known to the reward's tolerance.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.points import Points
+from surrogym_server.environment.samples import Samples
+from surrogym_server.models.abilities import RewardPeaks, offers
+from surrogym_server.models.port import DynamicsModel
+
+CLIMBERS, TRIES, CLIMBS = 16, 16, 24  # points that climb, steps that each tries at once, and how often
+WIDEST, SHRINK = 0.25, 0.75  # of the sampling range: deviation of the first tries, and of each next in that before
+NOTHING = torch.finfo(torch.float32).tiny  # reward: trainers compute in float32, where less is 0
+UNMET = 0.1  # of how far a foretold reward lies above the lowest: so much more than any sample was paid
+NEW = 0.01  # of the range: a place nearer to a sample than that has been asked for
+
+
+def highest(
+    model: DynamicsModel, samples: Samples, points: Points, tolerance: float, rng: np.random.Generator
+) -> Points | None:
+    """The step to ask for where the reward may be highest, from m points to begin at; None if that is known to the
+    tolerance, or the reward does not hide.
+
+    While no sample was paid anything there is nothing to climb: then it is the one farthest from all.
+    """
+    definition = model.definition
+    points = points[~definition.terminated(points.q)] if not definition.learns_termination else points
+    if definition.declared_reward is not None or not len(points):
+        return None
+    able = offers(model, RewardPeaks)
+    if able is not None and able.reward_hides:
+        top = _climbed(definition, able, points, rng)
+        unknown = _unknown(model, samples, top, tolerance)
+        new = unknown & (_distance(definition, samples, top) > NEW)
+        if bool(unknown[0]) and bool(new.any()):
+            return top[new.nonzero()[0]]
+    if float(samples.reward.abs().max()) >= NOTHING:
+        return None
+    return points[_distance(definition, samples, points).argmax()[None]]
+
+
+def _least(samples: Samples) -> float:
+    """The least difference of rewards that a trainer could tell."""
+    return max(NOTHING, torch.finfo(torch.float32).eps * float(samples.reward.abs().max()))
+
+
+def _unknown(model: DynamicsModel, samples: Samples, points: Points, tolerance: float) -> Tensor:
+    """Which of m points pay what is not known to the tolerance, or clearly more than any sample was paid, (m,) bool;
+    all, as long as nothing was paid that a trainer could tell from 0."""
+    foretold = model.transition(points.q, points.u, reward_deviation=True)
+    assert foretold.reward_deviation is not None
+    low, best = float(samples.reward.min()), float(samples.reward.max())
+    unmet = foretold.reward - best > UNMET * (foretold.reward - low)
+    return (foretold.reward_deviation > tolerance) | unmet | (best - low < _least(samples))
+
+
+def _climbed(definition: EnvironmentDefinition, able: RewardPeaks, points: Points, rng: np.random.Generator) -> Points:
+    """Points of high promise, the highest first: the best of m points, moved by the best of random steps that grow
+    shorter."""
+    low, high = _limits(definition)
+    value = able.promise(points.q, points.u)
+    best = value.topk(min(CLIMBERS, len(value))).indices
+    at, value, size = torch.cat([points.q, points.u], -1)[best], value[best], points.q.shape[1]
+    for climb in range(CLIMBS):
+        steps = torch.from_numpy(rng.standard_normal((len(at), TRIES, at.shape[1])))
+        tried = at[:, None] + WIDEST * SHRINK**climb * (high - low) * steps
+        tried = _in_space(definition, tried.clamp(low, high).flatten(0, 1))
+        values = able.promise(tried[:, :size], tried[:, size:]).reshape(len(at), TRIES)
+        found, place = values.max(1)
+        better = found > value
+        moved = tried.reshape(len(at), TRIES, -1)[torch.arange(len(at)), place]
+        at, value = torch.where(better[:, None], moved, at), torch.where(better, found, value)
+    at = at[value.argsort(descending=True)]
+    return Points(at[:, :size], at[:, size:])
+
+
+def _in_space(definition: EnvironmentDefinition, points: Tensor) -> Tensor:
+    """Points (m, C + F) with numbers of discrete actions made whole."""
+    return (
+        torch.cat([points[:, : len(definition.coordinates)], points[:, len(definition.coordinates) :].round()], 1)
+        if definition.action.nvec
+        else points
+    )
+
+
+def _limits(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
+    """Least and largest of each coordinate and action, (C + F,) each."""
+    action = definition.action
+    ranges = [(c.sampling.low, c.sampling.high) for c in definition.coordinates]
+    ranges += [(0.0, n - 1.0) for n in action.nvec] or list(zip(action.low, action.high, strict=True))
+    low, high = torch.tensor(ranges, dtype=torch.float64).T
+    return low, high
+
+
+def _distance(definition: EnvironmentDefinition, samples: Samples, points: Points) -> Tensor:
+    """Distance of the states of m points to the nearest of a sample, in widths of the sampling range, (m,)."""
+    low, high = _limits(definition)
+    width = (high - low)[: points.q.shape[1]].clamp_min(1e-12)
+    return torch.cdist(points.q / width, samples.q / width).amin(1)

@@ -1,0 +1,108 @@
+"""Rewards that pay in one place alone are learned by their logarithms, and other rewards are not."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from support.models import gaussian_processes
+from support.plane import Pay, drifting, plane
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.errors import InvalidInput
+from surrogym_server.models.files import from_bytes, to_bytes
+from surrogym_server.models.gaussian_process.codec.model import GaussianProcessCodec
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
+from surrogym_shared.spec import ModelChoice
+
+CODEC = GaussianProcessCodec()
+DEFINITION = definition_from_spec(plane())
+PLACE = torch.tensor([0.3, -0.2], dtype=torch.float64)
+
+
+def bump(q: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
+    return (-0.5 * ((q - PLACE) / 0.04).square().sum(-1)).exp()
+
+
+def around(pay: Pay, model: GaussianProcessModel) -> torch.Tensor:
+    """Errors (m,) of the reward near the place."""
+    noise = torch.randn(200, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    q, u = PLACE + 0.05 * noise, torch.zeros(200, 1, dtype=torch.float64)
+    moved = model.transition(q, u)
+    return moved.reward - pay(moved.q_next, u)
+
+
+def without_peaks() -> GaussianProcessModel:
+    design = plane().design.model_copy(
+        update={"model": ModelChoice(name="gaussian_process", settings={"reward_peaks": False})}
+    )
+    return gaussian_processes(definition_from_spec(plane().model_copy(update={"design": design})), drifting(bump, 12))
+
+
+def test_bump_is_known_from_samples_that_it_hardly_paid():
+    samples = drifting(bump, 12)
+    assert float(samples.reward.max()) < 0.05
+    model = gaussian_processes(DEFINITION, samples)
+    assert model.description["outputs"][-1]["learned"] == "log(reward)"
+    assert float(around(bump, model).abs().max()) < 0.02
+    assert float(around(bump, without_peaks()).abs().max()) > 0.5
+
+
+@pytest.mark.parametrize(
+    ("pay", "learned"),
+    [
+        (lambda q, u: -bump(q, u), "log(-(reward))"),
+        (lambda q, u: bump(q, u) - 1, "log(reward +1)"),
+    ],
+)
+def test_bump_below_nothing_or_beside_a_constant_is_known_too(pay, learned):
+    model = gaussian_processes(DEFINITION, drifting(pay, 150))
+    assert model.description["outputs"][-1]["learned"] == learned
+    assert float(around(pay, model).abs().max()) < 0.1
+
+
+def test_samples_that_paid_nothing_at_all_do_not_hide_the_bump():
+    samples = drifting(lambda q, u: torch.where(bump(q, u) < 1e-40, 0.0, bump(q, u)), 60)
+    assert int((samples.reward == 0).sum()) >= 5
+    assert float(around(bump, gaussian_processes(DEFINITION, samples)).abs().max()) < 0.1
+
+
+@pytest.mark.parametrize(
+    "pay",
+    [
+        lambda q, u: -q.square().sum(-1) - 0.1 * u[:, 0].square(),
+        lambda q, _: (q[:, 0] > 0.2).double(),
+        lambda q, _: q[:, 0].clamp_min(0),
+        lambda q, _: -torch.ones(len(q), dtype=torch.float64),
+        lambda q, _: torch.zeros(len(q), dtype=torch.float64),
+        lambda q, u: bump(q, u) - 0.01 * u[:, 0].square(),
+    ],
+    ids=["squares", "step", "ramp", "constant", "nothing", "bump with a cost"],
+)
+def test_rewards_of_other_forms_are_learned_as_they_are(pay):
+    model = gaussian_processes(DEFINITION, drifting(pay, 24))
+    assert model.reward.warp is None
+    assert not model.reward_hides
+
+
+def test_promise_tells_points_apart_that_are_paid_nothing():
+    model = gaussian_processes(DEFINITION, drifting(bump, 12))
+    q = PLACE + torch.tensor([[0.0, 0.0], [0.5, 0.0], [1.6, 0.0]], dtype=torch.float64)
+    near, far, farthest = model.promise(q, torch.zeros(3, 1, dtype=torch.float64)).tolist()
+    assert near > far + 50 > farthest + 100
+
+
+def test_model_by_logarithms_survives_storage():
+    model = gaussian_processes(DEFINITION, drifting(bump, 12))
+    loaded = from_bytes(DEFINITION, to_bytes(model))
+    q, u = PLACE.expand(5, 2), torch.linspace(-1, 1, 5, dtype=torch.float64)[:, None]
+    one, other = (m.transition(q, u, reward_deviation=True) for m in (model, loaded))
+    assert torch.equal(one.reward, other.reward)
+    assert torch.equal(one.reward_deviation, other.reward_deviation)
+
+
+@pytest.mark.parametrize("change", [{"sign": 2.0}, {"size": -1.0}, {"base": float("inf")}])
+def test_stored_logarithm_of_impossible_numbers_is_refused(change):
+    stored = CODEC.encode(gaussian_processes(DEFINITION, drifting(bump, 12)))
+    stored.header["outputs"][-1]["warp"] |= change
+    with pytest.raises(InvalidInput, match="warp"):
+        CODEC.decode(DEFINITION, stored)

@@ -1,0 +1,89 @@
+"""Where a reward that hides is highest is looked for, met, and then known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from support.hidden_bump import HiddenBump
+from support.models import gaussian_processes
+from support.plane import drifting, plane
+from surrogym import Design
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.points import Points
+from surrogym_server.environment.samples import Samples
+from surrogym_server.sampling.design import monte_carlo
+from surrogym_server.sampling.peaks import highest
+
+DEFINITION = definition_from_spec(plane())
+POINTS = Points(*monte_carlo(DEFINITION))[:500]
+PLACE = torch.tensor([0.3, -0.2], dtype=torch.float64)
+
+
+def bump(q: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
+    return (-0.5 * ((q - PLACE) / 0.02).square().sum(-1)).exp()
+
+
+def looked_for(samples, tolerance: float = 0.01) -> Points | None:
+    model = gaussian_processes(DEFINITION, samples)
+    return highest(model, samples, POINTS, tolerance, np.random.default_rng(0))
+
+
+def test_place_that_pays_is_asked_for_before_it_was_met():
+    samples = drifting(bump, 12)
+    assert float(samples.reward.max()) < 0.01
+    found = looked_for(samples)
+    assert found is not None
+    arrives = found.q + 0.1 * found.u[:, :1]
+    assert float((arrives - PLACE).norm()) < 0.02
+
+
+def test_nothing_is_asked_for_once_the_place_was_met():
+    samples = drifting(bump, 12)
+    q, u = PLACE[None], torch.zeros(1, 1, dtype=torch.float64)
+    met = replace(
+        samples,
+        q=torch.cat([samples.q, q]),
+        u=torch.cat([samples.u, u]),
+        q_next=torch.cat([samples.q_next, q]),
+        reward=torch.cat([samples.reward, torch.ones(1, dtype=torch.float64)]),
+        terminated=torch.cat([samples.terminated, torch.zeros(1, dtype=torch.bool)]),
+    )
+    assert looked_for(met) is None
+
+
+def test_rewards_that_do_not_hide_are_not_looked_for():
+    assert looked_for(drifting(lambda q, _: -q.square().sum(-1), 12)) is None
+
+
+def constant(value: float) -> Samples:
+    return drifting(lambda q, _: torch.full((len(q),), value, dtype=torch.float64), 12)
+
+
+def test_while_nothing_was_paid_the_farthest_place_is_asked_for():
+    samples = constant(0.0)
+    found = looked_for(samples)
+    assert found is not None
+    nearest = torch.cdist(POINTS.q, samples.q).amin(1)
+    assert float(torch.cdist(found.q, samples.q).min()) == pytest.approx(float(nearest.max()))
+
+
+def test_constant_reward_is_enough():
+    assert looked_for(constant(-1.0)) is None
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_design_meets_a_hidden_bump_in_twenty_steps(seed):
+    bump = HiddenBump(seed=seed)
+    design, met = Design(bump.spec(), budget=20), []
+    while (query := design.ask()) is not None:
+        step = bump.step_from(query.coordinates, query.action)
+        design.tell(query, step)
+        met.append(step.reward)
+    assert design.phase == "ready"
+    assert max(met) > 0.9
+    x, u = torch.tensor(bump.place)[None], torch.zeros(1, 2, dtype=torch.float64)
+    assert float(design.surrogate().model.transition(x, u).reward) == pytest.approx(1, abs=0.05)
