@@ -26,6 +26,7 @@ from surrogym_client.training.stable_baselines import search as training
 from surrogym_client.training.stable_baselines.algorithms import OffPolicySearch, OnPolicySearch
 from surrogym_client.training.stable_baselines.early_stopping import Checks
 from surrogym_client.training.stable_baselines.search import imagined_return
+from surrogym_client.training.verdicts import Imagined
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 
@@ -162,7 +163,7 @@ def test_the_policy_with_the_best_imagined_return_is_kept(surrogate, tmp_path: P
     result = train(surrogate, tmp_path / "policy.zip", settings, lambda p: seen.append(p.imagined_return))
     kept = PPO.load(result.path, device="cpu")
     assert result.imagined_return >= max(seen)
-    assert imagined_return(surrogate, kept, settings) == pytest.approx(result.imagined_return)
+    assert imagined_return(surrogate, kept, settings).mean == pytest.approx(result.imagined_return)
 
 
 def test_imagined_returns_are_whole_episodes_from_the_declared_starts(surrogate):
@@ -274,7 +275,12 @@ def test_a_network_that_learns_nothing_is_given_up_for_another(surrogate, tmp_pa
     assert 2 <= result.networks == len(made) == len(seeds) <= 4, "at most one for each quarter of the steps"
     assert 1_900 <= result.virtual_steps <= 2_000
     kept = PPO.load(result.path, device="cpu")
-    assert imagined_return(surrogate, kept, idle()) == pytest.approx(result.imagined_return)
+    assert imagined_return(surrogate, kept, idle()).mean == pytest.approx(result.imagined_return)
+
+
+def earning(each: float) -> Imagined:
+    """Every episode earns the same."""
+    return Imagined(float(each), float(each))
 
 
 def test_ctrl_c_while_the_next_network_is_made_keeps_what_was_learned(surrogate, tmp_path: Path, made, monkeypatch):
@@ -286,7 +292,7 @@ def test_ctrl_c_while_the_next_network_is_made_keeps_what_was_learned(surrogate,
         return plain(*args)
 
     monkeypatch.setattr(training, "make_learner", interrupted)
-    monkeypatch.setattr(training, "imagined_return", lambda *_: 0.0)
+    monkeypatch.setattr(training, "imagined_return", lambda *_: earning(0))
     with pytest.raises(TrainingInterrupted) as interruption:
         train(surrogate, tmp_path / "policy.zip", idle())
     assert 0 < interruption.value.result.virtual_steps < 2_000
@@ -297,7 +303,7 @@ def test_a_hundredth_of_what_an_episode_earned_is_to_be_learned(surrogate, tmp_p
     """An untrained network earns -40, the best episodes of four steps about 0."""
     for earned, networks in ((-39.9, {3, 4}), (-39.0, {1})):
         returns = itertools.chain([-40.0], itertools.repeat(earned))
-        monkeypatch.setattr(training, "imagined_return", lambda *_, returns=returns: next(returns))
+        monkeypatch.setattr(training, "imagined_return", lambda *_, returns=returns: earning(next(returns)))
         assert train(surrogate, tmp_path / "policy.zip", idle()).networks in networks
 
 
@@ -309,7 +315,7 @@ def test_a_hundredth_of_what_an_episode_earned_is_to_be_learned(surrogate, tmp_p
 def test_after_a_network_that_was_given_up_the_next_explores_by_state(
     surrogate, tmp_path: Path, made, monkeypatch, algorithm, own, later
 ):
-    monkeypatch.setattr(training, "imagined_return", lambda *_: 0.0)
+    monkeypatch.setattr(training, "imagined_return", lambda *_: earning(0))
     hyperparameters = (IDLE if algorithm == "PPO" else {"learning_rate": 0.0}) | own
     train(surrogate, tmp_path / "policy.zip", idle(algorithm=algorithm, hyperparameters=hyperparameters))
     explores = [settings.hyperparameters.get("use_sde") for settings in made]
@@ -319,7 +325,7 @@ def test_after_a_network_that_was_given_up_the_next_explores_by_state(
 
 
 def test_discrete_actions_and_the_papers_networks_do_not_explore_by_state(tmp_path: Path, made, monkeypatch):
-    monkeypatch.setattr(training, "imagined_return", lambda *_: 0.0)
+    monkeypatch.setattr(training, "imagined_return", lambda *_: earning(0))
     for spec in (cartpole(), make("Pendulum-v1", preset="paper").spec()):
         assert train(local(spec), tmp_path / "policy.zip", idle()).networks > 1
     assert not [settings for settings in made if "use_sde" in settings.hyperparameters]
@@ -348,7 +354,7 @@ def test_a_training_that_gained_in_its_last_quarter_takes_as_many_steps_again(
     surrogate, tmp_path: Path, monkeypatch, returns, prolong, taken
 ):
     seen = []
-    monkeypatch.setattr(training, "imagined_return", lambda *_: float(next(returns)))
+    monkeypatch.setattr(training, "imagined_return", lambda *_: earning(next(returns)))
     result = train(surrogate, tmp_path / "policy.zip", small(total_steps=1_536, prolong=prolong), seen.append)
     assert result.virtual_steps == taken * 1_536 == seen[-1].total_steps
     assert result.gaining == (returns is RISING)
@@ -375,7 +381,7 @@ def test_anew_a_saved_policy_waits_until_a_new_network_falls_short(
     saved, session, turns, plain = tmp_path / "saved.zip", {"time_limit": 4}, [], Checks.worth_keeping
     train(surrogate, saved, small(session=session))
     returns = itertools.chain([0.0, 100.0], itertools.repeat(earned))
-    monkeypatch.setattr(training, "imagined_return", lambda *_: next(returns))
+    monkeypatch.setattr(training, "imagined_return", lambda *_: earning(next(returns)))
     monkeypatch.setattr(
         Checks, "worth_keeping", lambda self, known: turns.append(self.verdicts.steps) or plain(self, known)
     )
@@ -393,7 +399,7 @@ def test_a_saved_policy_that_earns_no_more_than_an_untrained_one_is_not_gone_on_
     for path, seed in ((saved, theirs), (untrained, ours)):
         train(surrogate, path, small(seed=seed, hyperparameters=IDLE, total_steps=32))
     settings = small(seed=ours, hyperparameters=IDLE, total_steps=32, start_from=saved)
-    earned = [imagined_return(surrogate, PPO.load(p, device="cpu"), settings) for p in (saved, untrained)]
+    earned = [imagined_return(surrogate, PPO.load(p, device="cpu"), settings).mean for p in (saved, untrained)]
     result = train(surrogate, tmp_path / "policy.zip", settings)
     assert earned[0] != earned[1]
     assert result.imagined_return == pytest.approx(max(earned))
@@ -404,8 +410,8 @@ def test_policies_are_compared_by_what_was_asked_for_and_not_by_what_they_learn_
     asked = small(session=session, judge={"variant": "pathwise", "time_limit": 3})
     result = train(surrogate, tmp_path / "policy.zip", asked)
     kept = PPO.load(result.path, device="cpu")
-    assert imagined_return(surrogate, kept, asked) == pytest.approx(result.imagined_return)
-    assert imagined_return(surrogate, kept, small(session=session)) < result.imagined_return, "a fourth cost more"
+    assert imagined_return(surrogate, kept, asked).mean == pytest.approx(result.imagined_return)
+    assert imagined_return(surrogate, kept, small(session=session)).mean < result.imagined_return, "a fourth cost more"
 
 
 @pytest.mark.parametrize("threads", [0, 10**9, 1.5, True])

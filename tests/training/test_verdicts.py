@@ -6,16 +6,16 @@ from collections.abc import Sequence
 
 import pytest
 
-from surrogym_client.training.verdicts import Verdicts
+from surrogym_client.training.verdicts import Imagined, Verdicts
 
 
 def after(untrained: float, earned: Sequence[float], checks: Sequence[float]) -> Verdicts:
     """Verdicts after episodes of the training, and checks."""
-    verdicts = Verdicts(planned=1_000, untrained=untrained)
+    verdicts = Verdicts(planned=1_000, untrained=Imagined(untrained, untrained))
     verdicts.saw(earned)
     for number, imagined in enumerate(checks):
         verdicts.at(100 * (number + 1))
-        verdicts.check(imagined)
+        verdicts.check(Imagined(imagined, imagined))
     return verdicts
 
 

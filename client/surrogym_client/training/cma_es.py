@@ -127,7 +127,7 @@ class _Distribution:
 
     def imagined(self) -> float:
         """Imagined return of the mean."""
-        return checked(self._port, self.policy, self._settings)
+        return checked(self._port, self.policy, self._settings).mean
 
     def _network(self, vector: NDArray[np.float64]) -> Network:
         return Network.of(self._spec, self._mean, self._deviation, self.choices.units, vector)

@@ -4,6 +4,9 @@ the training goes on."""
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
 
 from surrogym_client.evaluation.imagined import imagined_returns
 from surrogym_client.policies.predict import Predict
@@ -17,6 +20,14 @@ LATELY = 0.25  # of the steps, the last of them
 GAIN = 0.01  # of what the best policy earns beyond an untrained one: a training that gained more lately is not done
 SATURATED = 3  # checks in a row in which every episode earned as much as the best one ever did
 LEARNED = 0.01  # of what the best virtual episode earned beyond an untrained network: who earns less learned nothing
+MANY = 0.25  # of the episodes have to earn that: a few do by the luck of their functions, whatever the policy does
+
+
+class Imagined(NamedTuple):
+    """What a policy earns in the episodes of a check."""
+
+    mean: float
+    many: float  # at least, in the best quarter of the episodes
 
 
 class Verdicts:
@@ -24,23 +35,25 @@ class Verdicts:
 
     A network that after a quarter of the steps earns no more than an untrained one, but for a hundredth of what some
     episode did, is given up while there is as much left for another: rewards that come at the end alone leave some
-    networks without a first success, and they stop exploring before they have one. Where a saved policy waits, a
-    network has half of the steps to come half as far.
+    networks without a first success, and they stop exploring before they have one. A quarter of the episodes has to
+    earn more: under functions drawn from an unsure model a few reach their end by themselves. Where a saved policy
+    waits, a network has half of the steps to come half as far.
 
     A training that still gained in its last quarter can take as many steps again, once.
 
     Args:
         planned: virtual steps of the training.
-        untrained: the imagined return of a network that has learned nothing yet.
-        saved: that of a policy from before, for which a network is given up that does not come near it.
+        untrained: what a network earns that has learned nothing yet.
+        saved: what a policy from before earns, for which a network is given up that does not come near it.
     """
 
-    def __init__(self, planned: int, untrained: float, saved: float | None = None) -> None:
+    def __init__(self, planned: int, untrained: Imagined, saved: Imagined | None = None) -> None:
         self._planned = planned
         self.total = planned
-        self.floor = untrained
-        self._half_way = untrained if saved is None else (untrained + saved) / 2
-        self._seen = untrained  # the most that an episode earned, from any start
+        self.floor = untrained.mean
+        self._half_way = self.floor if saved is None else (self.floor + saved.mean) / 2
+        self._few = self._many = untrained.many  # what many episodes earn: of an untrained network, and at best so far
+        self._seen = self.floor  # the most that an episode earned, from any start
         self._spent = 0  # by the networks before
         self._now = 0  # by this one
         self._rollouts = 0  # of this one
@@ -110,9 +123,10 @@ class Verdicts:
         self._rollouts += 1
         return self.steps * CHECKS >= (self._checked + 1) * self._planned
 
-    def check(self, imagined: float) -> bool:
+    def check(self, measured: Imagined) -> bool:
         """A check measured the policy as it is; whether that is the best so far."""
         self._checked = int(self.steps * CHECKS / self._planned)
+        imagined, self._many = measured.mean, max(self._many, measured.many)
         self.latest = imagined
         best = self.best is None or imagined >= self.best
         self.best = imagined if self.best is None else max(self.best, imagined)
@@ -126,14 +140,19 @@ class Verdicts:
         tried = self._rollouts >= PATIENT_ROLLOUTS and self._now >= PATIENCE * self._planned
         bar = self._half_way if self._now >= PROOF * self._planned else self._nothing
         left = self._planned - self.steps >= PATIENCE * self._planned
-        self.given_up = tried and self.best <= max(bar, self._nothing) and left
+        self.given_up = tried and (self.best <= max(bar, self._nothing) or not self._beyond(self._many)) and left
 
-    def knows(self, imagined: float) -> tuple[bool, bool]:
+    def knows(self, measured: Imagined) -> tuple[bool, bool]:
         """A policy from before earns so much: whether it is the best so far, and whether it learned anything."""
+        imagined = measured.mean
         best = imagined > max(self.floor, self.floor if self.best is None else self.best)
         if best:
             self.best = imagined
-        return best, imagined > self._nothing
+        return best, imagined > self._nothing and self._beyond(measured.many)
+
+    def _beyond(self, many: float) -> bool:
+        """Whether many episodes earn what an untrained network does not."""
+        return many > self._few + LEARNED * (self._seen - self._few)
 
     @property
     def _nothing(self) -> float:
@@ -141,6 +160,7 @@ class Verdicts:
         return self.floor + LEARNED * (self._seen - self.floor)
 
 
-def checked(port: SurrogatePort, predict: Predict, settings: TrainSettings) -> float:
-    """The mean imagined return of a policy as it is now, on the same starts at every check."""
-    return float(imagined_returns(port, predict, CHECK_EPISODES, settings.seed, **settings.judging).mean())
+def checked(port: SurrogatePort, predict: Predict, settings: TrainSettings) -> Imagined:
+    """What a policy earns as it is now, on the same starts at every check."""
+    returns = imagined_returns(port, predict, CHECK_EPISODES, settings.seed, **settings.judging)
+    return Imagined(float(returns.mean()), float(np.quantile(returns, 1 - MANY)))

@@ -27,7 +27,7 @@ from surrogym_client.training.fast_ppo.rollouts import Collector, Rollout
 from surrogym_client.training.proportions import even_batch, suggested_gamma
 from surrogym_client.training.search import SEARCHES, Found, PolicySearch, SearchTask
 from surrogym_client.training.settings import TrainProgress
-from surrogym_client.training.verdicts import Verdicts, checked
+from surrogym_client.training.verdicts import Imagined, Verdicts, checked
 from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec
 
@@ -180,7 +180,7 @@ class _Training:
         if self._verdicts.check(self._imagined(learner)):
             self._kept = _saved(learner)
 
-    def _imagined(self, learner: Learner) -> float:
+    def _imagined(self, learner: Learner) -> Imagined:
         return checked(self._task.port, learner.policy(), self._task.settings)
 
     def _found(self, policy: LearnedNetwork, *, whole: bool) -> Found:

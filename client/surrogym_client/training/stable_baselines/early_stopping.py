@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
 from surrogym_client.training.settings import TrainProgress
-from surrogym_client.training.verdicts import Verdicts
+from surrogym_client.training.verdicts import Imagined, Verdicts
 
 
 class Checks(BaseCallback):
@@ -22,7 +22,7 @@ class Checks(BaseCallback):
     Args:
         total: virtual steps of the training.
         progress: called after every rollout.
-        imagine: a learner's imagined return.
+        imagine: what a learner earns in virtual episodes.
         untrained: a learner that has learned nothing yet.
         saved: a policy from before, for which a network is given up that does not come near it.
     """
@@ -31,7 +31,7 @@ class Checks(BaseCallback):
         self,
         total: int,
         progress: Callable[[TrainProgress], None] | None,
-        imagine: Callable[[BaseAlgorithm], float],
+        imagine: Callable[[BaseAlgorithm], Imagined],
         untrained: BaseAlgorithm,
         saved: BaseAlgorithm | None = None,
     ) -> None:
@@ -99,7 +99,7 @@ class Checks(BaseCallback):
 
     def _check(self) -> None:
         imagined = self._imagine(self.model)
-        self.logger.record("surrogym/imagined_return", imagined)
+        self.logger.record("surrogym/imagined_return", imagined.mean)
         if self.verdicts.check(imagined):
             self._keep(self.model)
 

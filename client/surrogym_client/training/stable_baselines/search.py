@@ -29,7 +29,7 @@ from surrogym_client.training.search import Found, PolicySearch, SearchTask
 from surrogym_client.training.settings import TrainSettings
 from surrogym_client.training.stable_baselines.early_stopping import Checks
 from surrogym_client.training.stable_baselines.tracking import tracking
-from surrogym_client.training.verdicts import checked
+from surrogym_client.training.verdicts import Imagined, checked
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import EnvironmentSpec
 
@@ -217,8 +217,8 @@ def make_learner(
         raise ValueError(f"{settings.algorithm} can't be trained here: {error}") from error
 
 
-def imagined_return(port: SurrogatePort, learner: BaseAlgorithm, settings: TrainSettings) -> float:
-    """Mean imagined return of the policy as it is now, without exploration, on the same starts at every check."""
+def imagined_return(port: SurrogatePort, learner: BaseAlgorithm, settings: TrainSettings) -> Imagined:
+    """What the policy earns as it is now, without exploration, on the same starts at every check."""
 
     def predict(observation: Any) -> Any:
         return learner.predict(observation, deterministic=True)[0]

@@ -1,0 +1,37 @@
+"""When a network is given up, by what the episodes of its checks earned."""
+
+from __future__ import annotations
+
+import pytest
+
+from surrogym_client.training.verdicts import PATIENT_ROLLOUTS, Imagined, Verdicts
+
+UNTRAINED = Imagined(mean=4.9, many=-0.1)  # three of 64 functions reach the goal by themselves
+BEST = 95.0  # that an episode of the training earned
+
+
+@pytest.mark.parametrize(
+    ("measured", "given_up"),
+    [
+        (Imagined(mean=9.3, many=0.0), True),
+        (Imagined(mean=30.0, many=90.0), False),
+        (Imagined(mean=4.9, many=90.0), True),
+    ],
+    ids=["six functions instead of three", "a third of the episodes", "no more in the mean"],
+)
+def test_network_is_kept_if_a_quarter_of_the_episodes_earns_more(measured: Imagined, given_up: bool):
+    verdicts = Verdicts(1_000, UNTRAINED)
+    verdicts.saw([BEST])
+    for _ in range(PATIENT_ROLLOUTS):
+        verdicts.after_rollout()
+    verdicts.at(300)
+    verdicts.check(measured)
+    verdicts.judge()
+    assert verdicts.given_up == given_up
+
+
+def test_saved_policy_that_few_episodes_owe_their_return_to_has_learned_nothing():
+    verdicts = Verdicts(1_000, UNTRAINED)
+    verdicts.saw([BEST])
+    assert verdicts.knows(Imagined(mean=9.3, many=0.0)) == (True, False)
+    assert verdicts.knows(Imagined(mean=90.0, many=95.0)) == (True, True)
