@@ -12,13 +12,31 @@ from surrogym_server.environment.features import FeatureMap, leading
 from surrogym_server.environment.samples import saturated
 
 
-def usable(definition: EnvironmentDefinition, column: int, q_next: Tensor, feature_map: FeatureMap) -> Tensor:
-    """Which samples that end at q_next (m, C) the transition output ``column`` learns from under a map, (m,) bool."""
+def usable(
+    definition: EnvironmentDefinition, column: int, q_next: Tensor, feature_map: FeatureMap, *, past_limits: bool
+) -> Tensor:
+    """Which samples that end at q_next (m, C) the transition output ``column`` learns from under a map, (m,) bool;
+    ``past_limits`` says that it learns from those that end at a limit of another."""
     if definition.moves_observation:
         return torch.ones(len(q_next), dtype=torch.bool)
+    if past_limits:
+        return ~stopped(definition, definition.moving[column], q_next)
     if feature_map.lead:
         return ~saturates(definition, definition.moving[column], q_next)
     return ~saturated(definition, q_next)
+
+
+def stopped(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Tensor:
+    """Samples (n,) that ended at a bound which says nothing of coordinate ``index``: its own, that of a limited speed,
+    or a wall. The limit of another coordinate, such as a relief valve's, leaves its sample as good as any."""
+    limits = [
+        i
+        for i in definition.moving
+        if i != index and definition.coordinates[i].stops is None and i not in leading(definition)
+    ]
+    others = q_next.clone()
+    others[:, limits] = math.nan
+    return saturated(definition, others)
 
 
 def saturates(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Tensor:

@@ -202,7 +202,8 @@ class GaussianProcessModel(
         """Which samples that end at q_next (m, C) an output would learn from, (m,) bool."""
         if column == len(self.transitions):
             return ~self.terminated(q_next)
-        return usable(self.definition, column, q_next, self.transitions[column].feature_map)
+        output = self.transitions[column]
+        return usable(self.definition, column, q_next, output.feature_map, past_limits=output.past_limits)
 
     @cached_property
     def _compiled(self) -> ArraySteps | None:

@@ -56,6 +56,7 @@ def output_header(output: OutputModel) -> dict[str, Any]:
         "scores": output.scores,
         "posterior": None,
         "warp": None if output.warp is None else asdict(output.warp),
+        "past_limits": output.past_limits,
     }
     if (posterior := output.posterior) is not None:
         hyper = posterior.hyper
@@ -98,7 +99,8 @@ def read_output(
     scores = tuple((name, score) for name, score in entry["scores"])
     centre, scale = float(entry["centre"]), float(entry["scale"])
     name, left_out, warp = str(entry["name"]), int(entry["left_out"]), _warp(entry.get("warp"))
-    return OutputModel(name, feature_map, posterior, centre, scale, left_out, scores, warp)
+    past_limits = bool(entry.get("past_limits", False))
+    return OutputModel(name, feature_map, posterior, centre, scale, left_out, scores, warp, past_limits)
 
 
 def _warp(entry: dict[str, Any] | None) -> Warp | None:

@@ -8,9 +8,10 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import encode, leading
 from surrogym_server.environment.samples import Samples, increments, saturated
 from surrogym_server.errors import InvalidInput
-from surrogym_server.models.gaussian_process.censoring import saturates
+from surrogym_server.models.gaussian_process.censoring import saturates, stopped
 from surrogym_server.models.gaussian_process.feature_maps import candidates
 from surrogym_server.models.gaussian_process.learning.angle_prediction import learn_drift
+from surrogym_server.models.gaussian_process.learning.limits import past_limits
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.learning.region import learn_termination
 from surrogym_server.models.gaussian_process.learning.reward import learn_reward
@@ -55,5 +56,7 @@ def _transitions(learner: OutputLearner, samples: Samples) -> tuple[OutputModel,
         inputs = {m: encode(definition, m, samples.q, samples.u, samples.q_next[:, lead]) for m in maps}
         keep_lead = ~saturates(definition, index, samples.q_next) | ~keep.any()
         name = definition.coordinates[index].name
-        outputs.append(learner.output(name, change[:, column], inputs, keep, keep_lead | keep))
+        output = learner.output(name, change[:, column], inputs, keep, keep_lead | keep)
+        more = ~stopped(definition, index, samples.q_next)
+        outputs.append(past_limits(learner, output, change[:, column], inputs, keep, more))
     return tuple(outputs)

@@ -29,6 +29,7 @@ class OutputModel:
     left_out: int = 0  # samples left out because they ended at a bound
     scores: tuple[tuple[str, float], ...] = ()  # evidence of every feature map compared
     warp: Warp | None = None
+    past_limits: bool = False  # whether it was learned from samples that ended at a limit of another coordinate
 
     def mean(self, x: Tensor) -> Tensor:
         """Posterior mean at features x (m, d), in the output's unit, (m,)."""

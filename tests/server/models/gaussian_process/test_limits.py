@@ -1,0 +1,83 @@
+"""Samples that ended at a limit of another coordinate are learned from where they help."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from support.models import gaussian_processes
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.samples import Samples
+from surrogym_server.models.files import from_bytes, to_bytes
+from surrogym_server.models.gaussian_process.censoring import stopped
+from surrogym_server.models.gaussian_process.learning import learn as learning
+from surrogym_shared.spec import Bounds, BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
+
+VALVE = 1.0  # what the pressure is kept below
+
+
+def tank(**bounds: Bounds) -> EnvironmentDefinition:
+    """A level and a pressure."""
+    ranges = {"level": Uniform(low=-1, high=1), "pressure": Uniform(low=-1, high=1)}
+    spec = EnvironmentSpec(
+        coordinates=tuple(Coordinate(name=n, sampling=r, bounds=bounds.get(n)) for n, r in ranges.items()),
+        observation=tuple(ObservationEntry(name=n, term=Term.linear(**{n: 1})) for n in ranges),
+        action=BoxAction(low=(-1,), high=(1,)),
+        start=ranges,
+        time_limit=50,
+    )
+    return definition_from_spec(spec)
+
+
+RELIEVED = tank(pressure=Bounds(high=VALVE))
+
+
+def steps(count: int, bent: bool, seed: int) -> Samples:
+    """The pressure rises to the valve, and the level falls with it; at the valve it stays, if it is ``bent``."""
+    p = 2 * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1
+    q, u = p[:, :2], p[:, 2:]
+    pressure = (q[:, 1] + 0.5 + 0.3 * u[:, 0]).clamp_max(VALVE)
+    fall = -0.3 * (2 * q[:, 1]).exp() * (1 + 0.2 * q[:, 0])
+    level = q[:, 0] + torch.where((pressure >= VALVE) & torch.tensor(bent), 0.0, fall)
+    reward = torch.zeros(count, dtype=torch.float64)
+    return Samples(q, u, torch.stack([level, pressure], 1), reward, reward.bool())
+
+
+def error(samples: Samples, test: Samples) -> float:
+    off = gaussian_processes(RELIEVED, samples).transition(test.q, test.u).q_next[:, 0] - test.q_next[:, 0]
+    return float(off.square().mean().sqrt())
+
+
+@pytest.mark.parametrize(("bent", "share"), [(False, 0.1), (True, 0.5)])
+def test_level_is_better_known_with_samples_at_the_valve_of_the_pressure(monkeypatch, bent, share):
+    samples, test = steps(40, bent, 5), steps(300, bent, 1)
+    model = gaussian_processes(RELIEVED, samples)
+    assert [output.past_limits for output in model.transitions] == [True, False]
+    chosen = error(samples, test)
+    monkeypatch.setattr(learning, "past_limits", lambda _, output, *others: output)  # noqa: ARG005
+    assert chosen < share * error(samples, test)
+
+
+def test_samples_that_met_no_limit_are_all_there_is():
+    samples = steps(40, False, 5)
+    free = ~stopped(RELIEVED, 1, samples.q_next)
+    below = Samples(*(getattr(samples, name)[free] for name in Samples.__dataclass_fields__))
+    assert not any(output.past_limits for output in gaussian_processes(RELIEVED, below).transitions)
+
+
+def test_own_limit_a_limited_speed_and_a_wall_leave_samples_out():
+    at_valve = torch.tensor([[0.0, VALVE], [0.0, 0.0]], dtype=torch.float64)
+    assert stopped(RELIEVED, 1, at_valve).tolist() == [True, False]
+    assert stopped(RELIEVED, 0, at_valve).tolist() == [False, False]
+    limited = tank(pressure=Bounds(low=-VALVE, high=VALVE))
+    assert stopped(limited, 0, at_valve).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("bent", [False, True])
+def test_what_was_learned_from_survives_storage(bent):
+    model = gaussian_processes(RELIEVED, steps(20, bent, 0))
+    loaded = from_bytes(RELIEVED, to_bytes(model))
+    assert [o.past_limits for o in loaded.transitions] == [o.past_limits for o in model.transitions]
+    candidate = torch.tensor([[0.0, VALVE]], dtype=torch.float64)
+    assert bool(loaded._learns(0, candidate)[0]) == model.transitions[0].past_limits
