@@ -47,7 +47,7 @@ def test_an_address_that_is_none(surrogym):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("register", "Nowhere-v1"), "no adapter knows the environment 'Nowhere-v1'"),
+        (("register", "Nowhere-v1"), "Nowhere-v1 can't be made: "),
         (("register", "nothing.at_all:here"), "No module named 'nothing'"),
         (("register", "CartPole-v1", "--bins", "3"), "bins need a continuous action, got a discrete one"),
         (("register", "Pendulum-v1", "--budget", "5", "--initial", "9"), "initial 9 exceeds the budget 5"),
@@ -61,7 +61,7 @@ def test_an_address_that_is_none(surrogym):
         (("evaluate", "missing.zip", "--env", "Pendulum-v1"), "missing.zip: no such policy file"),
         (("evaluate", "junk.zip", "--env", "Pendulum-v1", "--quiet"), "junk.zip is no policy of PPO"),
         (("evaluate", "junk.zip"), "expected --env with the original environment, got none"),
-        (("evaluate", "junk.zip", "--env", "Nowhere-v1"), "no adapter knows the environment 'Nowhere-v1'"),
+        (("evaluate", "junk.zip", "--env", "Nowhere-v1"), "Nowhere-v1 can't be made: "),
         (
             ("evaluate", "junk.zip", "--env", "Pendulum-v1", "--algorithm", "Magic"),
             "Stable-Baselines3 has no algorithm 'Magic'",

@@ -18,11 +18,18 @@ ELSEWHERE = {
     "audit": "tests/training/test_handover.py",
     "conformance": "tests/diagnosis/test_conformance.py",
     "demo": "tests/experiments/test_demo.py",
+    "describe": "test_describe.py",
     "evaluate": "test_commands.py",
     "export-policy": "tests/policies/test_export.py",
     "optimise": "tests/server/cli/test_optimise.py",
+    "policy alias": "test_commands.py",
+    "policy delete": "test_commands.py",
+    "policy get": "test_commands.py",
+    "policy push": "test_commands.py",
+    "policy show": "test_commands.py",
     "reproduce efficiency": "test_reproduce.py",
     "reproduce paper": "test_reproduce_paper.py",
+    "reproduce trust": "tests/experiments/test_unseen.py",
     "serve": "tests/server/cli/test_serve.py",
     "train": "test_commands.py",
 }
@@ -36,6 +43,7 @@ change NAME --pause
 export NAME --out samples.csv
 delete NAME --yes
 doctor
+policies pendulum
 report pendulum
 export pendulum --out pendulum.surrogate
 import pendulum.surrogate --name NAME

@@ -196,7 +196,7 @@ def test_another_environment_than_the_surrogates_is_refused(api, line):
 
 def test_a_factory_that_fails_ends_the_worker_at_once(api, line):
     environment = IsolatedEnvironment(partial(original.make, "Nowhere-v1"))
-    with pytest.raises(UnknownEnvironment, match="no adapter knows"):
+    with pytest.raises(UnknownEnvironment, match="Nowhere-v1 can't be made"):
         Sampler(api, line, environment).run()
     assert api.surrogate(line).queries.leased == 0
 

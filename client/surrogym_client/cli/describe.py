@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from surrogym_client.cli.groups import add
-from surrogym_client.cli.options import Quiet
+from surrogym_client.cli.options import AsJson, Quiet
 
 
 def register(app: typer.Typer) -> None:
@@ -21,6 +21,7 @@ def command(
     ],
     steps: Annotated[int, typer.Option(min=20, help="Real steps of its episodes; some more check the result.")] = 400,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random actions.")] = 0,
+    as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
     """Draft a specification by random steps.
@@ -33,6 +34,7 @@ def command(
     from surrogym_client.original.describing import describe
     from surrogym_shared.terminal import say
 
+    del as_json  # a specification is JSON in any case
     description = describe(environment, steps, seed)
     typer.echo(description.text())
     for line in description.words():
