@@ -94,7 +94,7 @@ def requests_of(metrics: str) -> Counter[tuple[str, str, str]]:
 
 def changing(openapi: dict[str, Any]) -> list[tuple[str, str]]:
     return [
-        (method.upper(), path.format(name="pendulum", id="none", query_id=1, version=1))
+        (method.upper(), path.format(name="pendulum", id="none", query_id=1, version=1, form="zip", alias="production"))
         for path, methods in openapi["paths"].items()
         for method in methods
         if method.upper() not in SAFE

@@ -56,7 +56,7 @@ def test_compiled_steps_follow_the_same_functions(model, points):
         pytest.skip("steps can't be compiled here")
     paths = drawn(several, ROWS)
     arrays = [tensor.numpy() for tensor in points]
-    moved = steps(*arrays, process=None, paths=paths.numpy(), deviations=False, reward_deviation=False)
+    moved = steps(*arrays, noise=None, process=None, paths=paths.numpy(), deviations=False, reward_deviation=False)
     reference = several.transition_along(paths, *points)
     np.testing.assert_allclose(moved.q_next, reference.q_next, atol=1e-8)
     np.testing.assert_allclose(moved.reward, reference.reward, atol=1e-8)
