@@ -116,6 +116,18 @@ def judge(compared: Compared, before: Promise, after: Promise, floor: float | No
     )
 
 
+def disappointed(audit: Audit, floor: float | None) -> bool:
+    """Whether the model that has learned from an audit promises clearly less than the one before: the policy was chosen
+    in a model that is known better now. A wide promise may stand and disappoint.
+
+    Args:
+        audit: what was found.
+        floor: the return of an untrained policy; None where nobody measured it.
+    """
+    lost = audit.before.median - audit.after.median
+    return lost > SLACK * max(earned(audit.before, floor), earned(audit.after, floor))
+
+
 def earned(promise: Promise, floor: float | None) -> float:
     """What a policy earns beyond an untrained one, of return ``floor``; beyond nothing where nobody measured that."""
     return abs(promise.median - (floor or 0.0))

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from surrogym_client.evaluation.audit import AUDIT_STEPS
+from surrogym_client.evaluation.audit import AUDIT_STEPS, disappointed
+from surrogym_client.policies.evidence import Audit
 from surrogym_client.policies.files import load_policy
 from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.training.candidates import Candidates
@@ -32,8 +33,10 @@ MOST_AUDITS = 3  # of one training; each takes its own real steps
 class AuditedTraining:
     """Train a policy and hand it over.
 
-    Where an audit fails and the budget has steps left, they are asked where the policy goes, the policy learns on, and
-    is audited again. Where none are left, the policy is handed over with the failed audit.
+    If an audit fails and the budget has steps left, they are taken where the policy goes, the training continues, and
+    the policy is audited again. If none are left, the policy is handed over with the failed audit. If an audit passes,
+    but the model that has learned from it promises clearly less, the training continues in that model without further
+    steps of the budget, and the policy is audited again.
 
     Attributes:
         api: the server.
@@ -72,8 +75,7 @@ class AuditedTraining:
             for number in range(1, MOST_AUDITS + 1):
                 taken = self.api.surrogate(self.name).ledger.total
                 handover = hand_over(self._subject(result), self.audit, self.waiting)
-                passed = handover.audit is None or handover.audit.passed
-                if passed or number == MOST_AUDITS or not self._asked_more(result, taken, number):
+                if number == MOST_AUDITS or not self._to_be_trained_on(handover.audit, result, taken, number):
                     break
                 result = self._train_on(result)
         except TrainingInterrupted as interruption:
@@ -104,6 +106,11 @@ class AuditedTraining:
         predict, settings = load_policy(result.path, result.algorithm), self.settings
         session = chosen_for(self.api.surrogate(self.name), settings).judging
         return Subject(self.api, self.name, self.port, predict, dict(session), result.untrained, settings.seed)
+
+    def _to_be_trained_on(self, audit: Audit | None, result: TrainResult, taken: int, number: int) -> bool:
+        if audit is None or audit.passed:
+            return audit is not None and disappointed(audit, result.untrained)
+        return self._asked_more(result, taken, number)
 
     def _asked_more(self, result: TrainResult, taken: int, number: int) -> bool:
         """Spend what the budget has left where the policy goes. Whether real steps of the budget were taken since they

@@ -1,0 +1,84 @@
+"""A training goes on where an audit fails, and where the model that has learned from it promises clearly less."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
+
+import pytest
+
+from surrogym_client.policies.evidence import Audit, Promise
+from surrogym_client.training import audited
+from surrogym_client.training.audited import MOST_AUDITS, AuditedTraining
+from surrogym_client.training.handover import AuditSettings, Handover
+from surrogym_client.training.settings import TrainResult, TrainSettings
+
+
+def promise(median: float, low: float | None = None, high: float | None = None) -> Promise:
+    low, high = median if low is None else low, median if high is None else high
+    return Promise(median=median, low=low, high=high, functions=32, episodes=256)
+
+
+def found(before: float, after: float, passed: bool = True) -> Handover:
+    audit = Audit(steps=8, passed=passed, before=promise(before, -32, 102), after=promise(after))
+    return Handover(audit.after, audit, passed, "because")
+
+
+@dataclass
+class Trainings:
+    """Stands for trainings and audits: what each audit finds, and how many trainings there were."""
+
+    audits: list[Handover]
+    made: int = 0
+    trained_from: list[Path | None] = field(default_factory=list)
+
+    def train(self, _port: Any, out: Path, settings: TrainSettings, _progress: Any) -> TrainResult:
+        self.made += 1
+        self.trained_from.append(settings.start_from)
+        out.write_bytes(b"policy %d" % self.made)
+        return TrainResult(out, "fastppo", 100, 1.0, None, 0, {}, untrained=0.0)
+
+    def hand_over(self, *_: Any) -> Handover:
+        return self.audits[self.made - 1]
+
+
+def run(monkeypatch: pytest.MonkeyPatch, folder: Path, *audits: Handover) -> tuple[Trainings, TrainResult, Handover]:
+    trainings, api = Trainings(list(audits)), Mock()
+    api.surrogate.return_value.fidelity = None
+    api.surrogate.return_value.budget_left = 0
+    api.surrogate.return_value.ledger.total = 8
+    monkeypatch.setattr(audited, "train", trainings.train)
+    monkeypatch.setattr(audited, "hand_over", trainings.hand_over)
+    monkeypatch.setattr(AuditedTraining, "_subject", lambda *_: None)
+    monkeypatch.setattr(AuditedTraining, "_best", lambda _self, result: result)
+    settings = TrainSettings(algorithm="fastppo")
+    training = AuditedTraining(api, "plane", Mock(), folder / "p.zip", settings, audit=AuditSettings())
+    return trainings, *training.train()
+
+
+def test_a_promise_that_an_audit_halves_is_trained_on_without_the_budget(monkeypatch, tmp_path: Path) -> None:
+    trainings, result, handover = run(monkeypatch, tmp_path, found(95.6, -21.6), found(97.4, 97.5))
+    assert (trainings.made, result.virtual_steps) == (2, 200)
+    assert trainings.trained_from == [None, tmp_path / "p.zip"]
+    assert handover.promise.median == 97.5
+
+
+@pytest.mark.parametrize("after", [94.0, 120.0])
+def test_a_promise_that_stands_or_grows_is_handed_over(monkeypatch, tmp_path: Path, after: float) -> None:
+    trainings, _, handover = run(monkeypatch, tmp_path, found(95.6, after))
+    assert trainings.made == 1
+    assert handover.trusted
+
+
+def test_a_failed_audit_without_budget_is_handed_over_as_it_is(monkeypatch, tmp_path: Path) -> None:
+    trainings, _, handover = run(monkeypatch, tmp_path, found(95.6, -21.6, passed=False))
+    assert trainings.made == 1
+    assert not handover.trusted
+
+
+def test_promises_that_fall_again_and_again_end(monkeypatch, tmp_path: Path) -> None:
+    trainings, _, handover = run(monkeypatch, tmp_path, *[found(95.6, -21.6)] * MOST_AUDITS)
+    assert trainings.made == MOST_AUDITS
+    assert handover.promise.median == -21.6
