@@ -15,7 +15,7 @@ beta      ``weights`` (n,)        (K + sigma_n^2 I)^-1 y
 ========  ======================  =========================================================
 """
 
-from surrogym_server.gp.fit import FitOptions, Fitted, fit, refine
+from surrogym_server.gp.fit import NOISE_FLOOR, FitOptions, Fitted, fit, refine
 from surrogym_server.gp.hyperparameter_samples import hyperparameter_samples
 from surrogym_server.gp.joint import Joint
 from surrogym_server.gp.kernel import Hyperparameters, Reflection
@@ -26,6 +26,7 @@ from surrogym_server.gp.sparse import condition_many, condition_sparse
 from surrogym_server.gp.subsets import spread
 
 __all__ = [
+    "NOISE_FLOOR",
     "FitOptions",
     "Fitted",
     "Hyperparameters",

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_server.gp.fit import FitOptions, _blas, _Objective
+from surrogym_server.gp.fit import NOISE_FLOOR, FitOptions, _blas, _Objective
 from surrogym_server.gp.kernel import Hyperparameters
 from surrogym_server.gp.posterior import Posterior
 
@@ -23,16 +23,21 @@ NARROWEST = 1e-6  # radians; theta stays where it is when no other angle is left
 Array = NDArray[np.float64]
 
 
-def hyperparameter_samples(posterior: Posterior, count: int, seed: int) -> tuple[Hyperparameters, ...]:
+def hyperparameter_samples(
+    posterior: Posterior, count: int, seed: int, noise_floor: float = NOISE_FLOOR
+) -> tuple[Hyperparameters, ...]:
     """``count`` hyperparameters as likely as the points of a posterior make them. A pure function of its arguments.
 
     Args:
         posterior: an exact one, whose own hyperparameters are where the chain begins.
         count: how many.
         seed: of the chain.
+        noise_floor: that of the fit: the least variance of the noise, in shares of the output's.
     """
     hyper = posterior.hyper
-    options = FitOptions(linear=hyper.linear_variance > 0, quadratic=hyper.quadratic_variance > 0)
+    options = FitOptions(
+        linear=hyper.linear_variance > 0, quadratic=hyper.quadratic_variance > 0, noise_floor=noise_floor
+    )
     evidence = _Objective(posterior.x, posterior.y, options, hyper.reflection)
     chain = _Chain(evidence, np.random.default_rng(seed))
     theta, found = evidence.theta(hyper), []

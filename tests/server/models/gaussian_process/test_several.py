@@ -7,12 +7,14 @@ import pytest
 import torch
 
 from support.models import gaussian_processes
+from support.plane import drifting, plane
 from support.real_steps import random_steps
 from surrogym_client.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.models.abilities import CompiledSteps, FunctionDraws
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.several import MODELS, MOST_POINTS, FunctionsOfSeveral
+from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE
 
 ROWS = 24
 
@@ -85,3 +87,16 @@ def test_hyperparameters_are_sampled_once(model):
     assert several is model.uncertain_functions
     assert isinstance(several, FunctionsOfSeveral)
     assert len(several.models) == MODELS
+
+
+def test_functions_of_a_learned_logarithm_keep_its_noise_floor():
+    """A hundred times that noise is several per cent of a reward whose logarithm spreads over hundreds."""
+
+    def bump(q: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
+        return (-0.5 * (q / 0.04).square().sum(-1)).exp()
+
+    hidden = gaussian_processes(definition_from_spec(plane()), drifting(bump, 12))
+    assert hidden.reward.posterior.hyper.noise_variance < 2 * PEAK_NOISE
+    several = hidden.uncertain_functions
+    assert isinstance(several, FunctionsOfSeveral)
+    assert max(one.reward.posterior.hyper.noise_variance for one in several.models) < 10 * PEAK_NOISE

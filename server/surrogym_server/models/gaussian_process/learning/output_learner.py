@@ -14,6 +14,7 @@ from surrogym_server.environment.features import FeatureMap
 from surrogym_server.gp import FitOptions, Fitted, Posterior, condition_many, fit, refine, spread, subsets
 from surrogym_server.models.gaussian_process.feature_maps import reflection
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
+from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE
 from surrogym_server.models.gaussian_process.settings import Settings
 from surrogym_server.models.port import Warm
 
@@ -24,7 +25,6 @@ LEAD_ODDS, ALONE_ODDS, PARITY_ODDS, PLACE_ODDS = 3.0, -6.0, -3.0, 3.0
 CONSTANT = 1e-9  # an output whose deviation is below this share of its own size never varied
 SMALLEST = 1e-100  # deviation of an output: what is less has squares that are no numbers
 PEAK = "reward peak"  # the logarithm of a reward
-PEAK_NOISE = 1e-10  # of the variance of logarithms, at least: theirs is hundreds, and 1 % of a reward must be told
 
 
 @dataclass
@@ -84,11 +84,10 @@ class OutputLearner:
 
     def _options(self, name: str) -> FitOptions:
         """Dynamics tend to be near linear, costs to be quadratic."""
+        options = FitOptions(quadratic=name in (REWARD, PEAK))
         if self.settings.kernel == "squared_exponential":
-            return FitOptions(linear=False)
-        if name == PEAK:
-            return FitOptions(quadratic=True, noise_floor=PEAK_NOISE)
-        return FitOptions(quadratic=name == REWARD)
+            options = FitOptions(linear=False)
+        return replace(options, noise_floor=PEAK_NOISE) if name == PEAK else options
 
 
 def _odds(feature_map: FeatureMap) -> float:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from surrogym_server.environment.features import FeatureMap
-from surrogym_server.gp import Posterior
+from surrogym_server.gp import NOISE_FLOOR, Posterior
 from surrogym_server.models.abilities import LeaveOneOutErrors
-from surrogym_server.models.gaussian_process.prediction.warp import Warp
+from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE, Warp
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,11 @@ class OutputModel:
     def size(self) -> float:
         """Deviation of the output over the samples, in its unit; 1 for one that never varied."""
         return self.scale if self.warp is None else self.warp.size
+
+    @property
+    def noise_floor(self) -> float:
+        """The least variance of the noise that a fit may find, in shares of the targets'."""
+        return NOISE_FLOOR if self.warp is None else PEAK_NOISE
 
     @property
     def noise_deviation(self) -> float:

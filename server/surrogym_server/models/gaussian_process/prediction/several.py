@@ -46,7 +46,7 @@ def _sampled(output: OutputModel, seed: int) -> list[OutputModel]:
     posterior = output.posterior
     if posterior is None or not _uncertain(output):
         return [output] * MODELS
-    hypers = hyperparameter_samples(posterior, MODELS, seed)
+    hypers = hyperparameter_samples(posterior, MODELS, seed, output.noise_floor)
     return [replace(output, posterior=_conditioned(posterior, hyper)) for hyper in hypers]
 
 

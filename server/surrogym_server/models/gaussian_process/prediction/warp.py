@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 LARGEST = 300.0  # y beyond which nothing is told apart: exp(300) is a number still
+PEAK_NOISE = 1e-10  # of the variance of y, at least: it is hundreds, and 1 % of a reward must be told
 
 
 @dataclass(frozen=True)
