@@ -18,6 +18,7 @@ from surrogym_server.virtual.paths import function_draws
 
 Weighting = Literal["inverse_variance", "uniform"]
 WEIGHT_FLOOR = 1e-12  # of the reward's variance, so that a certain particle's weight stays finite
+LEAST_VARIANCE = 1e-290  # squares of what a hidden reward pays may be 0
 
 
 @dataclass(frozen=True)
@@ -148,5 +149,5 @@ def _weights(spread: Tensor, scale: Tensor, weighting: Weighting) -> Tensor:
     """Normalised weights (N, P) of particles whose rewards deviate by spread (N, P)."""
     if weighting == "uniform":
         return torch.full_like(spread, 1 / spread.shape[1])
-    precision = 1 / (spread.square() + WEIGHT_FLOOR * scale**2)
+    precision = 1 / (spread.square() + WEIGHT_FLOOR * scale**2).clamp_min(LEAST_VARIANCE)
     return precision / precision.sum(1, keepdim=True)

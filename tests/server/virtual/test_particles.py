@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from support.exact_models import ExactModel
+from support.models import gaussian_processes
+from support.plane import drifting, plane
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.virtual import step
 from surrogym_server.virtual.dynamics import mean_state, move_mean, move_particles
@@ -158,3 +160,38 @@ def test_a_step_in_which_every_lane_resets_moves_no_particle(cart, started):
     assert begun.reset_lanes.all()
     assert begun.deviation.tolist() == [[0.0, 0.0]] * 2
     assert lanes.particles.shape == (2, 3, 1)
+
+
+def bump(q: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
+    return (-0.5 * (q / 0.04).square().sum(-1)).exp()
+
+
+def test_compiled_particles_of_a_hidden_reward_agree_with_torch():
+    model = gaussian_processes(definition_from_spec(plane()), drifting(bump, 12))
+    assert model.reward.warp is not None
+    steps = model.compiled()
+    if steps is None:
+        pytest.skip("steps can't be compiled here")
+    noise = torch.randn(5, 6, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    near, u = 0.02 * noise, torch.zeros(5, 1, dtype=torch.float64)
+    ours, theirs = (
+        move_particles(model, near, u, penalty=1.0, noise=noise, weighting="inverse_variance", steps=how)
+        for how in (steps, None)
+    )
+    assert float(theirs.reward_mean.max()) > 0.1
+    for name in ("particles", "reward_mean", "reward", "deviation"):
+        torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=2e-5, atol=0.0)
+
+
+def test_rewards_whose_squares_are_no_numbers_weigh_particles_all_the_same():
+    """A hidden reward may have paid 1e-170 at most, and a particle then deviates by as little."""
+
+    def faint(q: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
+        return 1e-170 * bump(q, _)
+
+    model = gaussian_processes(definition_from_spec(plane()), drifting(faint, 12))
+    assert model.reward.warp is not None
+    near, u = torch.zeros(2, 3, 2, dtype=torch.float64), torch.zeros(2, 1, dtype=torch.float64)
+    moved = move_particles(model, near, u, penalty=0.0, noise=None, weighting="inverse_variance")
+    assert bool(torch.isfinite(moved.reward).all())
+    assert float(moved.reward.min()) > 0
