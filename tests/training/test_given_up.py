@@ -35,3 +35,18 @@ def test_saved_policy_that_few_episodes_owe_their_return_to_has_learned_nothing(
     verdicts.saw([BEST])
     assert verdicts.knows(Imagined(mean=9.3, many=0.0)) == (True, False)
     assert verdicts.knows(Imagined(mean=90.0, many=95.0)) == (True, True)
+
+
+@pytest.mark.parametrize(("mean", "given_up"), [(0.9, False), (0.3, True)], ids=["most starts", "no other start"])
+def test_mean_decides_where_a_quarter_of_the_starts_succeeds_untrained(mean: float, given_up: bool):
+    """Three starts in ten are next to the goal, and no episode earns more than 1."""
+    untrained = Imagined(mean=0.3, many=1.0)
+    verdicts = Verdicts(1_000, untrained)
+    verdicts.saw([1.0])
+    for _ in range(PATIENT_ROLLOUTS):
+        verdicts.after_rollout()
+    verdicts.at(300)
+    verdicts.check(Imagined(mean=mean, many=1.0))
+    verdicts.judge()
+    assert verdicts.given_up == given_up
+    assert verdicts.knows(Imagined(mean=0.95, many=1.0)) == (True, True)

@@ -36,8 +36,9 @@ class Verdicts:
     A network that after a quarter of the steps earns no more than an untrained one, but for a hundredth of what some
     episode did, is given up while there is as much left for another: rewards that come at the end alone leave some
     networks without a first success, and they stop exploring before they have one. A quarter of the episodes has to
-    earn more: under functions drawn from an unsure model a few reach their end by themselves. Where a saved policy
-    waits, a network has half of the steps to come half as far.
+    earn more: under functions drawn from an unsure model a few reach their end by themselves. Where a quarter of an
+    untrained network's episodes earns the most there is, as from starts next to the goal, the mean alone decides.
+    Where a saved policy waits, a network has half of the steps to come half as far.
 
     A training that still gained in its last quarter can take as many steps again, once.
 
@@ -151,8 +152,10 @@ class Verdicts:
         return best, imagined > self._nothing and self._beyond(measured.many)
 
     def _beyond(self, many: float) -> bool:
-        """Whether many episodes earn what an untrained network does not."""
-        return many > self._few + LEARNED * (self._seen - self._few)
+        """Whether many episodes earn what an untrained network does not; also where its best quarter leaves nothing to
+        earn, so that the mean alone can tell."""
+        room = self._seen - self._few
+        return room <= LEARNED * (self._seen - self.floor) or many > self._few + LEARNED * room
 
     @property
     def _nothing(self) -> float:
