@@ -46,3 +46,12 @@ def test_paired_best_median_and_worst_episodes_are_reported_with_their_seeds():
     assert [paired_start(result, among) for among in (1, 2, 4)] == [0, 0, 0]
     assert (said.returns, said.success, said.declared) == (returns.tolist(), [True, True, False, True], False)
     assert said.note == "starts anywhere in the sampling range, from seed 100"
+
+
+def test_report_of_the_most_coordinates_and_episodes_fits_into_a_request():
+    rng, steps = np.random.default_rng(0), 2_000
+    trace = Trace(rng.normal(size=(steps + 1, 64)), rng.normal(size=(steps, 64)), rng.normal(size=steps))
+    result = Evaluation(rng.normal(size=10_000), np.full(10_000, steps), None, (trace,) * 10_000)
+    said = as_reported(result, EvaluationSettings(episodes=10_000), "key")
+    assert len(said.traces) == 4
+    assert len(said.model_dump_json()) < 4 * 1024**2

@@ -104,6 +104,22 @@ def test_a_policy_without_a_surrogate_or_of_an_unknown_form_is_refused(away: Api
         pushing.push(away, odd)
 
 
+@pytest.mark.parametrize(
+    ("fields", "named"), [({"reason": "r" * 2_001}, "reason"), ({"versions": {"torch": "2\n"}}, "versions.torch")]
+)
+def test_a_card_that_no_server_takes_is_named(away: Api, policy: Path, fields: dict[str, object], named: str):
+    write_card(policy, PolicyCard(surrogate=NAME, **fields))
+    with pytest.raises(UnusablePolicy, match=f"the card beside .* can't be stored: {named}"):
+        pushing.push(away, policy)
+
+
+def test_a_card_with_a_long_curve_is_sent_with_a_thin_one(api: Api, policy: Path):
+    curve = tuple(wire.CurvePoint(steps=n) for n in range(501))
+    write_card(policy, PolicyCard(surrogate=NAME, curve=curve))
+    pushing.push(api, policy)
+    assert api.policies.get(NAME).curve[-1].steps == 500
+
+
 @pytest.mark.parametrize("count", [0, 1, 199, 200, 201, 999])
 def test_a_curve_is_thinned_and_keeps_its_last_point(count: int):
     curve = [wire.CurvePoint(steps=n) for n in range(count)]

@@ -117,7 +117,7 @@ def command(
     result = reports[0][1]
     version = None
     if push and ledger is not None:
-        _keep(policy, reports, settings)
+        _keep(policy, reports, settings, quiet=output.quiet)
         version = push_or_say(service.server, service.token_for(context), policy, ledger, quiet=output.quiet)
     promise = card.promise if settings.declared and settings.episodes >= FEWEST_TO_JUDGE else None
     found, token = None, service.token_for(context)
@@ -178,16 +178,31 @@ def _baseline(opener: Callable[[], Episode], compare: Compare) -> Predict:
         episode.close()
 
 
-def _keep(policy: Path, reports: Sequence[tuple[Controller, Evaluation]], settings: EvaluationSettings) -> None:
-    """Note the episodes beside the policy, from where they are sent."""
+def _keep(
+    policy: Path, reports: Sequence[tuple[Controller, Evaluation]], settings: EvaluationSettings, *, quiet: bool
+) -> None:
+    """Note the episodes beside the policy, from where they are sent. What no server takes, such as a return that is not
+    finite, costs nobody the result of the episodes."""
     from uuid import uuid4
 
+    from pydantic import ValidationError
+
+    from surrogym_client.cli.errors import invalid
     from surrogym_client.evaluation.reporting import as_reported, paired_start
     from surrogym_client.policies.pushing import keep
+    from surrogym_shared.terminal import say
 
     paired = paired_start(reports[0][1], settings.episodes)
-    for controller, result in reports:
-        keep(policy, as_reported(result, settings, uuid4().hex, controller=controller, paired=paired))
+    try:
+        noted = [
+            as_reported(result, settings, uuid4().hex, controller=controller, paired=paired)
+            for controller, result in reports
+        ]
+    except ValidationError as error:
+        say(f"the episodes can't be stored on the server: {invalid(error)}", quiet=quiet)
+        return
+    for one in noted:
+        keep(policy, one)
 
 
 def _run(

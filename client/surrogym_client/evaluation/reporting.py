@@ -11,6 +11,7 @@ from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings,
 from surrogym_shared import wire
 
 MAX_POINTS = 2_000  # of a trace that is stored; longer ones are stored up to there
+MAX_NUMBERS = 30_000  # of a trace: a request of at most 4 MiB has four of them
 
 
 def as_reported(
@@ -62,7 +63,8 @@ def words_of(settings: EvaluationSettings) -> str:
 
 
 def _trace(rank: wire.TraceRank, seed: int, trace: Trace) -> wire.EpisodeTrace:
-    steps = min(len(trace.reward), MAX_POINTS)
+    numbers = np.shape(trace.coordinates)[1] + np.shape(trace.action)[1] + 1  # of a step
+    steps = min(len(trace.reward), MAX_POINTS, MAX_NUMBERS // numbers)
     return wire.EpisodeTrace(
         rank=rank,
         seed=seed,

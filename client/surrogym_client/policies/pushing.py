@@ -54,7 +54,7 @@ def push(api: Api, policy: Path, surrogate: str | None = None) -> Pushed:
         surrogate: whose policy it is; None: as the card says.
 
     Raises:
-        UnusablePolicy: no surrogate is known, the file is of no known form, or the card is none.
+        UnusablePolicy: no surrogate is known, the file is of no known form, or the card is none that a server takes.
         SpecConflict: it was made for other observations or actions than the surrogate's.
         SurrogymClientError: the server can't be reached, or refuses; everything stays as it was.
     """
@@ -62,7 +62,11 @@ def push(api: Api, policy: Path, surrogate: str | None = None) -> Pushed:
     name = surrogate or card.surrogate
     if name is None:
         raise UnusablePolicy(f"expected the name of a surrogate, as no card beside {policy} names one")
-    sent = api.policies.push(name, as_pushed(card), card.curve, form, policy.read_bytes())
+    try:
+        card_sent, curve = as_pushed(card), thinned(card.curve)
+    except ValidationError as error:
+        raise UnusablePolicy(f"the card beside {policy} can't be stored: {_first(error)}") from error
+    sent = api.policies.push(name, card_sent, curve, form, policy.read_bytes())
     waiting = _read(policy)
     for done, evaluation in enumerate(waiting, start=1):
         api.policies.evaluate(name, sent.version, evaluation)
@@ -93,8 +97,15 @@ def _read(policy: Path) -> list[wire.AddEvaluation]:
             raise ValueError(f"expected at most {MAX_WAITING_BYTES} bytes")
         return _WAITING.validate_json(content)
     except (ValidationError, ValueError) as error:
-        said = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
+        said = _first(error) if isinstance(error, ValidationError) else str(error)
         raise UnusablePolicy(f"{path} is no list of evaluations: {said}") from error
+
+
+def _first(error: ValidationError) -> str:
+    """The first thing that is wrong, with its place."""
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    return f"{where}: {first['msg']}" if where else first["msg"]
 
 
 def _write(policy: Path, evaluations: Sequence[wire.AddEvaluation]) -> None:

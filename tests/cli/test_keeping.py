@@ -1,0 +1,37 @@
+"""Real episodes are never lost to a server that would not take them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from surrogym_client.cli.evaluate import _keep
+from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
+from surrogym_client.policies.pushing import waiting_path
+
+
+def episodes(returns: list[float]) -> Evaluation:
+    traces = tuple(Trace(np.zeros((2, 2)), np.zeros((1, 1)), np.array([r])) for r in returns)
+    return Evaluation(np.array(returns), np.ones(len(returns), dtype=np.int64), None, traces)
+
+
+@pytest.mark.parametrize(
+    ("returns", "named"),
+    [([np.inf, -1.0], "reward.0"), ([0.0] * 10_001, "returns")],
+    ids=["a return that is not finite", "more episodes than one request holds"],
+)
+def test_episodes_that_no_server_takes_are_named_and_lose_no_result(
+    returns: list[float], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    policy = tmp_path / "policy.zip"
+    _keep(policy, [("policy", episodes(returns))], EvaluationSettings(episodes=len(returns)), quiet=False)
+    assert f"the episodes can't be stored on the server: {named}" in capsys.readouterr().err
+    assert not waiting_path(policy).exists()
+
+
+def test_episodes_of_all_controllers_wait_beside_the_policy(tmp_path: Path):
+    policy, result = tmp_path / "policy.zip", episodes([-1.0, -2.0])
+    _keep(policy, [("policy", result), ("zero", result)], EvaluationSettings(episodes=2), quiet=True)
+    assert waiting_path(policy).read_text().count('"controller"') == 2
