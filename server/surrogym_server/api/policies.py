@@ -53,7 +53,7 @@ def list_all(name: str, use: Use) -> PolicyList:
     status_code=201,
     summary="Store a policy",
     dependencies=[TRAIN],
-    openapi_extra=json_up_to(128),
+    openapi_extra=json_up_to(256),
     responses=documented(Code.UNKNOWN_SURROGATE, Code.SPEC_CONFLICT, Code.INVALID_REQUEST, Code.TOO_LARGE),
 )
 def add(name: str, body: Annotated[AddPolicy, example(examples.POLICY)], use: Use) -> PushedPolicy:

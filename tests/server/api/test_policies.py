@@ -78,6 +78,13 @@ def test_a_policy_is_given_out_as_it_came(api: Api, surrogate: str, tmp_path: Pa
     assert (again.version, again.created, again.reason) == (1, False, "audited")
 
 
+def test_a_card_with_the_largest_specification_and_a_curve_is_stored(api: Api, surrogate: str, tmp_path: Path):
+    """A specification may have 128 KiB by itself."""
+    curve = [wire.CurvePoint(steps=10**9 + n, imagined_return=-1 / 3, seconds=1 / 7) for n in range(200)]
+    large = card(settings={"as large as a specification": "x" * 128 * 1024})
+    assert api.policies.push(surrogate, large, curve, "zip", network_file(tmp_path)).created
+
+
 def test_an_evaluation_has_intervals_and_says_whether_the_promise_was_kept(api: Api, surrogate: str, tmp_path: Path):
     api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))
     trace = wire.EpisodeTrace(
