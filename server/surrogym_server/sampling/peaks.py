@@ -34,7 +34,7 @@ def highest(
     While no sample was paid anything there is nothing to climb: then it is the one farthest from all.
     """
     definition = model.definition
-    points = points[~definition.terminated(points.q)] if not definition.learns_termination else points
+    points = points[~_over(definition, points.q)]
     if definition.declared_reward is not None or not len(points):
         return None
     able = offers(model, RewardPeaks)
@@ -75,13 +75,19 @@ def _climbed(definition: EnvironmentDefinition, able: RewardPeaks, points: Point
         steps = torch.from_numpy(rng.standard_normal((len(at), TRIES, at.shape[1])))
         tried = at[:, None] + WIDEST * SHRINK**climb * (high - low) * steps
         tried = _in_space(definition, tried.clamp(low, high).flatten(0, 1))
-        values = able.promise(tried[:, :size], tried[:, size:]).reshape(len(at), TRIES)
+        values = able.promise(tried[:, :size], tried[:, size:])
+        values = torch.where(_over(definition, tried[:, :size]), -torch.inf, values).reshape(len(at), TRIES)
         found, place = values.max(1)
         better = found > value
         moved = tried.reshape(len(at), TRIES, -1)[torch.arange(len(at)), place]
         at, value = torch.where(better[:, None], moved, at), torch.where(better, found, value)
     at = at[value.argsort(descending=True)]
     return Points(at[:, :size], at[:, size:])
+
+
+def _over(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
+    """Whether the declared termination holds at q (m, C), (m,): no episode passes there, so nothing is asked for."""
+    return q.new_zeros(len(q), dtype=torch.bool) if definition.learns_termination else definition.terminated(q)
 
 
 def _in_space(definition: EnvironmentDefinition, points: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.sampling.design import monte_carlo
 from surrogym_server.sampling.peaks import highest
+from surrogym_shared.spec import Inequality, Term
 
 DEFINITION = definition_from_spec(plane())
 POINTS = Points(*monte_carlo(DEFINITION))[:500]
@@ -39,6 +40,19 @@ def test_place_that_pays_is_asked_for_before_it_was_met():
     assert found is not None
     arrives = found.q + 0.1 * found.u[:, :1]
     assert float((arrives - PLACE).norm()) < 0.02
+
+
+def test_no_step_is_asked_for_from_where_episodes_have_ended():
+    """A reward that is highest behind the line at which episodes end."""
+    right = Inequality(term=Term.linear(x=1), relation=">", value=0.1)
+    definition = definition_from_spec(plane().model_copy(update={"termination": ((right,),)}))
+    samples = drifting(bump, 24)
+    left = samples.q[:, 0] <= 0.1
+    going = Samples(*(getattr(samples, field.name)[left] for field in fields(samples)))
+    model = gaussian_processes(definition, going)
+    found = highest(model, going, POINTS, 1e-9, np.random.default_rng(0))
+    assert found is not None
+    assert not bool(definition.terminated(found.q).any())
 
 
 def test_nothing_is_asked_for_once_the_place_was_met():
