@@ -8,10 +8,15 @@ import torch
 from support.models import gaussian_processes
 from support.plane import Pay, drifting, plane
 from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.features import encode
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.gaussian_process.codec.model import GaussianProcessCodec
+from surrogym_server.models.gaussian_process.feature_maps import reward_candidates
+from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
+from surrogym_server.models.gaussian_process.learning.peaks import _learned
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.settings import Settings
 from surrogym_shared.spec import ModelChoice
 
 CODEC = GaussianProcessCodec()
@@ -64,6 +69,20 @@ def test_samples_that_paid_nothing_at_all_do_not_hide_the_bump():
     samples = drifting(lambda q, u: torch.where(bump(q, u) < 1e-40, 0.0, bump(q, u)), 60)
     assert int((samples.reward == 0).sum()) >= 5
     assert float(around(bump, gaussian_processes(DEFINITION, samples)).abs().max()) < 0.1
+
+
+def test_samples_that_agree_with_a_fit_add_no_structure_to_it():
+    """Samples that paid nothing, where the others foretell as little, had no say in it."""
+    samples = drifting(lambda q, u: torch.where(bump(q, u) < 1e-40, 0.0, bump(q, u)), 60)
+    maps = (feature_map for feature_map in reward_candidates(DEFINITION) if feature_map.after)
+    inputs = {m: encode(DEFINITION, m, samples.q_next, samples.u) for m in maps}
+    paid, found = samples.reward > 0, []
+    assert int(paid.sum()) < 55
+    for going in (paid, torch.ones_like(paid)):
+        learner = OutputLearner(DEFINITION, Settings(), {}, {})
+        found.append(_learned(learner, samples.reward, inputs, going, 0.0, 1.0))
+    assert found[1][1] == pytest.approx(found[0][1])
+    assert len(found[1][0].posterior.y) == 60
 
 
 @pytest.mark.parametrize(

@@ -46,7 +46,7 @@ def with_peak(
     """The reward by its logarithm, from the samples ``going`` (n,), where that accounts for them better; else
     ``plain``."""
     accounts = [_learned(learner, reward, inputs, going, *base) for base in _bases(reward[going])]
-    better = [found for found in accounts if _better(found, plain, reward, inputs, going)]
+    better = [found for found, structure in accounts if _better(found, structure, plain, reward, inputs, going)]
     return max(better, key=lambda found: _agreement(found, reward, inputs, going), default=plain)
 
 
@@ -89,9 +89,9 @@ def _learned(
     going: Tensor,
     base: float,
     sign: float,
-) -> OutputModel:
+) -> tuple[OutputModel, float]:
     """A process of the logarithms: fitted to the samples that were paid anything, and to those paid nothing that would
-    contradict it; conditioned on all."""
+    contradict it; conditioned on all. And the structure that it found in those that it was fitted to."""
     height = _heights(reward, base, sign)
     paid = going & (height > 0)
     nothing, few = going & ~paid, int(paid.sum()) < FEWEST
@@ -105,19 +105,25 @@ def _learned(
             break
         told = told | against
         output = learner.output(PEAK, target, inputs, told, told)
+    structure = _structure(output)
     if output.posterior is not None and bool((going & ~told).any()):
         x = inputs[output.feature_map]
         y = (torch.where(nothing, output.mean(x).clamp_max(least), target) - output.centre) / output.scale
         posterior = condition_many([output.posterior.hyper], x[going], y[going])
         output = replace(output, posterior=posterior, left_out=int((~going).sum()))
     size = max(float(reward[going].std(correction=0)), torch.finfo(torch.float64).tiny)
-    return replace(output, name=REWARD, warp=Warp(base, sign, size))
+    return replace(output, name=REWARD, warp=Warp(base, sign, size)), structure
 
 
 def _better(
-    found: OutputModel, plain: OutputModel, reward: Tensor, inputs: Mapping[FeatureMap, Tensor], going: Tensor
+    found: OutputModel,
+    structure: float,
+    plain: OutputModel,
+    reward: Tensor,
+    inputs: Mapping[FeatureMap, Tensor],
+    going: Tensor,
 ) -> bool:
-    """Whether logarithms account for the samples better than their values do."""
+    """Whether logarithms, with such ``structure`` in them, account for the samples better than their values do."""
     if found.posterior is None:
         return False
     if plain.posterior is None:
@@ -126,14 +132,13 @@ def _better(
     height = _heights(reward[going], found.warp.base, found.warp.sign)
     if _trace(height, found.warp.base) or _spread(height) >= DECADES:
         return True
-    return _structure(found) >= GAIN and _agreement(found, reward, inputs, going) >= _agreement(
-        plain, reward, inputs, going
-    )
+    return structure >= GAIN and _agreement(found, reward, inputs, going) >= _agreement(plain, reward, inputs, going)
 
 
 def _structure(output: OutputModel) -> float:
-    """Log odds of the process against targets that have nothing to do with their inputs."""
-    assert output.posterior is not None
+    """Log odds of a process that was just fitted against targets that have nothing to do with their inputs."""
+    if output.posterior is None:
+        return 0.0
     count = len(output.posterior.y)
     return dict(output.scores)[str(output.feature_map)] + 0.5 * count * (1 + math.log(2 * math.pi))
 
