@@ -14,6 +14,7 @@ import pytest
 
 from support.simulators import CASES, Register, installed
 from surrogym_client.original.adapters import open_simulator
+from surrogym_client.original.adapters.parts import action_of
 from surrogym_client.original.adapters.pcgym import parameters_of
 from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.simulator import Simulator
@@ -88,6 +89,22 @@ def test_a_package_that_is_missing_is_named_with_its_extra(name: str, package: s
     extra = package.replace("_", "-")
     with pytest.raises(UnknownEnvironment, match=rf"pip install 'surrogym\[{extra}\]'"):
         open_simulator(name)
+
+
+@pytest.mark.parametrize("wrong", [{"a_space": [1, 2]}, {"o_space": {"low": [0.0]}}, {"x0": "cold"}])
+def test_parameters_of_another_form_are_named(wrong: dict[str, object], tmp_path) -> None:
+    file = tmp_path / "process.json"
+    file.write_text(json.dumps({"x0": [1.0], **wrong}))
+    with pytest.raises(UnknownEnvironment, match="expected x0 as a list of numbers, and low and high of a_space"):
+        parameters_of(str(file))
+
+
+def test_choices_that_do_not_begin_at_zero_are_refused() -> None:
+    space = gymnasium.spaces.MultiDiscrete([3, 3])
+    assert action_of("Own-v0", space).nvec == (3, 3)  # type: ignore[union-attr]
+    for later in (gymnasium.spaces.MultiDiscrete([3, 3], start=[0, 1]), gymnasium.spaces.Discrete(3, start=1)):
+        with pytest.raises(UnknownEnvironment, match="Discrete or MultiDiscrete from 0"):
+            action_of("Own-v0", later)
 
 
 def test_parameters_of_a_process_come_from_a_file(tmp_path) -> None:

@@ -57,11 +57,11 @@ def action_of(name: str, space: Any) -> Action:
         return BoxAction(low=tuple(map(float, space.low)), high=tuple(map(float, space.high)))
     if kind == "Discrete" and int(space.start) == 0:
         return DiscreteAction(n=int(space.n))
-    if kind == "MultiDiscrete" and len(space.shape) == 1:
+    if kind == "MultiDiscrete" and len(space.shape) == 1 and not np.any(space.start):
         return MultiDiscreteAction(nvec=tuple(map(int, space.nvec)))
     raise UnknownEnvironment(
-        f"{name} has the action space {space}: expected a Box with one row of finite bounds, Discrete from 0, or "
-        "MultiDiscrete; wrap it in a class of your own (docs/how-to/own-environment.md)"
+        f"{name} has the action space {space}: expected a Box with one row of finite bounds, Discrete or "
+        "MultiDiscrete from 0; wrap it in a class of your own (docs/how-to/own-environment.md)"
     )
 
 

@@ -64,8 +64,16 @@ def parameters_of(which: str) -> dict[str, Any]:
     for key, why in REFUSED.items():
         if given.get(key):
             raise UnknownEnvironment(f"pcgym:{which} asks for {key}, {why}: leave it out of the parameters")
-    spaces = {key: {end: np.array(v, dtype=float) for end, v in given[key].items()} for key in ARRAYS if key in given}
-    return {**given, **spaces, "x0": np.array(given["x0"], dtype=float)}
+    try:
+        spaces = {
+            key: {end: np.array(given[key][end], float) for end in ("low", "high")} for key in ARRAYS if key in given
+        }
+        return {**given, **spaces, "x0": np.array(given["x0"], dtype=float)}
+    except (KeyError, TypeError, ValueError) as error:
+        raise UnknownEnvironment(
+            f"pcgym:{which}: expected x0 as a list of numbers, and low and high of {', '.join(ARRAYS)} as such lists, "
+            f"got something else ({type(error).__name__}: {error})"
+        ) from error
 
 
 def _read(which: str) -> dict[str, Any]:
