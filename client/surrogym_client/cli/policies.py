@@ -52,7 +52,9 @@ def _table(rows: Sequence[tuple[str, PolicyView]]) -> str:
 
 
 def _row(name: str, policy: PolicyView) -> tuple[str, ...]:
-    real = latest_real(policy)
+    from surrogym_client.report.known import chosen_real
+
+    real = chosen_real(policy)
     promise, trusted = policy.promise, {True: "yes", False: "no", None: "not judged"}[policy.trusted]
     return (
         f"{name}@{policy.version}",
@@ -64,12 +66,6 @@ def _row(name: str, policy: PolicyView) -> tuple[str, ...]:
         "-" if real is None or real.success_rate is None else f"{real.success_rate:.0%}",
         ", ".join(file.form for file in policy.files if file.stored) or "missing",
     )
-
-
-def latest_real(policy: PolicyView) -> EvaluationView | None:
-    """The newest evaluation of the policy itself, from the declared starts where there is one."""
-    own = [one for one in policy.evaluations if one.controller == "policy"]
-    return next((one for one in reversed(own) if one.declared), own[-1] if own else None)
 
 
 def words_of_mean(evaluation: EvaluationView) -> str:

@@ -83,6 +83,11 @@ def read_card(policy: Path) -> PolicyCard:
     try:
         return PolicyCard.model_validate_json(content)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise UnusablePolicy(f"{card_path(policy)} is no card of a policy: {where}: {first['msg']}") from error
+        raise UnusablePolicy(f"{card_path(policy)} is no card of a policy: {first_fault(error)}") from error
+
+
+def first_fault(error: ValidationError) -> str:
+    """The first thing that is wrong, with its place."""
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    return f"{where}: {first['msg']}" if where else first["msg"]

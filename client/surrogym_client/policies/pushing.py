@@ -11,7 +11,7 @@ from typing import cast, get_args
 
 from pydantic import TypeAdapter, ValidationError
 
-from surrogym_client.policies.card import PolicyCard, UnusablePolicy, read_card
+from surrogym_client.policies.card import PolicyCard, UnusablePolicy, first_fault, read_card
 from surrogym_client.transport import Api
 from surrogym_shared import wire
 
@@ -65,7 +65,7 @@ def push(api: Api, policy: Path, surrogate: str | None = None) -> Pushed:
     try:
         card_sent, curve = as_pushed(card), thinned(card.curve)
     except ValidationError as error:
-        raise UnusablePolicy(f"the card beside {policy} can't be stored: {_first(error)}") from error
+        raise UnusablePolicy(f"the card beside {policy} can't be stored: {first_fault(error)}") from error
     sent = api.policies.push(name, card_sent, curve, form, policy.read_bytes())
     waiting = _read(policy)
     for done, evaluation in enumerate(waiting, start=1):
@@ -97,15 +97,8 @@ def _read(policy: Path) -> list[wire.AddEvaluation]:
             raise ValueError(f"expected at most {MAX_WAITING_BYTES} bytes")
         return _WAITING.validate_json(content)
     except (ValidationError, ValueError) as error:
-        said = _first(error) if isinstance(error, ValidationError) else str(error)
+        said = first_fault(error) if isinstance(error, ValidationError) else str(error)
         raise UnusablePolicy(f"{path} is no list of evaluations: {said}") from error
-
-
-def _first(error: ValidationError) -> str:
-    """The first thing that is wrong, with its place."""
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    return f"{where}: {first['msg']}" if where else first["msg"]
 
 
 def _write(policy: Path, evaluations: Sequence[wire.AddEvaluation]) -> None:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from surrogym_client.report.known import Known
+from surrogym_client.report.known import PREFERRED, Known
 from surrogym_client.surrogates.advice import advice
 
 FEW = 30  # episodes: fewer say little of an average
-PREFERRED = "production"
 
 
 def untested(known: Known) -> list[str]:

@@ -8,7 +8,15 @@ from functools import partial
 from surrogym_client.errors import NotInstalled, SurrogymClientError, UnknownPolicy
 from surrogym_client.report.maps import Cut, cuts
 from surrogym_client.transport import Api
-from surrogym_shared.wire import EvaluationDetail, EvaluationView, ModelView, PolicyDetail, SampleView, SurrogateView
+from surrogym_shared.wire import (
+    EvaluationDetail,
+    EvaluationView,
+    ModelView,
+    PolicyDetail,
+    PolicyView,
+    SampleView,
+    SurrogateView,
+)
 
 PREFERRED = "production"
 
@@ -73,7 +81,7 @@ def cuts_of(api: Api, known: Known) -> tuple[list[Cut], str]:
         return [], str(error)
 
 
-def chosen_real(policy: PolicyDetail) -> EvaluationView | None:
+def chosen_real(policy: PolicyView) -> EvaluationView | None:
     """The newest evaluation of the policy from the declared starts; where there is none, from others."""
     own = [one for one in policy.evaluations if one.controller == "policy"]
     return next((one for one in reversed(own) if one.declared), own[-1] if own else None)
