@@ -12,6 +12,8 @@ from support.moody import SPEC, Line
 from surrogym_client.original.episodes import SteppedEpisode
 from surrogym_client.original.port import OriginalPort
 from surrogym_client.policies.predict import Predict
+from surrogym_client.training import audited
+from surrogym_client.training.audited import AuditedTraining
 from surrogym_client.training.candidates import Candidates
 from surrogym_client.training.settings import TrainResult, TrainSettings
 
@@ -75,3 +77,22 @@ def test_a_policy_that_can_not_be_read_leaves_the_latest_in_place(port, tmp_path
     with pytest.raises(KeyError):
         candidates.best(port, latest, TrainSettings())
     assert path.read_bytes() == b"to the middle"
+
+
+class Audited(AuditedTraining):
+    """One that asks no server how to train."""
+
+    _chosen = TrainSettings()  # type: ignore[assignment]
+
+
+def test_policy_of_every_training_after_an_audit_is_a_candidate(port, tmp_path: Path, monkeypatch) -> None:
+    path, later = tmp_path / "policy.zip", iter([b"to the middle", b"slowly to the middle"])
+    monkeypatch.setattr(audited, "train", lambda *_: trained(path, next(later), 100))
+    training = Audited(None, "line", port, path, TrainSettings())  # type: ignore[arg-type]
+    training.candidates.load = load
+    result = trained(path, b"away", 100)
+    training.candidates.keep(result)
+    for _ in range(2):
+        result = training._train_on(result)
+    assert path.read_bytes() == b"to the middle"
+    assert result.virtual_steps == 300

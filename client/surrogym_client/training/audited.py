@@ -131,6 +131,7 @@ class AuditedTraining:
         if search_for(self.settings).resumable:
             now = replace(now, start_from=self.out, trust_policy=False)
         after = train(self.port, self.out, now, self.progress)
+        self.candidates.keep(after)
         return self._best(_joined(result, after))
 
 
