@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import statistics
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
-from surrogym_server.errors import Damaged, InvalidInput, SpecConflict, UnknownPolicy
+from surrogym_server.errors import Damaged, InvalidInput, NotThere, SpecConflict, UnknownPolicy
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.policy_files import check_file
 from surrogym_server.services.surrogates import Complete, difference, short
@@ -81,12 +82,9 @@ class PolicyService:
             raise InvalidInput(f"expected the file that version {version} was announced with, got another")
         check_file(file.form, content, file.bytes, file.digest)
         blob = self._storage.blobs.put(content)
-        try:
+        with self._removed_if_refused(blob):
             stored = PolicyFile(file.form, file.bytes, file.digest, blob)
             freed = self._storage.policies.attach(name, version, stored, self._most_bytes)
-        except BaseException:
-            self._storage.blobs.remove((blob,))
-            raise
         self._changed(name, freed)
         return self._storage.policies.get(name, str(version))
 
@@ -118,11 +116,8 @@ class PolicyService:
         digest = hashlib.sha256(content).hexdigest()
         blob = self._storage.blobs.put(content)
         new = NewEvaluation(key, _summary(episodes), len(content), digest, blob)
-        try:
+        with self._removed_if_refused(blob):
             stored, created, freed = self._storage.policies.evaluate(name, version, new, self._most_bytes)
-        except BaseException:
-            self._storage.blobs.remove((blob,))
-            raise
         self._changed(name, freed if created else (blob,))
         return self._storage.policies.get(name, str(version)), stored
 
@@ -162,6 +157,16 @@ class PolicyService:
     def delete(self, name: str, version: int) -> None:
         """Remove a policy with its files and evaluations. Raises ``UnknownPolicy``."""
         self._changed(name, self._storage.policies.delete(name, version))
+
+    @contextmanager
+    def _removed_if_refused(self, blob: str) -> Iterator[None]:
+        """Remove a blob whose row was refused. Where a connection was lost nobody knows whether the row is there, and a
+        row must not lead to nothing: the blob stays, and is swept where there is none."""
+        try:
+            yield
+        except (InvalidInput, NotThere):
+            self._storage.blobs.remove((blob,))
+            raise
 
     def _content(self, blob: str | None, digest: str, what: str) -> bytes:
         assert blob is not None

@@ -1,0 +1,74 @@
+"""A file of a policy is never lost to a connection that broke at the wrong moment."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import pytest
+
+from surrogym_server.errors import TooLarge, Unavailable
+from surrogym_server.services.notices import Notices
+from surrogym_server.services.policies import Episodes, PolicyService
+from surrogym_server.storage.policies import PolicyFile
+from surrogym_server.storage.port import Storage
+
+NAME = "pendulum"
+GIF = b"GIF89a and so on"
+EPISODES = Episodes("policy", "", True, 0, [-1.0], [3], None, [])
+
+
+class Silent(Notices):
+    """Notices without an event loop."""
+
+    def __init__(self) -> None: ...
+
+    def post(self, surrogate: str) -> None: ...
+
+
+def service(storage: Storage, most: int = 10_000) -> tuple[PolicyService, PolicyFile]:
+    """With a policy whose file is to come."""
+    file = PolicyFile("gif", len(GIF), hashlib.sha256(GIF).hexdigest())
+    policies = PolicyService(storage, lambda spec: spec, Silent(), most)
+    policies.add(NAME, {"spec": None}, [], file)
+    return policies, file
+
+
+def lost_at_commit(storage: Storage, monkeypatch: pytest.MonkeyPatch, operation: str) -> None:
+    """Let an operation be carried out, and its caller not hear of it."""
+    carry_out = getattr(storage.policies, operation)
+
+    def broken(*arguments: Any) -> None:
+        carry_out(*arguments)
+        raise Unavailable("the connection was lost")
+
+    monkeypatch.setattr(storage.policies, operation, broken)
+
+
+def test_file_whose_commit_nobody_heard_of_is_there(storage: Storage, monkeypatch: pytest.MonkeyPatch):
+    policies, file = service(storage)
+    with monkeypatch.context() as patched:
+        lost_at_commit(storage, patched, "attach")
+        with pytest.raises(Unavailable, match="connection was lost"):
+            policies.put_file(NAME, 1, file, GIF)
+    assert policies.file(NAME, "1", "gif") == (1, GIF)
+
+
+def test_episodes_whose_commit_nobody_heard_of_are_there_once(storage: Storage, monkeypatch: pytest.MonkeyPatch):
+    policies, _ = service(storage)
+    with monkeypatch.context() as patched:
+        lost_at_commit(storage, patched, "evaluate")
+        with pytest.raises(Unavailable, match="connection was lost"):
+            policies.evaluate(NAME, 1, EPISODES, "key")
+    _, stored = policies.evaluate(NAME, 1, EPISODES, "key")
+    assert policies.episodes(NAME, "1", stored.id)[2:] == (
+        {"returns": [-1.0], "lengths": [3], "success": None, "traces": []},
+        None,
+    )
+
+
+def test_file_that_is_refused_leaves_nothing(storage: Storage):
+    policies, file = service(storage, most=len(GIF) - 1)
+    with pytest.raises(TooLarge):
+        policies.put_file(NAME, 1, file, GIF)
+    assert storage.blobs.older(-1.0) == set()
