@@ -84,5 +84,5 @@ def test_a_missing_token_file_is_one_sentence(surrogym, server):
 
 def test_help_says_where_a_token_shows(surrogym):
     said = " ".join(surrogym("status", "--help").out.split())
-    assert "Typed here it shows in the list of processes" in said
+    assert "A token typed here shows in the list of processes." in said
     assert "--token-file" in said

@@ -1,4 +1,6 @@
-"""The ``surrogym`` command. Each command is a file here with ``register(app)``; others join through an entry point."""
+"""The ``surrogym`` command. Each file here is one command, with a function ``register(app)``. Other packages add
+commands through an entry point.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,10 @@ INTERRUPTED = 130
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one command and exit: 0 when it did its work, 1 when it could not, 2 for wrong usage, 130 after Ctrl-C."""
+    """Run one command and exit.
+
+    The exit status is 0 for success, 1 for failure, 2 for wrong usage, and 130 after Ctrl-C.
+    """
     try:
         build()(args=None if arguments is None else list(arguments), prog_name="surrogym")
     except KeyboardInterrupt:
@@ -53,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def build() -> typer.Typer:
-    """All commands, assembled: the client's own, then those that other packages bring."""
+    """Assemble all commands: the client's own, and those of other packages."""
     app = typer.Typer(
         name="surrogym",
         help="Learn a virtual environment from a handful of real steps, serve it, and train on it.",

@@ -1,4 +1,4 @@
-"""``surrogym audit``: compare a policy's promise with a few real steps on its way."""
+"""``surrogym audit``: compare a few real steps on a policy's way with the model."""
 
 from __future__ import annotations
 
@@ -21,19 +21,25 @@ def register(app: typer.Typer) -> None:
 
 def command(
     context: typer.Context,
-    policy: Annotated[Path, typer.Argument(help="Policy file that surrogym train wrote.")],
-    surrogate: Annotated[str | None, typer.Option(help="The surrogate. [default: as noted beside the policy]")] = None,
-    steps: Annotated[int, typer.Option(min=2, max=256, help="Real steps; they cost none of the budget.")] = 8,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of starts, functions and places.")] = 0,
+    policy: Annotated[Path, typer.Argument(help="Policy file from surrogym train.")],
+    surrogate: Annotated[
+        str | None, typer.Option(help="Surrogate that the policy was trained on. [default: as noted beside the policy]")
+    ] = None,
+    steps: Annotated[
+        int, typer.Option(min=2, max=256, help="Number of real steps. They don't count towards the budget.")
+    ] = 8,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of starts, of drawn functions, and of the places to audit.")
+    ] = 0,
     *,
     reading: PolicyReading,
     service: Service,
     output: Output,
 ) -> None:
-    """Test a policy's promise by a few real steps on its way.
+    """Test a policy's promise with a few real steps.
 
-    A sampler has to be running. Promise, audit and the verdict, whether the promise is to be trusted, go into the card
-    beside the policy.
+    The real steps are taken on the policy's way and compared with the model. This needs a running sampler. The promise,
+    the audit and the verdict (trusted or not) go into the card beside the policy.
 
     Example: surrogym audit policy.zip --steps 16
     """
@@ -66,6 +72,6 @@ def command(
 
 
 def _session(card: PolicyCard) -> dict[str, object]:
-    """Fields of the session that the policy was compared in, as its card has them."""
+    """Return the session options that the policy was compared in, from its card."""
     judged = card.settings.get("judge") or card.settings.get("session") or {}
     return dict(judged) if isinstance(judged, dict) else {}

@@ -1,4 +1,4 @@
-"""``surrogym change``: pause or resume a design, or ask more or less of it."""
+"""``surrogym change``: change a design's budget, target or tolerances, or pause it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from surrogym_client.cli.options import (
     read_tolerances,
 )
 
-USUAL = "=usual"  # takes a tolerance back
+USUAL = "=usual"  # returns an output to its default tolerance
 
 
 def register(app: typer.Typer) -> None:
@@ -25,20 +25,34 @@ def command(
     context: typer.Context,
     surrogate: Surrogate,
     tolerance: Tolerances = None,
-    budget: Annotated[int | None, typer.Option(min=0, help="Real steps the design may take; 0 of a log.")] = None,
-    target: Annotated[float | None, typer.Option(help="Confidence index to reach.")] = None,
+    budget: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="Maximum number of real steps that the design may take; 0 if all samples come from a log. [default: "
+            "unchanged]",
+        ),
+    ] = None,
+    target: Annotated[
+        float | None, typer.Option(help="Confidence index to reach, between 0.5 and 1. [default: unchanged]")
+    ] = None,
     paused: Annotated[
         bool | None,
-        typer.Option("--pause/--resume", help="Stop asking for queries, or go on, also with those set aside."),
+        typer.Option(
+            "--pause/--resume",
+            help="Stop choosing queries, or continue. --resume also retries queries that were set aside. [default: "
+            "unchanged]",
+        ),
     ] = None,
     *,
     service: Service,
     output: Output,
 ) -> None:
-    """Change a living surrogate. Its model is judged anew, and what is left out stays.
+    """Change or pause a surrogate's design.
 
-    Queries that the design had chosen before, and that no sampler has begun, are withdrawn and chosen anew. --resume
-    also asks again what was set aside as it kept failing, and takes up a design that has failed.
+    Options that are not given stay as they are. The server judges the model again with the new values. Queries that no
+    sampler has begun are withdrawn and chosen anew. --resume also retries queries that were set aside because they kept
+    failing, and restarts a failed design. --tolerance OUTPUT=usual returns an output to its default tolerance.
 
     Example: surrogym change pendulum --tolerance theta=0.01 --budget 30
 

@@ -1,4 +1,4 @@
-"""Rows as text that fits the terminal."""
+"""Tables as text that fits the terminal."""
 
 from __future__ import annotations
 
@@ -8,16 +8,20 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 from textwrap import fill, wrap
 
-ENDLESS = 10_000  # characters in a line that ends at no terminal's edge
+ENDLESS = 10_000  # characters in a line, where no terminal limits it
 GAP = "  "
 
 
 def columns(rows: Sequence[Sequence[object]], width: int | None = None) -> str:
-    """Rows as aligned columns; the first row is the heading.
+    """Format rows as aligned columns. The first row is the heading.
 
-    Where they don't fit ``width`` characters, headings are broken between words, then cells as well; where that is not
-    enough, each row becomes lines of heading and value. None is the width of the terminal that standard output is, if
-    it is one.
+    If the columns are too wide, headings are broken between words, and then cells too. If that is not enough, each row
+    becomes several lines, each with a heading and a value.
+
+    Args:
+        rows: the heading and the rows.
+        width: characters in a line; None takes the width of the terminal, without a limit if standard output is not
+            one.
     """
     heading, *body = [[_cell(value) for value in row] for row in rows]
     width = width or screen_width()
@@ -28,7 +32,10 @@ def columns(rows: Sequence[Sequence[object]], width: int | None = None) -> str:
 
 
 def fitted(markdown: str, width: int | None = None) -> str:
-    """Markdown for a terminal: its tables as ``columns``, its prose in lines of ``width``; elsewhere as it is."""
+    """Format Markdown for a terminal: tables by ``columns``, prose in lines of ``width`` characters.
+
+    Where standard output is not a terminal, the text is returned unchanged.
+    """
     width = width or screen_width()
     if width == ENDLESS:
         return markdown
@@ -45,12 +52,14 @@ def fitted(markdown: str, width: int | None = None) -> str:
 
 
 def screen_width() -> int:
-    """Characters in a line of standard output; without end where it is no terminal."""
+    """Number of characters in a line of standard output; ``ENDLESS`` if it is not a terminal."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else ENDLESS
 
 
 def _widths(heading: Sequence[str], body: Sequence[Sequence[str]], room: int) -> list[int] | None:
-    """The widest columns that fit: whole headings if they can be, then whole cells, then as even as words allow."""
+    """Choose the widest columns that fit: whole headings if possible, then whole cells, then widths as even as the
+    words allow.
+    """
     cells = [list(column) for column in zip(*body, strict=True)] or [[] for _ in heading]
     values = [max(map(len, column), default=0) for column in cells]
     words = [max(map(_longest_word, (name, *column))) for name, column in zip(heading, cells, strict=True)]
@@ -67,7 +76,9 @@ def _longest_word(text: str) -> int:
 
 
 def _broken(row: Sequence[str], widths: Sequence[int], *, bottom: bool = False) -> Iterator[str]:
-    """The lines of a row whose cells are broken between words; short ones stand at the top, or the bottom."""
+    """Return the lines of a row whose cells are broken between words. Short cells are aligned to the top, or to the
+    bottom.
+    """
     cells = [wrap(text, width, break_on_hyphens=False) or [""] for text, width in zip(row, widths, strict=True)]
     height = max(map(len, cells))
     for i in range(height):

@@ -1,4 +1,4 @@
-"""``surrogym conformance``: whether a server keeps the protocol."""
+"""``surrogym conformance``: check that a server follows the protocol."""
 
 from __future__ import annotations
 
@@ -17,14 +17,16 @@ def register(app: typer.Typer) -> None:
 def command(
     context: typer.Context,
     surrogate: Annotated[
-        str, typer.Option("--surrogate", help="A free name; the surrogate is deleted at the end.")
+        str,
+        typer.Option("--surrogate", help="Name for a temporary surrogate, not yet in use. It is deleted at the end."),
     ] = "conformance",
     *,
     service: Service,
     output: Output,
 ) -> None:
-    """Check a server against the protocol. One line a check; exit status 1 where it fails one. With --quiet, failed
-    checks alone are shown.
+    """Check that a server follows the protocol.
+
+    Each check prints one line. The exit status is 1 if a check fails. With --quiet, only failed checks are shown.
 
     Example: surrogym conformance --server http://127.0.0.1:8000
     """

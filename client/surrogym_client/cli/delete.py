@@ -18,12 +18,14 @@ def register(app: typer.Typer) -> None:
 def command(
     context: typer.Context,
     surrogate: Surrogate,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Delete without a confirmation.")] = False,
     *,
     service: Service,
     output: Output,
 ) -> None:
-    """Delete a surrogate. Its samples, models and sessions are gone for good.
+    """Delete a surrogate with its samples, models and sessions.
+
+    Its policies are deleted too. This can't be undone.
 
     Example: surrogym delete pendulum --yes
     """

@@ -1,4 +1,4 @@
-"""``surrogym demo``: the whole loop on one machine, as three processes that talk over HTTP."""
+"""``surrogym demo``: run the whole method on one machine, as three processes that talk over HTTP."""
 
 from __future__ import annotations
 
@@ -19,35 +19,41 @@ else:
     Task, ArmName = Literal[tuple(EVERY_TASK)], Literal[tuple(ARMS)]
 
 
+RunFolder = Annotated[
+    Path | None, typer.Option(help="Folder for the results of the run. [default: runs/TASK-seedSEED-TIME]")
+]
+Arm = Annotated[ArmName, typer.Option(help="Method to choose real steps by; docs/results/efficiency.md explains each.")]
+Budget = Annotated[int | None, typer.Option(min=2, help="Maximum number of real steps. [default: from the task]")]
+Steps = Annotated[int | None, typer.Option(min=1, help="Virtual steps of the training. [default: from the task]")]
+Algorithm = Annotated[str | None, typer.Option(help="Policy search, as in surrogym train. [default: that command's]")]
+
+
 def register(app: typer.Typer) -> None:
     """Add the command."""
     app.command("demo")(command)
 
 
 def command(
-    task: Annotated[Task, typer.Argument(help="What to solve.")] = "pendulum",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of design, policy and virtual environment.")] = 0,
+    task: Annotated[Task, typer.Argument(help="Task to solve.")] = "pendulum",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the design, the policy and the virtual environment.")] = 0,
     json_file: Annotated[
         Path | None,
-        typer.Option("--json", help="Write the metrics to this file too; - prints them instead of the table."),
+        typer.Option("--json", help="Write the metrics to this file as well. With -, print them instead of the table."),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Run folder. [default: runs/TASK-seedSEED-TIME]")] = None,
-    arm: Annotated[
-        ArmName, typer.Option(help="How to spend the real steps; see docs/results/efficiency.md.")
-    ] = "default",
-    budget: Annotated[int | None, typer.Option(min=2, help="Real steps, at most. [default: the task's]")] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Virtual steps of the training.")] = None,
-    algorithm: Annotated[
-        str | None, typer.Option(help="Policy search, as of surrogym train. [default: that command's]")
-    ] = None,
-    episodes: Annotated[int, typer.Option(min=1, help="Real episodes of the evaluation.")] = 100,
-    pictures: Annotated[bool, typer.Option(help="Draw the run.")] = True,
-    keep: Annotated[bool, typer.Option("--keep", help="Leave the server running until Ctrl-C.")] = False,
+    out: RunFolder = None,
+    arm: Arm = "default",
+    budget: Budget = None,
+    steps: Steps = None,
+    algorithm: Algorithm = None,
+    episodes: Annotated[int, typer.Option(min=1, help="Number of real episodes of the evaluation.")] = 100,
+    pictures: Annotated[bool, typer.Option(help="Draw pictures of the run.")] = True,
+    keep: Annotated[bool, typer.Option("--keep", help="Keep the server running until Ctrl-C.")] = False,
     exit_with_parent: ExitWithParent = False,
     quiet: Quiet = False,
 ) -> None:
-    """Solve a task from a few real steps, on this machine. Server, sampler and trainer are started, and the last words
-    say what came of it.
+    """Solve a task from a few real steps, on this machine.
+
+    The command starts a server, a sampler and a trainer, evaluates the policy, and prints a table of the results.
 
     Example: surrogym demo pendulum --seed 0 --json metrics.json
     """

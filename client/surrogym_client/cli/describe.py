@@ -17,17 +17,22 @@ def register(app: typer.Typer) -> None:
 
 def command(
     environment: Annotated[
-        str, typer.Argument(help="Gymnasium id, package:Id-v0, dm_control:DOMAIN-TASK, pcgym:MODEL or pcgym:FILE.json.")
+        str,
+        typer.Argument(
+            help="Environment: a Gymnasium id, package:Id-v0, dm_control:DOMAIN-TASK, pcgym:MODEL or pcgym:FILE.json."
+        ),
     ],
-    steps: Annotated[int, typer.Option(min=20, help="Real steps of its episodes; some more check the result.")] = 400,
+    steps: Annotated[
+        int, typer.Option(min=20, help="Real steps to take in random episodes. Some more real steps check the result.")
+    ] = 400,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random actions.")] = 0,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Draft a specification by random steps.
+    """Draft an environment's specification from random steps.
 
-    The file says in plain words what was found out, and asks for what can't be. The real steps are counted; they are in
-    no ledger, as no surrogate is registered yet.
+    The draft goes to standard output. Its notes say what the steps showed, and ask for what they can't show. The
+    command prints the number of real steps. No ledger counts them, because no surrogate is registered yet.
 
     Example: surrogym describe Swimmer-v5 > env.json
     """

@@ -1,4 +1,4 @@
-"""Where real steps and the model disagree, as lines for a person and as JSON."""
+"""Text and JSON about where real steps and the model disagree."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 
 def left(promise: Promise | None, result: Evaluation) -> bool:
-    """Whether the mean return lies outside of the promise's interval, on either side."""
+    """Whether the mean return lies outside the promise's interval."""
     return promise is not None and not promise.low <= result.returns.mean() <= promise.high
 
 
 def differ_from(
     surrogate: str | None, server: str | None, token: str | None, result: Evaluation, first_seed: int, *, quiet: bool
 ) -> Differing | None:
-    """Real steps of the episodes held against the surrogate's model; None where that can't be asked."""
+    """Compare the real steps of the episodes with the surrogate's model; None if that is not possible."""
     from surrogym_client.cli.options import connect
     from surrogym_client.errors import SurrogymClientError
     from surrogym_client.evaluation.comparing import compared, disagreements, steps_of
@@ -43,13 +43,13 @@ def differ_from(
 
 @dataclass(frozen=True)
 class Differing:
-    """Where reality and the model disagree, in episodes from ``first_seed`` on."""
+    """Where reality and the model disagree, for episodes whose reset seeds begin at ``first_seed``."""
 
     found: Disagreements
     first_seed: int
 
     def in_words(self, spec: EnvironmentSpec | None) -> list[str]:
-        """A line for all steps, one for each of the worst episodes, and one for each of the worst steps."""
+        """Return one line about all steps, one for each of the worst episodes, and one for each of the worst steps."""
         from surrogym_client.evaluation.comparing import SHOWN
 
         found = self.found
@@ -66,7 +66,7 @@ class Differing:
         return [*lines, *(f"  {self._at(one, names)}" for one in found.found[:SHOWN])]
 
     def as_json(self) -> dict[str, Any]:
-        """All of it."""
+        """Return all disagreements as JSON."""
         counts = self.found.by_episode()
         return {
             "compared": self.found.compared,

@@ -1,4 +1,4 @@
-"""``surrogym doctor``: whether everything is in place."""
+"""``surrogym doctor``: check the installation, the server and the environment."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def command(
     env: Annotated[
         str | None,
         typer.Option(
-            help="Also make this environment, take some real steps, and say how to use it: a name, as for register."
+            help="Also check this environment, by some real steps. Takes the same names as surrogym register."
         ),
     ] = None,
     spec: SpecFile = None,
@@ -39,9 +39,11 @@ def command(
     service: Service,
     output: Output,
 ) -> None:
-    """Check versions, server, token, round trip, environment. One line each, with the way out
-    of what is wrong. With --env, states are set and read back, and steps and resets are repeated, to
-    say how exact the environment is. Exit status 1 where anything is; with --quiet, problems alone are shown.
+    """Check the installation, the server and an environment.
+
+    The checks cover versions, server, token and round trip time. Each check prints one line; a problem's line says how
+    to solve it. With --env, the command sets states and reads them back, and repeats steps and resets, to show how
+    exact the environment is. The exit status is 1 if there is a problem. With --quiet, only problems are shown.
 
     Example: surrogym doctor --env Pendulum-v1
     """
@@ -77,7 +79,7 @@ def command(
 
 
 def _described(env: str) -> tuple[EnvironmentSpec | None, list[Finding]]:
-    """The specification of an environment that brings none, found by real steps; nothing where it can't be opened."""
+    """Draft the specification of an environment that has none, by real steps. None if it has one or can't be opened."""
     from surrogym_client.diagnosis.doctor import Finding
     from surrogym_client.original.describing import describe
     from surrogym_client.original.errors import OriginalError

@@ -1,4 +1,4 @@
-"""What a command tells a person when it can't do its work: one sentence, never a traceback."""
+"""Errors of a command as one sentence for a person, without a traceback."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ if TYPE_CHECKING:
 
 
 class CommandError(Exception):
-    """A command can't do what was asked; ``str(error)`` is the sentence for the person."""
+    """A command can't do its work. ``str(error)`` is the sentence to show."""
 
 
 def sentence(error: Exception) -> str | None:
-    """The sentence for an error that a person can do something about; None for a defect of the program."""
+    """Return the sentence for an error that a person can act on; None for a defect of the program."""
     from pydantic import ValidationError
 
     from surrogym_client.errors import SurrogymClientError
@@ -38,7 +38,7 @@ def sentence(error: Exception) -> str | None:
 
 
 def _way_out(error: SurrogymClientError) -> str:
-    """What to do about what a server, or none, has said."""
+    """Return advice on what to do about an error of the server or the connection."""
     from surrogym_client import errors
 
     match error:
@@ -59,7 +59,7 @@ def _way_out(error: SurrogymClientError) -> str:
 
 
 def invalid(error: Exception) -> str:
-    """The first thing that is wrong with a model, with its place."""
+    """Describe the first validation error of a model, with its place."""
     from pydantic import ValidationError
 
     if not isinstance(error, ValidationError):

@@ -1,4 +1,4 @@
-"""``surrogym evaluate``: what a policy is worth in the original environment."""
+"""``surrogym evaluate``: measure a policy in the original environment."""
 
 from __future__ import annotations
 
@@ -27,7 +27,34 @@ if TYPE_CHECKING:
 
 
 Compare = Literal["zero", "random"]
-FEWEST_TO_JUDGE = 30  # episodes: the mean of fewer says little of a promise
+FEWEST_TO_JUDGE = 30  # episodes: the mean of fewer is too uncertain to judge a promise
+
+
+Environment = Annotated[
+    str | None,
+    typer.Option(
+        help="Gymnasium id or package.module:factory. [default: the environment that the policy was trained for]"
+    ),
+]
+Where = Annotated[
+    bool,
+    typer.Option(
+        "--where",
+        help="Show the states at which real steps differ from the model. [default: on if the mean return is "
+        "outside the promise]",
+    ),
+]
+Ledger = Annotated[
+    str | None,
+    typer.Option(help="Surrogate whose ledger counts the real steps. [default: as noted beside the policy]"),
+]
+Compared = Annotated[
+    Compare | None,
+    typer.Option(
+        help="Also run the same starts without the policy: with an action of zero, or with random actions. These "
+        "real steps count too."
+    ),
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -37,28 +64,39 @@ def register(app: typer.Typer) -> None:
 
 @dataclass(frozen=True)
 class Episodes:
-    """How many real episodes, from which starts, of how many instances."""
+    """Options of the real episodes: how many, from which starts, in how many instances of the environment."""
 
-    episodes: Annotated[int, typer.Option(min=1, help="How many real episodes.")] = 100
-    first_seed: Annotated[int, typer.Option(min=0, help="Reset seed of the first episode; the next follow.")] = 10_000
-    wide: Annotated[bool, typer.Option("--wide", help="Start anywhere in the sampling range.")] = False
+    episodes: Annotated[int, typer.Option(min=1, help="Number of real episodes.")] = 100
+    first_seed: Annotated[
+        int, typer.Option(min=0, help="Reset seed of the first episode. Each further episode takes the next seed.")
+    ] = 10_000
+    wide: Annotated[bool, typer.Option("--wide", help="Start episodes anywhere in the sampling range.")] = False
     start_scale: Annotated[
-        float, typer.Option(min=0, help="Spread the declared starts so many times as far about their middle.")
+        float, typer.Option(min=0, help="Factor by which to widen the declared starts about their middle.")
     ] = 1.0
     perturb: Annotated[
-        float, typer.Option(min=0, help="Deviation of random factors on masses, lengths and limits.")
+        float,
+        typer.Option(
+            min=0,
+            help="Standard deviation of the random factors that multiply masses, lengths and limits; 0 leaves them "
+            "as they are.",
+        ),
     ] = 0.0
     parallel: Annotated[
         int | None,
         typer.Option(
             min=1,
-            help="Instances of the environment that are open at once. [default: 1; one for each episode where the "
-            "environment declares that it runs in parallel, as Gymnasium's do]",
+            help="Number of instances of the environment that are open at once. [default: 1, or one for each episode "
+            "if the environment declares that it runs in parallel, as Gymnasium's do]",
         ),
     ] = None
 
     def settings(self) -> EvaluationSettings:
-        """The settings of the evaluation. Raises ``CommandError`` where they contradict each other."""
+        """Return the settings of the evaluation.
+
+        Raises:
+            CommandError: two options contradict each other.
+        """
         from surrogym_client.cli.errors import CommandError
         from surrogym_client.evaluation.evaluator import EvaluationSettings
 
@@ -69,38 +107,26 @@ class Episodes:
 
 def command(
     context: typer.Context,
-    policy: Annotated[Path, typer.Argument(help="Policy file that surrogym train, or Stable-Baselines3, wrote.")],
-    env: Annotated[
-        str | None, typer.Option(help="Gymnasium id or package.module:factory. [default: what it was trained for]")
-    ] = None,
+    policy: Annotated[Path, typer.Argument(help="Policy file from surrogym train or Stable-Baselines3.")],
+    env: Environment = None,
     spec: SpecFile = None,
     *,
     episodes: Episodes,
     reading: PolicyReading,
-    where: Annotated[
-        bool,
-        typer.Option(
-            "--where", help="Say at which states real steps differ from the model. [default: if the promise was missed]"
-        ),
-    ] = False,
-    surrogate: Annotated[
-        str | None, typer.Option(help="Enter the real steps into this surrogate's ledger. [default: as noted]")
-    ] = None,
-    compare: Annotated[
-        Compare | None,
-        typer.Option(
-            help="Run the same starts without the policy as well: with an action of zero, or random actions. These "
-            "real steps count too."
-        ),
-    ] = None,
-    push: Annotated[bool, typer.Option("--push/--no-push", help="Store the episodes on the server as well.")] = True,
+    where: Where = False,
+    surrogate: Ledger = None,
+    compare: Compared = None,
+    push: Annotated[
+        bool, typer.Option("--push/--no-push", help="Store the policy and its episodes on the server as well.")
+    ] = True,
     service: Service,
     output: Output,
 ) -> None:
-    """Run real episodes with a policy and count successes. The real steps go to the surrogate's ledger.
+    """Run real episodes with a policy, and report its returns.
 
-    The server keeps the policy and the episodes. While it is away, they wait beside the policy. Where the mean return
-    leaves the interval of the promise, the steps are held against the model, to say at which states the two disagree.
+    The real steps count in the surrogate's ledger. The server stores the policy and the episodes; if it does not
+    answer, they wait beside the policy until surrogym policy push. If the mean return lies outside the promise's
+    interval, the command compares the steps with the model and shows the states at which the two disagree.
 
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 100
     """
@@ -130,7 +156,7 @@ def command(
 
 
 def _summary(reports: Sequence[tuple[Controller, Evaluation]]) -> dict[str, Any]:
-    """The policy's episodes as JSON, and those without it where they were compared."""
+    """Return the policy's episodes as JSON, together with those of ``--compare``."""
     summary = reports[0][1].summary()
     for actions, without in reports[1:]:
         summary["without"] = {"actions": actions, **without.summary()}
@@ -140,7 +166,7 @@ def _summary(reports: Sequence[tuple[Controller, Evaluation]]) -> dict[str, Any]
 def _controllers(
     policy: Path, card: PolicyCard, reading: PolicyReading, opener: Callable[[], Episode], compare: Compare | None
 ) -> dict[Controller, Callable[[], Predict]]:
-    """What acts in the episodes, each loaded when its turn comes."""
+    """Return loaders of whatever chooses the actions: the policy, and the baseline of ``--compare``."""
     controllers: dict[Controller, Callable[[], Predict]] = {"policy": lambda: reading.load(policy, card)}
     if compare is not None:
         controllers[compare] = lambda: _baseline(opener, compare)
@@ -154,7 +180,7 @@ def _reports(
     settings: EvaluationSettings,
     policy: Path,
 ) -> list[tuple[Controller, Evaluation]]:
-    """Run the episodes of each controller, and enter their real steps."""
+    """Run the episodes of each controller, and enter their real steps into the ledger."""
     reports: list[tuple[Controller, Evaluation]] = []
     for controller, load in controllers.items():
         actions = "" if controller == "policy" else f"{controller} actions"
@@ -181,8 +207,10 @@ def _baseline(opener: Callable[[], Episode], compare: Compare) -> Predict:
 def _keep(
     policy: Path, reports: Sequence[tuple[Controller, Evaluation]], settings: EvaluationSettings, *, quiet: bool
 ) -> None:
-    """Note the episodes beside the policy, from where they are sent. What no server takes, such as a return that is not
-    finite, costs nobody the result of the episodes."""
+    """Write the episodes to files beside the policy, from which they are sent to the server.
+
+    Episodes that the server can't store, such as those with an infinite return, are reported and left out.
+    """
     from uuid import uuid4
 
     from pydantic import ValidationError
@@ -214,7 +242,7 @@ def _run(
     *,
     quiet: bool,
 ) -> Evaluation:
-    """Run the episodes; where they fail or are interrupted, their real steps are entered all the same."""
+    """Run the episodes. Their real steps are entered into the ledger even if they fail or are interrupted."""
     from surrogym_client.evaluation.evaluator import EvaluationInterrupted, evaluate
     from surrogym_client.original.errors import EvaluationFailed
     from surrogym_client.runtime.lifetime import terminations_as_interrupts
@@ -234,7 +262,9 @@ def _run(
 
 
 def _opener(env: str | None, given: EnvironmentSpec | None, card: PolicyCard, *, quiet: bool) -> Callable[[], Episode]:
-    """Return what opens an episode. A card is believed for Gymnasium's own ids alone, never for a module."""
+    """Return a function that opens an episode. An environment named by a card alone is opened only if it is Gymnasium's
+    own, because a module would run code.
+    """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.original.episodes import open_episode
     from surrogym_client.original.loading import is_known, is_own, make
@@ -253,7 +283,8 @@ def _opener(env: str | None, given: EnvironmentSpec | None, card: PolicyCard, *,
 
 
 def _limited(noted: EnvironmentSpec, *, quiet: bool) -> EnvironmentSpec:
-    """Cut a card's time limit to that of the environment, which takes the real steps: a card may only shorten it."""
+    """Shorten the environment's time limit to that of the card. A card can't lengthen it, as this would cost real
+    steps."""
     from surrogym_client.original.loading import own_time_limit
     from surrogym_shared.terminal import say
 
@@ -270,7 +301,7 @@ def _limited(noted: EnvironmentSpec, *, quiet: bool) -> EnvironmentSpec:
 
 
 def _bins(spec: EnvironmentSpec | None) -> int | None:
-    """How many values of each continuous action a policy was trained to choose from; None where from all of them."""
+    """Number of values of each continuous action that the policy chooses from; None without discretisation."""
     from surrogym_shared.spec import BoxAction
 
     action = None if spec is None else spec.action
@@ -282,7 +313,8 @@ def _telling(update: Update, episodes: int) -> Progress:
 
 
 def _ledger(surrogate: str | None, server: str | None, card: PolicyCard, noted_in: Path, *, quiet: bool) -> str | None:
-    """The surrogate whose ledger gets the real steps; None where a card alone names its server, which is not asked."""
+    """Name of the surrogate whose ledger counts the real steps. None if only the card names a server, which is not
+    trusted."""
     from surrogym_client.transport.connection import DEFAULT_URL
     from surrogym_shared.terminal import say
 
@@ -306,7 +338,7 @@ def _enter(
     *,
     quiet: bool,
 ) -> None:
-    """Enter the real steps into the ledger; a server that is gone does not spoil the result."""
+    """Enter the real steps into the ledger. If the server does not answer, say so and keep the evaluation's result."""
     from surrogym_client.cli.options import connect
     from surrogym_client.errors import SurrogymClientError
     from surrogym_shared.terminal import say
@@ -326,7 +358,7 @@ def _settings(settings: EvaluationSettings) -> dict[str, Any]:
 
 
 def _kept(promise: Promise | None, result: Evaluation) -> bool | None:
-    """Whether the mean return is at least the promise's 5 % quantile; None without a promise."""
+    """Whether the mean return is at least the 5 % quantile of the promise; None without a promise."""
     return None if promise is None else bool(result.returns.mean() >= promise.low)
 
 

@@ -1,4 +1,4 @@
-"""``surrogym export``: a whole surrogate, its real samples, its latest model or its specification as a file."""
+"""``surrogym export``: write a surrogate, its samples, its model or its specification to a file."""
 
 from __future__ import annotations
 
@@ -25,15 +25,19 @@ def command(
     out: Annotated[
         Path,
         typer.Option(
-            "--out", "-o", help="File to write; its ending says what: .surrogate, .csv, .npz, .safetensors, .json."
+            "--out",
+            "-o",
+            help="File to write. Its ending chooses the content: .surrogate, .csv, .npz, .safetensors or .json.",
         ),
     ],
     *,
     service: Service,
     output: Output,
 ) -> None:
-    """Write a whole surrogate into one file (.surrogate). It is what surrogym import takes. Other endings write
-    a part alone: every real sample (.csv, .npz), the latest model (.safetensors), the specification (.json).
+    """Write a surrogate, or a part of it, to a file.
+
+    The file's ending chooses the content: the whole surrogate for surrogym import (.surrogate), every real sample (.csv
+    or .npz), the latest model (.safetensors), or the specification (.json).
 
     Example: surrogym export pendulum --out pendulum.surrogate
 

@@ -1,4 +1,4 @@
-"""``surrogym export-policy``: a policy for other programs."""
+"""``surrogym export-policy``: convert a policy for other programs."""
 
 from __future__ import annotations
 
@@ -16,19 +16,21 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
-    policy: Annotated[Path, typer.Argument(help="Policy file that surrogym train, or Stable-Baselines3, wrote.")],
+    policy: Annotated[Path, typer.Argument(help="Policy file from surrogym train or Stable-Baselines3.")],
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="File to write; its ending says what: .onnx, or .pt2 for torch.export.")
+        Path,
+        typer.Option(
+            "--out", "-o", help="File to write. Its ending chooses the format: .onnx, or .pt2 for torch.export."
+        ),
     ],
     *,
     reading: PolicyReading,
     output: Output,
 ) -> None:
-    """Write a policy as ONNX (.onnx) or for torch (.pt2). It gives the most probable action; .pt2 is a program of
-    torch.export.
+    """Convert a policy to ONNX (.onnx) or torch.export (.pt2).
 
-    The file is checked to give the policy's actions on random observations. The policy itself is a zip that
-    Stable-Baselines3 loads.
+    The converted policy returns the most probable action. The command checks on random observations that it gives the
+    same actions as the original policy, which is a zip file that Stable-Baselines3 loads.
 
     Example: surrogym export-policy policy.zip --out policy.onnx
     """

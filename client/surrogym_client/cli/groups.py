@@ -1,4 +1,4 @@
-"""Options in groups: frozen dataclasses whose fields are options, shared by commands and passed on whole."""
+"""Groups of command-line options: frozen dataclasses whose fields are options, which several commands share."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Service:
-    """Which server, and the token for it."""
+    """Options of the server and its token."""
 
     server: Server = None
     token: Token = None
     token_file: TokenFile = None
 
     def token_for(self, context: typer.Context) -> str | None:
-        """The bearer token. Raises as ``token_from``."""
+        """Return the bearer token. Raises as ``token_from``."""
         return token_from(context, self.token, self.token_file)
 
     def connect(self, context: typer.Context, wait: float = 0.0, *, quiet: bool = False) -> Api:
-        """The server, which must answer within ``wait`` seconds. Raises as ``connect``."""
+        """Connect to the server, and wait up to ``wait`` seconds until it answers. Raises as ``connect``."""
         return connect(self.server, self.token_for(context), wait, quiet=quiet)
 
 
 @dataclass(frozen=True)
 class Output:
-    """How a command shows its result."""
+    """Options of how a command shows its result."""
 
     as_json: AsJson = False
     quiet: Quiet = False
 
     def give(self, result: dict[str, Any], words: Callable[[], str]) -> None:
-        """Print the result as JSON, or in words."""
+        """Print the result as JSON, or as text."""
         from surrogym_shared.terminal import give
 
         give(result, words, as_json=self.as_json, quiet=self.quiet)
@@ -53,27 +53,31 @@ class Output:
 
 @dataclass(frozen=True)
 class PolicyReading:
-    """How a policy's file is read."""
+    """Options of how to read a policy file."""
 
     algorithm: Annotated[
-        str | None, typer.Option(help="Stable-Baselines3 algorithm of the file. [default: as noted beside it, or PPO]")
+        str | None,
+        typer.Option(
+            help="Algorithm of Stable-Baselines3 that wrote the file. [default: as noted beside the policy, or PPO]"
+        ),
     ] = None
     trust_policy: TrustPolicy = False
 
     def load(self, policy: Path, card: PolicyCard) -> Predict:
-        """The policy as a function of observations. Raises as ``load_policy``."""
+        """Load the policy as a function of observations. Raises as ``load_policy``."""
         from surrogym_client.policies.files import load_policy
 
         return load_policy(policy, self.algorithm or card.algorithm, trust=self.trust_policy)
 
 
 def add(app: typer.Typer, name: str, command: Callable[..., None]) -> None:
-    """Add a command. Each parameter whose type is a group becomes the options of its fields, in their order."""
+    """Add a command to an app. Each parameter whose type is a group of options becomes these options, in their
+    order."""
     app.command(name)(ungrouped(command))
 
 
 def ungrouped(command: Callable[..., None]) -> Callable[..., None]:
-    """The same command with the options of its groups as parameters of its own, as typer reads them."""
+    """Return the command with the options of its groups as separate parameters, which typer can read."""
     asked = inspect.signature(command, eval_str=True).parameters.values()
     groups: dict[str, Any] = {one.name: one.annotation for one in asked if is_dataclass(one.annotation)}
     flat = [option for parameter in asked for option in _flattened(parameter)]

@@ -1,4 +1,4 @@
-"""``surrogym import``: a surrogate from its file, or from a log of real steps."""
+"""``surrogym import``: make a surrogate from an exported file, or from a log of real steps."""
 
 from __future__ import annotations
 
@@ -17,38 +17,55 @@ if TYPE_CHECKING:
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import SurrogateView
 
-SHOWN = 5  # rejected rows and reasons in words; the file has all of them
+SHOWN = 5  # rejected rows to print; the file of rejected rows has all of them
 
 
 @dataclass(frozen=True)
 class OfLogs:
-    """Options of an import that reads a log."""
+    """Options of importing a log."""
 
     register: Annotated[
         str | None,
-        typer.Option("--register", help="Of a log: register a surrogate of this name with what was drafted."),
+        typer.Option(
+            "--register", help="For a log: register a new surrogate of this name, with the drafted specification."
+        ),
     ] = None
     to: Annotated[
         str | None,
-        typer.Option("--to", help="Of a log: the surrogate to add it to, by whose specification it is read."),
+        typer.Option(
+            "--to", help="For a log: add its steps to this existing surrogate, whose specification is used to read it."
+        ),
     ] = None
     mapping: Annotated[
-        Path | None, typer.Option("--map", help="Of a log: JSON or TOML file that says what its columns are.")
+        Path | None, typer.Option("--map", help="For a log: JSON or TOML file that says what each column means.")
     ] = None
     spec: SpecFile = None
     draft: Annotated[
-        Path | None, typer.Option("--draft", help="Of a log: write the drafted specification to this file, to edit it.")
+        Path | None,
+        typer.Option(
+            "--draft", help="For a log: write the drafted specification to this file, so that you can edit it."
+        ),
     ] = None
     budget: Annotated[
-        int, typer.Option(min=0, help="Real steps that the design may take beyond the log; 0 without a machine.")
+        int,
+        typer.Option(
+            min=0,
+            help="For a log: real steps that the design may take beyond the log; 0 if there is no machine to take "
+            "them.",
+        ),
     ] = 0
     picture: Annotated[
         Path | None,
-        typer.Option("--picture", help="Of a log: draw where it has been into this file (.png, .svg or .pdf)."),
+        typer.Option(
+            "--picture", help="For a log: draw its coverage of the sampling range to this file (.png, .svg or .pdf)."
+        ),
     ] = None
     rejected: Annotated[
         Path | None,
-        typer.Option("--rejected", help="Of a log: file for the rows that can't be used. [default: beside the log]"),
+        typer.Option(
+            "--rejected",
+            help="For a log: file for the rows that can't be used. [default: LOG.rejected.csv, beside the log]",
+        ),
     ] = None
 
 
@@ -62,12 +79,12 @@ def command(
     file: Annotated[
         Path,
         typer.Argument(
-            help="What surrogym export wrote with the ending .surrogate; or a log as CSV, NPZ or Parquet, or the name "
-            "of a Minari data set."
+            help="A .surrogate file from surrogym export; or a log as CSV, NPZ or Parquet; or the name of a Minari "
+            "data set."
         ),
     ],
     name: Annotated[
-        str | None, typer.Option(help="Name of the surrogate, of a .surrogate file. [default: as in the file]")
+        str | None, typer.Option(help="For a .surrogate file: name of the new surrogate. [default: as in the file]")
     ] = None,
     *,
     log: OfLogs,
@@ -75,15 +92,15 @@ def command(
     service: Service,
     output: Output,
 ) -> None:
-    """Make a surrogate of an exported file, or of a log.
+    """Make a surrogate from an exported file, or from a log.
 
-    An exported surrogate serves the same model at once, judged by the same tolerances, its design paused. Its real
-    samples are stored as manual ones. surrogym change NAME --resume lets the design go on, with its initial queries
-    first.
+    A .surrogate file: the server stores its real samples as manual ones, and serves the same model at once, with the
+    same tolerances. The design is paused. surrogym change NAME --resume continues it, beginning with its initial
+    queries.
 
-    A log is checked row by row. Rows that can't be used go to LOG.rejected.csv, with line and reason, and a
-    specification is drafted and shown. With --register or --to all other rows are stored, at no cost to the budget,
-    and a model is fitted to them. The same log twice changes nothing.
+    A log: the command checks each row, then drafts and shows a specification. Rows that can't be used go to
+    LOG.rejected.csv, with line and reason. With --register or --to, the server stores the other rows and fits a model
+    to them. They don't count towards the budget. Importing the same log again changes nothing.
 
     Example: surrogym import reactor.csv --register reactor --wait 120
     """
@@ -157,7 +174,11 @@ def _import_log(context: typer.Context, file: Path, log: OfLogs, wait: float, se
 
 
 def _draw(log: ReadLog, file: Path) -> None:
-    """Draw the coverage of a log. Raises ``CommandError`` for an unknown kind of picture."""
+    """Draw the coverage of a log.
+
+    Raises:
+        CommandError: the file's ending is not of a known kind of picture.
+    """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.report.coverage import coverage_of
     from surrogym_client.report.figures import draw_coverage
@@ -168,7 +189,9 @@ def _draw(log: ReadLog, file: Path) -> None:
 
 
 def _again(context: typer.Context, log: OfLogs) -> str:
-    """The command that stores the log, with the options of this one; what was drafted is then read, as edited."""
+    """Return the command that stores the log, with the options of this one. It reads the drafted specification, as
+    edited.
+    """
     without = ["token", "as_json", "quiet", *(["draft"] if log.draft is not None else [])]
     drafted = "" if log.draft is None else f" --spec {shlex.quote(str(log.draft))}"
     if drafted:
@@ -177,7 +200,7 @@ def _again(context: typer.Context, log: OfLogs) -> str:
 
 
 def _await_model(name: str, wait: float, server: str | None, token: str | None, *, quiet: bool) -> SurrogateView:
-    """The surrogate once it has a model of the log. Raises ``DesignUnfinished``."""
+    """Wait until the server has fitted a model to the log, and return the surrogate. Raises ``DesignUnfinished``."""
     from surrogym_client.surrogates.waiting import wait_for_model, words_of_design
     from surrogym_shared.terminal import on_interrupt, progress
 
@@ -212,7 +235,7 @@ def _as_json(imported: Imported, view: SurrogateView | None) -> dict[str, Any]:
 
 
 def _covered(log: ReadLog) -> dict[str, float]:
-    """The share of cells that the log has been in, by pair of columns."""
+    """Share of cells that the log has visited, for each pair of columns."""
     from surrogym_client.report.coverage import coverage_of
 
     coverage = coverage_of(log.spec, log.steps.q, log.steps.u)
@@ -267,6 +290,6 @@ def _specified(spec: EnvironmentSpec, notes: tuple[str, ...]) -> list[str]:
 
 
 def _origin(ledger: dict[str, int]) -> str:
-    """What the real steps were where the file comes from."""
+    """Return the ledger of the server that the file comes from, as text."""
     steps = ", ".join(f"{count} {purpose}" for purpose, count in ledger.items() if count)
     return f" (there {steps})" if steps else ""

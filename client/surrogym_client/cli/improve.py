@@ -1,4 +1,4 @@
-"""``surrogym improve``: spend more real steps on a surrogate."""
+"""``surrogym improve``: add real steps to a surrogate's design."""
 
 from __future__ import annotations
 
@@ -18,17 +18,21 @@ def register(app: typer.Typer) -> None:
 def command(
     context: typer.Context,
     surrogate: Surrogate,
-    queries: Annotated[int, typer.Option("--queries", "-n", min=1, help="How many more real steps.")] = 10,
+    queries: Annotated[int, typer.Option("--queries", "-n", min=1, help="Number of real steps to add.")] = 10,
     checkpoint: Annotated[
-        str | None, typer.Option(help="Weigh by the states that policies visited up to this checkpoint.")
+        str | None,
+        typer.Option(
+            help="Name of the occupancy whose states the queries are chosen near. [default: the latest one, if any]"
+        ),
     ] = None,
     *,
     service: Service,
     output: Output,
 ) -> None:
-    """Ask the design for more queries. A sampler has to answer them.
+    """Add queries to a surrogate's design.
 
-    The budget has to hold them. With an admin's token, or on a server without tokens, it is raised to.
+    A sampler has to take their real steps. The budget must have enough steps left. With an admin's token, or on a
+    server without tokens, the budget is raised as needed.
 
     Example: surrogym improve pendulum --queries 10
     """

@@ -24,7 +24,7 @@ QUICK = 1.0  # seconds a person waits for a server that is not there
 
 
 def names_of_surrogates(ctx: typer.Context, incomplete: str) -> list[str]:
-    """What a shell completes a surrogate's name to; nothing where no server answers within a second."""
+    """Complete a surrogate's name in the shell. Empty if no server answers within a second."""
     from surrogym_client.errors import SurrogymClientError
     from surrogym_client.transport.api import Api
     from surrogym_client.transport.connection import Retries, Timeouts, token_in
@@ -41,50 +41,56 @@ def names_of_surrogates(ctx: typer.Context, incomplete: str) -> list[str]:
 Surrogate = Annotated[str, typer.Argument(help="Name of the surrogate.", autocompletion=names_of_surrogates)]
 Server = Annotated[
     str | None,
-    typer.Option("--server", envvar="SURROGYM_URL", help="Address of the server. [default: http://127.0.0.1:8000]"),
+    typer.Option("--server", envvar="SURROGYM_URL", help="URL of the server. [default: http://127.0.0.1:8000]"),
 ]
 Token = Annotated[
     str | None,
     typer.Option(
         "--token",
         envvar="SURROGYM_TOKEN",
-        help="Bearer token of the server. Typed here it shows in the list of processes; the variable and --token-file "
-        "don't show it.",
+        help="Bearer token for the server. A token typed here shows in the list of processes. SURROGYM_TOKEN and "
+        "--token-file keep it out of there.",
     ),
 ]
 TokenFile = Annotated[
-    Path | None, typer.Option("--token-file", envvar="SURROGYM_TOKEN_FILE", help="File with the bearer token.")
+    Path | None, typer.Option("--token-file", envvar="SURROGYM_TOKEN_FILE", help="File that contains the bearer token.")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no remarks.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress and no remarks.")]
 TrustPolicy = Annotated[
     bool,
     typer.Option(
         "--trust-policy",
         "--trust",
-        help="Unpickle the policy's objects. This runs any code in the file. Policies of surrogym train don't need it.",
+        help="Unpickle the objects in the policy file. This runs any code in the file. Policies of surrogym "
+        "train don't need it.",
     ),
 ]
-Wait = Annotated[float, typer.Option("--wait", min=0, help="Seconds to wait for what is not there yet.")]
+Wait = Annotated[
+    float, typer.Option("--wait", min=0, help="Seconds to wait for a server or surrogate that is not there yet.")
+]
 ExitWithParent = Annotated[
     bool, typer.Option("--exit-with-parent", hidden=True, help="End when the process that started this one ends.")
 ]
 SpecFile = Annotated[
-    Path | None, typer.Option("--spec", help="JSON file with a specification, instead of the environment's own.")
+    Path | None, typer.Option("--spec", help="JSON file with a specification. It replaces the environment's own.")
 ]
 Tolerances = Annotated[
     list[str] | None,
-    typer.Option("--tolerance", help="Error an output may have, in its own unit, such as theta=0.01. May be repeated."),
+    typer.Option(
+        "--tolerance", help="Tolerance of an output, in its own unit, such as theta=0.01. May be given several times."
+    ),
 ]
-StepLimit = Annotated[float, typer.Option(min=0.001, help="Seconds one real step, or a reset, may take.")]
+StepLimit = Annotated[float, typer.Option(min=0.001, help="Seconds that one real step, or one reset, may take.")]
 Preset = Literal["default", "paper"]
 
 
 def connect(server: str | None, token: str | None, wait: float = 0.0, *, quiet: bool = False) -> Api:
-    """The server, which must answer within ``wait`` seconds; a person sees what is waited for.
+    """Connect to the server, and wait up to ``wait`` seconds until it answers. The terminal shows what the command
+    waits for.
 
     Raises:
-        SurrogymClientError: it does not, or it is none.
+        SurrogymClientError: no server answered in time, or what answered is not a Surrogym server.
     """
     from surrogym_client.errors import ServerUnreachable
     from surrogym_client.transport.api import Api
@@ -101,13 +107,13 @@ def connect(server: str | None, token: str | None, wait: float = 0.0, *, quiet: 
 
 
 def token_from(context: typer.Context, token: str | None, file: Path | None) -> str | None:
-    """The bearer token: what was typed comes before the environment, and there the token before its file.
+    """Return the bearer token. A value on the command line precedes the environment, and a token precedes a token file.
 
-    A person is told what shows the token to others.
+    Warns on the terminal if other users of the machine can read the token.
 
     Raises:
-        CommandError: both were typed.
-        UnusableToken: the file does not hold one.
+        CommandError: both options are on the command line.
+        UnusableToken: the file does not contain a token.
     """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.transport.connection import token_in
@@ -127,10 +133,11 @@ def token_from(context: typer.Context, token: str | None, file: Path | None) -> 
 
 
 def awaited_surrogate(api: Api, name: str, wait: float, *, quiet: bool) -> SurrogateView:
-    """The surrogate, which must be registered within ``wait`` seconds; a person sees what is waited for.
+    """Return the surrogate, and wait up to ``wait`` seconds until it is registered. The terminal shows what the command
+    waits for.
 
     Raises:
-        UnknownSurrogate: it is not.
+        UnknownSurrogate: the surrogate was not registered in time.
     """
     from surrogym_client.errors import UnknownSurrogate
     from surrogym_client.surrogates.waiting import wait_for_surrogate
@@ -154,13 +161,13 @@ def _waiting(words: str, *, quiet: bool) -> Iterator[None]:
 
 
 def given_here(context: typer.Context, name: str) -> bool:
-    """Whether a person gave an option on this command line, and not by the environment."""
+    """Whether an option is on this command line. A value from the environment does not count."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
 
 
 def typed(context: typer.Context, without: Sequence[str] = ()) -> str:
-    """The arguments and options that were given on the command line, but some, as they are typed."""
+    """Return the arguments and options of this command line as text for a shell, except those named in ``without``."""
     words: list[str] = []
     for parameter in context.command.params:
         name = str(parameter.name)
@@ -178,11 +185,11 @@ def typed(context: typer.Context, without: Sequence[str] = ()) -> str:
 
 
 def read_spec(path: Path | None) -> EnvironmentSpec | None:
-    """A specification from its file, or from what ``surrogym describe`` wrote.
+    """Read a specification from its file, or from the output of ``surrogym describe``.
 
     Raises:
-        OSError: it can't be read.
-        CommandError: it is none, or contradicts itself.
+        OSError: the file can't be read.
+        CommandError: the file is not a valid specification.
     """
     if path is None:
         return None
@@ -204,10 +211,10 @@ def read_spec(path: Path | None) -> EnvironmentSpec | None:
 
 
 def read_tolerances(given: list[str]) -> dict[str, float]:
-    """Tolerances by output, from ``output=number`` each.
+    """Parse tolerances of the form ``output=number`` into a dictionary.
 
     Raises:
-        CommandError: one is not of this form.
+        CommandError: a text does not have this form.
     """
     from surrogym_client.cli.errors import CommandError
 
@@ -222,7 +229,11 @@ def read_tolerances(given: list[str]) -> dict[str, float]:
 
 
 def require_known(algorithm: str) -> None:
-    """Refuse an unknown policy search before anything begins."""
+    """Refuse an unknown policy search before any work begins.
+
+    Raises:
+        CommandError: no policy search has this name.
+    """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.training.search import SEARCHES
 

@@ -30,9 +30,9 @@ def command(
     service: Service,
     output: Output,
 ) -> None:
-    """List the policies that the server keeps.
+    """List the policies that the server stores, newest first.
 
-    Newest first, each with aliases, promise, real return and files.
+    Each row has the policy's aliases, promise, real return and files.
 
     Example: surrogym policies pendulum
     """

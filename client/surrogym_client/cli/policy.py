@@ -1,4 +1,4 @@
-"""``surrogym policy``: one policy that the server keeps, or will keep."""
+"""``surrogym policy``: show, send, download, name or delete one policy."""
 
 from __future__ import annotations
 
@@ -17,27 +17,29 @@ if TYPE_CHECKING:
 
 SHOW = "show"
 Named = Annotated[
-    str, typer.Argument(metavar="NAME@WHICH", help="A surrogate and a version, an alias or latest, such as pendulum@3.")
+    str,
+    typer.Argument(
+        metavar="NAME@WHICH", help="Surrogate and policy, such as pendulum@3: a version, an alias, or latest."
+    ),
 ]
 
 
 class PolicyGroup(TyperGroup):
-    """Takes ``surrogym policy pendulum@3`` for ``surrogym policy show pendulum@3``."""
+    """Command group that reads ``surrogym policy pendulum@3`` as ``surrogym policy show pendulum@3``."""
 
     default = SHOW
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command of the first word, or ``show`` where that is none and names a policy."""
+        """Return the command of the first word, or ``show`` if that word names a policy."""
         named = bool(args) and args[0] not in self.commands and not args[0].startswith("-")
         return super().resolve_command(ctx, [self.default, *args] if named else args)
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command and its parts."""
+    """Add the command and its subcommands."""
     parts = typer.Typer(
         cls=PolicyGroup,
-        help="Look at a policy that the server keeps.\n\nTake its file, name it, delete it, or send one.\n\n"
-        "Example: surrogym policy pendulum@3",
+        help="Show, store, download, name or delete a policy.\n\nExample: surrogym policy pendulum@3",
         no_args_is_help=True,
         rich_markup_mode=None,
     )
@@ -47,7 +49,7 @@ def register(app: typer.Typer) -> None:
 
 
 def show(context: typer.Context, policy: Named, *, service: Service, output: Output) -> None:
-    """Say what a policy promises, what it gave in reality, and which files there are.
+    """Show a policy's promise, real returns and files.
 
     Example: surrogym policy show pendulum@3
     """
@@ -60,18 +62,23 @@ def show(context: typer.Context, policy: Named, *, service: Service, output: Out
 def push(
     context: typer.Context,
     policy: Annotated[Path, typer.Argument(help="Policy file, with its card beside it.")],
-    surrogate: Annotated[str | None, typer.Option(help="Whose policy it is. [default: as the card says]")] = None,
+    surrogate: Annotated[
+        str | None, typer.Option(help="Surrogate that the policy belongs to. [default: as noted in the card]")
+    ] = None,
     forms: Annotated[
         list[str] | None,
-        typer.Option("--with", help="Convert to this form and send it as well: onnx or pt2. May be repeated."),
+        typer.Option(
+            "--with", help="Also convert the policy to this form and send it: onnx or pt2. May be given several times."
+        ),
     ] = None,
     *,
     service: Service,
     output: Output,
 ) -> None:
-    """Store a policy on the server, with its card, its curve and the evaluations that wait beside it.
+    """Store a policy on the server.
 
-    A repeat is harmless. The server never loads the file.
+    The command sends the policy, its card, its training curve, and evaluations that are not stored yet. Sending a
+    policy again is harmless. The server never loads the file.
 
     Example: surrogym policy push policy.zip
     """
@@ -92,12 +99,16 @@ def push(
 def get(
     context: typer.Context,
     policy: Named,
-    out: Annotated[Path, typer.Option("--out", "-o", help="File to write; its ending says which form.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="File to write. Its ending chooses the form: .zip, .onnx or .pt2.")
+    ],
     *,
     service: Service,
     output: Output,
 ) -> None:
-    """Take a policy's file from the server, with its card. A form that is not there is converted from the zip.
+    """Download a policy and its card from the server.
+
+    If the server does not have the form, the command converts it from the zip file.
 
     Example: surrogym policy get pendulum@production --out policy.zip
     """
@@ -124,13 +135,15 @@ def get(
 def alias(
     context: typer.Context,
     policy: Named,
-    name: Annotated[str, typer.Argument(help="Such as production.")],
-    remove: Annotated[bool, typer.Option("--remove", help="Take the name away instead.")] = False,
+    name: Annotated[str, typer.Argument(help="Alias, such as production.")],
+    remove: Annotated[bool, typer.Option("--remove", help="Remove the alias.")] = False,
     *,
     service: Service,
     output: Output,
 ) -> None:
-    """Give a policy a name that leads to it and to no other; needs a token of role admin.
+    """Give a policy an alias, such as production.
+
+    An alias names one policy of a surrogate at a time. This needs a token of role admin.
 
     Example: surrogym policy alias pendulum@3 production
     """
@@ -146,7 +159,9 @@ def alias(
 
 
 def delete(context: typer.Context, policy: Named, *, service: Service, output: Output) -> None:
-    """Remove a policy with its files and evaluations; needs a token of role admin. There is no way back.
+    """Delete a policy with its files and evaluations.
+
+    This needs a token of role admin, and can't be undone.
 
     Example: surrogym policy delete pendulum@3
     """
@@ -158,13 +173,13 @@ def delete(context: typer.Context, policy: Named, *, service: Service, output: O
 
 
 def _parsed(policy: str) -> tuple[str, str]:
-    """Surrogate and version of ``NAME@WHICH``; the newest where no version is named."""
+    """Split ``NAME@WHICH`` into surrogate and version. The version is ``latest`` if the text has none."""
     name, _, which = policy.partition("@")
     return name, which or "latest"
 
 
 def _card(name: str, found: PolicyDetail, spec: EnvironmentSpec | None) -> PolicyCard:
-    """The card as it came, as far as the server keeps it."""
+    """Rebuild the policy's card from the fields that the server stores."""
     from surrogym_client.policies.card import PolicyCard
 
     noted = found.model_dump(mode="json", include=set(PolicyCard.model_fields))

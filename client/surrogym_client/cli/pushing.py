@@ -1,4 +1,4 @@
-"""Policies that commands send to the server as they end."""
+"""Store policies on the server at the end of other commands."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from pathlib import Path
 def push_or_say(
     server: str | None, token: str | None, policy: Path, surrogate: str | None = None, *, quiet: bool = False
 ) -> int | None:
-    """Send a policy with what waits beside it; gives its version, or says why it is not there and how to send it later.
+    """Store a policy and its waiting evaluations on the server, and return its version.
 
-    A server that is away must not cost a training or an evaluation, so nothing is raised.
+    An unreachable server must not spoil a training or an evaluation. Nothing is raised then: the terminal shows the
+    error and the command that stores the policy later, and the result is None.
     """
     from surrogym_client.cli.options import connect
     from surrogym_client.errors import SurrogymClientError

@@ -1,4 +1,4 @@
-"""``surrogym register``: tell the server about an original environment."""
+"""``surrogym register``: register an original environment with the server."""
 
 from __future__ import annotations
 
@@ -31,26 +31,60 @@ def register(app: typer.Typer) -> None:
 
 @dataclass(frozen=True)
 class DesignChoices:
-    """What of the environment's own specification is chosen anew; None keeps it."""
+    """Options that replace parts of the environment's own specification; None keeps a part."""
 
-    preset: Annotated[Preset | None, typer.Option(help="default, or paper: the method as printed.")] = None
-    budget: Annotated[int | None, typer.Option(min=0, help="Real steps the design may take; 0 of a log.")] = None
-    initial: Annotated[int | None, typer.Option(min=2, help="Real steps before the first model.")] = None
-    target: Annotated[float | None, typer.Option(help="Confidence index to reach.")] = None
+    preset: Annotated[
+        Preset | None,
+        typer.Option(
+            help="Settings of the method: default, or paper for the method as published. [default: from the "
+            "specification]"
+        ),
+    ] = None
+    budget: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="Maximum number of real steps that the design may take; 0 if all samples come from a log. [default: "
+            "from the specification]",
+        ),
+    ] = None
+    initial: Annotated[
+        int | None,
+        typer.Option(min=2, help="Number of real steps before the first model. [default: from the specification]"),
+    ] = None
+    target: Annotated[
+        float | None,
+        typer.Option(help="Confidence index to reach, between 0.5 and 1. [default: from the specification]"),
+    ] = None
     acquisition: Annotated[
         str | None,
         typer.Option(
-            help="Criterion of the queries after the first model: integrated_variance, variance, uncertainty_index, "
-            "latin_hypercube, or one that is installed beside the server. [default: the preset's]"
+            help="Criterion that chooses queries after the first model: integrated_variance, variance, "
+            "uncertainty_index, latin_hypercube, or one that a package on the server adds. [default: from the "
+            "preset]"
         ),
     ] = None
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the design.")] = None
-    bins: Annotated[int | None, typer.Option(min=2, help="Offer a continuous action as so many values.")] = None
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the design. [default: from the specification]")] = (
+        None
+    )
+    bins: Annotated[
+        int | None,
+        typer.Option(
+            min=2, help="Offer each continuous action to policies as this many discrete values. [default: continuous]"
+        ),
+    ] = None
     teleport: Annotated[
-        bool, typer.Option("--teleport/--no-teleport", help="Whether it can be set to any state, or only be reset.")
+        bool,
+        typer.Option(
+            "--teleport/--no-teleport",
+            help="Whether the environment can be set to any state. --no-teleport: it can only be reset.",
+        ),
     ] = True
     max_rollout: Annotated[
-        int | None, typer.Option(min=1, help="Longest action sequence of a query, without teleport.")
+        int | None,
+        typer.Option(
+            min=1, help="Without teleport: maximum number of actions in one query. [default: from the specification]"
+        ),
     ] = None
 
 
@@ -59,30 +93,32 @@ def command(
     environment: Annotated[
         str | None,
         typer.Argument(
-            help="Gymnasium id, dm_control:DOMAIN-TASK, pcgym:MODEL, or package.module:factory of one's own. With "
-            "--env or FILE behind it, the surrogate's name."
+            help="Environment: a Gymnasium id, dm_control:DOMAIN-TASK, pcgym:MODEL, or your own "
+            "package.module:factory. With --env or FILE, this argument is the surrogate's name instead."
         ),
     ] = None,
     file: Annotated[
-        Path | None, typer.Argument(help="Specification that surrogym describe wrote, the same as --spec.")
+        Path | None, typer.Argument(help="Specification that surrogym describe wrote; the same as --spec.")
     ] = None,
-    env: Annotated[str | None, typer.Option(help="The environment, where the first argument is a name.")] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the surrogate. [default: from the environment's]")] = None,
+    env: Annotated[str | None, typer.Option(help="Environment, if the first argument is the surrogate's name.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the surrogate. [default: derived from the environment's name]")
+    ] = None,
     spec: SpecFile = None,
     *,
     choices: DesignChoices,
     tolerance: Tolerances = None,
     print_spec: Annotated[
-        bool, typer.Option("--print-spec", help="Print the specification and register nothing.")
+        bool, typer.Option("--print-spec", help="Print the specification, and register nothing.")
     ] = False,
     wait: Wait = 0.0,
     service: Service,
     output: Output,
 ) -> None:
-    """Register an original environment. Samplers and trainers can then use it by name.
+    """Register an original environment under a name.
 
-    An environment without a built-in specification is described first, as surrogym describe does, which takes real
-    steps.
+    Samplers and trainers use this name. If the environment has no built-in specification, the command first drafts one
+    as surrogym describe does, which takes real steps.
 
     Example: surrogym register Pendulum-v1 --name pendulum --budget 30
     """
@@ -106,7 +142,7 @@ def command(
 def _sorted_out(
     environment: str | None, file: Path | None, env: str | None, name: str | None, spec: Path | None
 ) -> tuple[str | None, str | None, Path | None]:
-    """Environment, name and file of a specification, whichever way they were typed."""
+    """Return the environment, the surrogate's name and the specification file, from either form of the command line."""
     from surrogym_client.cli.errors import CommandError
 
     if file is not None:
@@ -121,7 +157,8 @@ def _sorted_out(
 
 
 def _described(environment: str, *, quiet: bool) -> tuple[EnvironmentSpec | None, int]:
-    """A specification of an environment that has none, and the real steps that it took; None where it has one."""
+    """Draft a specification if the environment has none. Returns it with the number of real steps taken, or None and
+    0."""
     from surrogym_client.original.describing import describe
     from surrogym_client.original.loading import has_specification
     from surrogym_shared.terminal import say
@@ -135,7 +172,7 @@ def _described(environment: str, *, quiet: bool) -> tuple[EnvironmentSpec | None
 
 
 def default_name(environment: str) -> str:
-    """The environment's name without its version: ``Pendulum-v1`` is ``pendulum``."""
+    """Derive a surrogate's name from an environment's, without the version: ``Pendulum-v1`` becomes ``pendulum``."""
     plain = re.sub(r"-v\d+$", "", environment.rpartition(":")[2])
     return re.sub(r"[^a-z0-9._-]+", "-", plain.lower()).strip("-._")[:64] or "surrogate"
 

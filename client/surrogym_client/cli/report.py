@@ -1,4 +1,4 @@
-"""``surrogym report``: one page about a surrogate and its policy."""
+"""``surrogym report``: write one page about a surrogate and its policy."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ def command(
     ] = Path("report.html"),
     policy: Annotated[
         str | None,
-        typer.Option(help="Version or alias of the policy. [default: the one in production, otherwise the newest]"),
+        typer.Option(help="Version or alias of the policy. [default: the one in production, or else the newest]"),
     ] = None,
     *,
     service: Service,
     output: Output,
 ) -> None:
-    """Write one HTML page that needs nothing else.
+    """Write a report about a surrogate and its policy.
 
-    First for whoever decides: what it cost, what the policy gives in reality with intervals, with and without it,
-    whether that was predicted, what was not tested, what to do next. Then for whoever works: fidelity, samples, maps,
-    the ledger, structure and hyperparameters, and every model.
+    The report is one HTML file that needs no other file. Its first part is for decisions: cost, real return with and
+    without the policy, intervals, the prediction, what was not tested, and next steps. Its second part is for
+    engineers: fidelity, samples, maps, ledger, structure and hyperparameters, and every model.
 
     Example: surrogym report pendulum --out report.html
     """
@@ -50,7 +50,7 @@ def command(
         from surrogym_client.report.known import collect, cuts_of
 
         known = collect(api, surrogate, policy)
-        shown, lacking = cuts_of(api, known)  # without maps, the page says all that was stored
+        shown, lacking = cuts_of(api, known)  # if maps can't be computed, the page shows all stored data without them
         update(0.3, "drawing")
         from surrogym_client.report.files import write
         from surrogym_client.report.page import page

@@ -33,6 +33,19 @@ if TYPE_CHECKING:
     Tell = Callable[[Query, Outcome, str], None]
 
 
+Environment = Annotated[
+    str | None,
+    typer.Option(
+        help="Environment to take real steps in: a Gymnasium id or package.module:factory. [default: the surrogate's]"
+    ),
+]
+UntilDone = Annotated[bool, typer.Option("--until-done", help="Stop when the design is ready or has spent its budget.")]
+MaxQueries = Annotated[int | None, typer.Option(min=1, help="Maximum number of queries to begin. [default: no limit]")]
+TimeLimit = Annotated[
+    float | None, typer.Option(min=0, help="Seconds after which no further query begins. [default: no limit]")
+]
+
+
 def register(app: typer.Typer) -> None:
     """Add the command."""
     add(app, "sample", command)
@@ -41,27 +54,26 @@ def register(app: typer.Typer) -> None:
 def command(
     context: typer.Context,
     surrogate: Surrogate,
-    env: Annotated[
-        str | None, typer.Option(help="Gymnasium id or package.module:factory. [default: the surrogate's id]")
-    ] = None,
+    env: Environment = None,
     spec: SpecFile = None,
-    once: Annotated[bool, typer.Option("--once", help="Stop after the first claim that gives queries.")] = False,
-    until_done: Annotated[
-        bool, typer.Option("--until-done", help="Stop when the design has reached its target or budget.")
-    ] = False,
-    max_queries: Annotated[int | None, typer.Option(min=1, help="Most queries to begin.")] = None,
-    time_limit: Annotated[float | None, typer.Option(min=0, help="Seconds after which no query is begun.")] = None,
+    once: Annotated[bool, typer.Option("--once", help="Stop after the first claim that returns queries.")] = False,
+    until_done: UntilDone = False,
+    max_queries: MaxQueries = None,
+    time_limit: TimeLimit = None,
     step_limit: StepLimit = 30.0,
-    batch: Annotated[int, typer.Option(min=1, max=256, help="Queries to claim at once.")] = 4,
-    worker: Annotated[str | None, typer.Option(help="Name of this worker. [default: host and process]")] = None,
+    batch: Annotated[int, typer.Option(min=1, max=256, help="Number of queries to claim at once.")] = 4,
+    worker: Annotated[str | None, typer.Option(help="Name of this sampler. [default: host and process]")] = None,
     wait: Wait = 0.0,
     exit_with_parent: ExitWithParent = False,
     *,
     service: Service,
     output: Output,
 ) -> None:
-    """Answer queries by real steps. The original environment is set to a state, takes one real step, and that is
-    reported; where it can't be set to a state, it is reset and acts. Ctrl-C ends it.
+    """Take the real steps that the server asks for.
+
+    For each query, the sampler sets the original environment to a state, takes one real step and reports the sample. If
+    the environment can't be set to a state, the sampler resets it and takes a sequence of actions. Ctrl-C ends the
+    command.
 
     Example: surrogym sample pendulum --until-done
     """
@@ -99,7 +111,9 @@ def command(
 
 
 def _factory(env: str | None, given: EnvironmentSpec | None, asked: EnvironmentSpec) -> Factory:
-    """How to make the environment; a server's word is taken for Gymnasium's own ids alone, never for a module."""
+    """Return a function that makes the environment. The server's choice is trusted only for Gymnasium's own ids,
+    because a module would run code.
+    """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.original.loading import is_known, is_own, make
 
@@ -115,7 +129,7 @@ def _factory(env: str | None, given: EnvironmentSpec | None, asked: EnvironmentS
 
 @contextmanager
 def _telling(api: Api, surrogate: str, *, quiet: bool) -> Iterator[Tell | None]:
-    """How queries are told of: a bar of the design on a terminal, a line each elsewhere."""
+    """Show progress: one bar for the design on a terminal, or a line for each query otherwise."""
     from surrogym_shared.terminal import progress
 
     if quiet or not sys.stderr.isatty():
@@ -126,7 +140,7 @@ def _telling(api: Api, surrogate: str, *, quiet: bool) -> Iterator[Tell | None]:
         def tell(query: Query, outcome: Outcome, error: str) -> None:
             if error:
                 _tell(query, outcome, error)
-            with suppress(SurrogymClientError):  # a server that is away for a moment is the sampler's business
+            with suppress(SurrogymClientError):  # the sampler itself handles a server that is away for a moment
                 view = api.surrogate(surrogate)
                 update(share_of_design(view), words_of_design(view))
 

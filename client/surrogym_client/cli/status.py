@@ -1,4 +1,4 @@
-"""``surrogym status``: what the server holds."""
+"""``surrogym status``: show the surrogates on the server."""
 
 from __future__ import annotations
 
@@ -33,17 +33,20 @@ def register(app: typer.Typer) -> None:
 def command(
     context: typer.Context,
     surrogate: Annotated[
-        str | None, typer.Argument(help="One surrogate. [default: all]", autocompletion=names_of_surrogates)
+        str | None, typer.Argument(help="Name of a surrogate. [default: all]", autocompletion=names_of_surrogates)
     ] = None,
-    watching: Annotated[bool, typer.Option("--watch", "-w", help="Stay, and show it anew until Ctrl-C.")] = False,
+    watching: Annotated[bool, typer.Option("--watch", "-w", help="Refresh the output until Ctrl-C.")] = False,
     as_json: AsJson = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Names and phases alone, without a heading.")] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="Show names and phases only, without a heading.")
+    ] = False,
     *,
     service: Service,
 ) -> None:
-    """Show all surrogates, or one with fidelity and real steps.
+    """Show all surrogates, or the details of one.
 
-    With --watch --json, every change is a line of JSON.
+    The details of a surrogate are its confidence index, errors and real steps. With --watch --json, each change is one
+    line of JSON.
 
     Example: surrogym status pendulum --watch
     """
@@ -52,7 +55,7 @@ def command(
     form: Form = "json" if as_json else "short" if quiet else "words"
     with service.connect(context) as api:
         look = partial(_all, api, form) if surrogate is None else partial(_one, api, surrogate, form)
-        seen = look()  # an unknown name or a wrong address ends it here, also with --watch
+        seen = look()  # an unknown name or a wrong address ends the command here, also with --watch
         if watching:
             watch(partial(_patiently, look, as_json))
         else:
@@ -76,7 +79,7 @@ def _one(api: Api, name: str, form: Form) -> str:
 
 
 def _patiently(look: Callable[[], str], as_json: bool) -> str:
-    """What there is to see, or that the server is away."""
+    """Return the current output, or a remark that the server does not answer."""
     from surrogym_client.errors import ServerUnreachable
 
     try:
@@ -145,7 +148,7 @@ def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
 
 
 def _steps(seen: SurrogateSummary) -> str:
-    """Real steps of the budget, and those of a log, which cost none."""
+    """Real steps of the budget, and logged steps, which don't count towards it."""
     ledger = seen.ledger
     taken = f"{ledger.total} of {seen.budget}" if seen.budget or ledger.total else ""
     logged = f"{ledger.logged} logged" if ledger.logged else ""
@@ -153,7 +156,7 @@ def _steps(seen: SurrogateSummary) -> str:
 
 
 def _hint(view: SurrogateView) -> str | None:
-    """What has to happen next, where nothing does by itself."""
+    """Return what a person has to do next, if nothing proceeds without them."""
     if view.phase == "from_log":
         return f"the model holds what the log shows, and no real step is asked for; next: surrogym train {view.name}"
     if view.budget == 0 and view.model_version is None and not view.samples:

@@ -59,11 +59,11 @@ def command(
     service: Service,
     output: Output,
 ) -> None:
-    """Train a policy in the virtual environment. A running sampler takes the few real steps of its audit.
+    """Train a policy in the virtual environment.
 
-    No other real step is taken, unless --improve asks for more.
-
-    The imagined return that is shown is what the policy earns in the surrogate, not in the original environment.
+    A running sampler takes the few real steps of the audit. No other real step is taken, unless --improve is given. The
+    command prints the imagined return: what the policy earns in the virtual environment, not in the original
+    environment.
 
     Example: surrogym train pendulum --out policy.zip --seed 0
     """
@@ -94,7 +94,7 @@ def command(
 
 
 def _settings(search: SearchOptions, session: SessionOptions, start: StartOptions, log: LogOptions) -> TrainSettings:
-    """The settings of the training; everything that needs no server is refused here."""
+    """Return the settings of the training. Errors that can be found without a server are raised here."""
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.training import TrainSettings
 
@@ -117,7 +117,7 @@ def _settings(search: SearchOptions, session: SessionOptions, start: StartOption
 
 
 def _import(algorithm: str, *, quiet: bool) -> None:
-    """Import what the search works with, once there is something to train on; a person sees what takes the time."""
+    """Import the packages of the search, and show on the terminal what takes the time."""
     from surrogym_client.training.search import SEARCHES
     from surrogym_shared.terminal import on_interrupt, progress
 
@@ -128,7 +128,7 @@ def _import(algorithm: str, *, quiet: bool) -> None:
 
 @contextmanager
 def _keeping(write_card: Callable[[TrainResult], object], asked: str) -> Iterator[None]:
-    """Say after Ctrl-C what there is to go on with; a policy that was saved gets its card."""
+    """After Ctrl-C, say what was saved and how to continue. A saved policy gets its card."""
     from surrogym_client.training.settings import TrainingInterrupted
     from surrogym_client.training.words import words_of_interruption
     from surrogym_shared.terminal import say
@@ -148,7 +148,10 @@ def _keeping(write_card: Callable[[TrainResult], object], asked: str) -> Iterato
 def _trainable(
     surrogate: str, server: str | None, token: str | None, wait: float, algorithm: str, *, quiet: bool
 ) -> tuple[EnvironmentSpec, str]:
-    """Specification and server of a surrogate whose design is done; with ``wait``, the search is imported meanwhile."""
+    """Wait until the surrogate's design has ended, and return its specification and the server's URL.
+
+    With ``wait``, the packages of the policy search are imported in the meantime.
+    """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.surrogates.phases import COMPLETED
     from surrogym_client.surrogates.waiting import (
@@ -182,7 +185,7 @@ def _trainable(
 
 @contextmanager
 def _recording(path: Path | None, curve: list[CurvePoint], update: Update) -> Iterator[Record]:
-    """Shows progress, collects the curve, and writes it to a file for those who watch from outside."""
+    """Show progress, collect the training curve, and append it to a file that other processes can watch."""
     from surrogym_client.training.words import words_of
     from surrogym_shared.wire import CurvePoint
 
@@ -240,7 +243,7 @@ def _train(
 
 
 def _waiting(update: Update) -> Callable[[SurrogateView], None]:
-    """Shows a round's real steps while a sampler takes them; the bar stays where the training left it."""
+    """Show a round's real steps while a sampler takes them. The progress bar keeps the training's position."""
     from surrogym_client.surrogates.waiting import words_of_design
 
     return lambda view: update(None, f"waiting for a sampler (surrogym sample {view.name}): {words_of_design(view)}")
@@ -256,7 +259,7 @@ def _write_card(
     seed: int,
     curve: list[CurvePoint],
 ) -> dict[str, Any]:
-    """Write the policy's card; gives back the result as JSON."""
+    """Write the policy's card beside it, and return the result as JSON."""
     from surrogym_client.policies.card import NotedAddress, PolicyCard, write_card
     from surrogym_client.policies.pushing import thinned
     from surrogym_client.runtime.versions import versions

@@ -21,34 +21,34 @@ Log = Literal["tensorboard", "wandb", "mlflow", "none"]
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """How to search, for how long."""
+    """Options that choose the policy search and its length."""
 
     algorithm: Annotated[
         str,
         typer.Option(
-            help="Search by ppo, a2c, sac, td3, ddpg, dqn (Stable-Baselines3), fastppo (the same PPO in NumPy), cmaes, "
-            "gradient, or a package's own."
+            help="Policy search: ppo, a2c, sac, td3, ddpg, dqn (Stable-Baselines3), fastppo (the same PPO in NumPy), "
+            "cmaes, gradient, or one from an installed package."
         ),
     ] = "PPO"
     steps: Annotated[
         int | None,
         typer.Option(
             min=1,
-            help="Virtual steps, those of all rounds of --improve included; seeing where a round's policy goes comes "
-            "on top. [default: from the algorithm]",
+            help="Virtual steps to train for, summed over all rounds of --improve. The steps that collect each "
+            "round's occupancy are not included. [default: from the algorithm]",
         ),
     ] = None
     num_envs: Annotated[
-        int | None, typer.Option(min=1, help="Lanes of the session. [default: from the specification]")
+        int | None, typer.Option(min=1, help="Number of lanes to train on. [default: from the specification]")
     ] = None
     chosen: Annotated[
         list[str] | None,
-        typer.Option("--set", help="A hyperparameter of the algorithm as NAME=VALUE; may be given several times."),
+        typer.Option("--set", help="Hyperparameter of the algorithm, as NAME=VALUE. May be given several times."),
     ] = None
-    seed: Annotated[int, typer.Option(min=0, help="Seed of policy and virtual environment.")] = 0
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the policy and of the virtual environment.")] = 0
 
     def hyperparameters(self) -> dict[str, Any]:
-        """What ``--set`` was given: values are JSON, or text where they are none."""
+        """Parse ``--set``. A value is read as JSON, or as text if it is not valid JSON."""
         from surrogym_client.cli.errors import CommandError
 
         found: dict[str, Any] = {}
@@ -65,46 +65,67 @@ class SearchOptions:
 
 @dataclass(frozen=True)
 class SessionOptions:
-    """How the state moves in the session that the policy learns in; each is a field of ``OpenSession``."""
+    """Options of the session that the policy learns in. Each is a field of ``OpenSession``."""
 
     variant: Annotated[
         Variant | None,
         typer.Option(
-            help="The state moves by the mean, as particles, or along a drawn function. [default: the mean. If the "
-            "design is not ready, the final training draws from the posterior]"
+            help="How the state moves: by the mean (deterministic), as particles (probabilistic), or along a drawn "
+            "function (pathwise). [default: the mean. If the design is not ready, the final training draws from "
+            "the posterior]"
         ),
     ] = None
-    particles: Annotated[int | None, typer.Option(min=1, help="Particles of variant probabilistic.")] = None
+    particles: Annotated[
+        int | None, typer.Option(min=1, help="Number of particles of each lane, for variant probabilistic.")
+    ] = None
     propagation: Annotated[
-        Propagation | None, typer.Option(help="How a particle moves: by the mean or by a draw. [default: sample]")
+        Propagation | None,
+        typer.Option(
+            help="How a particle moves: to the predicted mean, or to a sample of the prediction. [default: sample]"
+        ),
     ] = None
     weighting: Annotated[
-        Weighting | None, typer.Option(help="Of the particles' rewards. [default: inverse_variance]")
+        Weighting | None,
+        typer.Option(
+            help="How to average the particles' rewards: by inverse variance, or with equal weights. [default: "
+            "inverse_variance]"
+        ),
     ] = None
     spread: Annotated[
-        float | None, typer.Option(help="First deviation of particles, as a share of the range. [default: 0.01]")
+        float | None,
+        typer.Option(
+            help="Initial standard deviation of the particles, as a share of the sampling range. [default: 0.01]"
+        ),
     ] = None
     process_noise: Annotated[
         bool,
         typer.Option(
             "--process-noise",
-            help="Let the learned noise move the state. [default: where repeated real steps confirm noise]",
+            help="Add the learned noise to the state. [default: on if repeated real steps confirm noise]",
             show_default=False,
         ),
     ] = False
     trust: Annotated[
         float | None,
         typer.Option(
-            help="End an episode where an output's predicted deviation is more than TRUST times its deviation in the "
-            "samples. [default: none]"
+            help="Truncate the episode when an output's predicted standard deviation exceeds TRUST times the "
+            "output's standard deviation in the samples. [default: no limit]"
         ),
     ] = None
     penalty: Annotated[
-        float | None, typer.Option(min=0, help="Deviations taken off the reward. [default: the specification's]")
+        float | None,
+        typer.Option(
+            min=0,
+            help="Subtract PENALTY predicted standard deviations from each reward. [default: from the specification]",
+        ),
     ] = None
 
     def fields(self) -> dict[str, Any]:
-        """The fields that were given a value. Raises ``CommandError`` where they contradict each other."""
+        """Return the options that were given, by the names of ``OpenSession``.
+
+        Raises:
+            CommandError: an option needs another variant.
+        """
         from surrogym_client.cli.errors import CommandError
         from surrogym_shared.wire import OF_PARTICLES
 
@@ -117,17 +138,18 @@ class SessionOptions:
 
 @dataclass(frozen=True)
 class StartOptions:
-    """Where episodes and the policy start, and how long a training may go on."""
+    """Options of where episodes and the policy start, and of prolonging the training."""
 
     start_box: Annotated[
         float | None,
         typer.Option(
             min=0,
             max=1,
-            help="Share of episodes that start anywhere in the sampling range. [default: 0.5; 0 with a log alone]",
+            help="Share of episodes that start anywhere in the sampling range, between 0 and 1. The others start "
+            "where the specification says. [default: 0.5; 0 if all samples come from a log]",
         ),
     ] = None
-    start_from: Annotated[Path | None, typer.Option(help="Policy file to go on from.")] = None
+    start_from: Annotated[Path | None, typer.Option(help="Policy file to continue the training from.")] = None
     trust_policy: Annotated[
         bool,
         typer.Option(
@@ -140,8 +162,8 @@ class StartOptions:
         bool | None,
         typer.Option(
             "--prolong/--no-prolong",
-            help="As many virtual steps again, once, where the imagined return still rises at the end. Not with cmaes "
-            "or gradient. [default: where --steps is not given]",
+            help="Train for as many virtual steps again, once, if the imagined return still rises at the end. Not "
+            "with cmaes or gradient. [default: on if --steps is not given]",
             show_default=False,
         ),
     ] = None
@@ -149,26 +171,27 @@ class StartOptions:
 
 @dataclass(frozen=True)
 class LoopOptions:
-    """The closed loop: real steps between trainings."""
+    """Options of the closed loop, which takes real steps between trainings, and of the audit."""
 
     improve: Annotated[
         int,
         typer.Option(
             min=0,
-            help="More real queries in each round, where the policy goes, until that is known or the design ready. A "
-            "sampler has to be running, and the budget has to hold them; an admin's token raises it.",
+            help="Real steps to add in each round, at states that the policy visits; 0 trains without rounds. Rounds "
+            "end when the model is certain at these states, or when the design is ready. This needs a running "
+            "sampler and enough budget; an admin's token raises the budget.",
         ),
     ] = 0
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds of --improve, at most.")] = 3
+    rounds: Annotated[int, typer.Option(min=1, help="Maximum number of rounds of --improve.")] = 3
     audit: Annotated[
         bool,
         typer.Option(
             "--audit/--no-audit",
-            help="Compare the model with a few real steps on the policy's way, beyond the budget, before the policy is "
-            "handed over. A sampler has to be running; without one the card says that there was no audit.",
+            help="Audit the policy: compare a few real steps on its way with the model. They don't count towards the "
+            "budget. This needs a running sampler; without one the card says that there was no audit.",
         ),
     ] = True
-    audit_steps: Annotated[int, typer.Option(min=2, max=256, help="Real steps of an audit.")] = 8
+    audit_steps: Annotated[int, typer.Option(min=2, max=256, help="Number of real steps of an audit.")] = 8
 
     def settings(self) -> LoopSettings | None:
         from surrogym_client.training.closed_loop import LoopSettings
@@ -183,16 +206,16 @@ class LoopOptions:
 
 @dataclass(frozen=True)
 class LogOptions:
-    """Where the curves of a training go."""
+    """Options of where the training's curves and the policy go."""
 
-    log: Annotated[Log, typer.Option(help="Where the curves of the training go.")] = "tensorboard"
+    log: Annotated[Log, typer.Option(help="Tracker that records the curves of the training.")] = "tensorboard"
     tensorboard: Annotated[
-        Path | None, typer.Option(help="Folder for TensorBoard. [default: tensorboard beside the policy]")
+        Path | None, typer.Option(help="Folder for TensorBoard's files. [default: tensorboard, beside the policy]")
     ] = None
     push: Annotated[
         bool,
         typer.Option(
-            "--push/--no-push", help="Store the policy on the server as well; surrogym policy push does so later."
+            "--push/--no-push", help="Store the policy on the server as well. To do so later: surrogym policy push."
         ),
     ] = True
     progress_file: Annotated[Path | None, typer.Option(hidden=True, help="Write progress as JSON lines.")] = None

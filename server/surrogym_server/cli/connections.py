@@ -1,4 +1,4 @@
-"""Connections that bring no request, or too slowly, or are too many."""
+"""Limits on connections that send nothing, send too slowly, or are too many."""
 
 from __future__ import annotations
 
@@ -23,14 +23,16 @@ SPARE_FILES = 128  # for the database, pipes and whatever else is open beside co
 
 
 def connections_within(most: int) -> int:
-    """Raise this process's limit of open files as far as it may; returns how many connections then fit, at most."""
+    """Raise this process's limit of open files as far as allowed, and return how many connections then fit, at most
+    ``most``.
+    """
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     return most if hard == resource.RLIM_INFINITY else max(min(most, hard - SPARE_FILES), 1)
 
 
 class TooMuch(Exception):
-    """Raised inside the parser, which then stops: what came is beyond a limit."""
+    """A request exceeds a limit. Raised inside the parser, which then stops."""
 
     def __init__(self, detail: str, status: int) -> None:
         super().__init__(detail)
@@ -38,7 +40,9 @@ class TooMuch(Exception):
 
 
 class Patient(HttpToolsProtocol):
-    """uvicorn's protocol, with limits of connections, of a request's head, and of the time it takes to arrive whole."""
+    """uvicorn's HTTP protocol with limits on connections, on the size of a request's head, and on the time a request
+    takes to arrive.
+    """
 
     seconds: float
     most: int  # connections
@@ -47,8 +51,8 @@ class Patient(HttpToolsProtocol):
     _head_lines = 0
     _head_complete = False
     _too_much: TooMuch | None = None
-    _working: RequestResponseCycle | None = None  # the request that the app works at, or did last
-    _unparsed = 0  # bytes since the parser last came to the end of something
+    _working: RequestResponseCycle | None = None  # the request that the app is answering, or answered last
+    _unparsed = 0  # bytes received since the parser last completed an element
 
     def data_received(self, data: bytes) -> None:
         self._unparsed += len(data)
@@ -153,5 +157,5 @@ class Patient(HttpToolsProtocol):
 
 
 def patient(seconds: float, most: int) -> type[HttpToolsProtocol]:
-    """``Patient`` with its limits, as uvicorn takes it: a class."""
+    """Return the class ``Patient`` with these limits set, as uvicorn expects a class."""
     return type("Patient", (Patient,), {"seconds": seconds, "most": most})

@@ -1,4 +1,4 @@
-"""``surrogym optimise``: a policy by gradients straight through an exported model, beside the server."""
+"""``surrogym optimise``: find a policy by gradients through an exported model, without a server."""
 
 from __future__ import annotations
 
@@ -24,20 +24,24 @@ def register(app: typer.Typer) -> None:
 
 
 def optimise(
-    spec: Annotated[Path, typer.Option(help="Specification of the surrogate (JSON), as surrogym export writes it.")],
-    model: Annotated[Path, typer.Option(help="Its model (safetensors), as surrogym export writes it.")],
+    spec: Annotated[Path, typer.Option(help="JSON file with the specification, from surrogym export.")],
+    model: Annotated[Path, typer.Option(help="File with the model (.safetensors), from surrogym export.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write the policy to.")] = Path("policy.zip"),
-    seed: Annotated[int, typer.Option(min=0, help="Seed of policy and starts.")] = 0,
-    updates: Annotated[int | None, typer.Option(min=1, help="Steps up the gradient. [default: 200]")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the policy and of the starts.")] = 0,
+    updates: Annotated[int | None, typer.Option(min=1, help="Number of gradient steps. [default: 200]")] = None,
     horizon: Annotated[
-        int | None, typer.Option(min=1, help="Steps of an episode to differentiate. [default: from the specification]")
+        int | None,
+        typer.Option(
+            min=1, help="Number of steps of an episode to differentiate through. [default: from the specification]"
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no remarks.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress and no remarks.")] = False,
 ) -> None:
-    """Optimise a policy by gradients through a model. Continuous actions only, no server is asked.
+    """Find a policy by gradients through an exported model.
 
-    The imagined return that is shown is what the policy earns in the model, not in the original environment.
+    This works for continuous actions only, and needs no server. The command prints the imagined return: what the policy
+    earns in the model, not in the original environment.
 
     Example: surrogym optimise --spec spec.json --model model.safetensors --out policy.zip
     """
@@ -81,7 +85,7 @@ def optimise(
 def _write_card(
     out: Path, spec: EnvironmentSpec, settings: GradientSettings, found: Optimised, seconds: float
 ) -> dict[str, Any]:
-    """Write the policy's card beside it; gives what is in the card."""
+    """Write the policy's card beside it, and return its content."""
     card: dict[str, Any] = {
         "algorithm": "gradient",
         "spec": spec.model_dump(mode="json"),

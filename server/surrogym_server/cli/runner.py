@@ -1,4 +1,4 @@
-"""The server process: from its listening socket to its clean end."""
+"""Run the server process, from its listening socket to a clean end."""
 
 from __future__ import annotations
 
@@ -34,7 +34,9 @@ ANY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 
 
 class Runner(uvicorn.Server):
-    """Announces its address, ends long polls at shutdown, and takes a signal as a wish, not as a failure."""
+    """uvicorn's server, which also announces its address, ends long polls at shutdown, and treats a signal as a normal
+    end.
+    """
 
     def __init__(self, app: FastAPI, settings: Settings, url: str, ready_file: Path | None, tell: Tell) -> None:
         config = uvicorn.Config(
@@ -67,7 +69,8 @@ class Runner(uvicorn.Server):
 
     @contextmanager
     def capture_signals(self) -> Generator[None, None, None]:
-        """Besides those of uvicorn the signal of a terminal that closes, unless it is ignored, as under nohup."""
+        """Handle SIGHUP, the signal of a closed terminal, as well as uvicorn's signals. Under nohup it stays
+        ignored."""
         ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
         with super().capture_signals(), nullcontext() if ignored else _handled(signal.SIGHUP, self.handle_exit):
             yield
@@ -85,11 +88,17 @@ class Runner(uvicorn.Server):
 
 
 def run(settings: Settings, ready_file: Path | None, exit_with_parent: bool, tell: Tell) -> None:
-    """Serve until a signal comes, or the parent ends; ``tell`` is called with the address once requests are accepted.
+    """Serve until a signal arrives or the parent process ends.
+
+    Args:
+        settings: the server's settings.
+        ready_file: file to write the URL to, once requests are accepted.
+        exit_with_parent: end when the parent process ends.
+        tell: called with the URL, once requests are accepted.
 
     Raises:
-        InvalidInput: the address can't be listened on.
-        Unavailable: the database is taken or does not answer.
+        InvalidInput: the server can't listen on the address.
+        Unavailable: the database is in use by another server, or does not answer.
     """
     logs.configure(settings.log_level, settings.log_format)
     with _listen(settings.host, settings.port) as listener:
@@ -109,14 +118,18 @@ def _handled(sig: signal.Signals, handler: Callable[[int, FrameType | None], Non
 
 
 def _exempt_from_collection() -> None:
-    """What is there now stays for good: torch and all else that was imported. Each full collection would go through it,
-    for some 200 ms in which no step is answered. The first one is left out as well: of all that, 3 % is garbage."""
+    """Exempt all objects that exist now from garbage collection.
+
+    They are torch and other imports, which stay alive. Each full collection would traverse them, and no step is
+    answered for some 200 ms meanwhile. The first collection is skipped as well, because only 3 % of these objects are
+    garbage.
+    """
     gc.freeze()
     gc.enable()
 
 
 def _listen(host: str, port: int) -> socket.socket:
-    """A bound socket, so that a taken port is known before anything else is opened."""
+    """Return a bound socket, so that a port in use is reported before anything else is opened."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listener = socket.socket(family, kind, protocol)
@@ -128,14 +141,14 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def _url(listener: socket.socket, settings: Settings) -> str:
-    """The address under which a client on this machine finds the server."""
+    """URL under which a client on this machine reaches the server."""
     name = ANY_ADDRESS.get(settings.host, settings.host)
     scheme = "http" if settings.tls_certificate is None else "https"
     return f"{scheme}://{f'[{name}]' if ':' in name else name}:{listener.getsockname()[1]}"
 
 
 def _write_at_once(path: Path, text: str) -> None:
-    """Write a file that readers see whole or not at all."""
+    """Write a file atomically, so that readers see either nothing or all of it."""
     draft = path.with_name(f"{path.name}.tmp")
     draft.write_text(text, encoding="utf-8")
     draft.replace(path)

@@ -18,52 +18,65 @@ WORKERS_VARIABLE = "WEB_CONCURRENCY"
 OF_THE_COMMAND = ("ready_file", "exit_with_parent", "as_json", "quiet")  # its other options are settings
 
 Host = Annotated[str | None, typer.Option(help="Address to listen on. [default: 127.0.0.1]")]
-Port = Annotated[int | None, typer.Option(help="Port; 0 takes any free one. [default: 8000]")]
-Database = Annotated[str | None, typer.Option(help="SQLite file, or a SQLAlchemy URL. [default: surrogym.db]")]
+Port = Annotated[int | None, typer.Option(help="Port to listen on; 0 takes any free one. [default: 8000]")]
+Database = Annotated[
+    str | None, typer.Option(help="Database: a SQLite file or a SQLAlchemy URL. [default: surrogym.db]")
+]
 Synchronous = Annotated[
-    str | None, typer.Option(help="Of a SQLite file: full waits for the disk, normal not always. [default: full]")
+    str | None,
+    typer.Option(
+        help="When to flush a SQLite file to disk: full at each commit; normal less often, so that a power "
+        "failure can lose the latest commits. [default: full]"
+    ),
 ]
-TokenFile = Annotated[Path | None, typer.Option(help="File with one token a line: an admin token, or role:token.")]
+TokenFile = Annotated[Path | None, typer.Option(help="File with one token per line: an admin token, or role:token.")]
 Insecure = Annotated[
-    bool | None, typer.Option("--insecure", help="Allow another address than loopback without a token.")
+    bool | None, typer.Option("--insecure", help="Allow an address other than loopback without a token.")
 ]
-PublicUrl = Annotated[
-    str | None, typer.Option(help="Address that browsers know the server by, where a proxy stands before it.")
+PublicUrl = Annotated[str | None, typer.Option(help="URL of the server as browsers see it, if it is behind a proxy.")]
+TlsCertificate = Annotated[
+    Path | None, typer.Option(help="PEM file with the certificate. The server then accepts HTTPS only.")
 ]
-TlsCertificate = Annotated[Path | None, typer.Option(help="PEM file; the server then speaks HTTPS alone.")]
 TlsKey = Annotated[Path | None, typer.Option(help="PEM file with the certificate's private key.")]
 Device = Annotated[
-    str | None, typer.Option(help="What steps sessions: cpu, or cuda where torch has it. [default: cpu]")
+    str | None, typer.Option(help="Device that steps sessions: cpu, or cuda if torch supports it. [default: cpu]")
 ]
-Threads = Annotated[int | None, typer.Option(help="Threads of one torch operation. [default: 1]")]
+Threads = Annotated[int | None, typer.Option(help="Number of threads of one torch operation. [default: 1]")]
 SessionIdleSeconds = Annotated[
-    float | None, typer.Option(help="Idle time after which a session expires. [default: 3600]")
+    float | None, typer.Option(help="Seconds without a request after which a session expires. [default: 3600]")
 ]
 FitSeconds = Annotated[
-    float | None, typer.Option(help="Time after which a fit is ended, and has failed. [default: 3600]")
+    float | None, typer.Option(help="Seconds after which a fit is stopped and counts as failed. [default: 3600]")
 ]
 Engine = Annotated[
-    str | None, typer.Option(help="Where sessions are: local, in this process, or ray, in a cluster. [default: local]")
+    str | None,
+    typer.Option(help="Where sessions live: local in this process, or ray in a Ray cluster. [default: local]"),
 ]
 RayAddress = Annotated[
-    str | None, typer.Option(help="Ray cluster; auto finds the one that this machine belongs to. [default: auto]")
+    str | None,
+    typer.Option(help="Address of the Ray cluster; auto finds the one that this machine belongs to. [default: auto]"),
 ]
 RayHosts = Annotated[
-    int | None, typer.Option(help="Processes of the cluster that hold sessions, each with a CPU. [default: 2]")
+    int | None,
+    typer.Option(help="Number of processes in the cluster that hold sessions, each with one CPU. [default: 2]"),
 ]
 FitWorkers = Annotated[
-    int | None, typer.Option(help="Fits of different surrogates at once, each in a process. [default: 1]")
+    int | None, typer.Option(help="Number of surrogates that are fitted at once, each in a process. [default: 1]")
 ]
-LogLevel = Annotated[str | None, typer.Option(help="critical, error, warning, info or debug. [default: info]")]
-LogFormat = Annotated[str | None, typer.Option(help="text, or json: one object a line. [default: text]")]
+LogLevel = Annotated[
+    str | None, typer.Option(help="Lowest level to log: critical, error, warning, info or debug. [default: info]")
+]
+LogFormat = Annotated[
+    str | None, typer.Option(help="Format of the log: text, or json with one object per line. [default: text]")
+]
 ReadyFile = Annotated[Path | None, typer.Option(help="File to write the URL to, once the server accepts requests.")]
 ExitWithParent = Annotated[
-    bool, typer.Option("--exit-with-parent", help="End when the process that started this one ends.")
+    bool, typer.Option("--exit-with-parent", help="Stop when the process that started the server ends.")
 ]
 AsJson = Annotated[
-    bool, typer.Option("--json", help="Print address and version as JSON, once the server accepts requests.")
+    bool, typer.Option("--json", help="Print URL and version as JSON, once the server accepts requests.")
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No remarks; the log is what --log-level says.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no remarks. The log still follows --log-level.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -99,13 +112,14 @@ def serve(
 ) -> None:
     """Run the server until Ctrl-C.
 
-    SIGTERM and the end of its terminal (SIGHUP, unless ignored as under nohup) end it as cleanly: sessions are saved.
+    SIGTERM stops the server as well, and so does closing its terminal (SIGHUP), unless it runs under nohup. Each of
+    them saves the sessions.
 
-    Most options can also be given as environment variables, such as SURROGYM_PORT; a token as SURROGYM_TOKEN.
+    Most options can also be set by environment variables, such as SURROGYM_PORT. SURROGYM_TOKEN sets the token.
 
     Example: surrogym serve --port 8000 --database surrogym.db
     """
-    gc.disable()  # what is imported stays: to look for garbage in it takes an eighth of the start
+    gc.disable()  # imported objects stay alive: searching them for garbage takes an eighth of the start-up time
     try:
         from surrogym_server.settings import read_settings
 

@@ -1,4 +1,4 @@
-"""``surrogym reproduce``: the figures in the documentation, made again; one study a file."""
+"""``surrogym reproduce``: repeat the experiments behind the figures in the documentation. Each file is one study."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STUDIES = (efficiency, paper, trust, table)
 def register(app: typer.Typer) -> None:
     """Add the command and its studies."""
     studies = typer.Typer(
-        help="Make the figures in the documentation again.\n\nExample: surrogym reproduce efficiency --seeds 3",
+        help="Repeat the experiments of the documentation.\n\nExample: surrogym reproduce efficiency --seeds 3",
         no_args_is_help=True,
         rich_markup_mode=None,
     )

@@ -24,30 +24,35 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
-    tasks: Annotated[str, typer.Option(help="Tasks of the demo with commas between, or all.")] = "all",
-    arms: Annotated[str, typer.Option(help="Arms with commas between, or all, or study.")] = "default",
-    seeds: Annotated[int, typer.Option(min=1, help="How many seeds.")] = 3,
-    first_seed: Annotated[int, typer.Option(min=0, help="The first of them.")] = 0,
-    jobs: Annotated[int, typer.Option(min=1, help="Runs at once; each takes about one core.")] = 1,
-    out: Annotated[Path, typer.Option(help="Folder of rows, tables, pictures, logs and runs.")] = Path(
+    tasks: Annotated[str, typer.Option(help="Tasks of the demo, separated by commas, or all.")] = "all",
+    arms: Annotated[str, typer.Option(help="Arms, separated by commas, or all, or study.")] = "default",
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 3,
+    first_seed: Annotated[int, typer.Option(min=0, help="First seed. The others follow it.")] = 0,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of runs at once. Each takes about one core.")] = 1,
+    out: Annotated[Path, typer.Option(help="Folder for rows, tables, pictures, logs and runs.")] = Path(
         "runs/efficiency"
     ),
-    shares: Annotated[str, typer.Option(help="Shares of each task's budget, with commas between.")] = "1",
-    again: Annotated[bool, typer.Option("--again", help="Run also what has a row already.")] = False,
-    steps: Annotated[int | None, typer.Option(min=1, help="Virtual steps of each training.")] = None,
-    episodes: Annotated[int, typer.Option(min=1, help="Real episodes of each evaluation.")] = 100,
+    shares: Annotated[
+        str, typer.Option(help="Shares of each task's budget, separated by commas. Each share is a run of its own.")
+    ] = "1",
+    again: Annotated[bool, typer.Option("--again", help="Repeat runs that have a row already.")] = False,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Virtual steps of each training. [default: from the task]")
+    ] = None,
+    episodes: Annotated[int, typer.Option(min=1, help="Number of real episodes of each evaluation.")] = 100,
     algorithm: Annotated[
-        str | None, typer.Option(help="Policy search, as of surrogym train. [default: that command's]")
+        str | None, typer.Option(help="Policy search, as in surrogym train. [default: that command's]")
     ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Run the demo over tasks, arms and seeds. rows.csv, efficiency.md and a picture of each task go into a folder.
+    """Run the demo over tasks, arms and seeds.
 
-    A run that has its row in rows.csv is not repeated, so the same command resumes after Ctrl-C. Arms: default,
-    no_symmetry, declared_starts, no_loop, variance, latin_hypercube, paper, paper_hypercube, oracle;
-    docs/results/efficiency.md explains each. "study" runs the default on every task, a hypercube and paper on four of
-    them, and on the same four the other arms with half of the seeds.
+    The folder --out gets rows.csv, efficiency.md and a picture of each task. A run that has a row in rows.csv is not
+    repeated, so the same command continues after Ctrl-C. An arm is a way to choose real steps: default, no_symmetry,
+    declared_starts, no_loop, variance, latin_hypercube, paper, paper_hypercube or oracle; docs/results/efficiency.md
+    explains each. --arms study runs default on every task, latin_hypercube and paper on four of them, and the other
+    arms on the same four with half of the seeds.
 
     Example: surrogym reproduce efficiency --seeds 10 --jobs 2 --out runs/efficiency
 
@@ -61,7 +66,11 @@ def command(
 
 
 def run_study(wanted: Sequence[Cell], out: Path, jobs: int, *, again: bool, as_json: bool, quiet: bool) -> None:
-    """Run what has no row yet, or all ``again``, and present the rows. Raises ``CommandError`` if a run ends badly."""
+    """Run the cells that have no row yet, or all of them if ``again``, and show the table.
+
+    Raises:
+        CommandError: a run failed.
+    """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.cli.reproduce.table import present
     from surrogym_client.experiments.reproduce.cells import done_already, run_cells
@@ -87,7 +96,7 @@ def run_study(wanted: Sequence[Cell], out: Path, jobs: int, *, again: bool, as_j
 
 
 def _wanted(tasks: str, arms: str, seeds: Sequence[int], chosen: dict[str, Any]) -> list[Cell]:
-    """The runs of these tasks and arms."""
+    """Return the runs of the chosen tasks and arms."""
     from surrogym_client.experiments.arms import ARMS
     from surrogym_client.experiments.reproduce.cells import cells, study
     from surrogym_client.experiments.tasks import TASKS
@@ -101,7 +110,11 @@ def _wanted(tasks: str, arms: str, seeds: Sequence[int], chosen: dict[str, Any])
 
 
 def names_of(what: str, given: str, known: Iterable[str], *words: str) -> list[str]:
-    """The names given with commas between, or all known. Raises ``CommandError`` for an unknown one."""
+    """Split names that are separated by commas; ``all`` means every known name.
+
+    Raises:
+        CommandError: a name is not known.
+    """
     from surrogym_client.cli.errors import CommandError
 
     if given == "all":

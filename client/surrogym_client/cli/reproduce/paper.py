@@ -1,4 +1,4 @@
-"""``surrogym reproduce paper``: section 5 of the paper, its figures 5 to 15 and its numbers beside ours."""
+"""``surrogym reproduce paper``: section 5 of the paper, its figures 5 to 15, and its numbers beside ours."""
 
 from __future__ import annotations
 
@@ -17,19 +17,25 @@ def register(app: typer.Typer) -> None:
 
 def command(
     out: Annotated[
-        Path, typer.Option(help="Folder of stages, table and pictures; a run goes on where it ended.")
+        Path,
+        typer.Option(
+            help="Folder for intermediate results, table and pictures. The same command continues an interrupted run."
+        ),
     ] = Path("runs/paper"),
-    tasks: Annotated[str, typer.Option(help="pendulum, cartpole, with commas between.")] = "pendulum,cartpole",
-    seeds: Annotated[int, typer.Option(min=1, help="How many seeds, from 0 on.")] = 5,
+    tasks: Annotated[str, typer.Option(help="Tasks, separated by commas: pendulum, cartpole.")] = "pendulum,cartpole",
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, from 0 on.")] = 5,
     steps: Annotated[
         int | None, typer.Option(min=1, help="Virtual steps of each training. [default: from the specification]")
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Hardly any of everything, to see that it works.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Run a minimal form of everything, to check that it works.")
+    ] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Run section 5 of the paper. results.md, results.csv, rows.json and figure05.png to figure15.png
-    go into a folder.
+    """Run the experiments of section 5 of the paper.
+
+    The folder --out gets results.md, results.csv, rows.json and figure05.png to figure15.png.
 
     Example: surrogym reproduce paper --out runs/paper
 

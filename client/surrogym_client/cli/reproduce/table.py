@@ -1,4 +1,4 @@
-"""``surrogym reproduce table``: rows of several sittings and machines, merged into one table."""
+"""``surrogym reproduce table``: merge the rows of several runs and machines into one table."""
 
 from __future__ import annotations
 
@@ -20,8 +20,11 @@ def register(app: typer.Typer) -> None:
 
 
 def command(
-    rows: Annotated[list[Path], typer.Option(help="File of rows; may be given again, later ones win.")],
-    out: Annotated[Path, typer.Option(help="Folder of the merged efficiency.csv, the table and the pictures.")] = Path(
+    rows: Annotated[
+        list[Path],
+        typer.Option(help="File of rows. May be given several times; a later file replaces rows of an earlier one."),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the merged efficiency.csv, the table and the pictures.")] = Path(
         "runs/table"
     ),
     page: Annotated[
@@ -33,7 +36,9 @@ def command(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Merge files of rows. efficiency.csv, efficiency.md and a picture of each task go into a folder.
+    """Merge files of rows into one table.
+
+    The folder --out gets efficiency.csv, efficiency.md and a picture of each task.
 
     Example: surrogym reproduce table --rows night/rows.csv --rows day/rows.csv --out runs/table
     """
@@ -55,7 +60,7 @@ def command(
 
 
 def present(rows: Sequence[Row], out: Path, *, as_json: bool, quiet: bool) -> None:
-    """Write table and pictures of rows, and show the table."""
+    """Write the table and the pictures of rows, and print the table."""
     from surrogym_client.cli.columns import fitted
     from surrogym_client.experiments.reproduce.table import report
     from surrogym_shared.terminal import give, progress

@@ -1,4 +1,4 @@
-"""``surrogym reproduce trust``: whether policies that are handed over as trusted keep their promise."""
+"""``surrogym reproduce trust``: count how often trusted policies keep their promise."""
 
 from __future__ import annotations
 
@@ -17,21 +17,22 @@ def register(app: typer.Typer) -> None:
 
 def command(
     tasks: Annotated[
-        str, typer.Option(help="Tasks with commas between: unseen, those of the demo as well, or all of both.")
+        str, typer.Option(help="Tasks, separated by commas: unseen, tasks of the demo, or all.")
     ] = "unseen",
-    seeds: Annotated[int, typer.Option(min=1, help="How many seeds.")] = 5,
-    first_seed: Annotated[int, typer.Option(min=0, help="The first of them.")] = 2000,
-    jobs: Annotated[int, typer.Option(min=1, help="Runs at once; each takes about one core.")] = 1,
-    out: Annotated[Path, typer.Option(help="Folder of rows, tables, pictures, logs and runs.")] = Path("runs/trust"),
-    again: Annotated[bool, typer.Option("--again", help="Run also what has a row already.")] = False,
-    episodes: Annotated[int, typer.Option(min=1, help="Real episodes of each evaluation.")] = 100,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 5,
+    first_seed: Annotated[int, typer.Option(min=0, help="First seed. The others follow it.")] = 2000,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of runs at once. Each takes about one core.")] = 1,
+    out: Annotated[Path, typer.Option(help="Folder for rows, tables, pictures, logs and runs.")] = Path("runs/trust"),
+    again: Annotated[bool, typer.Option("--again", help="Repeat runs that have a row already.")] = False,
+    episodes: Annotated[int, typer.Option(min=1, help="Number of real episodes of each evaluation.")] = 100,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Run the demo on ten tasks that the method was not made on. rows.csv, efficiency.md and pictures go into a folder.
+    """Count how often trusted policies keep their promise.
 
-    The table counts trusted runs whose real mean return is at least their promise's 5 % quantile. A run that has its
-    row in rows.csv is not repeated, so that the same command goes on after Ctrl-C.
+    The command runs the demo on ten tasks that were not used to develop the method. A promise is kept if the real mean
+    return is at least the promise's 5 % quantile. The folder --out gets rows.csv, efficiency.md and pictures. A run
+    that has a row in rows.csv is not repeated, so the same command continues after Ctrl-C.
 
     Example: surrogym reproduce trust --seeds 5 --jobs 2
 
