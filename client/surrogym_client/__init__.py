@@ -1,8 +1,8 @@
-"""The Surrogym client: remote environments, the sampler, training and evaluation.
+"""The Surrogym client: virtual environments over HTTP, the sampler, training and evaluation.
 
-Importing it enters ``surrogym/Remote-v0`` into Gymnasium's registry: at once where Gymnasium is loaded, otherwise as
-soon as it is. Most commands never load it. Gymnasium has looked for no plugins by itself since 1.0.
-``gymnasium.make("surrogym_client:surrogym/Remote-v0", ...)`` needs no import.
+Importing this package registers ``surrogym/Remote-v0`` with Gymnasium: at once if Gymnasium is loaded, otherwise as
+soon as it is. This keeps commands that don't need Gymnasium fast. Since version 1.0, Gymnasium does not search for
+plug-ins itself. ``gymnasium.make("surrogym_client:surrogym/Remote-v0", ...)`` works without an import.
 """
 
 from surrogym_client.runtime.after_import import after_import
@@ -13,7 +13,8 @@ after_import("gymnasium", "surrogym_client.registration:register")
 def register() -> None:
     """Register ``surrogym/Remote-v0`` with Gymnasium now.
 
-    Importing this package does so by itself. Worker processes that were forked before Gymnasium was loaded call this.
+    Importing this package does so automatically. Only worker processes that were forked before Gymnasium was loaded
+    need to call this function.
     """
     from surrogym_client.registration import register as enter
 

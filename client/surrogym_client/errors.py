@@ -43,11 +43,11 @@ from surrogym_shared.codes import STATUS, Code, Problem
 
 
 class SurrogymClientError(Exception):
-    """Base of everything the client raises on purpose. ``str(error)`` is one sentence for a person."""
+    """Base class of all errors of the client. ``str(error)`` is one sentence for a person."""
 
 
 class ServerUnreachable(SurrogymClientError):
-    """No answer within the retry budget. Check the address, and that the server runs."""
+    """The server did not answer within the retry budget. Check the address, and that the server runs."""
 
 
 class RequestTimeout(ServerUnreachable):
@@ -55,15 +55,15 @@ class RequestTimeout(ServerUnreachable):
 
 
 class UnusableToken(SurrogymClientError):
-    """The file that should hold the token can't be read, or does not hold one. Check its path, and its only line."""
+    """The token file can't be read, or does not contain a token. Check its path, and its only line."""
 
 
 class ProtocolMismatch(SurrogymClientError):
-    """What answered is no Surrogym server, or one of another protocol version."""
+    """The address does not belong to a Surrogym server, or its protocol version differs."""
 
 
 class ProblemError(SurrogymClientError):
-    """The server refused; ``problem`` says why, in words and as a code."""
+    """The server refused the request. ``problem`` says why, as text and as a code."""
 
     def __init__(self, problem: Problem) -> None:
         super().__init__(problem)
@@ -75,15 +75,15 @@ class ProblemError(SurrogymClientError):
 
 
 class InvalidInput(ProblemError):
-    """The request can't be used; its detail says what was expected and what came."""
+    """The server can't use the request. The detail says what was expected and what came."""
 
 
 class InvalidSpec(InvalidInput):
-    """A specification that contradicts itself."""
+    """The specification contradicts itself."""
 
 
 class TooLarge(InvalidInput):
-    """More than a limit allows."""
+    """The request exceeds a limit of the server."""
 
 
 class NotThere(ProblemError):
@@ -91,27 +91,27 @@ class NotThere(ProblemError):
 
 
 class UnknownSurrogate(NotThere):
-    """No surrogate of this name; register it first."""
+    """There is no surrogate of this name. Register it first."""
 
 
 class UnknownQuery(NotThere):
-    """No query of this number."""
+    """There is no query of this number."""
 
 
 class UnknownModel(NotThere):
-    """No model of this version."""
+    """There is no model of this version."""
 
 
 class UnknownPolicy(NotThere):
-    """No policy of this version or alias, or it lacks the file or evaluation that was asked for."""
+    """There is no policy of this version or alias, or it lacks the requested file or evaluation."""
 
 
 class SessionLost(NotThere):
-    """The session is gone; its episodes can't go on."""
+    """The session no longer exists, so its episodes can't continue."""
 
 
 class UnknownSession(SessionLost):
-    """No session of this id."""
+    """There is no session of this id."""
 
 
 class SessionExpired(SessionLost):
@@ -119,19 +119,19 @@ class SessionExpired(SessionLost):
 
 
 class Conflict(ProblemError):
-    """The request does not fit the present state."""
+    """The request does not fit the server's present state."""
 
 
 class SpecConflict(Conflict):
-    """The name exists with another specification; choose another name."""
+    """A surrogate of this name exists with another specification. Choose another name."""
 
 
 class IdempotencyConflict(Conflict):
-    """The same idempotency key came with another body."""
+    """The idempotency key was used before, with another body."""
 
 
 class SeqConflict(Conflict):
-    """Someone else steps this session, or a step was given up and had been carried out after all."""
+    """Another client steps this session, or the server carried out a step that this client had given up."""
 
     @property
     def expected_seq(self) -> int | None:
@@ -139,27 +139,27 @@ class SeqConflict(Conflict):
 
 
 class ForeignLease(Conflict):
-    """The lease token was never given out for this query."""
+    """The lease token does not belong to this query."""
 
 
 class LeaseExpired(Conflict):
-    """The lease has ended; claim again."""
+    """The lease has expired. Claim a query again."""
 
 
 class NotReset(Conflict):
-    """A lane has to be reset before it can be stepped."""
+    """The lane has to be reset before it can be stepped."""
 
 
 class NoModel(Conflict):
-    """Nothing has been fitted yet; let a sampler answer the first queries."""
+    """There is no model yet. A sampler has to answer the first queries."""
 
 
 class Refused(ProblemError):
-    """The caller may not do this."""
+    """The caller may not send this request."""
 
 
 class Unauthenticated(Refused):
-    """No token, or an unknown one; set SURROGYM_TOKEN."""
+    """The request has no token, or an unknown one. Set SURROGYM_TOKEN."""
 
 
 class Forbidden(Refused):
@@ -167,23 +167,23 @@ class Forbidden(Refused):
 
 
 class BeyondBudget(Refused):
-    """The budget has not as many real steps left, and this token may not raise it."""
+    """The budget has too few real steps left, and this token may not raise it."""
 
 
 class Unavailable(ProblemError):
-    """The server can't serve this now."""
+    """The server can't answer this request at the moment."""
 
 
 class Overloaded(Unavailable):
-    """A queue or a cap of the server is full."""
+    """A queue or a limit of the server is full."""
 
 
 class NotInstalled(ProblemError):
-    """The surrogate needs a plug-in that the server lacks; whoever runs the server installs it."""
+    """The surrogate needs a plug-in that the server lacks. Ask the server's operator to install it."""
 
 
 class ServerFailure(ProblemError):
-    """A defect of the server; its log says more."""
+    """The server has a defect. Its log says more."""
 
 
 BY_CODE: dict[Code, type[ProblemError]] = {
@@ -220,11 +220,12 @@ BY_CODE: dict[Code, type[ProblemError]] = {
 
 
 def error_from_problem(problem: Problem) -> ProblemError:
-    """The exception that stands for a problem body."""
+    """Return the exception for a problem body."""
     return BY_CODE[problem.code](problem)
 
 
 def refused_here(code: Code, detail: str) -> ProblemError:
-    """The exception the server would have caused, for what can't even be sent (NaN has no JSON form)."""
+    """Return the exception that the server would have caused. Used for values that can't be sent, such as NaN in
+    JSON."""
     title = code.value.replace("_", " ").capitalize()
     return error_from_problem(Problem(title=title, status=STATUS[code], code=code, detail=detail))

@@ -1,4 +1,5 @@
-"""What makes ``gymnasium.make`` know this package's ids: a server's surrogates, those in files, and the swing-up."""
+"""Register this package's environments with Gymnasium: surrogates on a server, surrogates in files, and the
+swing-up."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ SWING_UP_STEPS = 40  # of 0.1 s
 
 
 def register() -> None:
-    """Enter this package's environments into Gymnasium's registry; doing it twice is harmless."""
+    """Register this package's environments with Gymnasium. Repeating it is harmless."""
     for environment_id, module in ((ENVIRONMENT_ID, "gym_factories"), (FILE_ID, "file_factories")):
         if environment_id not in gymnasium.registry:
             gymnasium.register(

@@ -19,21 +19,21 @@ from surrogym_shared.wire import SubmittedOccupancy
 
 
 class SurrogateVecEnv(VecEnv):
-    """Many lanes of a learned virtual environment, for any Stable-Baselines3 algorithm.
+    """Vector environment of Stable-Baselines3 whose lanes are virtual environments of one surrogate.
 
     Infos have ``TimeLimit.truncated``, ``model_version`` and ``reward_mean``, and at the end of an episode
-    ``terminal_observation`` and, in a session with a penalty, ``penalty``: what it took off the episode's
-    return. In a session with a trust region, ``untrusted`` says whether leaving it truncated the episode. An
-    episode that ends because the server lost the session is truncated, with the reason in
+    ``terminal_observation``. In a session with a penalty, the last info of an episode has ``penalty``: the amount it
+    subtracted from the episode's return. In a session with a trust region, ``untrusted`` says whether leaving it
+    truncated the episode. An episode that ends because the server lost the session is truncated, with the reason in
     ``surrogym_session_lost``.
 
     Args:
         url: the server's address; None takes ``SURROGYM_URL``, then http://127.0.0.1:8000.
-        surrogate: its name.
-        num_envs: N.
+        surrogate: name of the surrogate.
+        num_envs: number of lanes, N.
         token: bearer token; default ``SURROGYM_TOKEN``, then the one in the file ``SURROGYM_TOKEN_FILE``.
-        timeouts: seconds per kind of request.
-        retries: how long to go on after lost connections, lost replies and 503.
+        timeouts: seconds for each kind of request.
+        retries: how long to retry after lost connections, lost replies and status 503.
         transport: how steps travel; see ``HttpSurrogate``.
         options: fields of ``OpenSession``: variant, seed, model, time_limit, penalty, occupancy, ...
 
@@ -63,7 +63,7 @@ class SurrogateVecEnv(VecEnv):
 
     @classmethod
     def from_port(cls, port: SurrogatePort, num_envs: int = 16, **options: Any) -> Self:
-        """The same over a ready port, such as one in this process."""
+        """Make the vector environment from an existing port, such as one in this process."""
         env = cls.__new__(cls)
         env._open(port, num_envs, options)
         return env
@@ -75,16 +75,19 @@ class SurrogateVecEnv(VecEnv):
         view = self._lanes.view
         super().__init__(num_envs, space(view.observation_space), space(view.action_space))
         self._actions: NDArray[Any] | None = None
-        self._penalty = np.zeros(num_envs)  # taken off the running episodes' returns
+        self._penalty = np.zeros(num_envs)  # subtracted from the return of each running episode so far
 
     @property
     def session(self) -> str:
-        """Id of the session; another one after a loss."""
+        """Id of the session. It changes if the session is lost and opened again."""
         return self._lanes.view.id
 
     def submit_occupancy(self, checkpoint: str) -> SubmittedOccupancy:
-        """Store the states visited so far under a name, for the design to weigh its queries by; says how many, and the
-        confidence index there."""
+        """Submit the states visited so far as the occupancy of a checkpoint.
+
+        The design can then choose queries near these states. Returns the number of states, and the confidence index
+        over them.
+        """
         return self.port.submit_occupancy(self.session, checkpoint)
 
     def reset(self) -> NDArray[Any]:
@@ -146,7 +149,7 @@ class SurrogateVecEnv(VecEnv):
         return [None] * self.num_envs
 
     def _attribute(self, lane: int, name: str) -> Any:
-        """A lane has what was set on it, and what all lanes share."""
+        """Return an attribute of a lane: the lane's own value, or else the value that all lanes share."""
         known = self._attributes[lane]
         if name in known:
             return known[name]

@@ -1,4 +1,4 @@
-"""The laws of a policy search as plain functions, for the tests of whoever writes one.
+"""Laws that every policy search must keep, as functions for the tests of a search's author.
 
 Examples:
     >>> @pytest.mark.parametrize("law", POLICY_SEARCH_LAWS)
@@ -28,11 +28,11 @@ OBSERVATIONS = 200
 
 
 class LawBroken(AssertionError):
-    """What was expected of a search, and what it did."""
+    """A policy search breaks a law. The message says what was expected and what the search did."""
 
 
 def same_seed_gives_same_policy(port: SurrogatePort, settings: TrainSettings, folder: Path) -> None:
-    """Two searches with one seed give the same actions; another seed gives others."""
+    """Check that two searches with one seed return the same actions, and that another seed returns different ones."""
     first, again, other = (
         _actions(port, train(port, folder / f"policy-{name}.zip", replace(settings, seed=seed)))
         for name, seed in (("first", settings.seed), ("again", settings.seed), ("other", settings.seed + 1))
@@ -42,7 +42,8 @@ def same_seed_gives_same_policy(port: SurrogatePort, settings: TrainSettings, fo
 
 
 def steps_are_bounded_and_reported(port: SurrogatePort, settings: TrainSettings, folder: Path) -> None:
-    """Progress never falls, never exceeds its total, and the result has at most the steps that were asked for."""
+    """Check that progress never decreases or exceeds its total, and that the search takes at most the requested
+    steps."""
     seen: list[TrainProgress] = []
     result = train(port, folder / "policy.zip", settings, seen.append)
     steps = [now.steps for now in seen]
@@ -54,7 +55,7 @@ def steps_are_bounded_and_reported(port: SurrogatePort, settings: TrainSettings,
 
 
 def interruption_keeps_the_policy(port: SurrogatePort, settings: TrainSettings, folder: Path) -> None:
-    """Ctrl-C at the first progress leaves a policy that can be read, or none at all, and no session."""
+    """Check that Ctrl-C at the first progress leaves a readable policy or none, and no open session."""
     watched, out = _Watched(port), folder / "policy.zip"
     try:
         train(watched, out, settings, _interrupt)
@@ -67,7 +68,7 @@ def interruption_keeps_the_policy(port: SurrogatePort, settings: TrainSettings, 
 
 
 def sessions_are_closed(port: SurrogatePort, settings: TrainSettings, folder: Path) -> None:
-    """No session is left open, whether the search ends well or by an error."""
+    """Check that the search leaves no session open, whether it succeeds or fails."""
     watched = _Watched(port)
     train(watched, folder / "policy.zip", settings)
     _require(not watched.open_sessions, "all sessions closed at the end", watched.open_sessions)
@@ -77,7 +78,7 @@ def sessions_are_closed(port: SurrogatePort, settings: TrainSettings, folder: Pa
 
 
 def unknown_hyperparameters_are_refused(port: SurrogatePort, settings: TrainSettings, folder: Path) -> None:
-    """A hyperparameter that there is none of raises ValueError, and no file is left."""
+    """Check that an unknown hyperparameter raises ValueError and leaves no file."""
     asked = replace(settings, hyperparameters={**settings.hyperparameters, "no_such_hyperparameter": 1})
     try:
         train(port, folder / "policy.zip", asked)
@@ -89,7 +90,7 @@ def unknown_hyperparameters_are_refused(port: SurrogatePort, settings: TrainSett
 
 
 def start_is_taken_or_refused(port: SurrogatePort, settings: TrainSettings, folder: Path) -> None:
-    """A search starts from a policy of its own, or, where it says that it can't, refuses to."""
+    """Check that the search continues from its own policy file, or refuses to if it declares that it can't."""
     start = train(port, folder / "start.zip", replace(settings, seed=settings.seed + 1)).path
     resumed = replace(settings, start_from=start)
     if SEARCHES.get(settings.algorithm).resumable:
@@ -103,7 +104,7 @@ def start_is_taken_or_refused(port: SurrogatePort, settings: TrainSettings, fold
 
 
 def policy_is_read_without_trust(port: SurrogatePort, settings: TrainSettings, folder: Path) -> None:
-    """The file gives actions of the action space, and says nothing that only the search's package could read."""
+    """Check that the policy file loads without unpickling, and returns actions of the action space."""
     result = train(port, folder / "policy.zip", settings)
     actions = _actions(port, result)
     _require(bool(np.isfinite(actions).all()), "finite actions", "others")
@@ -122,11 +123,11 @@ POLICY_SEARCH_LAWS = (
 
 
 class _Failure(Exception):
-    """Raised by whoever looks at the progress."""
+    """Error that the law's own progress callback raises."""
 
 
 class _Watched:
-    """A port that notes which sessions are open."""
+    """A port that records which sessions are open."""
 
     def __init__(self, port: SurrogatePort) -> None:
         self._port = port
@@ -149,7 +150,7 @@ class _Watched:
 
 
 def _actions(port: SurrogatePort, result: TrainResult) -> NDArray[np.float64]:
-    """Actions (OBSERVATIONS, F) of a policy's file, each of the action space."""
+    """Return actions (OBSERVATIONS, F) of a policy file, each within the action space."""
     spec = port.spec()
     rng = np.random.default_rng(0)
     observations = rng.normal(size=(OBSERVATIONS, len(spec.observation))).astype(np.float32)

@@ -17,17 +17,17 @@ from surrogym_shared.wire import SessionView
 
 
 class SurrogateVectorEnv(BaseVectorEnv):  # type: ignore[misc]  # tianshou is not installed where types are checked
-    """Many lanes of a learned virtual environment for tianshou's collectors, stepped in one request.
+    """Vector environment of tianshou whose lanes are virtual environments of one surrogate, stepped in one request.
 
     Infos are those of ``RemoteEnv``. ``seed`` takes effect at the next reset.
 
     Args:
         url: the server's address; None takes ``SURROGYM_URL``, then http://127.0.0.1:8000.
-        surrogate: its name.
-        num_envs: N.
+        surrogate: name of the surrogate.
+        num_envs: number of lanes, N.
         token: bearer token; default ``SURROGYM_TOKEN``.
-        timeouts: seconds per kind of request.
-        retries: how long to go on after lost connections, lost replies and 503.
+        timeouts: seconds for each kind of request.
+        retries: how long to retry after lost connections, lost replies and status 503.
         transport: how steps travel; see ``HttpSurrogate``.
         options: fields of ``OpenSession``: variant, seed, model, time_limit, penalty, ...
 
@@ -57,7 +57,7 @@ class SurrogateVectorEnv(BaseVectorEnv):  # type: ignore[misc]  # tianshou is no
 
     @classmethod
     def from_port(cls, port: SurrogatePort, num_envs: int = 16, **options: Any) -> Self:
-        """The same over a ready port, such as one in this process."""
+        """Make the vector environment from an existing port, such as one in this process."""
         env = cls.__new__(cls)
         env._open(port, num_envs, options)
         return env
@@ -74,7 +74,7 @@ class SurrogateVectorEnv(BaseVectorEnv):  # type: ignore[misc]  # tianshou is no
 
 
 class _Lane(EnvWorker):  # type: ignore[misc]  # as above
-    """What tianshou talks to in place of an environment: one lane."""
+    """One lane in the form of tianshou's environment worker."""
 
     def __init__(self, calls: LaneCalls, lane: int, view: SessionView) -> None:
         self._calls, self._lane = calls, lane
@@ -97,7 +97,7 @@ class _Lane(EnvWorker):  # type: ignore[misc]  # as above
         self._attributes[key] = value
 
     def send(self, action: Any, **kwargs: Any) -> None:
-        """Note a step, or a reset where the action is None; a surrogate has no options of a reset."""
+        """Note a step, or a reset if the action is None. A reset of a surrogate takes no options."""
         if action is None:
             self._calls.reset(self._lane, kwargs.get("seed", self._seed))
             self._seed = None
@@ -116,7 +116,7 @@ class _Lane(EnvWorker):  # type: ignore[misc]  # as above
         return super().seed(seed)
 
     def render(self, **_: Any) -> None:
-        """A lane has no render mode."""
+        """Refuse to render, because a lane has no render mode."""
 
     def close_env(self) -> None:
-        """The session is closed with the vector environment."""
+        """Do nothing: closing the vector environment closes the session."""

@@ -1,6 +1,6 @@
-"""The front door of Surrogym: the design of queries in this process, environments, the client, and specifications.
+"""Public names of Surrogym: the design in this process, virtual environments, the client, and specifications.
 
-Importing it loads neither torch nor Gymnasium. What a name needs is loaded when the name is first used.
+Importing this package loads neither torch nor Gymnasium. Each name loads what it needs on first use.
 
 Examples:
     >>> import surrogym
@@ -101,7 +101,11 @@ _LAZY = {  # name: module, its name there, the extra that brings what the module
 
 
 def __getattr__(name: str) -> Any:
-    """Loads a name on first use. Raises ``ImportError`` with the extra to install where a package is missing."""
+    """Load a name on first use.
+
+    Raises:
+        ImportError: a package is missing; the message names the extra to install.
+    """
     if name not in _LAZY:
         raise AttributeError(f"module 'surrogym' has no attribute {name!r}")
     module, attribute, extra = _LAZY[name]

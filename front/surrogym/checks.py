@@ -1,4 +1,6 @@
-"""What a design takes: a check gives the value back, or raises ``InvalidInput`` with what was expected and what came.
+"""Checks of a design's arguments.
+
+Each check returns the value, or raises ``InvalidInput`` with what was expected and what came.
 
 Shapes: C coordinates, F action entries.
 """
@@ -23,12 +25,12 @@ Floats = NDArray[np.float64]
 
 MOST_STEPS = 100_000  # as in a specification
 MOST_THREADS = 1_024
-FARTHEST = 1e6  # from the middle of a coordinate's sampling range, in its widths: beyond, a fit has no digits left
-SHOWN = 80  # characters of what came
+FARTHEST = 1e6  # distance from the middle of a sampling range, in its widths; a fit loses all digits beyond
+SHOWN = 80  # characters of the given value in an error message
 
 
 def whole(what: str, value: Any, low: int, high: int, why: str = "") -> int:
-    """A whole number within bounds; ``why`` is said of the bounds."""
+    """Check a whole number within bounds. ``why`` explains the bounds in the error message."""
     try:
         number = None if isinstance(value, bool | np.bool_) else operator.index(value)
     except TypeError:
@@ -39,14 +41,14 @@ def whole(what: str, value: Any, low: int, high: int, why: str = "") -> int:
 
 
 def share(what: str, value: Any) -> float:
-    """A confidence index to aim at."""
+    """Check a target confidence index."""
     if isinstance(value, bool) or not isinstance(value, float | np.floating | int) or not 0.5 < value < 1:
         raise InvalidInput(f"{what}: expected a number above 0.5 and below 1, got {_shown(value)}")
     return float(value)
 
 
 def states(definition: EnvironmentDefinition, what: str, values: Any) -> Floats:
-    """States (v, C), at least one."""
+    """Check states of shape (v, C), with at least one row."""
     rows = check_coordinates(definition, what, _numbers(what, values))
     if not len(rows):
         raise InvalidInput(f"{what}: expected at least one state, got none")
@@ -54,7 +56,7 @@ def states(definition: EnvironmentDefinition, what: str, values: Any) -> Floats:
 
 
 def steps_of(given: Any) -> list[RealStep]:
-    """One real step, or several, as a list."""
+    """Return one or several real steps as a list."""
     steps = [given] if isinstance(given, RealStep) else list(given) if isinstance(given, Sequence) else [given]
     for step in steps:
         if not isinstance(step, RealStep):
@@ -63,7 +65,7 @@ def steps_of(given: Any) -> list[RealStep]:
 
 
 def real_step(definition: EnvironmentDefinition, step: RealStep) -> RealStep:
-    """A real step with its arrays (C,), (F,), (C,)."""
+    """Check a real step, and return it with arrays of shapes (C,), (F,) and (C,)."""
     q, q_next = (
         _near(definition, what, check_coordinates(definition, what, _row(what, getattr(step, what))))
         for what in ("coordinates", "next_coordinates")
@@ -77,7 +79,7 @@ def real_step(definition: EnvironmentDefinition, step: RealStep) -> RealStep:
 
 
 def _near(definition: EnvironmentDefinition, what: str, rows: Floats) -> Floats:
-    """States (n, C) that are finite, and not absurdly far from the sampling range."""
+    """Check that states (n, C) are finite and not absurdly far from the sampling range."""
     if not np.isfinite(rows).all():
         raise InvalidInput(f"{what}: expected finite numbers, got {_shown(rows.tolist())}")
     for index, coordinate in enumerate(definition.coordinates):

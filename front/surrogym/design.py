@@ -1,7 +1,7 @@
 """The adaptive design of queries in this process.
 
-It does what the server's designer does, by the same functions on the same arrays, so that the same answers lead to the
-same queries. It keeps everything in memory; ``save`` writes it down.
+It calls the same functions as the server's designer, so the same samples lead to the same queries. It keeps everything
+in memory; ``save`` writes it to a file.
 
 Shapes: n samples, C coordinates, F action entries, T steps of a rollout.
 """
@@ -31,12 +31,12 @@ from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
 
 Floats = NDArray[np.float64]
-LEAST_SAMPLES = 2  # that a model can be learned from
+LEAST_SAMPLES = 2  # fewest samples that a model can be fitted to
 Phase = Literal["collecting", "sampling", "ready", "over_budget", "from_log"]
 
 
 class QueriesOpen(RuntimeError):
-    """The next round needs the answers to these queries first. ``ids`` are their numbers."""
+    """Queries of this round still lack an answer. ``ids`` are their numbers."""
 
     def __init__(self, ids: Sequence[int]) -> None:
         self.ids = tuple(ids)
@@ -45,33 +45,32 @@ class QueriesOpen(RuntimeError):
 
 @dataclass(frozen=True)
 class Query:
-    """What the design asks of the real environment: one step from ``coordinates``, or, where no state can be set, the
-    ``actions`` one after the other from a reset."""
+    """A query: one step from ``coordinates``, or several ``actions`` from a reset if no state can be set."""
 
     id: int
     purpose: Literal["initial", "adaptive"]
     coordinates: tuple[float, ...]  # (C,); empty for a rollout
     actions: tuple[tuple[float, ...], ...]  # (T, F); T is 1 for a step
-    design: str = field(default="", repr=False)  # which one asked: equal specifications begin with equal queries
+    design: str = field(default="", repr=False)  # identifies the design: equal specifications begin with equal queries
 
     @property
     def action(self) -> tuple[float, ...]:
-        """The action of a step, (F,): continuous values, or the number of each discrete action."""
+        """Action of a one-step query, (F,): continuous values, or the number of each discrete action."""
         return self.actions[0]
 
 
 class Design:
-    """Chooses real steps until the model is known well enough, or the budget is spent.
+    """Choose real steps until the model is ready, or the budget is spent.
 
     Args:
         spec: what is known of the real environment.
-        budget: real steps, at most, 2 or more; None takes that of the specification.
+        budget: maximum number of real steps, 2 or more; None takes that of the specification.
         target: confidence index to reach for each output, above 0.5 and below 1; None takes that of the specification.
-        threads: of a fit.
+        threads: number of threads of a fit.
 
     Raises:
-        InvalidInput: no specification, or another argument is out of its range; or the specification asks for something
-            that is not installed.
+        InvalidInput: ``spec`` is not a specification; or another argument is out of its range; or the specification
+            needs a package that is not installed.
 
     Examples:
         >>> design = Design(spec, budget=20)
@@ -101,31 +100,35 @@ class Design:
         self._visited: Floats | None = None
         self._phase: Phase = "collecting"
         self._result: DesignResult | None = None
-        self._settled = 0  # samples and queries given up before the last fit
+        self._settled = 0  # number of samples and abandoned queries at the last fit
         self._state, q, u, rollouts = initial_queries(self._definition, self.budget)
         self._queue = deque(self._queries("initial", q, u, rollouts))
 
     @property
     def phase(self) -> Phase:
-        """``collecting`` the initial queries, ``sampling`` adaptive ones, ``ready``, or ``over_budget``."""
+        """Phase of the design: ``collecting`` the initial queries, ``sampling`` adaptive ones, ``ready``, or
+        ``over_budget``."""
         return self._phase
 
     @property
     def steps(self) -> int:
-        """Real steps that were told."""
+        """Number of real steps that ``tell`` has received."""
         return len(self._samples)
 
     @property
     def fidelity(self) -> dict[str, Any]:
-        """How well the model is known: ``confidence_index`` and more, of all and of each output; empty before a fit."""
+        """How well the model is known: ``confidence_index`` and more, overall and for each output. Empty before the
+        first fit."""
         return {} if self._result is None else self._result.fidelity
 
     def ask(self) -> Query | None:
-        """The next query; None once the design has ended. Fits the model when a round has been answered.
+        """Return the next query, or None once the design has ended. Fits the model when all queries of a round are
+        answered.
 
         Raises:
-            QueriesOpen: the rest of this round was asked already, and is not answered.
-            InvalidInput: nothing can be fitted, since fewer than two steps were told, and the other queries given up.
+            QueriesOpen: all queries of this round were handed out, and some lack an answer.
+            InvalidInput: the model can't be fitted, because fewer than two steps were given and the other queries were
+                given up.
             NumericalFailure, PluginFailed: the fit fails.
         """
         if not self._queue and self._open:
@@ -144,15 +147,15 @@ class Design:
         return query
 
     def tell(self, query: Query | None, steps: RealStep | Sequence[RealStep]) -> None:
-        """Answer a query with its real step, or with the steps of its rollout, in order.
+        """Answer a query with its real step, or with the steps of its rollout in order.
 
         Args:
-            query: one that was asked; None for steps of one's own, such as those of a log.
-            steps: what happened, with the coordinates and the action that were achieved.
+            query: a query from ``ask``; None for steps of your own, such as those of a log.
+            steps: the real steps, with the coordinates and the actions that were actually achieved.
 
         Raises:
-            InvalidInput: the query is not open; or a step has another shape, is not finite, absurdly far from where the
-                environment is sampled, or its action out of bounds. Then nothing is kept.
+            InvalidInput: the query is not open; or a step has the wrong shape, is not finite, is absurdly far from the
+                sampling range, or has an action out of bounds. The design then keeps none of the steps.
         """
         taken = checks.steps_of(steps)
         if query is not None:
@@ -164,7 +167,7 @@ class Design:
             self._answered.append(self._open.pop(query.id))
 
     def give_up(self, query: Query) -> None:
-        """Leave a query without an answer: it counts against the budget, and others like it are not asked.
+        """Leave a query unanswered. It counts towards the budget, and similar queries are avoided.
 
         Raises:
             InvalidInput: the query is not open.
@@ -173,14 +176,14 @@ class Design:
         self._given_up.append(self._open.pop(query.id))
 
     def improve(self, steps: int, visited: Floats | None = None) -> None:
-        """Have the next round choose more real steps within the budget, whatever the verdict.
+        """Add real steps to the next round within the budget, even if the design is ready.
 
         Args:
-            steps: how many.
-            visited: states that a policy visits, (v, C), at least one: queries are then chosen for where it goes.
+            steps: number of real steps.
+            visited: states that a policy visits, (v, C), at least one. Queries are then chosen for these states.
 
         Raises:
-            InvalidInput: the budget has not as many left, or the states have another shape or are not finite.
+            InvalidInput: the budget has fewer steps left, or the states have the wrong shape or are not finite.
         """
         left = self.budget - self._spoken_for()
         wanted = checks.whole("steps", steps, 1, left, why=", which is what the budget has left")
@@ -188,12 +191,18 @@ class Design:
         self._extra = wanted
 
     def surrogate(self) -> LocalSurrogate:
-        """The model of the last fit, to be stepped in this process. Raises ``InvalidInput`` before the first fit."""
+        """Return the model of the last fit, to be stepped in this process.
+
+        Raises:
+            InvalidInput: there was no fit yet.
+        """
         return LocalSurrogate.from_bytes(self.spec, self._last().model)
 
     def save(self, path: str | Path, name: str = "surrogate") -> None:
-        """Write specification, model and samples into one file, which ``surrogym import`` gives to a server, and from
-        which ``load`` goes on. The specification there has the budget, less what was given up, and the target.
+        """Write specification, model and samples to one file.
+
+        ``surrogym import`` sends the file to a server, and ``load`` continues the design from it. The file's
+        specification contains the target and the budget, less the queries given up.
 
         Raises:
             InvalidInput: there is no model yet.
@@ -209,16 +218,17 @@ class Design:
     def load(cls, path: str | Path, **options: Any) -> Self:
         """Restore a design from a file that ``save`` or ``surrogym export`` wrote.
 
-        The design has the file's model and samples, and the phase that follows from them. It asks the queries that the
-        saved design would have asked.
+        The design has the file's model and samples, and the phase that follows from them. It returns the queries that
+        the saved design would have returned.
 
         Args:
             path: the file.
-            options: those of the class: ``budget``, which counts the samples as well, ``target``, ``threads``.
+            options: arguments of the class: ``budget``, which includes the file's samples, ``target``, ``threads``.
 
         Raises:
-            OSError, NotASurrogateFile: the file can't be read, or is none.
-            InvalidInput: its model is none of its specification, or an option is out of its range.
+            OSError: the file can't be read.
+            NotASurrogateFile: the file is not an exported surrogate.
+            InvalidInput: the file's model does not fit its specification, or an option is out of its range.
         """
         file = SurrogateFile.load(existing(path))
         design = cls(file.spec, **options)
@@ -231,8 +241,10 @@ class Design:
         return design
 
     def _take_up(self, file: SurrogateFile) -> None:
-        """Be where the round that made the file's model left off. Where samples have come since, or the budget or the
-        target asks for more, the next ``ask`` fits."""
+        """Continue after the round that made the file's model.
+
+        The next ``ask`` fits again if the file has later samples, or if the budget or the target requires more.
+        """
         known = [file.tolerances.get(output) for output in self._definition.outputs]
         usual = [tolerance for tolerance in known if tolerance is not None]
         if len(usual) == len(known):

@@ -1,4 +1,4 @@
-"""Virtual environments by one name, wherever the surrogate is: on a server, in a file, or a design of this process."""
+"""Virtual environments of a surrogate on a server, in a file, or from a design in this process."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def make(surrogate: Any, **options: Any) -> gymnasium.Env[Any, Any]:
-    """A virtual environment of Gymnasium, with one lane.
+    """Make a virtual environment of Gymnasium with one lane.
 
     Args:
         surrogate: the name of a surrogate on a server; the path of a file that ``surrogym export`` wrote, ending in
@@ -29,10 +29,10 @@ def make(surrogate: Any, **options: Any) -> gymnasium.Env[Any, Any]:
             ``penalty``, ``max_episode_steps``, ...
 
     Raises:
-        TypeError: none of these, or an unknown option.
+        TypeError: the surrogate is none of these, or an option is unknown.
         ImportError: a file or a design needs the extra ``server``.
-        OSError: the file can't be read, or is not there.
-        SurrogymClientError: the server can't be reached or refuses.
+        OSError: the file can't be read.
+        SurrogymClientError: the server can't be reached, or refuses.
 
     Examples:
         >>> env = surrogym.make("pendulum", url="http://127.0.0.1:8000")
@@ -44,7 +44,8 @@ def make(surrogate: Any, **options: Any) -> gymnasium.Env[Any, Any]:
 
 
 def make_vec(surrogate: Any, num_envs: int = 1, **options: Any) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
-    """A virtual environment with ``num_envs`` lanes; arguments and errors as of ``make``.
+    """Make a virtual vector environment of Gymnasium with ``num_envs`` lanes. Arguments and errors are those of
+    ``make``.
 
     Examples:
         >>> envs = surrogym.make_vec("pendulum.surrogate", num_envs=8)
@@ -55,8 +56,9 @@ def make_vec(surrogate: Any, num_envs: int = 1, **options: Any) -> gymnasium.vec
 
 
 def make_sb3(surrogate: Any, num_envs: int = 16, **options: Any) -> SurrogateVecEnv:
-    """A vector environment of Stable-Baselines3 with ``num_envs`` lanes; arguments and errors as of ``make``, but that
-    ``options`` are those of ``SurrogateVecEnv``. It needs the extra ``train``.
+    """Make a vector environment of Stable-Baselines3 with ``num_envs`` lanes. This needs the extra ``train``.
+
+    Arguments and errors are those of ``make``, except that ``options`` are those of ``SurrogateVecEnv``.
 
     Examples:
         >>> PPO("MlpPolicy", surrogym.make_sb3(design)).learn(100_000)

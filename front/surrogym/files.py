@@ -1,4 +1,4 @@
-"""Files of whole surrogates, by their paths."""
+"""Paths of surrogate files."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ SUFFIX = ".surrogate"
 
 
 def existing(path: str | Path) -> Path:
-    """A path to a file. Raises ``FileNotFoundError`` where there is none, in words."""
+    """Return the path of an existing file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+    """
     if not Path(path).exists():
         raise FileNotFoundError(f"expected a file that Design.save or surrogym export wrote, got no file at {path}")
     return Path(path)

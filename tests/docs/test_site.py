@@ -52,5 +52,5 @@ def test_every_command_is_in_the_reference(site: Path) -> None:
 
 def test_the_client_is_in_the_reference_with_its_docstrings(site: Path) -> None:
     page = (site / "reference" / "client.html").read_text(encoding="utf-8")
-    assert "Many lanes of a learned virtual environment" in page
+    assert "Vector environment of Stable-Baselines3 whose lanes are virtual environments of one surrogate" in page
     assert "surrogym_client.transport.Api.create_surrogate" in page

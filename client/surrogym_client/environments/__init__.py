@@ -1,4 +1,4 @@
-"""A surrogate as an environment of Gymnasium: one lane, many lanes, over a server or from a file."""
+"""Environments of Gymnasium whose steps a surrogate computes: one lane or many, over a server or from a file."""
 
 from surrogym_client.environments.env import RemoteEnv
 from surrogym_client.environments.file_factories import open_file

@@ -1,4 +1,4 @@
-"""Lanes in which a policy of arrays acts: whole rollouts where the surrogate's side can, else step by step.
+"""Lanes in which a policy of arrays acts: in one request for a whole rollout if the port can, else step by step.
 
 Shapes: N lanes, D observation entries, F action entries, T steps.
 """
@@ -18,18 +18,18 @@ from surrogym_shared.port import Bools, Floats, PolicyRollout, StepResult
 
 @dataclass(frozen=True)
 class Taken:
-    """What a policy did in T steps, and for which observations."""
+    """Record of T steps of a policy, with the observations that it acted on."""
 
     rollout: PolicyRollout
     seen: Floats  # (T, N, D) before each step
-    cut: Bools  # (T, N) lanes whose episode was lost with the session, and is ended by this step
+    cut: Bools  # (T, N) whether this step ends an episode because the session was lost
 
 
 class ActingLanes:
-    """Lanes between two rollouts: a policy acts on what they showed last.
+    """Lanes that a policy steps in rollouts. Each rollout begins with the observations that the last one ended with.
 
     Args:
-        lanes: of a session with autoreset in the same step.
+        lanes: lanes of a session with autoreset in the same step.
     """
 
     def __init__(self, lanes: Lanes) -> None:
@@ -43,7 +43,7 @@ class ActingLanes:
     def take(
         self, policy: ActingPolicy, steps: int, noise: NoiseKey | None = None, until: Bools | None = None
     ) -> Taken:
-        """Let a policy act for T steps; see ``PolicyPort.rollout_policy``."""
+        """Step all lanes T times with a policy; see ``PolicyPort.rollout_policy``."""
         first, done = self._observation, _Done([], [], [], [])
         waiting = np.ones(self.lanes.num_envs, dtype=bool) if until is None else until
         while len(done.results) < steps and waiting.any():
@@ -92,7 +92,7 @@ class ActingLanes:
 
 @dataclass(frozen=True)
 class _Done:
-    """Steps so far."""
+    """Record of the steps taken so far."""
 
     results: list[StepResult]
     actions: list[Floats]  # (N, F) each

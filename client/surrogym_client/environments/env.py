@@ -20,20 +20,19 @@ Observation = NDArray[np.float32]
 
 
 class RemoteEnv(gymnasium.Env[Observation, Any]):
-    """A learned virtual environment, stepped like any Gymnasium environment.
+    """Virtual environment of a surrogate, stepped like any Gymnasium environment.
 
-    ``reset(seed=s)`` starts episode 0 of the seed, ``reset()`` goes on to the next episode. The time
-    limit is the server's; it shows as ``truncated``. ``info`` carries ``model_version`` and, after a
-    step, ``reward_mean`` (the reward before the penalty) and ``deviation`` (O,) when asked for. In a
-    session with a trust region, ``untrusted`` says whether leaving it truncated the episode. When the
-    server has lost the session, the episode ends as truncated with the reason in
-    ``info["surrogym_session_lost"]``, and the next reset begins in a new session.
+    ``reset(seed=s)`` starts episode 0 of seed s, and ``reset()`` starts the next episode. The server applies the time
+    limit; it shows as ``truncated``. ``info`` has ``model_version`` and, after a step, ``reward_mean`` (the reward
+    before the penalty) and, if requested, ``deviation`` (O,). In a session with a trust region, ``untrusted`` says
+    whether leaving it truncated the episode. If the server loses the session, the episode ends as truncated with the
+    reason in ``info["surrogym_session_lost"]``, and the next reset begins in a new session.
 
     Args:
         port: the surrogate.
-        deviations: ask for the deviation of each model output.
-        render_mode: None, or rgb_array: the state is shown by the original environment's renderer, if it is installed.
-        original: ``package.module:factory`` of one's own environment, to render it.
+        deviations: whether steps return the predicted standard deviation of each model output.
+        render_mode: None, or rgb_array: the state is drawn by the original environment's renderer, if it is installed.
+        original: ``package.module:factory`` of your own environment, for rendering.
         options: fields of ``OpenSession``: variant, seed, model, time_limit, penalty, ...
 
     Raises:
@@ -86,7 +85,7 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
         return self._shown, float(result.reward[0]), terminated, truncated, step_info(step, 0)
 
     def render(self) -> Picture | None:
-        """The picture (height, width, 3) of the state that was last observed; None without a render mode."""
+        """Draw the state that was observed last, as an array (height, width, 3). None without a render mode."""
         return None if self._pictures is None else self._pictures.of(self._shown)
 
     def close(self) -> None:
@@ -96,7 +95,7 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
 
 
 def start_info(start: LaneReset, lane: int) -> dict[str, Any]:
-    """The info of one lane's reset."""
+    """Return the info of one lane's reset."""
     info: dict[str, Any] = {"model_version": int(start.model_version[lane])}
     if start.lost is not None:
         info[LOST] = start.lost
@@ -104,7 +103,7 @@ def start_info(start: LaneReset, lane: int) -> dict[str, Any]:
 
 
 def step_info(step: LaneStep, lane: int) -> dict[str, Any]:
-    """The info of one lane's step."""
+    """Return the info of one lane's step."""
     result = step.result
     info: dict[str, Any] = {
         "model_version": int(result.model_version[lane]),

@@ -1,4 +1,4 @@
-"""A surrogate's file as an environment: stepped in this process, without a server."""
+"""Environments from a surrogate's file, stepped in this process without a server."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from surrogym_client.environments.env import RemoteEnv
 from surrogym_client.environments.vector import RemoteVectorEnv
 from surrogym_shared.port import SurrogatePort
 
-ENTRY_POINTS = "surrogym.ports"  # what steps a surrogate in this process, brought by the server's package
+ENTRY_POINTS = "surrogym.ports"  # implementations that step a surrogate in this process, from the server's package
 
 
 def open_file(path: str | Path) -> SurrogatePort:
-    """A surrogate stepped in this process, without a server; the same seeds give the same steps, bit for bit.
+    """Open a surrogate's file and step it in this process. The same seeds give the same steps as on a server, bit for
+    bit.
 
     Raises:
-        ImportError: this needs the extra ``server``.
+        ImportError: the extra ``server`` is missing.
         OSError: the file can't be read.
-        ValueError: it is no surrogate's file, or its model none of its specification.
+        ValueError: the file is not an exported surrogate, or its model does not fit its specification.
 
     Examples:
         >>> env = SurrogateVecEnv.from_port(open_file("pendulum.surrogate"), num_envs=16)
@@ -33,10 +34,11 @@ def open_file(path: str | Path) -> SurrogatePort:
 
 
 def make_env(*, file: str | Path, **options: Any) -> RemoteEnv:
-    """One lane of a surrogate's file, for ``gymnasium.make("surrogym/File-v0", file=...)``; raises as ``open_file``."""
+    """Make an environment from a file, for ``gymnasium.make("surrogym/File-v0", file=...)``. Raises as
+    ``open_file``."""
     return RemoteEnv(open_file(file), **options)
 
 
 def make_vector_env(*, num_envs: int, file: str | Path, **options: Any) -> RemoteVectorEnv:
-    """Many lanes, for ``gymnasium.make_vec``; raises as ``open_file``."""
+    """Make a vector environment from a file, for ``gymnasium.make_vec``. Raises as ``open_file``."""
     return RemoteVectorEnv(open_file(file), num_envs, **options)

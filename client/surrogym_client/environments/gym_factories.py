@@ -1,7 +1,6 @@
-"""The environments of ``gymnasium.make`` and ``gymnasium.make_vec``: they reach their surrogate by HTTP.
+"""Environments of ``gymnasium.make`` and ``gymnasium.make_vec`` that reach their surrogate over HTTP.
 
-Prefer SURROGYM_TOKEN to the argument ``token``: Gymnasium keeps arguments in the environment's spec, and
-prints them.
+Prefer SURROGYM_TOKEN to the argument ``token``: Gymnasium keeps arguments in the environment's spec, and prints them.
 """
 
 from __future__ import annotations
@@ -22,7 +21,11 @@ def make_env(
     transport: Transport = "auto",
     **options: Any,
 ) -> RemoteEnv:
-    """One lane of a surrogate; options are those of ``RemoteEnv``. Raises ``ValueError`` without a surrogate."""
+    """Make an environment of a surrogate on a server. Options are those of ``RemoteEnv``.
+
+    Raises:
+        ValueError: no surrogate was given.
+    """
     return RemoteEnv(HttpSurrogate(url, _named(surrogate), token, transport=transport), **options)
 
 
@@ -35,7 +38,11 @@ def make_vector_env(
     transport: Transport = "auto",
     **options: Any,
 ) -> RemoteVectorEnv:
-    """Many lanes; options are those of ``RemoteVectorEnv``. Raises ``ValueError`` without a surrogate."""
+    """Make a vector environment of a surrogate on a server. Options are those of ``RemoteVectorEnv``.
+
+    Raises:
+        ValueError: no surrogate was given.
+    """
     return RemoteVectorEnv(HttpSurrogate(url, _named(surrogate), token, transport=transport), num_envs, **options)
 
 

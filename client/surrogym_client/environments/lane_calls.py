@@ -1,4 +1,4 @@
-"""LaneCalls: calls of single lanes, sent together, for libraries that talk to each lane by itself."""
+"""Collect the calls of single lanes into one request, for libraries that step each lane separately."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ Stepped = tuple[Observation, float, bool, bool, dict[str, Any]]
 
 
 class LaneCalls:
-    """Notes what each lane is to do, and sends all of it in one request when the first answer is wanted.
+    """Collects resets and steps of single lanes, and sends them in one request when the first answer is read.
 
     Args:
-        lanes: a session with autoreset disabled: who talks to each lane also resets it.
+        lanes: lanes of a session with autoreset disabled; the library that calls each lane also resets it.
     """
 
     def __init__(self, lanes: Lanes) -> None:
@@ -29,18 +29,18 @@ class LaneCalls:
         self._answers: dict[int, Started | Stepped] = {}
 
     def reset(self, lane: int, seed: int | None = None) -> None:
-        """Start a new episode in a lane; None goes on unseeded."""
+        """Start a new episode in a lane. Without a seed, the lane's next episode begins."""
         self._seeds[lane] = seed
 
     def step(self, lane: int, action: Any) -> None:
-        """Step a lane by an action (F,), or a number."""
+        """Step a lane with an action: an array (F,), or a number."""
         self._actions[lane] = np.asarray(action)
 
     def answer(self, lane: int) -> Started | Stepped:
-        """What ``Env.reset`` or ``Env.step`` would have returned for the lane's last call.
+        """Return what ``Env.reset`` or ``Env.step`` returns for the lane's last call.
 
         Raises:
-            SurrogymClientError: as ``Lanes``; nothing that was noted is kept.
+            SurrogymClientError: as ``Lanes``; the collected calls are then discarded.
         """
         if lane not in self._answers:
             self._send()

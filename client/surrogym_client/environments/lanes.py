@@ -1,8 +1,7 @@
-"""N lanes of one session, kept going over the loss of the session: what every environment class stands on.
+"""N lanes of one session, which survive the loss of the session. All environment classes use them.
 
-When a server forgets a session (a crash, or idle for too long), the running episodes can't go on. They
-end as truncated at their last known observation, with the reason told, and new episodes start in a new
-session. Nothing is reset silently.
+If the server loses a session (it crashed, or the session expired), the running episodes end as truncated at their last
+observation, with the reason. New episodes start in a new session. Nothing is reset silently.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ OPTIONS = tuple(name for name in OpenSession.model_fields if name not in ("num_e
 
 @dataclass(frozen=True)
 class LaneReset:
-    """``lost`` is why the session was lost just before, None when it was not."""
+    """Result of a reset. ``lost`` is the reason if the session was lost just before, else None."""
 
     observation: Floats  # (N, D)
     model_version: Ints  # (N,)
@@ -45,21 +44,21 @@ class LaneReset:
 
 @dataclass(frozen=True)
 class LaneStep:
-    """A step, and what the dialects of the environment classes need beside it."""
+    """Result of a step, with what the environment classes need to report it in their own form."""
 
     result: StepResult
-    began: Bools  # (N,) lanes whose observation starts an episode and whose action went nowhere (next_step)
+    began: Bools  # (N,) lanes that were reset instead of stepped (autoreset mode next_step); their action had no effect
     ended_under: Ints  # (N,) model version the step was computed under
-    cut: Bools  # (N,) lanes whose episode was lost, and is ended by this step
+    cut: Bools  # (N,) lanes whose episode this step ends, because the session was lost
     lost: str | None = None
 
 
 def session_request(num_envs: int, mode: AutoresetMode, options: dict[str, Any]) -> OpenSession:
-    """The request that opens a session.
+    """Build the request that opens a session.
 
     Raises:
-        TypeError: an unknown option, in Python's words for an unknown keyword: trainers pass keywords to try whether an
-            environment takes them (TorchRL's ``GymEnv`` passes ``frameskip``), and take back those refused like this.
+        TypeError: an unknown option. The message is Python's for an unknown keyword, because trainers such as TorchRL's
+            ``GymEnv`` try a keyword, ``frameskip``, and retry without it after this error.
         ValueError: an option is out of range.
     """
     for name in options:
@@ -75,12 +74,12 @@ def session_request(num_envs: int, mode: AutoresetMode, options: dict[str, Any])
 
 
 class Lanes:
-    """N lanes of one session of a surrogate; opened when made.
+    """N lanes of one session of a surrogate. Making the object opens the session.
 
     Args:
         port: the surrogate.
-        request: how to open the session.
-        deviations: ask for the deviation of each output with every step.
+        request: options of the session.
+        deviations: whether each step returns the predicted standard deviation of each output.
     """
 
     def __init__(self, port: SurrogatePort, request: OpenSession, *, deviations: bool = False) -> None:
@@ -94,7 +93,7 @@ class Lanes:
         self._reason = ""
         lanes = request.num_envs
         self._observation: Floats = np.zeros((lanes, len(self.view.observation_space.low)), dtype=np.float32)
-        self._start = self._observation  # first observations of a new session's episodes
+        self._start = self._observation  # first observations of the episodes in a new session
         self._version: Ints = np.array(self.view.model_version, dtype=np.int64)
         self._running = _none(lanes)
         self._cut = _none(lanes)  # lost with a session, and not yet reported as ended
@@ -109,10 +108,11 @@ class Lanes:
         return self._request.autoreset_mode
 
     def reset(self, seed: int | Sequence[int | None] | None = None, mask: Bools | None = None) -> LaneReset:
-        """Start new episodes in all lanes, or those of the mask (N,); a None among seeds goes on unseeded.
+        """Start new episodes in all lanes, or only in those of the mask (N,). A lane whose seed is None begins its next
+        episode.
 
         Raises:
-            ValueError: a list of seeds that has not N entries.
+            ValueError: the list of seeds has not N entries.
         """
         chosen = np.ones(self.num_envs, dtype=bool) if mask is None else mask
         try:
@@ -127,7 +127,7 @@ class Lanes:
         return LaneReset(self._observation.copy(), self._version.copy(), lost)
 
     def step(self, action: NDArray[Any], mask: Bools | None = None) -> LaneStep:
-        """Step all lanes with actions (N, F) or (N,), or with autoreset disabled those of the mask (N,)."""
+        """Step all lanes, or with autoreset disabled only those of the mask (N,), with actions (N, F) or (N,)."""
         chosen = np.ones(self.num_envs, dtype=bool) if mask is None else mask
         try:
             result = self._advance(action, chosen)
@@ -149,15 +149,15 @@ class Lanes:
 
     @property
     def rolls_policies(self) -> bool:
-        """Whether ``rollout`` is possible: the port can, and lanes that end begin anew in the same step."""
+        """Whether ``rollout`` is possible. The port must support it, and autoreset must happen in the same step."""
         return self._rolls
 
     def rollout(
         self, policy: ActingPolicy, steps: int, noise: NoiseKey | None = None, until: Bools | None = None
     ) -> PolicyRollout | None:
-        """Let a policy act in all lanes, in one request; see ``PolicyPort.rollout_policy``.
+        """Step all lanes with a policy, in one request; see ``PolicyPort.rollout_policy``.
 
-        Gives None where the session was lost. No step was taken then, and the next ``step`` ends the episodes.
+        Returns None if the session was lost. Then no step was taken, and the next ``step`` ends the episodes.
         """
         assert isinstance(self.port, PolicyPort)
         if not self._cut.any():
@@ -171,7 +171,7 @@ class Lanes:
         return None
 
     def close(self) -> None:
-        """End the session. A server that is gone has ended it already."""
+        """Close the session. If the server no longer has it, nothing happens."""
         with suppress(SurrogymClientError):
             self.port.close(self.view.id)
 
@@ -197,7 +197,7 @@ class Lanes:
         return self.port.step(self.view.id, action, mask=mask, deviations=self._deviations)
 
     def _standing(self) -> StepResult:
-        """What a step of no lane looks like: every lane shows where its episode stands."""
+        """Return the result of a step in which no lane moves: each lane repeats its last observation."""
         lanes, size = self._observation.shape
         return StepResult(
             observation=np.where(self._held[:, None], self._start, self._observation),
@@ -229,9 +229,9 @@ class Lanes:
         )
 
     def _reopen(self, error: SessionLost, attempts: int = REOPENINGS) -> None:
-        """Open a session in place of the lost one, and begin the episodes the caller won't ask for.
+        """Open a session in place of the lost one, and begin the episodes that the caller will not reset.
 
-        Its seed follows from the first session's and the number of losses: starts are new, and still
+        The new seed follows from the first session's seed and the number of losses. So the starts are new, and still
         repeatable.
         """
         self._losses += 1

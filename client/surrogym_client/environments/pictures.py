@@ -1,4 +1,5 @@
-"""Pictures of virtual states: an observation is turned back into coordinates, and the original's renderer draws them.
+"""Pictures of virtual states: an observation is converted to coordinates, and the original environment's renderer draws
+them.
 
 Shapes: D observation entries, C coordinates.
 """
@@ -17,19 +18,20 @@ from surrogym_client.original.protocol import Array
 from surrogym_client.original.rendering import Picture, can_be_drawn, renderer_of
 from surrogym_shared.spec import EnvironmentSpec, Part
 
-Read = Callable[[Array], float]  # a coordinate from an observation (D,)
+Read = Callable[[Array], float]  # computes a coordinate from an observation (D,)
 RENDER_MODES = ["rgb_array"]
 
 
 class Pictures:
-    """Draws observations of one surrogate.
+    """Draws observations of one surrogate with the original environment's renderer.
 
     Args:
-        spec: the original environment.
-        original: ``package.module:factory`` of one's own environment; those with a built-in adapter need none.
+        spec: specification of the original environment.
+        original: ``package.module:factory`` of your own environment. Environments with a built-in adapter don't need
+            it.
 
     Raises:
-        NotRenderable: it has no renderer, or observations don't tell the state.
+        NotRenderable: the environment has no renderer, or the state can't be computed from observations.
     """
 
     def __init__(self, spec: EnvironmentSpec, original: str | None = None) -> None:
@@ -38,7 +40,11 @@ class Pictures:
         self.frames_per_second = self._renderer.frames_per_second
 
     def of(self, observation: NDArray[Any] | None) -> Picture:
-        """The picture (height, width, 3) of an observation (D,). Raises ``ResetNeeded`` where there is none yet."""
+        """Draw an observation (D,) as an array (height, width, 3).
+
+        Raises:
+            ResetNeeded: there is no observation yet.
+        """
         if observation is None:
             raise gymnasium.error.ResetNeeded("nothing to render yet: expected reset() before render()")
         return self._renderer.draw(self._read(np.asarray(observation, dtype=np.float64)))
@@ -49,10 +55,10 @@ class Pictures:
 
 
 def pictures_for(render_mode: str | None, spec: EnvironmentSpec, original: str | None) -> Pictures | None:
-    """What draws in this mode; None where nothing is to be drawn.
+    """Return an object that draws in this render mode; None without a render mode.
 
     Raises:
-        ValueError: a mode there is none of.
+        ValueError: an unknown render mode.
         NotRenderable: as ``Pictures``.
     """
     if render_mode is None:
@@ -65,8 +71,8 @@ def pictures_for(render_mode: str | None, spec: EnvironmentSpec, original: str |
 
 
 def metadata_of(spec: EnvironmentSpec, original: str | None, pictures: Pictures | None) -> dict[str, Any]:
-    """Gymnasium's ``metadata`` of a surrogate: the render modes that work here, and the frames per second of its
-    pictures."""
+    """Return Gymnasium's ``metadata`` of a surrogate: the render modes that work here, and the pictures' frames per
+    second."""
     fps = {} if pictures is None else {"render_fps": pictures.frames_per_second}
     return {"render_modes": _render_modes(spec, original), **fps}
 
@@ -77,11 +83,12 @@ def _render_modes(spec: EnvironmentSpec, original: str | None) -> list[str]:
 
 
 def coordinates_from_observation(spec: EnvironmentSpec) -> Callable[[Array], Array]:
-    """The function from observations (D,) to coordinates (C,): entries that show a coordinate as it is, and angles from
-    their sine and cosine.
+    """Return a function that computes coordinates (C,) from an observation (D,).
+
+    It uses entries that show a coordinate unchanged, and pairs that show the sine and cosine of an angle.
 
     Raises:
-        NotRenderable: a coordinate can't be read off.
+        NotRenderable: a coordinate can't be computed from the observation.
     """
     reads = [_read(spec, name) for name in spec.coordinate_names]
     if missing := [name for name, read in zip(spec.coordinate_names, reads, strict=True) if read is None]:

@@ -1,4 +1,4 @@
-"""From the spaces of the wire to Gymnasium's."""
+"""Convert the spaces of the wire to Gymnasium's."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from surrogym_shared.wire import BoxSpace, DiscreteSpace, MultiDiscreteSpace
 
 
 def space(wire: BoxSpace | DiscreteSpace | MultiDiscreteSpace) -> gymnasium.Space[Any]:
-    """The Gymnasium space of one lane: float32 Box, Discrete or MultiDiscrete."""
+    """Return the Gymnasium space of one lane: float32 Box, Discrete or MultiDiscrete."""
     match wire:
         case BoxSpace():
             return gymnasium.spaces.Box(_filled(wire.low, -np.inf), _filled(wire.high, np.inf), dtype=np.float32)

@@ -26,20 +26,19 @@ WIRE_MODE: dict[AutoresetMode, wire.AutoresetMode] = {
 
 
 class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
-    """Many lanes of a learned virtual environment, stepped in one request.
+    """Vector environment of Gymnasium whose lanes are virtual environments of one surrogate, stepped in one request.
 
-    Autoreset happens on the server; observations, flags and infos are those of Gymnasium's
-    ``SyncVectorEnv``: ``final_obs`` and ``final_info`` in the same-step mode, ``options={"reset_mask":
-    mask}`` with the mode disabled. An int seed s gives lane i the key (s, i); a list gives lane i its own
-    seed. Infos are as in ``RemoteEnv``.
+    Autoreset happens on the server. Observations, flags and infos are those of Gymnasium's ``SyncVectorEnv``:
+    ``final_obs`` and ``final_info`` in the same-step mode, ``options={"reset_mask": mask}`` with autoreset disabled. An
+    int seed s seeds lane i with the pair (s, i); a list has one seed for each lane. Infos are as in ``RemoteEnv``.
 
     Args:
         port: the surrogate.
-        num_envs: N.
+        num_envs: number of lanes, N.
         autoreset_mode: Gymnasium's enum, or its value or name.
-        deviations: ask for the deviation of each model output.
+        deviations: whether steps return the predicted standard deviation of each model output.
         render_mode: None, or rgb_array: as in ``RemoteEnv``.
-        original: ``package.module:factory`` of one's own environment, to render it.
+        original: ``package.module:factory`` of your own environment, for rendering.
         max_episode_steps: Gymnasium's name of the option ``time_limit``, as ``make_vec`` passes it.
         options: fields of ``OpenSession``: variant, seed, model, time_limit, penalty, ...
 
@@ -113,7 +112,7 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         return result.observation.copy(), result.reward, result.terminated, result.truncated, infos
 
     def render(self) -> tuple[Picture, ...] | None:
-        """A picture (height, width, 3) of every lane; None without a render mode."""
+        """Draw every lane as an array (height, width, 3). None without a render mode."""
         if self._pictures is None:
             return None
         shown = [None] if self._shown is None else self._shown
@@ -137,7 +136,7 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         }
 
     def _checked(self, mask: Any) -> Bools:
-        """The mask of a partial reset, refused as Gymnasium refuses it."""
+        """Check the mask of a partial reset, with the errors that Gymnasium raises."""
         if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
             found = f"dtype {mask.dtype}" if isinstance(mask, np.ndarray) else type(mask).__name__
             raise TypeError(f"options['reset_mask']: expected an array of dtype bool, got {found}")
@@ -164,7 +163,7 @@ def _with_time_limit(options: dict[str, Any], max_episode_steps: int | None) -> 
 
 
 def _step_infos(step: LaneStep, lanes: Bools) -> dict[str, Any]:
-    """What a step tells of the lanes given: those that acted, or those that ended."""
+    """Return the infos of a step for the given lanes: those that acted, or those whose episode ended."""
     if not lanes.any():
         return {}
     infos = _entry("reward_mean", step.result.reward_mean, lanes)
@@ -178,7 +177,7 @@ def _step_infos(step: LaneStep, lanes: Bools) -> dict[str, Any]:
 
 
 def _entry(key: str, values: NDArray[Any], lanes: Bools) -> dict[str, Any]:
-    """Gymnasium's form of an info: an array over lanes, zero where a lane has none, beside its mask."""
+    """Return an info in Gymnasium's form: an array over lanes, zero for lanes without a value, and its mask."""
     shown = np.zeros_like(values)
     shown[lanes] = values[lanes]
     return {key: shown, f"_{key}": lanes.copy()}

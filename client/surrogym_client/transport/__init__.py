@@ -1,4 +1,5 @@
-"""A server over the network: every route as a typed method, and a surrogate's sessions as a ``SurrogatePort``."""
+"""Access to a server over the network: a typed method for each route, and ``HttpSurrogate`` for a surrogate's
+sessions."""
 
 from surrogym_client.transport.api import Api
 from surrogym_client.transport.connection import Retries, Timeouts

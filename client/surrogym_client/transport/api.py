@@ -1,4 +1,4 @@
-"""Every route but the sessions', one typed method each."""
+"""One typed method for each route of the server, except the routes of sessions and policies."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ R = TypeVar("R", bound=wire.Reply)
 P = TypeVar("P", wire.Uncertainty, wire.Prediction)
 
 _EVENT_SILENCE_SECONDS = 60.0
-_NUMBERS = 2_000  # in one request about points: each has up to 25 characters, and the server takes 64 KiB of JSON
+_NUMBERS = 2_000  # most numbers in one request: each has up to 25 characters, and the server accepts 64 KiB of JSON
 _OF_ALL_POINTS = ("model_version", "outputs")
 _MODEL_FILE = "application/octet-stream"
-_BATCH_BYTES = 96 * 1024  # of samples in one request; the server takes 128 KiB of JSON
+_BATCH_BYTES = 96 * 1024  # most bytes of samples in one request; the server accepts 128 KiB of JSON
 
 
 class Api:
-    """The service, as a sampler, a dashboard or a person at a prompt uses it.
+    """Client of a server's HTTP routes, for samplers, dashboards and scripts.
 
-    Every method raises a ``SurrogymClientError``: ``ServerUnreachable`` after the retry budget, or the
-    subclass of ``ProblemError`` that stands for the server's answer. Calls that must happen once carry an
-    idempotency key, made here where none is given, so a lost reply never doubles them.
+    Every method raises a ``SurrogymClientError``: ``ServerUnreachable`` after the retry budget, or the subclass of
+    ``ProblemError`` for the server's answer. Calls that must take effect only once carry an idempotency key, which is
+    made here if none is given, so a lost reply never doubles them.
 
     Args:
         url: the server's address; default ``SURROGYM_URL``, then http://127.0.0.1:8000.
         token: bearer token; default ``SURROGYM_TOKEN``, then the one in the file ``SURROGYM_TOKEN_FILE``.
-        timeouts: seconds per kind of request.
-        retries: how long to go on after lost connections, lost replies and 503.
+        timeouts: seconds for each kind of request.
+        retries: how long to retry after lost connections, lost replies and status 503.
 
     Examples:
         >>> with Api() as api:
@@ -58,14 +58,14 @@ class Api:
 
     @classmethod
     def over(cls, connection: Connection) -> Self:
-        """The service over a connection that is there already."""
+        """Make a client that uses an existing connection."""
         api = cls.__new__(cls)
         api.connection = connection
         return api
 
     @property
     def url(self) -> str:
-        """Where the server is."""
+        """Address of the server."""
         return self.connection.url
 
     def __enter__(self) -> Self:
@@ -81,36 +81,36 @@ class Api:
     # Service
 
     def health(self) -> wire.Health:
-        """That a Surrogym server of this protocol answers.
+        """Check that a Surrogym server of this protocol answers.
 
         Raises:
-            ProtocolMismatch: it speaks another version.
+            ProtocolMismatch: the server has another protocol version.
         """
         health = self._get(wire.Health, "/healthz")
         check_protocol(health.protocol, self.url)
         return health
 
     def ready(self) -> wire.Ready:
-        """That the server can work: its database answers.
+        """Check that the server can work: its database answers.
 
         Raises:
-            Unavailable: it does not.
+            Unavailable: the database does not answer.
         """
         return self._get(wire.Ready, "/readyz")
 
     def access(self) -> wire.Access:
-        """What this token may do.
+        """Return what this token may do.
 
         Raises:
-            Unauthenticated: the server asks for a token, and there is none, or an unknown one.
+            Unauthenticated: the server requires a token, and the client has none or an unknown one.
         """
         return self._get(wire.Access, "/v1/access")
 
     def wait_until_ready(self, seconds: float = 60.0) -> wire.Health:
-        """Wait for the server to come up.
+        """Wait until the server is ready, for at most ``seconds``.
 
         Raises:
-            ServerUnreachable: it did not within ``seconds``.
+            ServerUnreachable: the server was not ready in time.
         """
         content = self.connection.send("GET", "/readyz", retries=Retries(seconds=seconds))
         parse(wire.Ready, content, "/readyz")
@@ -119,12 +119,14 @@ class Api:
     # Surrogates
 
     def create_surrogate(self, name: str, spec: EnvironmentSpec) -> wire.CreatedSurrogate:
-        """Register an original environment; the same name with the same specification is harmless, and ``created`` of
-        the reply is False then."""
+        """Register an original environment under a name.
+
+        Repeating it with the same specification is harmless; the reply's ``created`` is then False.
+        """
         return self._post(wire.CreatedSurrogate, "/v1/surrogates", wire.CreateSurrogate(name=name, spec=spec))
 
     def surrogates(self) -> list[wire.SurrogateSummary]:
-        """All of them, oldest first, with phase, what was spent, and confidence."""
+        """List all surrogates, oldest first, with phase, real steps taken, and confidence index."""
         found: list[wire.SurrogateSummary] = []
         after: int | None = 0
         while after is not None:
@@ -133,10 +135,10 @@ class Api:
         return found
 
     def surrogate(self, name: str) -> wire.SurrogateView:
-        """One, with its specification, the fidelity of every output, its ledger and counts of queries.
+        """Return one surrogate with its specification, the fidelity of every output, its ledger and counts of queries.
 
         Raises:
-            UnknownSurrogate: there is none of this name.
+            UnknownSurrogate: there is no surrogate of this name.
         """
         return self._get(wire.SurrogateView, routes.surrogate(name))
 
@@ -149,17 +151,19 @@ class Api:
         target: float | None = None,
         tolerances: Mapping[str, float | None] | None = None,
     ) -> wire.SurrogateView:
-        """Pause or resume the design, or change its budget, target or tolerances; None leaves a field as it is, and in
-        ``tolerances`` it takes back what was set."""
+        """Pause or resume the design, or change its budget, target or tolerances.
+
+        An argument of None leaves a field as it is. A tolerance of None returns that output to its default tolerance.
+        """
         given = None if tolerances is None else dict(tolerances)
         body = wire.PatchSurrogate(paused=paused, budget=budget, target=target, tolerances=given)
         return self._post(wire.SurrogateView, routes.surrogate(name), body, method="PATCH")
 
     def delete_surrogate(self, name: str) -> None:
-        """Remove it with its samples, models and sessions; there is no way back.
+        """Delete a surrogate with its samples, models and sessions. This can't be undone.
 
         Raises:
-            UnknownSurrogate: there is none of this name.
+            UnknownSurrogate: there is no surrogate of this name.
         """
         self.connection.send("DELETE", routes.surrogate(name))
 
@@ -174,12 +178,12 @@ class Api:
         wait_seconds: float = 0.0,
         lease_seconds: float = 60.0,
     ) -> wire.ClaimedQueries:
-        """Lease queries to answer; waits up to ``wait_seconds`` for some. An empty list is no error.
+        """Lease queries for a sampler, and wait up to ``wait_seconds`` until there are some. The list may be empty.
 
-        A claim whose reply is lost is not sent again: its leases run out, and the queries come back.
+        A claim whose reply is lost is not sent again. Its leases expire, and the queries return to the queue.
 
         Raises:
-            ProtocolMismatch: the server gave more than ``max_queries``.
+            ProtocolMismatch: the server returned more than ``max_queries``.
         """
         body = wire.ClaimQueries(
             sampler=sampler, max_queries=max_queries, wait_seconds=wait_seconds, lease_seconds=lease_seconds
@@ -204,16 +208,16 @@ class Api:
         lease_seconds: float = 60.0,
         retries: Retries | None = None,
     ) -> None:
-        """Keep a lease alive while the original environment works; ``retries`` replaces the connection's.
+        """Extend a lease while the original environment works. ``retries`` replaces the connection's.
 
         Raises:
-            LeaseExpired: it has ended; the answer may still be sent.
+            LeaseExpired: the lease has expired; the sample may still be sent.
         """
         body = wire.RenewLease(lease_token=lease_token, lease_seconds=lease_seconds)
         self._send(f"{routes.surrogate(name)}/queries/{query_id}:renew", body, retries=retries)
 
     def fail(self, name: str, query_id: int, lease_token: str, error: str, *, begun: bool = True) -> None:
-        """Give a query back with the error it caused, and whether a real step may have been taken."""
+        """Return a query with the error it caused. ``begun`` says whether a real step may have been taken."""
         body = wire.FailQuery(lease_token=lease_token, error=error, begun=begun)
         self._send(f"{routes.surrogate(name)}/queries/{query_id}:fail", body)
 
@@ -227,8 +231,11 @@ class Api:
         audit: bool = False,
         idempotency_key: str | None = None,
     ) -> list[wire.QueryView]:
-        """Put queries of one's own into the queue: coordinates (n, C) and action (n, F); or, where the original
-        environment can only be reset, action sequences, each (T, F). Those of an audit cost none of the budget."""
+        """Add queries of your own to the queue.
+
+        A query is a state and an action: coordinates (n, C) and action (n, F). If the original environment can only be
+        reset, a query is a sequence of actions (T, F). Queries of an audit don't count towards the budget.
+        """
         body = (wire.AuditModel if audit else wire.AddQueries)(
             coordinates=[list(row) for row in coordinates] or None,
             action=[list(row) for row in action] or None,
@@ -238,12 +245,12 @@ class Api:
         return self._post(wire.QueryList, f"{routes.surrogate(name)}/{'audit' if audit else 'queries'}", body).queries
 
     def withdraw_audit(self, name: str, query_ids: Sequence[int]) -> int:
-        """Take queries of an audit back that no sampler has begun; gives how many that were."""
+        """Withdraw queries of an audit that no sampler has begun, and return how many were withdrawn."""
         body = wire.WithdrawQueries(query_ids=list(query_ids))
         return self._post(wire.WithdrawnQueries, f"{routes.surrogate(name)}/audit:withdraw", body).withdrawn
 
     def queries(self, name: str) -> list[wire.QueryView]:
-        """Every query ever asked, with its state, attempts and last error."""
+        """List all queries so far, each with its state, attempts and last error."""
         return self._get(wire.QueryList, f"{routes.surrogate(name)}/queries").queries
 
     # Samples and the ledger
@@ -258,13 +265,13 @@ class Api:
         complete: bool = True,
         idempotency_key: str | None = None,
     ) -> wire.AddedSamples:
-        """Hand in real steps; the answer comes after they are stored for good.
+        """Send real steps, and return once the server has stored them.
 
-        ``logged`` ones were recorded before: they cost no budget, and those that are there already change nothing. A
-        fit becomes due for them with the call that makes the log ``complete``.
+        ``logged`` steps were recorded before: they don't count towards the budget, and those that are stored already
+        change nothing. The call with ``complete`` makes a fit of the log due.
 
         A batch of up to about 300 samples is stored whole or not at all. A larger one is sent in several requests, so
-        that an error may leave its first part stored; the same call with the same key then adds the rest.
+        an error may leave its first part stored; the same call with the same key then adds the rest.
         """
         key = idempotency_key or new_key()
         batches = _batches(samples)
@@ -290,7 +297,7 @@ class Api:
         )
 
     def samples(self, name: str) -> Iterator[wire.SampleView]:
-        """All samples in order of arrival, page by page."""
+        """Iterate over all samples in order of arrival, page by page."""
         after: int | None = 0
         while after is not None:
             page = self._get(wire.SamplePage, f"{routes.surrogate(name)}/samples", after=after)
@@ -298,7 +305,7 @@ class Api:
             after = page.next_after
 
     def export_samples(self, name: str, file_format: Literal["csv", "npz"]) -> bytes:
-        """All samples as one file."""
+        """Return all samples as the content of one CSV or NPZ file."""
         return self.connection.send("GET", f"{routes.surrogate(name)}/samples", params={"format": file_format})
 
     def report_steps(
@@ -311,10 +318,10 @@ class Api:
     def improve(
         self, name: str, queries: int, *, checkpoint: str | None = None, idempotency_key: str | None = None
     ) -> wire.ImprovedSurrogate:
-        """Ask the design for more queries, weighted by the occupancy submitted under ``checkpoint``.
+        """Add queries to the design, chosen near the occupancy submitted as ``checkpoint``.
 
         Raises:
-            BeyondBudget: the budget has not as many left, and this token may not raise it; one of role admin does.
+            BeyondBudget: the budget has too few steps left, and this token may not raise it; a token of role admin may.
         """
         body = wire.Improve(queries=queries, checkpoint=checkpoint, idempotency_key=idempotency_key or new_key())
         return self._post(wire.ImprovedSurrogate, f"{routes.surrogate(name)}/improve", body)
@@ -322,7 +329,7 @@ class Api:
     # Models
 
     def session_coordinates(self, session: str) -> list[list[float]]:
-        """Where each lane of a session is, (N, C)."""
+        """Return the coordinates of each lane of a session, (N, C)."""
         return self._get(wire.SessionCoordinates, f"{routes.session(session)}/coordinates").coordinates
 
     def query_uncertainty(
@@ -333,7 +340,8 @@ class Api:
         *,
         model: int | None = None,
     ) -> wire.Uncertainty:
-        """Mean, deviation and uncertainty index at coordinates (n, C) and action (n, F)."""
+        """Return the model's mean, standard deviation and uncertainty index at coordinates (n, C) and actions (n,
+        F)."""
         return self._of_points(
             wire.Uncertainty, f"{routes.surrogate(name)}/query_uncertainty", coordinates, action, model
         )
@@ -346,15 +354,19 @@ class Api:
         *,
         model: int | None = None,
     ) -> wire.Prediction:
-        """One transition each from coordinates (n, C) under action (n, F)."""
+        """Predict one transition from each of the coordinates (n, C) under its action (n, F)."""
         return self._of_points(wire.Prediction, f"{routes.surrogate(name)}/predict", coordinates, action, model)
 
     def models(self, name: str) -> list[wire.ModelView]:
-        """Every fit with its structure, hyperparameters and fidelity, oldest first."""
+        """List all models with structure, hyperparameters and fidelity, oldest first."""
         return self._get(wire.ModelList, f"{routes.surrogate(name)}/models").models
 
     def model(self, name: str) -> wire.ModelView:
-        """The latest model's structure and fidelity. Raises ``NoModel`` before the first fit."""
+        """Return the structure and fidelity of the latest model.
+
+        Raises:
+            NoModel: there was no fit yet.
+        """
         view = self.surrogate(name)
         if view.model_version is None:
             detail = f"{name!r} has no model yet: let a sampler answer its first queries, or import a log"
@@ -362,12 +374,12 @@ class Api:
         return self._get(wire.ModelView, f"{routes.surrogate(name)}/models/{view.model_version}")
 
     def export_model(self, name: str, version: int) -> bytes:
-        """The model itself, complete, as a safetensors file."""
+        """Return a complete model as the content of a safetensors file."""
         route = f"{routes.surrogate(name)}/models/{version}"
         return self.connection.send("GET", route, params={"format": "safetensors"})
 
     def import_model(self, name: str, data: bytes) -> wire.ModelView:
-        """Make an exported model the newest version of a surrogate with the same outputs."""
+        """Store an exported model as the newest version of a surrogate with the same outputs."""
         route = f"{routes.surrogate(name)}/models"
         reply = self.connection.send("POST", route, data, media_type=_MODEL_FILE, repeatable=False)
         return parse(wire.ModelView, reply, route)
@@ -376,17 +388,17 @@ class Api:
 
     @property
     def policies(self) -> PolicyCalls:
-        """Policies of surrogates: store, list, give out, evaluate, name."""
+        """Methods for the routes of policies."""
         return PolicyCalls(self.connection)
 
     # Events
 
     def events(self, name: str, after: int | None = None) -> Iterator[wire.Event]:
-        """Follow what happens to a surrogate, for ever; a broken stream goes on after the last event seen.
+        """Iterate over the events of a surrogate without end. A broken stream continues after the last event received.
 
         Args:
-            name: the surrogate.
-            after: id of the last event already known; None starts with what happens from now on.
+            name: name of the surrogate.
+            after: id of the last event already known; None starts with events from now on.
 
         Raises:
             ServerUnreachable: the stream stayed broken for the retry budget.
@@ -407,7 +419,7 @@ class Api:
                 time.sleep(pause)
 
     def _one_stream(self, name: str, after: int | None) -> Iterator[wire.Event | None]:
-        """Events of one connection; None for a sign of life. Ends only by an error."""
+        """Iterate over the events of one connection; None is a keep-alive message. Only an error ends the iteration."""
         path = f"{routes.surrogate(name)}/events"
         headers = {"Accept": "text/event-stream"}
         if after is not None:
@@ -428,7 +440,7 @@ class Api:
         action: Sequence[Sequence[float]],
         model: int | None,
     ) -> P:
-        """What one model says of any number of points, in requests of a size that the server takes."""
+        """Evaluate a model at any number of points, in requests that are small enough for the server."""
         if len(coordinates) != len(action):
             raise ValueError(f"expected an action for each of {len(coordinates)} points, got {len(action)}")
         parts: list[P] = []
@@ -459,7 +471,7 @@ class Api:
 
 
 def new_key() -> str:
-    """A fresh idempotency key."""
+    """Return a new idempotency key."""
     return uuid4().hex
 
 
@@ -470,7 +482,8 @@ def check_protocol(protocol: int, url: str) -> None:
 
 
 def _batches(samples: Sequence[wire.NewSample]) -> list[list[wire.NewSample]]:
-    """The samples in requests of at most ``_BATCH_BYTES``; one batch, perhaps an empty one, at least."""
+    """Split samples into batches of at most ``_BATCH_BYTES``. There is always at least one batch, which may be
+    empty."""
     batches: list[list[wire.NewSample]] = [[]]
     room = _BATCH_BYTES
     for sample in samples:

@@ -1,4 +1,4 @@
-"""One server, reached by HTTP: time-outs, retries and errors, the same for every request."""
+"""Connection to one server over HTTP. It handles time-outs, retries and errors of every request in the same way."""
 
 from __future__ import annotations
 
@@ -45,20 +45,20 @@ _KEEPALIVE_SECONDS = 3.0  # shorter than the server's 5 s, so that a request rar
 
 @dataclass(frozen=True)
 class Timeouts:
-    """Seconds without an answer after which a request is given up and tried again."""
+    """Seconds to wait for the answer to each kind of request, before it is retried."""
 
     connect: float = 5.0
     request: float = 30.0
     step: float = 60.0
     rollout: float = 600.0
-    open: float = 150.0  # of a session: a server that is new on its machine first compiles its steps
+    open: float = 150.0  # to open a session: a server that is new on its machine compiles its steps first
 
 
 @dataclass(frozen=True)
 class Retries:
-    """How long a request is tried again: pauses grow by ``factor``, and each is drawn from its upper half.
+    """How long a request is retried. Pauses grow by ``factor``, and each is drawn from the upper half of its range.
 
-    ``seconds`` counts from the first failure; 0 gives up at once.
+    ``seconds`` counts from the first failure; 0 does not retry.
     """
 
     seconds: float = 30.0
@@ -67,7 +67,7 @@ class Retries:
     factor: float = 2.0
 
     def delays(self) -> Iterator[float]:
-        """Pauses between attempts; ends when the budget is spent."""
+        """Iterate over the pauses between attempts, in seconds, until the retry budget is spent."""
         if self.seconds <= 0:
             return
         deadline = time.monotonic() + self.seconds
@@ -78,17 +78,17 @@ class Retries:
 
 
 class Connection:
-    """Sends requests to one server; safe to share between threads, and pickles (the copy connects anew).
+    """Sends requests to one server. It is safe to share between threads, and a pickled copy opens its own connection.
 
     Args:
         url: the server's address; default ``SURROGYM_URL``, then http://127.0.0.1:8000.
         token: bearer token; default ``SURROGYM_TOKEN``, then the one in the file ``SURROGYM_TOKEN_FILE``.
-        timeouts: seconds per kind of request.
-        retries: how long to go on after lost connections, lost replies and 503.
+        timeouts: seconds for each kind of request.
+        retries: how long to retry after lost connections, lost replies and status 503.
 
     Raises:
-        ServerUnreachable: the address is none.
-        UnusableToken: the file of the token can't be used.
+        ServerUnreachable: ``url`` is not a valid address.
+        UnusableToken: the token file can't be used.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class Connection:
         self.close()
 
     def close(self) -> None:
-        """Close the sockets. Sessions and leases on the server stay, and a later request connects anew."""
+        """Close the sockets. Sessions and leases on the server remain, and a later request connects again."""
         self._client.close()
 
     def send(
@@ -133,7 +133,7 @@ class Connection:
         repeatable: bool = True,
         retries: Retries | None = None,
     ) -> bytes:
-        """Send a request until it is answered; give back the body of the answer.
+        """Send a request, retry it until it is answered, and return the body of the answer.
 
         Args:
             method: HTTP method.
@@ -141,14 +141,15 @@ class Connection:
             body: bytes of the media type.
             params: query parameters.
             timeout: seconds to wait for the answer; None takes ``timeouts.request``.
-            media_type: of the body.
-            repeatable: carrying it out twice does no harm, so that it may be sent again after a lost reply.
-            retries: another retry budget than the connection's.
+            media_type: media type of the body.
+            repeatable: whether the request may be sent again after a lost reply, because carrying it out twice is
+                harmless.
+            retries: retry budget that replaces the connection's.
 
         Raises:
             ServerUnreachable: no connection, or every reply was lost, within the retry budget.
             RequestTimeout: the last attempt was not answered in time.
-            ProtocolMismatch: what answered is no Surrogym server.
+            ProtocolMismatch: the answer is not a Surrogym server's.
             ProblemError: the server refused; its subclass says why.
         """
         attempt = self.attempt(method, path, body, params=params, timeout=timeout, media_type=media_type)
@@ -164,7 +165,7 @@ class Connection:
         timeout: float | None = None,
         media_type: str = JSON,
     ) -> Callable[[], bytes]:
-        """One try of a request, for ``persist``; the arguments are those of ``send``."""
+        """Send a request once, for ``persist``. The arguments are those of ``send``."""
 
         def send_once() -> bytes:
             client = self._open_client()
@@ -181,7 +182,7 @@ class Connection:
         return send_once
 
     def persist(self, attempt: Callable[[], T], *, repeatable: bool = True, retries: Retries | None = None) -> T:
-        """Try until it succeeds, is refused, or the retry budget is spent. Raises as ``send``."""
+        """Call ``attempt`` until it succeeds, is refused, or the retry budget is spent. Raises as ``send``."""
         delays: Iterator[float] | None = None
         while True:
             try:
@@ -196,20 +197,20 @@ class Connection:
 
     @property
     def proxied(self) -> bool:
-        """Whether a proxy of the environment stands between; it carries HTTP alone."""
+        """Whether a proxy from the environment variables is in use. Such a proxy only carries HTTP."""
         url = httpx.URL(self.url)
         return not _is_loopback(self.url) and url.scheme in getproxies() and not proxy_bypass(url.host)
 
     def stream_to(self, path: str) -> Stream:
-        """A stream of messages with this server, not connected yet."""
+        """Return a stream of messages with this server. It connects on first use."""
         return Stream(self.url + path, self._token, self.timeouts.connect)
 
     @contextmanager
     def stream(self, path: str, headers: Mapping[str, str], idle_seconds: float) -> Iterator[Iterator[str]]:
-        """Open a stream of text lines; ``idle_seconds`` without one count as a lost connection.
+        """Open a stream of text lines. After ``idle_seconds`` without a line, the connection counts as lost.
 
         Raises:
-            ServerUnreachable: no connection, or it broke.
+            ServerUnreachable: the connection failed or broke.
             ProblemError: the server refused.
         """
         timeout = self._timeout(idle_seconds)
@@ -233,10 +234,10 @@ class Connection:
 
 
 def token_in(path: Path) -> str:
-    """The token in a file, of the form that ``surrogym serve --token-file`` takes too, with one line.
+    """Read the token from a file with one line, in the form that ``surrogym serve --token-file`` accepts too.
 
     Raises:
-        UnusableToken: it can't be read, or does not hold one token.
+        UnusableToken: the file can't be read, or does not contain exactly one token.
     """
     try:
         tokens = tokens_in(path)
@@ -261,7 +262,7 @@ def _checked(url: str) -> str:
         raise ServerUnreachable(f"expected a server address like {DEFAULT_URL}, got {url!r}: {error}") from error
     if parsed.scheme not in ("http", "https") or not parsed.host:
         raise ServerUnreachable(f"expected a server address like {DEFAULT_URL}, got {url!r}")
-    if parsed.userinfo:  # it would be written into cards and reports, and sent in the place of the token
+    if parsed.userinfo:  # a password in the URL would be written into cards and reports, and sent instead of the token
         raise ServerUnreachable(f"expected an address without user and password, got one with them at {parsed.host!r}")
     return url.rstrip("/")
 
@@ -274,7 +275,7 @@ def _new_client(url: str, token: str | None) -> httpx.Client:
 
 
 def _is_loopback(url: str) -> bool:
-    """A proxy of the environment must never stand between two programs of one machine."""
+    """Whether a host is this machine. A proxy must never stand between two programs of one machine."""
     host = httpx.URL(url).host
     try:
         return ip_address(host).is_loopback

@@ -1,4 +1,4 @@
-"""HttpSurrogate: the SurrogatePort of a server, over a stream of frames, or HTTP with frames or JSON."""
+"""HttpSurrogate: implements SurrogatePort for a server, by a stream of frames, or by HTTP with frames or JSON."""
 
 from __future__ import annotations
 
@@ -30,12 +30,14 @@ __all__ = ["Api", "HttpSurrogate", "Retries", "Timeouts", "Transport"]
 Transport = Literal["auto", "stream", "binary", "json"]
 T = TypeVar("T")
 
-_UPGRADE_PAUSE_SECONDS = 60.0  # until a stream is asked for again where none got through, or broke before any answer
+_UPGRADE_PAUSE_SECONDS = (
+    60.0  # before the next attempt to open a stream, after one was refused or broke without an answer
+)
 
 
 @dataclass
 class _Live:
-    """What is known of a session; ``seq`` is the last one answered."""
+    """Client's record of an open session. ``seq`` is the number of the last answered request."""
 
     route: str
     shape: Shape
@@ -44,25 +46,24 @@ class _Live:
 
 
 class HttpSurrogate:
-    """One surrogate of a server; see ``SurrogatePort`` for the laws it keeps.
+    """One surrogate on a server. It keeps the laws of ``SurrogatePort``.
 
-    A lost reply, a time-out or a dropped connection is answered by sending the same request with the same
-    seq, so a step happens once. A session is an id, not a connection: any HttpSurrogate may go on with
-    it, and this one pickles and connects anew. Two can't step one session at once: the second to try gets
-    ``SeqConflict``.
+    After a lost reply, a time-out or a dropped connection, the same request is sent again with the same sequence
+    number, so a step happens once. A session is an id, not a connection: another HttpSurrogate may continue it, and a
+    pickled copy opens its own connection. Two clients can't step one session at once: the second gets ``SeqConflict``.
 
     Args:
         url: the server's address; default ``SURROGYM_URL``, then http://127.0.0.1:8000.
         surrogate: name of the surrogate.
         token: bearer token; default ``SURROGYM_TOKEN``, then the one in the file ``SURROGYM_TOKEN_FILE``.
-        timeouts: seconds per kind of request.
-        retries: how long to go on after lost connections, lost replies and 503.
-        transport: how reset, step and rollout travel. ``stream`` is the fastest: frames over a WebSocket;
-            ``binary`` is frames over HTTP, ``json`` what a person can read. ``auto`` takes the stream, and
-            HTTP with frames where the stream does not get through: refused, or opened and never answering.
+        timeouts: seconds for each kind of request.
+        retries: how long to retry after lost connections, lost replies and status 503.
+        transport: how reset, step and rollout travel. ``stream`` is the fastest: frames over a WebSocket. ``binary``
+            sends frames over HTTP, ``json`` text that a person can read. ``auto`` uses the stream, and frames over HTTP
+            if the stream is refused or never answers.
 
     Raises:
-        ValueError: a transport there is none of.
+        ValueError: an unknown transport.
         SurrogymClientError: every method; see ``surrogym_client.errors``.
 
     Examples:
@@ -90,7 +91,7 @@ class HttpSurrogate:
         self._form: Form = JsonForm() if transport == "json" else BinaryForm()
         self._live: dict[str, _Live] = {}
         self._upgrade_after = math.inf if self.connection.proxied else 0.0  # by time.monotonic
-        self._streamed = False  # some stream has brought an answer
+        self._streamed = False  # whether a stream has ever brought an answer
         self._spec: EnvironmentSpec | None = None
 
     def __repr__(self) -> str:
@@ -103,7 +104,7 @@ class HttpSurrogate:
         self.disconnect()
 
     def disconnect(self) -> None:
-        """Close the sockets. Sessions stay, until ``close`` or their expiry; a later request connects anew."""
+        """Close the sockets. Sessions remain until ``close`` or their expiry, and a later request connects again."""
         for live in list(self._live.values()):
             live.stream.close()
         self.connection.close()
@@ -180,7 +181,7 @@ class HttpSurrogate:
         return parse(wire.SubmittedOccupancy, self.connection.send("POST", route, body), route)
 
     def close(self, session: str) -> None:
-        """End the session; with the last one, the sockets are closed too."""
+        """Close the session. The sockets are closed with the last session."""
         self._forget(session)
         try:
             with suppress(SessionLost):
@@ -201,7 +202,8 @@ class HttpSurrogate:
         read: Callable[[bytes, Shape], tuple[int, T]],
         timeout: float,
     ) -> T:
-        """Send a request that changes the session under its next seq; an error leaves the seq as it was."""
+        """Send a request that changes the session, with the next sequence number. After an error, the number is used
+        again."""
         live = self._live.get(session) or self._look_up(session)
         content = write(live.seq + 1, live.shape)
         attempt = self._attempt(live, what, content, timeout)
@@ -220,7 +222,7 @@ class HttpSurrogate:
         return result
 
     def _attempt(self, live: _Live, what: str, content: bytes, timeout: float) -> Callable[[], bytes]:
-        """One try to get a request answered, to be called again after a failure."""
+        """Return a function that sends the request once. The caller repeats it after a failure."""
         if self.transport == "stream":
             return lambda: live.stream.exchange(content, timeout)
         by_http = self.connection.attempt(
@@ -231,7 +233,8 @@ class HttpSurrogate:
         first = True
 
         def stream_first() -> bytes:
-            """A repeat goes by HTTP: what broke the stream may break it again, and HTTP says what it was."""
+            """Send by the stream at the first attempt, and by HTTP when repeated. What broke the stream may break it
+            again, and HTTP returns the reason."""
             nonlocal first
             if not first:
                 return by_http()
@@ -249,7 +252,7 @@ class HttpSurrogate:
             except TimeoutError:
                 if (
                     not self._streamed
-                ):  # something on the way lets the upgrade through alone: it would wait as long again
+                ):  # a proxy passes the upgrade but no messages: a repeat over the stream would time out too
                     self._avoid_stream(math.inf)
                 raise
             return answer
@@ -260,7 +263,7 @@ class HttpSurrogate:
         self._upgrade_after = time.monotonic() + seconds
 
     def _look_up(self, session: str) -> _Live:
-        """A session that another client opened."""
+        """Look up a session that another client opened."""
         route = routes.session(session)
         return self._know(parse(wire.SessionView, self.connection.send("GET", route), route))
 

@@ -1,4 +1,4 @@
-"""Routes of policies, one typed method each."""
+"""One typed method for each route of policies."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from surrogym_client.transport.replies import parse
 from surrogym_shared import wire
 
 _FILE = "application/octet-stream"
-_SECONDS = 300.0  # for a file of the largest size over a slow line
+_SECONDS = 300.0  # enough for the largest file over a slow connection
 
 
 class PolicyCalls:
-    """Policies of a server's surrogates. A policy is named by its version, an alias, or ``latest``.
+    """Routes of the policies that a server stores. A policy is named by its version, an alias, or ``latest``.
 
-    Every method raises as those of ``Api``; of a policy that is not there, ``UnknownPolicy``.
+    Every method raises as those of ``Api``, and ``UnknownPolicy`` for a policy that does not exist.
     """
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
 
     def list(self, surrogate: str) -> list[wire.PolicyView]:
-        """All policies, newest first."""
+        """List all policies of a surrogate, newest first."""
         route = f"{routes.surrogate(surrogate)}/policies"
         return parse(wire.PolicyList, self._connection.send("GET", route), route).policies
 
     def get(self, surrogate: str, which: str | int = "latest") -> wire.PolicyDetail:
-        """One policy, with the settings and the curve of its training."""
+        """Return one policy, with the settings and the curve of its training."""
         route = routes.policy(surrogate, which)
         return parse(wire.PolicyDetail, self._connection.send("GET", route), route)
 
@@ -41,10 +41,10 @@ class PolicyCalls:
         form: wire.PolicyForm,
         file: bytes,
     ) -> wire.PushedPolicy:
-        """Store a policy and its file. A file that the server knows is the same policy, which gets this card.
+        """Store a policy with its file. If the server has this file already, the same policy gets the new card.
 
         Raises:
-            SpecConflict: it was made for other observations or actions.
+            SpecConflict: the policy was made for other observations or actions.
             InvalidInput: the file is not of this form.
         """
         notice = wire.FileNotice(form=form, bytes=len(file), digest=_digest(file))
@@ -57,39 +57,39 @@ class PolicyCalls:
         return pushed
 
     def put_file(self, surrogate: str, version: int, form: wire.PolicyForm, file: bytes) -> wire.PolicyView:
-        """Send a further file of a policy; one of the same form is replaced."""
+        """Store a further file of a policy. It replaces a file of the same form."""
         route = f"{routes.policy(surrogate, version)}/files/{form}"
         digest = {"digest": _digest(file)}
         reply = self._connection.send("PUT", route, file, params=digest, media_type=_FILE, timeout=_SECONDS)
         return parse(wire.PolicyView, reply, route)
 
     def file(self, surrogate: str, which: str | int, form: wire.PolicyForm) -> bytes:
-        """A file as it was sent."""
+        """Return the content of a policy's file."""
         return self._connection.send("GET", f"{routes.policy(surrogate, which)}/files/{form}", timeout=_SECONDS)
 
     def evaluate(self, surrogate: str, version: int, evaluation: wire.AddEvaluation) -> wire.EvaluationView:
-        """Store real episodes of a policy, once per idempotency key. The ledger is apart."""
+        """Store real episodes of a policy, once for each idempotency key. This does not change the ledger."""
         route = f"{routes.policy(surrogate, version)}/evaluations"
         reply = self._connection.send("POST", route, evaluation.model_dump_json().encode())
         return parse(wire.EvaluationView, reply, route)
 
     def evaluation(self, surrogate: str, which: str | int, id: int) -> wire.EvaluationDetail:
-        """Real episodes: the return of each, and traces of some."""
+        """Return stored real episodes: the return of each, and the traces of some."""
         route = f"{routes.policy(surrogate, which)}/evaluations/{id}"
         return parse(wire.EvaluationDetail, self._connection.send("GET", route), route)
 
     def put_alias(self, surrogate: str, alias: str, version: int) -> wire.PolicyView:
-        """Let an alias lead to a version; needs a token of role admin."""
+        """Let an alias name a version. This needs a token of role admin."""
         route = f"{routes.policy(surrogate, 'aliases')}/{routes.alias(alias)}"
         reply = self._connection.send("PUT", route, wire.PutAlias(version=version).model_dump_json().encode())
         return parse(wire.PolicyView, reply, route)
 
     def drop_alias(self, surrogate: str, alias: str) -> None:
-        """Take an alias away; needs a token of role admin."""
+        """Remove an alias. This needs a token of role admin."""
         self._connection.send("DELETE", f"{routes.policy(surrogate, 'aliases')}/{routes.alias(alias)}")
 
     def delete(self, surrogate: str, version: int) -> None:
-        """Remove a policy with its files and evaluations; needs a token of role admin."""
+        """Delete a policy with its files and evaluations. This needs a token of role admin."""
         self._connection.send("DELETE", routes.policy(surrogate, version))
 
 

@@ -1,4 +1,4 @@
-"""Replies of the service, read with the models that it writes them with."""
+"""Parse the server's replies into the wire models."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ R = TypeVar("R", bound=wire.Reply)
 
 
 def parse(reply: type[R], content: bytes, path: str) -> R:
-    """Read a reply.
+    """Parse a reply.
 
     Raises:
-        ProtocolMismatch: it is not of this protocol.
+        ProtocolMismatch: the reply is not of this protocol.
     """
     try:
         return reply.model_validate_json(content)

@@ -1,6 +1,6 @@
-"""Routes of the service: the one place where a name becomes part of an address.
+"""Routes of the server. Only this module turns names into parts of a URL.
 
-Quoting alone would not do: ``..`` has no quoted form, and a server undoes that of a slash.
+Names are checked as well as quoted: ``..`` has no quoted form, and a server undoes the quoting of a slash.
 """
 
 from __future__ import annotations
@@ -13,27 +13,28 @@ from surrogym_shared.codes import Code
 from surrogym_shared.spec import NAME_IN_WORDS, NAME_PATTERN
 
 POLICY_PATTERN = r"[a-z0-9][a-z0-9_-]{0,31}"
-SESSION_PATTERN = r"[^/\\]*[^/\\.][^/\\]*"  # a server chooses the form of its ids
+SESSION_PATTERN = r"[^/\\]*[^/\\.][^/\\]*"  # the server chooses the form of session ids
 
 
 def surrogate(name: str) -> str:
-    """The route of a surrogate. Raises ``InvalidInput`` for a name that none can have."""
+    """Return the route of a surrogate. Raises ``InvalidInput`` for an invalid name."""
     return f"/v1/surrogates/{_segment(name, NAME_PATTERN, f'name of a surrogate: expected {NAME_IN_WORDS}')}"
 
 
 def policy(name: str, which: str | int) -> str:
-    """The route of a policy by its version, an alias or ``latest``. Raises ``InvalidInput`` for what can be none."""
+    """Return the route of a policy by its version, an alias or ``latest``. Raises ``InvalidInput`` for an invalid
+    one."""
     expected = "policy: expected a version, an alias or latest"
     return f"{surrogate(name)}/policies/{_segment(str(which), POLICY_PATTERN, expected)}"
 
 
 def alias(name: str) -> str:
-    """An alias as the last part of a route. Raises ``InvalidInput`` for what can be none."""
+    """Return an alias as the last part of a route. Raises ``InvalidInput`` for an invalid one."""
     return _segment(name, POLICY_PATTERN, "alias of a policy: expected lower-case letters, digits, - and _")
 
 
 def session(identity: str) -> str:
-    """The route of a session. Raises ``InvalidInput`` for an id that none can have."""
+    """Return the route of a session. Raises ``InvalidInput`` for an invalid id."""
     expected = "id of a session: expected no slash, and something else than dots"
     return f"/v1/sessions/{_segment(identity, SESSION_PATTERN, expected)}"
 

@@ -1,6 +1,6 @@
-"""The two forms of reset, step and rollout: JSON, and the frames of ``surrogym_shared.frames``.
+"""Two encodings of reset, step and rollout: JSON, and the frames of ``surrogym_shared.frames``.
 
-A form turns arguments into the body of a request, and the body of a reply into ``(seq, result)``.
+An encoding turns arguments into the body of a request, and the body of a reply into ``(seq, result)``.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from surrogym_shared.port import Bools, PolicyRollout, ResetResult, StepResult
 Array = NDArray[Any]
 Seeds = int | Sequence[int] | None
 
-UNREADABLE = (msgspec.DecodeError, FrameError)  # what the readers raise for what is no reply
+UNREADABLE = (msgspec.DecodeError, FrameError)  # raised by the readers if the body is not a reply
 
 R = TypeVar("R", frames.ResetReply, frames.StepReply, frames.RolloutReply, frames.PolicyReply)
 
 
 class Form(Protocol):
-    """How requests and replies are written. Writers raise ``InvalidInput`` for what can't be sent."""
+    """Encoding of requests and replies. Writers raise ``InvalidInput`` for values that can't be sent."""
 
     media_type: str
 
@@ -50,7 +50,8 @@ class Form(Protocol):
 
 
 class BinaryForm:
-    """Frames: arrays travel as they lie in memory, so sizes are checked here, where they are still known."""
+    """Encoding as frames. Arrays travel as they lie in memory, so their sizes are checked here, while they are
+    known."""
 
     media_type = frames.MEDIA_TYPE
 
@@ -127,12 +128,12 @@ _ROLLOUT = msgspec.json.Decoder(_RolloutBody)
 
 
 class JsonForm:
-    """JSON: what a person can read, at several times the cost."""
+    """Encoding as JSON. A person can read it, but it takes several times as long."""
 
     media_type = "application/json"
 
     def reset(self, seq: int, seed: Seeds, mask: Bools | None, shape: Shape) -> bytes:
-        del shape  # the server's to judge
+        del shape  # the server checks it
         body = {"seq": seq, "seed": _plain(seed), "mask": _listed(mask)}
         return _ENCODER.encode({name: value for name, value in body.items() if value is not None})
 
@@ -184,7 +185,7 @@ class JsonForm:
 
 
 def _reply(content: bytes, kind: type[R]) -> R:
-    """A frame of the kind that was asked for; raises the error that a problem frame stands for."""
+    """Parse a frame of the expected kind, or raise the error that a problem frame contains."""
     reply = frames.read_reply(content)
     if isinstance(reply, kind):
         return reply
@@ -196,7 +197,7 @@ def _reply(content: bytes, kind: type[R]) -> R:
 
 
 def _rows(what: str, raw: Array, expected: tuple[int, ...]) -> Array:
-    """Actions with all their axes; the last may be left out where it has one entry."""
+    """Check the shape of actions. The last axis may be missing if it has one entry."""
     array = np.asarray(raw)
     _require_numbers(array)
     if array.ndim == len(expected) - 1 and expected[-1] == 1:
@@ -223,7 +224,7 @@ def _listed(mask: Bools | None) -> list[bool] | None:
 
 
 def _sendable(action: Array) -> Any:
-    """Actions as nested lists; what JSON can't carry is refused here, the rest is the server's to judge."""
+    """Return actions as nested lists. Values that JSON can't represent are refused here; the server checks the rest."""
     array = np.asarray(action)
     _require_numbers(array)
     if not np.isfinite(array).all():

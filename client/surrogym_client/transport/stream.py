@@ -1,8 +1,8 @@
-"""A stream of binary messages to the server: WebSocket without threads, one message there and one back.
+"""Stream of binary messages to the server: a WebSocket without threads, on which each message gets one reply.
 
-The protocol is websockets' own; this is the blocking socket around it. A background thread, as a chat program
-needs, would add two switches between threads to every step. Once hands are shaken, whole binary messages are written
-and read here, and every other frame is left to the protocol.
+The websockets package implements the protocol; this module adds a blocking socket. A background thread would add two
+thread switches to every step. After the handshake, complete binary messages are written and read here directly, and the
+package handles every other frame.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ DEFAULT_PORTS = {"http": 80, "https": 443}
 
 
 class StreamUnavailable(OSError):
-    """No stream: nothing listens, or what does knows none. Nothing was sent."""
+    """No stream could be opened: nothing listens, or the server offers no stream. Nothing was sent."""
 
 
 class StreamLost(OSError):
-    """The connection ended before the reply; the message may have been carried out."""
+    """The connection ended before the reply. The message may have been carried out."""
 
 
 class Stream:
-    """One connection, opened by its first message. Any failure closes it, so that a late reply finds nobody.
+    """One connection, opened by its first message. Any failure closes it, so a late reply is never read.
 
-    Threads take turns; a copy (it pickles) connects anew.
+    Threads take turns. A pickled copy opens its own connection.
 
     Args:
-        url: of the stream, beginning with http or https.
+        url: address of the stream, beginning with http or https.
         token: bearer token, sent with the handshake.
-        connect_seconds: limit of connecting and of the handshake.
+        connect_seconds: time limit of connecting and of the handshake.
     """
 
     def __init__(self, url: str, token: str | None, connect_seconds: float) -> None:
@@ -66,18 +66,18 @@ class Stream:
         """Send a message and wait for its reply.
 
         Raises:
-            StreamUnavailable: there is no connection, and none could be made.
-            StreamLost: it ended; the next message connects anew.
-            TimeoutError: no reply for so many seconds.
-            ProblemError: the server refused the connection, or so large a message.
+            StreamUnavailable: no connection exists, and none could be opened.
+            StreamLost: the connection ended; the next message opens a new one.
+            TimeoutError: no reply within ``seconds``.
+            ProblemError: the server refused the connection, or the message is too large.
         """
         with self._turn:
             try:
                 connected = self._socket or self._connect()
-                if seconds != connected.gettimeout():  # setting it is a call of the system
+                if seconds != connected.gettimeout():  # setting a time-out is a system call
                     connected.settimeout(seconds)
                 key = secrets.token_bytes(KEY_BYTES)
-                with suppress(ConnectionError):  # who refuses so large a message says so, and reads no more of it
+                with suppress(ConnectionError):  # a server that refuses a large message answers, and stops reading it
                     connected.sendall(b"".join((header(len(message), MASKED), key, apply_mask(message, key))))
                 return self._receive(connected)
             except (WebSocketException, ConnectionError) as error:
@@ -88,7 +88,7 @@ class Stream:
                 raise
 
     def close(self) -> None:
-        """Drop the connection; a later message makes another."""
+        """Close the connection. A later message opens a new one."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -133,7 +133,7 @@ class Stream:
                 return message
 
     def _gathered(self, parts: list[bytes]) -> bytes | None:
-        """The message that the protocol's events complete, after the parts that came before."""
+        """Return the complete message that the protocol's events and the earlier parts make up, if there is one."""
         for event in self._protocol.events_received():
             assert isinstance(event, Frame)
             if event.opcode is Opcode.CLOSE:
@@ -152,7 +152,7 @@ class Stream:
         raise self._closed()
 
     def _feed(self, connected: socket.socket) -> None:
-        """Hand an answer to the handshake to the protocol."""
+        """Pass the server's answer to the handshake to the protocol."""
         if chunk := connected.recv(CHUNK_BYTES):
             self._protocol.receive_data(chunk)
         else:
@@ -176,7 +176,7 @@ class Stream:
 
 
 def _refused(response: Response) -> Exception:
-    """What the answer to a handshake means: a problem with this session, or no stream at all."""
+    """Return the error for a refused handshake: a problem of this session, or no stream at all."""
     try:
         problem = Problem.model_validate_json(response.body or b"")
     except ValidationError:
