@@ -1,4 +1,4 @@
-"""Learning a policy in a surrogate. Importing this room needs no torch; a search imports what it works with."""
+"""Train a policy in a surrogate. Importing this package needs no torch; each search imports its own libraries."""
 
 from surrogym_client.training.settings import TrainingInterrupted, TrainProgress, TrainResult, TrainSettings
 from surrogym_client.training.trainer import train

@@ -1,4 +1,4 @@
-"""A training whose policy is audited before it is handed over, and trained on where the audit fails."""
+"""A training that audits its policy, and continues if the audit fails."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from surrogym_client.transport.api import Api
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import SurrogateView
 
-MOST_AUDITS = 3  # of one training; each takes its own real steps
+MOST_AUDITS = 3  # audits of one training at most; each takes its own real steps
 
 
 @dataclass(frozen=True)
 class AuditedTraining:
-    """Train a policy and hand it over.
+    """Train a policy, audit it, and hand it over.
 
     If an audit fails and the budget has steps left, they are taken where the policy goes, the training continues, and
     the policy is audited again. If none are left, the policy is handed over with the failed audit. If an audit passes,
@@ -40,14 +40,14 @@ class AuditedTraining:
 
     Attributes:
         api: the server.
-        name: of the surrogate.
+        name: name of the surrogate.
         port: the surrogate.
-        out: where the policy goes.
-        settings: of each training.
-        rounds: of the closed loop; None: without one.
-        audit: how to audit; None: don't.
+        out: file to write the policy to.
+        settings: settings of each training.
+        rounds: settings of the closed loop; None trains without one.
+        audit: settings of the audit; None takes no audit.
         progress: called after every rollout.
-        waiting: called with every look at the surrogate, while a sampler answers queries.
+        waiting: called each time the surrogate is polled, while a sampler answers queries.
     """
 
     api: Api
@@ -62,11 +62,11 @@ class AuditedTraining:
     candidates: Candidates = field(default_factory=Candidates, init=False)
 
     def train(self) -> tuple[TrainResult, Handover]:
-        """Train, audit, and train on where that fails.
+        """Train, audit, and train further if the audit fails.
 
         Raises:
             DesignUnfinished: queries were not answered in time.
-            TrainingInterrupted: Ctrl-C came when there was a policy already.
+            TrainingInterrupted: Ctrl-C was pressed when there was a policy already.
             ValueError, SurrogymClientError: as ``train``.
         """
         result = self._first()
@@ -94,7 +94,7 @@ class AuditedTraining:
         return self._best(loop.train())
 
     def _best(self, result: TrainResult) -> TrainResult:
-        """The policy to hand over: what the model of all real steps so far holds for the best."""
+        """Return the policy that is best in the model of all real steps so far."""
         return self.candidates.best(self.port, result, self._chosen)
 
     @property
@@ -113,8 +113,10 @@ class AuditedTraining:
         return self._asked_more(result, taken, number)
 
     def _asked_more(self, result: TrainResult, taken: int, number: int) -> bool:
-        """Spend what the budget has left where the policy goes. Whether real steps of the budget were taken since they
-        were ``taken``."""
+        """Spend the rest of the budget where the policy goes.
+
+        Returns whether the budget's real steps are now more than ``taken``.
+        """
         view = self.api.surrogate(self.name)
         wanted = min(self.rounds.queries if self.rounds else AUDIT_STEPS, view.budget_left)
         if wanted > 0:
@@ -126,7 +128,7 @@ class AuditedTraining:
         return view.ledger.total > taken
 
     def _train_on(self, result: TrainResult) -> TrainResult:
-        """Train in the model that has learned from the audit, from the policy that there is."""
+        """Train further, from the present policy, in the model that includes the audit's samples."""
         now = self._chosen
         if search_for(self.settings).resumable:
             now = replace(now, start_from=self.out, trust_policy=False)
@@ -136,7 +138,7 @@ class AuditedTraining:
 
 
 def _joined(before: TrainResult, after: TrainResult) -> TrainResult:
-    """The later result, with what both trainings took."""
+    """Return the later result, with the steps and seconds of both trainings."""
     return replace(
         after,
         virtual_steps=before.virtual_steps + after.virtual_steps,

@@ -1,4 +1,4 @@
-"""The policies that a training had: none is handed over that the latest model holds for worse than an earlier one."""
+"""Policies of one training, compared in the latest model so that the best one is handed over."""
 
 from __future__ import annotations
 
@@ -14,14 +14,17 @@ from surrogym_client.policies.predict import Predict
 from surrogym_client.training.settings import TrainResult, TrainSettings
 from surrogym_shared.port import SurrogatePort
 
-EPISODES = 128  # of each policy, from the same starts
+EPISODES = 128  # virtual episodes of each policy, from the same starts
 CLEARLY = 2.0  # standard errors of a mean difference: less may be chance
 
 
 @dataclass
 class Candidates:
-    """What each training left at the end, with its file. Real steps between two trainings change the model, and what
-    an earlier model held for the better policy can be the worse one."""
+    """Policies that the trainings so far ended with, and their files.
+
+    Real steps between two trainings change the model. A policy that was better in an earlier model can be worse in the
+    new one.
+    """
 
     load: Callable[[Path, str], Predict] = load_policy
     _kept: list[tuple[TrainResult, bytes]] = field(default_factory=list)
@@ -31,8 +34,10 @@ class Candidates:
         self._kept.append((result, Path(result.path).read_bytes()))
 
     def best(self, port: SurrogatePort, latest: TrainResult, settings: TrainSettings) -> TrainResult:
-        """The latest result, or an earlier one whose policy clearly earns more in the model as it is now; its file is
-        then in its place again."""
+        """Return the latest result, or an earlier one whose policy earns clearly more in the present model.
+
+        The policy's file is restored if it is an earlier one.
+        """
         others = [(result, content) for result, content in self._kept if content != Path(latest.path).read_bytes()]
         if not others:
             return latest

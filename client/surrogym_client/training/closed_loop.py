@@ -1,4 +1,4 @@
-"""The closed loop: train a little, see where the policy goes, query there, refit, train on from the policy one has."""
+"""The closed loop: train for a while, query where the policy goes, fit again, and train further."""
 
 from __future__ import annotations
 
@@ -24,42 +24,46 @@ from surrogym_client.transport.api import Api
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import SurrogateView
 
-ROUND_SHARE = 0.25  # of a whole training, in each round before the last
+ROUND_SHARE = 0.25  # virtual steps of each round before the last, as a share of a whole training
 VISIT_LANES = 32
-VISIT_STEPS = 1_000  # where the specification has no time limit
+VISIT_STEPS = 1_000  # length of a visit if the specification has no time limit
 
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """How often to close the loop. No round follows once the design is ready, or once the confidence index where the
-    policy goes has the design's target."""
+    """Number of rounds, and of queries in each.
 
-    queries: int  # real steps a round
+    The rounds end early if the design is ready, or if the confidence index over the states that the policy visits
+    reaches the design's target.
+    """
+
+    queries: int  # real steps of one round
     rounds: int = 3
-    patience_seconds: float = 3_600.0  # for the sampler to answer one round
+    patience_seconds: float = 3_600.0  # longest time that the sampler may take for one round
 
 
 @dataclass
 class ClosedLoop:
-    """Learn a policy, with rounds of queries where it goes until that is known, or the design is ready.
+    """Learn a policy in rounds, with queries where it goes, until the model is certain there or the design is ready.
 
-    Each round submits the states that the policy visits from the declared starts, as a checkpoint of its own, so the
-    same seeds ask the same queries. Where the model is as sure over these states as the design wants it over the whole
-    range, no more queries follow. The rounds move lanes by the mean: their policies go where the model promises most.
-    The settings of the last training are ``chosen_for`` the phase that the design has then. Only the last training may
-    be prolonged: the next round makes up for what a round's policy lacks.
+    Each round submits the states that the policy visits from the declared starts. They are the occupancy of a
+    checkpoint of its own, so the same seeds choose the same queries. The rounds end once the confidence index over
+    these states reaches the target that the design has for the whole range. In the rounds, lanes move by the mean, so
+    that a policy goes where the model predicts the highest return. The settings of the last training are ``chosen_for``
+    the phase that the design then has. Only the last training may be prolonged, because a later round makes up for a
+    short earlier one.
 
     Attributes:
         api: the server.
-        name: of the surrogate.
+        name: name of the surrogate.
         port: the surrogate.
-        out: where the policy goes, after every round.
-        settings: of each training.
-        rounds: how many rounds, of how many queries.
+        out: file to write the policy to, after every round.
+        settings: settings of each training.
+        rounds: number of rounds, and of queries in each.
         progress: called after every rollout, with steps summed over the rounds.
-        waiting: called with every look at a round's queries, while a sampler answers them.
-        trained: the trainings so far.
-        candidates: the policies that they left.
+        waiting: called each time the surrogate is polled, while a sampler answers a round's queries.
+        trained: results of the trainings so far.
+        candidates: policies of these trainings.
     """
 
     api: Api
@@ -72,8 +76,10 @@ class ClosedLoop:
     waiting: Callable[[SurrogateView], None] | None = None
     trained: list[TrainResult] = field(default_factory=list, init=False)
     candidates: Candidates = field(default_factory=Candidates)
-    _visited: int = field(default=0, init=False)  # virtual steps beside the trainings
-    _known: list[float | None] = field(default_factory=list, init=False)  # confidence where each round's policy went
+    _visited: int = field(default=0, init=False)  # virtual steps that collected occupancies
+    _known: list[float | None] = field(
+        default_factory=list, init=False
+    )  # confidence index over each round's visited states
     _region_known: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
@@ -88,7 +94,7 @@ class ClosedLoop:
 
         Raises:
             DesignUnfinished: the queries of a round were not answered in time.
-            TrainingInterrupted: Ctrl-C came when there was a policy already.
+            TrainingInterrupted: Ctrl-C was pressed when there was a policy already.
             ValueError, SurrogymClientError: as ``train``.
         """
         try:
@@ -106,7 +112,8 @@ class ClosedLoop:
         return self.result()
 
     def round(self) -> bool:
-        """Train a little, see where the policy goes, and query there; whether another round may follow."""
+        """Run one round: train for a while, submit the visited states, and query there. Returns whether another
+        round may follow."""
         view = self.api.surrogate(self.name)
         if view.phase == "ready":
             return False
@@ -124,7 +131,7 @@ class ClosedLoop:
         return True
 
     def last(self) -> None:
-        """Train the policy that is used, by what the design came to."""
+        """Train the policy to hand over, with settings that depend on the design's phase."""
         settings, taken = self.settings, self._steps
         left = self._whole - taken
         left = max(left if settings.total_steps else min(planned_steps(settings), left), 1)
@@ -132,7 +139,7 @@ class ClosedLoop:
         self._learn(left, taken + self._visited + left, replace(last, prolong=self._prolong))
 
     def result(self) -> TrainResult:
-        """The last training's result, with what all of them took."""
+        """Return the last training's result, with the steps and seconds of all trainings."""
         return replace(
             self.trained[-1],
             virtual_steps=self._steps + self._visited,
@@ -156,18 +163,23 @@ class ClosedLoop:
 
 
 def _for_use(view: SurrogateView, settings: TrainSettings, *, region_known: bool) -> TrainSettings:
-    """Settings of the last training, whose policy is used. It goes on from the policy whose region is known; where none
-    is, it begins anew by draws, as a network that has learned from wrong models stays with what these taught it."""
+    """Return the settings of the last training.
+
+    If the model is certain where the last round's policy goes, training continues from that policy. Otherwise it begins
+    with a new network and the variant of draws, because a network that has learned from wrong models keeps what they
+    taught it.
+    """
     last = chosen_for(view, settings, by_mean=search_for(settings).by_mean)
     anew = last is not settings and settings.start_from is None and not region_known
     return replace(last, anew=anew)
 
 
 def shares(settings: TrainSettings, rounds: int) -> tuple[int, int]:
-    """Virtual steps of the whole training, all rounds included, and of each round; visits come on top.
+    """Return the virtual steps of the whole training, all rounds included, and of each round.
 
-    What was asked for bounds the whole; what is suggested is the last training's, and rounds come on top, up to the
-    paper's cap. A round has the same share of the last training either way.
+    Steps that collect occupancies are not included. Requested steps limit the whole training. Suggested steps are those
+    of the last training; the rounds add to them, up to the paper's maximum. In both cases a round has the same share of
+    the last training.
     """
     planned, share = planned_steps(settings), min(ROUND_SHARE, 1 / (rounds + 1))
     if settings.total_steps is not None:
@@ -179,8 +191,10 @@ def shares(settings: TrainSettings, rounds: int) -> tuple[int, int]:
 def visit(
     port: SurrogatePort, learned: TrainResult, settings: TrainSettings, checkpoint: str
 ) -> tuple[int, float | None]:
-    """Let the policy of a round run from the declared starts and submit where it went. Returns how many virtual steps
-    that took, and the confidence index there."""
+    """Run the policy of a round from the declared starts, and submit the visited states.
+
+    Returns the number of virtual steps that this took, and the confidence index over the visited states.
+    """
     spec = port.spec()
     act = search_for(settings).explorer(learned.path, learned.algorithm, VISIT_LANES)
     options = {**settings.session, "occupancy": True}

@@ -1,7 +1,7 @@
-"""CMA-ES on the lanes of a session: a small network's parameters, judged by whole virtual episodes.
+"""CMA-ES on the lanes of a session: it searches the parameters of a small network by the returns of virtual episodes.
 
-As Black-DROPS does (Chatzilygeroudis et al., 2017): a policy of few parameters, no gradient, no value function. All
-candidates of a generation are stepped together, each from the same starts.
+This is the approach of Black-DROPS (Chatzilygeroudis et al., 2017): a policy of few parameters, no gradient, no value
+function. All candidates of a generation are stepped together, each from the same starts.
 """
 
 from __future__ import annotations
@@ -26,20 +26,21 @@ from surrogym_client.training.verdicts import checked
 from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
 
-FULL_COVARIANCE = 200  # parameters; beyond, the covariance is diagonal (separable CMA-ES)
+FULL_COVARIANCE = 200  # most parameters with a full covariance; beyond, it is diagonal (separable CMA-ES)
 
 
 @dataclass(frozen=True)
 class CmaEs(PolicySearch):
-    """CMA-ES over the parameters of a network; gives the mean of the distribution whose imagined return was best."""
+    """Policy search by CMA-ES over the parameters of a network. Returns the distribution's mean with the best
+    imagined return."""
 
-    population: int = 24  # candidates a generation
-    starts: int = 16  # episodes a candidate
+    population: int = 24  # candidates of each generation
+    starts: int = 16  # episodes of each candidate
     units: int = 10  # hidden units of the network
-    sigma: float = 1.0  # first deviation of a parameter
+    sigma: float = 1.0  # initial standard deviation of a parameter
 
     suggested_steps = 10_000_000
-    most_steps = None  # it learns from whole episodes and takes far more steps, each far cheaper
+    most_steps = None  # no limit: CMA-ES takes far more steps than PPO, but each is far cheaper
 
     def search(self, task: SearchTask) -> Found:
         run = _Run(task, self)
@@ -50,7 +51,7 @@ class CmaEs(PolicySearch):
 
 
 class _Run:
-    """The generations of one search, and the best mean so far."""
+    """Generations of one search, and the best mean so far."""
 
     def __init__(self, task: SearchTask, choices: CmaEs) -> None:
         self._task, self._choices = task, choices
@@ -65,7 +66,7 @@ class _Run:
         self._penalty: float | None = None
 
     def generation(self, number: int) -> None:
-        """Learn from one generation; the mean is judged ``CHECKS`` times in a search."""
+        """Run one generation. The mean is evaluated ``CHECKS`` times in a search."""
         seen = self._distribution.generation(number)
         self._done, self._penalty = number, seen.episode_penalty
         if number * CHECKS // self.generations > (number - 1) * CHECKS // self.generations:
@@ -74,7 +75,7 @@ class _Run:
         self._task.progress(TrainProgress(steps, total, self._latest, seen.penalty_share, self._penalty))
 
     def found(self) -> Found:
-        """The best mean, of as many generations as there were."""
+        """Return the best mean of the generations so far."""
         return Found(
             self._kept or self._distribution.policy,
             self._done * self._cost,
@@ -91,7 +92,7 @@ class _Run:
 
 
 class _Distribution:
-    """The distribution of parameters, and the episodes that judge it."""
+    """Distribution of parameters, and the virtual episodes that evaluate them."""
 
     def __init__(self, port: SurrogatePort, settings: TrainSettings, choices: CmaEs) -> None:
         self.choices = choices
@@ -104,11 +105,12 @@ class _Distribution:
 
     @property
     def policy(self) -> Network:
-        """The network at the mean of the distribution."""
+        """Return the network at the mean of the distribution."""
         return self._network(np.array(self._cma.mean))
 
     def generation(self, number: int) -> Imagined:
-        """Draw a population, let each candidate run from the same starts, and learn from their mean returns."""
+        """Draw a population, run each candidate from the same starts, and update the distribution from their mean
+        returns."""
         choices = self.choices
         drawn = [self._cma.ask() for _ in range(choices.population)]
         everyone = self._network(np.stack(drawn))

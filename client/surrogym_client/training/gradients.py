@@ -1,7 +1,7 @@
-"""Gradients straight through the model's mean step, for those who have the extra ``server`` as well.
+"""Policy search by gradients through the model's mean step. It needs the extra ``server``.
 
-The search itself is in the server's package: it needs the model, not a session. This file fetches the model, and holds
-the search to the port.
+The search itself is in the server's package, because it needs the model and not a session. This module fetches the
+model and adapts the search to the port ``PolicySearch``.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from surrogym_client.training.settings import DRAWS, FUNCTIONS, TrainProgress
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_shared.port import SurrogatePort
 
-ENTRY_POINTS = "surrogym.gradients"  # brought by the server's package
+ENTRY_POINTS = "surrogym.gradients"  # entry point of the server's package
 
 
 @dataclass(frozen=True)
 class Gradients(PolicySearch):
-    """Climbs the gradient of the imagined return. Continuous actions only.
+    """Policy search that follows the gradient of the imagined return. For continuous actions only.
 
-    The model moves by its mean, whatever the session's variant. Another model than the latest, a penalty, a trust
-    region and a policy to start from are refused.
+    The model moves by its mean, whatever the session's variant. Other models than the latest, a penalty, a trust region
+    and a policy to start from are refused.
     """
 
     lanes: int = 128
@@ -60,7 +60,7 @@ class Gradients(PolicySearch):
         return Found(found.policy, found.virtual_steps, found.imagined_return, ran_with, whole=found.whole)
 
     def _settings(self, library: Any, task: SearchTask) -> Any:
-        """As many updates as the steps allow, after those of the checks."""
+        """Return settings with as many updates as the steps allow, after those of the checks."""
         limit = task.port.spec().time_limit or LONGEST_EPISODE
         third = min(max(limit // 3, library.SHORTEST_HORIZON), library.LONGEST_HORIZON)
         horizon = min(self.horizon or third, limit)
@@ -71,13 +71,13 @@ class Gradients(PolicySearch):
 
 
 def _require_plain(task: SearchTask) -> None:
-    """Refuse what has no meaning for the mean of the latest model."""
+    """Refuse settings that have no meaning for the mean of the latest model."""
     if others := sorted({*task.settings.session} - {*DRAWS, *FUNCTIONS}):
         raise ValueError(f"gradients follow the mean of the latest model: expected no session options, got {others}")
 
 
 def _library() -> Any:
-    """The module of the server's package that searches.
+    """Return the module of the server's package that contains the search.
 
     Raises:
         ModuleNotFoundError: the extra ``server`` is not installed.
@@ -87,7 +87,7 @@ def _library() -> Any:
 
 
 def _with_model(port: SurrogatePort) -> Any:
-    """The surrogate with its model in this process: as it is, or fetched from its server."""
+    """Return a surrogate whose model is in this process. It is fetched from the server if necessary."""
     if not isinstance(port, HttpSurrogate):
         if hasattr(port, "model"):
             return port

@@ -1,4 +1,4 @@
-"""What a policy is handed over with: a promise, an audit by real steps, and whether the promise is to be trusted."""
+"""Handover of a policy: its promise, its audit, and whether the promise is to be trusted."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from surrogym_client.transport.api import Api
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import SurrogateView
 
-MATTERS = 0.02  # of what a policy earns: errors of rewards that add up to less in an episode are no fault
-WAY_LANES = 16  # episodes whose states an audit chooses from
-MOST_OF_A_WAY = 200  # steps of an episode that are held against a log
-WIDE = 0.5  # of what a policy earns beyond an untrained one: a promise with a wider lower half is no promise
+MATTERS = 0.02  # share of the policy's return: smaller reward errors, summed over an episode, are not a fault
+WAY_LANES = 16  # virtual episodes whose states an audit chooses from
+MOST_OF_A_WAY = 200  # steps of an episode that are compared with a log
+WIDE = 0.5  # share of the gain over an untrained policy: a promise with a wider lower half is not trusted
 NO_SAMPLER = "no sampler is connected"
 
 Array = NDArray[np.float64]
@@ -36,13 +36,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Handover:
-    """A policy's promise, and what speaks for it.
+    """A policy's promise, with the evidence for it.
 
     Attributes:
-        promise: of the latest model; None where the policy goes where a log has never been: no model knows it.
-        audit: real steps on the policy's way; None without one.
+        promise: promise of the latest model; None if the policy goes where the log has no data.
+        audit: audit of the policy; None without one.
         trusted: whether the promise is to be trusted.
-        reason: why, or why not, in one sentence.
+        reason: why it is trusted or not, in one sentence.
     """
 
     promise: Promise | None
@@ -53,39 +53,39 @@ class Handover:
 
 @dataclass(frozen=True)
 class AuditSettings:
-    """How to audit."""
+    """Settings of an audit."""
 
     steps: int = AUDIT_STEPS
-    patience_seconds: float = 3_600.0  # for a sampler to answer
+    patience_seconds: float = 3_600.0  # longest time that a sampler may take
     seed: int = 0
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A policy to hand over, and what it was trained with."""
+    """A policy to hand over, with the session and the seed that it was trained with."""
 
     api: Api
     name: str  # of the surrogate
     port: SurrogatePort
     predict: Predict
     session: dict[str, Any] = field(default_factory=dict)  # fields of ``OpenSession``
-    floor: float | None = None  # the return of an untrained policy
+    floor: float | None = None  # imagined return of an untrained policy
     seed: int = 0
 
     def promise(self) -> Promise:
-        """What the latest model promises."""
+        """Compute the policy's promise in the latest model."""
         return promise_of(self.port, self.predict, self.seed, self.session)
 
 
 def hand_over(
     subject: Subject, audit: AuditSettings | None, progress: Callable[[SurrogateView], None] | None = None
 ) -> Handover:
-    """Make the promise of a policy, audit it where a sampler is connected, and say whether it is to be trusted.
+    """Compute the promise of a policy, audit it if a sampler is connected, and decide whether to trust it.
 
     Args:
         subject: the policy.
-        audit: how to audit; None: don't.
-        progress: called with every look at the surrogate while a sampler works.
+        audit: settings of the audit; None takes no audit.
+        progress: called each time the surrogate is polled, while a sampler works.
 
     Raises:
         DesignUnfinished: the audit's queries were not answered in time.
@@ -105,7 +105,7 @@ def hand_over(
 
 
 def _left_the_log(subject: Subject) -> Outside | None:
-    """How much of a policy's way lies outside of the log that its model is of; None for a model of anything else."""
+    """Return how much of a policy's way lies outside the log; None if the model is not of a log alone."""
     view, spec = subject.api.surrogate(subject.name), subject.port.spec()
     if view.phase != "from_log":
         return None
@@ -118,7 +118,7 @@ def _left_the_log(subject: Subject) -> Outside | None:
 def take(
     subject: Subject, settings: AuditSettings, before: Promise, progress: Callable[[SurrogateView], None] | None
 ) -> Audit | None:
-    """Take an audit's real steps, let the model learn from them, and judge; None where no step was taken."""
+    """Take the real steps of an audit, fit the model to them, and judge. Returns None if no real step was taken."""
     api, name, spec = subject.api, subject.name, subject.port.spec()
     view = api.surrogate(name)
     q, u = way_of(subject, WAY_LANES, spec.time_limit or LONGEST_EPISODE)
@@ -139,8 +139,11 @@ def take(
 
 
 def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array) -> set[int]:
-    """Ask for an audit's real steps, at some of the states q (m, C) under their actions u (m, F); where no state can be
-    set, along the actions of one episode. Gives the numbers of the queries."""
+    """Add the queries of an audit, at some of the states q (m, C) with their actions u (m, F).
+
+    If the environment can't be set to a state, the query is one episode's sequence of actions. Returns the queries'
+    numbers.
+    """
     spec = subject.port.spec()
     if spec.query == "rollout":
         _, actions = way_of(subject, 1, min(settings.steps, spec.max_rollout or settings.steps))
@@ -154,8 +157,10 @@ def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array) -> set
 
 
 def way_of(subject: Subject, episodes: int, steps: int) -> tuple[Array, Array]:
-    """States (m, C) that a policy visits in whole virtual episodes from the declared starts, each along a function of
-    its own, and the actions (m, F) that it takes there, in the original environment's units."""
+    """Return the states (m, C) and actions (m, F) of a policy in whole virtual episodes from the declared starts.
+
+    Each episode follows a drawn function of its own. Actions are in the original environment's units.
+    """
     spec = subject.port.spec()
     options = {**subject.session, **WHOLE, "variant": "pathwise", "seed": subject.seed}
     lanes = Lanes(subject.port, session_request(episodes, "same_step", options))
@@ -179,7 +184,7 @@ def way_of(subject: Subject, episodes: int, steps: int) -> tuple[Array, Array]:
 
 
 def _not_possible(subject: Subject) -> str | None:
-    """Why there can be no audit, or None."""
+    """Return why no audit is possible; None if one is."""
     view = subject.api.surrogate(subject.name)
     if view.spec.design.preset == "paper":
         return "preset paper has none"
@@ -197,14 +202,14 @@ def _verdict(audit: Audit, floor: float | None) -> tuple[bool, str]:
 
 
 def _unaudited(subject: Subject, promise: Promise, why: str) -> Handover:
-    """A handover that no real step speaks for."""
+    """Return a handover whose promise no real step supports."""
     if (left := _left_the_log(subject)) is not None and left.much:
         return Handover(None, None, False, f"{left.words()}: nothing can be promised of it")
     return _without(subject.api.surrogate(subject.name), promise, subject.floor, why)
 
 
 def _without(view: SurrogateView, promise: Promise, floor: float | None, why: str) -> Handover:
-    """A handover without an audit: trusted only where the design is ready."""
+    """Return a handover without an audit. It is trusted only if the design is ready."""
     if (wide := _too_wide(promise, floor)) is not None:
         return Handover(promise, None, False, wide)
     if view.phase == "ready":
@@ -214,7 +219,7 @@ def _without(view: SurrogateView, promise: Promise, floor: float | None, why: st
 
 
 def _too_wide(promise: Promise, floor: float | None) -> str | None:
-    """Why a promise is no promise, or None."""
+    """Return why a promise is too wide to be trusted; None if it is not."""
     if floor is None or promise.median - promise.low <= WIDE * abs(promise.median - floor):
         return None
     return (

@@ -1,17 +1,17 @@
-"""PolicySearch: the port of every way to find a policy in a surrogate, and the names of those that are installed.
+"""PolicySearch: the port of policy searches, and the names of the installed ones.
 
 The laws of a search, which ``surrogym_client.testing`` checks:
 
 1. The same surrogate, settings and seed give the same policy, bit for bit.
-2. It takes at most ``task.steps`` virtual steps, but whole units of its own work (a rollout, a generation) and at least
-   one of them. Steps that only compare policies are not counted.
-3. It reports progress with steps that never fall, and never beyond their total.
-4. On Ctrl-C it gives back the best policy so far, with ``whole=False``. ``KeyboardInterrupt`` leaves it only where
-   there is no policy yet.
-5. Every session that it opens is closed on every way out. It writes no file: the policy does when it is asked to.
-6. What its policy saves, ``load_policy`` reads without trust, and gives actions of the surrogate's action space.
+2. It takes at most ``task.steps`` virtual steps, rounded to whole units of its own work (a rollout, a generation), and
+   at least one unit. Steps that only compare policies are not counted.
+3. It reports progress with steps that never decrease and never exceed their total.
+4. On Ctrl-C it returns the best policy so far, with ``whole=False``. It raises ``KeyboardInterrupt`` only if there is
+   no policy yet.
+5. It closes every session that it opens, also after errors. It writes no file; the policy's ``save`` does.
+6. ``load_policy`` reads the saved policy without trust, and the policy gives actions of the surrogate's action space.
 7. Impossible settings raise ``ValueError`` with what was expected and what came, before the first virtual step.
-8. It starts from the policy of ``settings.start_from`` where there is one; if it can't, it says ``resumable = False``.
+8. It starts from the policy of ``settings.start_from`` if that is set. A search that can't has ``resumable = False``.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from surrogym_shared.plugins import Registry
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import EnvironmentSpec
 
-MAX_STEPS = 10_000_000  # virtual steps that can be asked for: hours of PPO
+MAX_STEPS = 10_000_000  # most virtual steps of a training: hours of PPO
 ALGORITHMS = ("A2C", "DDPG", "DQN", "PPO", "SAC", "TD3")  # of Stable-Baselines3
 
 Progress = Callable[[TrainProgress], None]
@@ -37,13 +37,13 @@ Progress = Callable[[TrainProgress], None]
 
 @dataclass(frozen=True)
 class SearchTask:
-    """What a search has to do."""
+    """Task of a policy search."""
 
     port: SurrogatePort
     settings: TrainSettings
-    steps: int  # virtual ones, at most
+    steps: int  # virtual steps at most
     out: Path  # where the policy will be saved; names the run to trackers
-    prolong: bool = False  # take as many steps again, once, while the imagined return still rises
+    prolong: bool = False  # whether to take as many steps again, once, if the imagined return still rises
     progress: Progress = lambda _: None
 
 
@@ -57,13 +57,13 @@ class Saved(Protocol):
 
 @dataclass(frozen=True)
 class Found:
-    """What a search found, and what that took."""
+    """Result of a policy search."""
 
     policy: Saved
     virtual_steps: int
-    imagined_return: float | None  # of the policy; None where nothing was measured
-    settings: Mapping[str, Any] = field(default_factory=dict)  # what it ran with, defaults included
-    algorithm: str | None = None  # class of Stable-Baselines3 that reads the file; None where the file says enough
+    imagined_return: float | None  # of the policy; None if it was not measured
+    settings: Mapping[str, Any] = field(default_factory=dict)  # settings of the search, defaults included
+    algorithm: str | None = None  # class of Stable-Baselines3 that reads the file; None if the file needs none
     whole: bool = True  # False after Ctrl-C
     episode_penalty: float | None = None
     lost_episodes: int = 0
@@ -87,19 +87,19 @@ class PolicySearch(ABC):
         ...         return Found(Network.of(spec, zeros, ones, self.units, vector), 0, None)
     """
 
-    suggested_steps: ClassVar[int] = 600_000  # virtual ones, where a person asks for no number
-    most_steps: ClassVar[int | None] = MAX_STEPS  # None: no bound, as for a search whose steps are cheap
-    prolongable: ClassVar[bool] = False  # heeds ``task.prolong``
+    suggested_steps: ClassVar[int] = 600_000  # virtual steps by default
+    most_steps: ClassVar[int | None] = MAX_STEPS  # None: no limit, for a search whose steps are cheap
+    prolongable: ClassVar[bool] = False  # supports ``task.prolong``
     tracked: ClassVar[bool] = False  # logs its curves to ``settings.tracker``
-    by_mean: ClassVar[bool] = False  # it follows the mean without noise, whatever the session
+    by_mean: ClassVar[bool] = False  # moves by the mean without noise, whatever the session's variant
     resumable: ClassVar[bool] = True  # can start from a policy, and so learn in rounds
 
     @abstractmethod
     def search(self, task: SearchTask) -> Found:
-        """Find a policy. See the laws at the top of this file."""
+        """Find a policy. The laws are at the top of this module."""
 
     def explorer(self, policy: Path, algorithm: str, num_envs: int) -> Predict:  # noqa: ARG002  for those that have noise
-        """A saved policy as it explores while it learns; its most probable actions where it has no noise."""
+        """Load a saved policy that explores as in training; a policy without noise takes its most probable actions."""
         return load_policy(policy, algorithm)
 
 
@@ -117,11 +117,11 @@ SEARCHES = Registry[PolicySearch](
 
 
 def search_for(settings: TrainSettings) -> PolicySearch:
-    """The search that settings name, made with their hyperparameters.
+    """Return the search that the settings name, with its hyperparameters.
 
     Raises:
-        ValueError: there is none of this name, it has no such hyperparameter, or it can't be prolonged, tracked or
-            started from a policy.
+        ValueError: the name or a hyperparameter is unknown, or the search can't be prolonged, tracked or started from a
+            policy as the settings require.
     """
     name, kind = SEARCHES.name_of(settings.algorithm), SEARCHES.get(settings.algorithm)
     if settings.prolong and not kind.prolongable:
@@ -138,7 +138,11 @@ def search_for(settings: TrainSettings) -> PolicySearch:
 
 
 def planned_steps(settings: TrainSettings) -> int:
-    """Virtual steps of a training. Raises ValueError where they exceed the cap, or for an unknown algorithm."""
+    """Return the virtual steps of a training.
+
+    Raises:
+        ValueError: the steps exceed the maximum, or the algorithm is unknown.
+    """
     kind = SEARCHES.get(settings.algorithm)
     total = kind.suggested_steps if settings.total_steps is None else settings.total_steps
     if total < 1 or (kind.most_steps is not None and total > kind.most_steps):
@@ -147,5 +151,6 @@ def planned_steps(settings: TrainSettings) -> int:
 
 
 def is_prolonged(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
-    """Whether a training that still gains at its end takes as many steps again. Raises as ``search_for``."""
+    """Whether a training takes as many steps again if its imagined return still rises at the end. Raises as
+    ``search_for``."""
     return search_for(settings).prolongable and prolongs(settings, spec)

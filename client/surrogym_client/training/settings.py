@@ -1,4 +1,4 @@
-"""What every policy search is asked, tells while it runs, and gives back."""
+"""Settings, progress and result of a training, which all policy searches share."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any, Literal
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import OF_PARTICLES, SurrogateView
 
-CHECKS = 12  # of the imagined return in one training; the best policy is kept
+CHECKS = 12  # checks of the imagined return in one training; the best policy is kept
 CHECK_EPISODES = 64
-SUGGESTED_STEPS = 1_000_000  # virtual ones, the most that is suggested for all rounds together; the paper's cap
+SUGGESTED_STEPS = 1_000_000  # most virtual steps by default, for all rounds together; the paper's maximum
 DRAWS: dict[str, Any] = {"variant": "probabilistic", "particles": 1, "spread": 0.0}  # each step of a lane is a draw
 FUNCTIONS: dict[str, Any] = {"variant": "pathwise"}  # each episode follows one function
 
-START_BOX = 0.5  # usually
+START_BOX = 0.5  # default
 
 MOST_THREADS = 1_024  # more than any machine has; torch would end the process when the system refuses another thread
 
@@ -26,10 +26,13 @@ Tracker = Literal["tensorboard", "wandb", "mlflow"]
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """What to train. None takes what the specification suggests.
+    """Settings of a training. None takes the specification's suggestion.
 
-    ``session`` holds further fields of ``OpenSession`` (variant, particles, model, penalty, ...); ``hyperparameters``
-    go to the algorithm's constructor, over the defaults. Raises ValueError for ``threads`` that no machine has.
+    ``session`` has further fields of ``OpenSession`` (variant, particles, model, penalty, ...). ``hyperparameters`` go
+    to the algorithm's constructor and replace its defaults.
+
+    Raises:
+        ValueError: ``threads`` exceeds any machine's.
     """
 
     algorithm: str = "PPO"  # name of a ``PolicySearch``, in any case
@@ -37,17 +40,17 @@ class TrainSettings:
     num_envs: int | None = None
     seed: int = 0
     start_box: float | None = None  # share of episodes that start anywhere in the sampling range; None: START_BOX
-    start_from: Path | None = None  # go on from a saved policy
+    start_from: Path | None = None  # saved policy to continue from
     trust_policy: bool = False  # unpickle that policy's objects, which may run code
-    anew: bool = False  # begin with a new network, and go on from the saved policy only where that falls short
-    prolong: bool | None = None  # as many steps again while it still gains; None: as ``prolongs``
+    anew: bool = False  # begin with a new network, and use the saved policy only if the new one stays worse
+    prolong: bool | None = None  # whether to take as many steps again if the return still rises; None: as ``prolongs``
     threads: int = 1
-    tracker: Tracker | None = None  # of the searches that log curves
+    tracker: Tracker | None = None  # for searches that log curves
     tensorboard: Path | None = (
         None  # folder of TensorBoard's files; None: beside the policy, where the tracker has some
     )
     session: dict[str, Any] = field(default_factory=dict)
-    judge: dict[str, Any] | None = None  # session fields by which policies are compared; None: those they learn in
+    judge: dict[str, Any] | None = None  # session fields for comparing policies; None: those of the training
     hyperparameters: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -56,7 +59,7 @@ class TrainSettings:
 
     @property
     def learning(self) -> dict[str, Any]:
-        """Session fields of the lanes that a policy learns in."""
+        """Return the session fields of the lanes that a policy learns in."""
         start_box = START_BOX if self.start_box is None else self.start_box
         return {"seed": self.seed, "start_box": start_box, **self.session}
 
@@ -66,19 +69,19 @@ class TrainSettings:
 
 
 def chosen_for(view: SurrogateView, settings: TrainSettings, *, by_mean: bool = False) -> TrainSettings:
-    """The settings for a policy that is to be used, by what its surrogate's design came to.
+    """Return settings adapted to the phase that the surrogate's design ended in.
 
-    Where repeated steps have shown that the original environment is noisy, the learned noise moves the lanes. Where the
-    design is not ready the policy learns on draws, a state a lane (TS1 of Chua et al. 2018): what relies on the mean
-    where the model is unsure fails in the original environment. Policies are compared by functions of the posterior:
-    draws shake a lane out of a state in which the policy would leave it for good. Who names a variant keeps it, and
-    preset ``paper`` has AUR-D. Where a specification pays for leaving what a log has shown, no episode starts
-    anywhere else.
+    If repeated steps have shown that the original environment is noisy, the learned noise moves the lanes. If the
+    design is not ready, the policy learns on draws, one state for each lane (TS1 of Chua et al. 2018), because a policy
+    that relies on an uncertain mean fails in the original environment. Policies are compared along drawn functions of
+    the posterior: independent draws would shake a lane out of a state in which the policy would remain. A variant in
+    ``settings`` is kept, and preset ``paper`` has AUR-D. If a specification penalises leaving the states of a log, no
+    episode starts outside of them.
 
     Args:
         view: the surrogate.
-        settings: what was asked for.
-        by_mean: the search follows the mean without noise, whatever the session.
+        settings: settings that the user chose.
+        by_mean: whether the search moves by the mean without noise, whatever the session's variant.
     """
     if view.spec.design.preset == "paper":
         return settings
@@ -94,15 +97,18 @@ def chosen_for(view: SurrogateView, settings: TrainSettings, *, by_mean: bool = 
 
 
 def prolongs(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
-    """Whether a training that still gains at its end takes as many steps again: where nobody said so, if no number of
-    steps was asked for either. Preset ``paper`` has its cap."""
+    """Whether a training takes as many steps again if its imagined return still rises at the end.
+
+    By default it does if the number of steps was not chosen. With preset ``paper``, the paper's maximum holds.
+    """
     if settings.prolong is not None:
         return settings.prolong
     return settings.total_steps is None and spec.design.preset != "paper"
 
 
 def with_folder(settings: TrainSettings, out: Path) -> TrainSettings:
-    """The settings with the folder of TensorBoard's files, where the tracker has some: beside the policy by default."""
+    """Return the settings with the folder for TensorBoard's files, if the tracker has some. Default: beside the
+    policy."""
     if settings.tensorboard is not None or settings.tracker not in ("tensorboard", "wandb"):
         return settings
     return replace(settings, tensorboard=out.parent / TENSORBOARD)
@@ -110,32 +116,38 @@ def with_folder(settings: TrainSettings, out: Path) -> TrainSettings:
 
 @dataclass(frozen=True)
 class TrainProgress:
+    """State of a training at one report."""
+
     steps: int
     total_steps: int
-    imagined_return: float | None  # at the last check: mean over virtual episodes from the declared starts
-    penalty_share: float  # of the reward's size, since the last report
+    imagined_return: float | None  # at the last check: mean return of virtual episodes from the declared starts
+    penalty_share: float  # size of the penalty as a share of the reward's size, since the last report
     episode_penalty: float | None = None  # what it takes off a training episode's return; mean of the last 100
-    visited_confidence: float | None = None  # the confidence index where the policy went in the last round
+    visited_confidence: float | None = (
+        None  # confidence index over the states that the policy visited in the last round
+    )
 
 
 @dataclass(frozen=True)
 class TrainResult:
+    """Result of a training."""
+
     path: Path
     algorithm: str
     virtual_steps: int
     seconds: float
-    imagined_return: float | None  # of the policy that was kept
-    lost_episodes: int  # cut because the server lost the session
+    imagined_return: float | None  # of the saved policy
+    lost_episodes: int  # episodes that ended because the server lost the session
     settings: dict[str, Any]
     episode_penalty: float | None = None  # what it takes off a training episode's return; mean of the last 100
-    networks: int = 1  # that learned in the last training, one after another where one was given up
-    gaining: bool = False  # the best policy was still getting better when the training ended
+    networks: int = 1  # networks of the last training; more than one if networks were abandoned
+    gaining: bool = False  # whether the best policy was still improving when the training ended
     untrained: float | None = None  # imagined return of a network that has learned nothing; None: not measured
-    visited_confidence: tuple[float | None, ...] = ()  # the confidence index where the policy went, of each round
+    visited_confidence: tuple[float | None, ...] = ()  # confidence index over the visited states, of each round
 
 
 class TrainingInterrupted(KeyboardInterrupt):
-    """Ctrl-C came in a training; ``result`` is of the policy that was saved then."""
+    """Ctrl-C interrupted a training. ``result`` is that of the policy that was saved then."""
 
     def __init__(self, result: TrainResult) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""One training: a policy search by name, its policy's file, and beside it what the policy was found with."""
+"""One training: run a policy search, save the policy, and write the settings beside it."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ def train(
     settings: TrainSettings | None = None,
     progress: Progress | None = None,
 ) -> TrainResult:
-    """Learn a policy in the surrogate behind a port, and save it.
+    """Train a policy in the surrogate behind a port, and save it.
 
     Args:
         port: the surrogate.
-        out: where the policy goes; beside it, with suffix .json, what it was trained with.
-        settings: what to train, and by which search.
-        progress: called after every rollout, generation or whatever the search works in.
+        out: file to write the policy to; its settings go to the file with suffix .json beside it.
+        settings: settings of the training, which name the search.
+        progress: called after every rollout, generation or other unit of the search.
 
     Raises:
-        ValueError: an unknown algorithm, one that can't take the action space, or too many steps.
-        SurrogymClientError: the surrogate can't be reached, or has no model yet; or the file to go on from is no policy
-            of the algorithm.
-        TrainingInterrupted: Ctrl-C came; the policy with the best imagined return so far is saved.
+        ValueError: an unknown algorithm, one that does not support the action space, or too many steps.
+        SurrogymClientError: the surrogate can't be reached, or has no model yet.
+        UnusablePolicy: the file to start from is not a policy of the algorithm.
+        TrainingInterrupted: Ctrl-C was pressed; the policy with the best imagined return so far is saved.
     """
     settings = settings or TrainSettings()
     search = search_for(settings)

@@ -1,4 +1,4 @@
-"""What ``surrogym train`` says, while it runs and at its end."""
+"""Text that ``surrogym train`` prints while it runs and at its end."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def words_of_result(
     result: TrainResult, handover: Handover | None = None, *, closed_loop: bool = False, server: str | None = None
 ) -> str:
-    """What a training gave, and what is next; ``server`` is an address that the next command has to be given too."""
+    """Describe the result of a training and the next command, which needs ``server`` if that is given."""
     on_server = "" if server is None else f" --server {shlex.quote(server)}"
     lost = result.lost_episodes
     cut = f"; {lost} episode{'s' * (lost > 1)} cut short, lost with the server's sessions" if lost else ""
@@ -27,7 +27,7 @@ def words_of_result(
 
 
 def words_of_handover(handover: Handover) -> str:
-    """The promise of a policy, and whether to trust it, on a line of its own."""
+    """Describe the promise of a policy, and whether to trust it, in one line."""
     promise, trusted = handover.promise, "trusted" if handover.trusted else "not trusted"
     if promise is None:
         return f"no promise, {trusted}: {handover.reason}"
@@ -39,7 +39,8 @@ def words_of_handover(handover: Handover) -> str:
 
 
 def words_of_interruption(result: TrainResult, asked: str) -> str:
-    """What Ctrl-C left, and how to go on; ``asked`` is the surrogate, with the options that were given."""
+    """Describe what is left after Ctrl-C and how to continue; ``asked`` is the surrogate with the options of the
+    command."""
     return (
         f"interrupted after {result.virtual_steps} virtual steps; the policy so far is in {result.path}; to go on: "
         f"surrogym train {asked} --start-from {result.path} --out {result.path}"
@@ -47,7 +48,7 @@ def words_of_interruption(result: TrainResult, asked: str) -> str:
 
 
 def words_of(now: dict[str, Any]) -> str:
-    """One look at the training, from the fields of ``TrainProgress``."""
+    """Describe the state of a training, from the fields of ``TrainProgress``."""
     penalty = f", penalty {now['episode_penalty']:.1f} an episode" if now["episode_penalty"] else ""
     known = _known(now.get("visited_confidence"))
     return f"{now['steps']} of {now['total_steps']} virtual steps{_imagined(now['imagined_return'])}{penalty}{known}"
@@ -62,7 +63,7 @@ def _gaining(result: TrainResult) -> str:
 
 
 def _loop(rounds: Sequence[float | None]) -> str:
-    """How the closed loop went, from the confidence index of each round."""
+    """Describe the closed loop by the confidence index of each round."""
     if not rounds:
         return "; the design was ready, no round was needed"
     return f"; {len(rounds)} round{'s' * (len(rounds) > 1)}{_known(rounds[-1])}"

@@ -1,1 +1,1 @@
-"""Proximal policy optimisation in NumPy, with gradients written out; needs no torch."""
+"""Proximal policy optimisation in NumPy, with gradients written out. It needs no torch."""

@@ -1,4 +1,4 @@
-"""The distributions of ``surrogym_shared.distributions`` as they are learned: first parameters, and derivatives."""
+"""Learning the action distributions of ``surrogym_shared.distributions``: initial parameters and derivatives."""
 
 from __future__ import annotations
 
@@ -15,34 +15,36 @@ from surrogym_shared.network import Activation
 
 
 class Distribution(Sampled, Protocol):
-    """A distribution of actions (B, F) that a learner can improve."""
+    """Distribution of actions (B, F) with the derivatives that a learner needs."""
 
     @property
     def activation(self) -> Activation:
-        """Of an actor's hidden layers, and a critic's."""
+        """Activation of the hidden layers of actor and critic."""
         ...
 
     def further(self) -> Array:
-        """The further parameters at first, (K,)."""
+        """Initial values of the parameters besides the network's, (K,)."""
         ...
 
     def arrays(self) -> tuple[tuple[int, ...], Array, Array]:
-        """Counts of choices, centre and reach, as compiled code takes them; what there is none of is empty."""
+        """Return the numbers of choices, the centre and the reach, as compiled code expects them. Absent ones are
+        empty."""
         ...
 
     def slopes(self, outputs: Array, further: Array, actions: Array, by: Array) -> tuple[Array, Array]:
-        """Derivatives of a loss by outputs and further parameters, from ``by`` (B,), those by log probabilities."""
+        """Return a loss's derivatives by outputs and further parameters, given those by log probabilities, ``by``
+        (B,)."""
         ...
 
 
 @dataclass(frozen=True)
 class Bounded(distributions.Bounded):
-    """Continuous, with deviations that no state changes."""
+    """Continuous actions within bounds; their standard deviations do not depend on the state."""
 
     activation: Activation = "tanh"
 
     def further(self) -> Array:
-        """Logarithms of the deviations."""
+        """Initial logarithms of the standard deviations."""
         logarithms: Array = np.log(EXPLORATION * self.reach).astype(np.float32)
         return logarithms
 
@@ -58,7 +60,7 @@ class Bounded(distributions.Bounded):
 
 @dataclass(frozen=True)
 class Choices(distributions.Choices):
-    """Discrete."""
+    """Discrete actions."""
 
     activation: Activation = "relu"
 
@@ -78,7 +80,7 @@ class Choices(distributions.Choices):
 
 
 def distribution_of(counts: tuple[int, ...], low: NDArray[np.float64], high: NDArray[np.float64]) -> Distribution:
-    """The distribution of actions with these choices, or within these bounds (F,)."""
+    """Return the distribution for these numbers of choices, or for continuous actions within these bounds (F,)."""
     if counts:
         return Choices(counts)
     return Bounded(*middle_and_reach(low, high, np.dtype(np.float32)))

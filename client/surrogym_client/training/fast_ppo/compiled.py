@@ -1,10 +1,10 @@
-"""One update of PPO in compiled code; ``learner.Learner.update`` in NumPy is the reference.
+"""One update of PPO in compiled code. ``learner.Learner.update`` is the same in NumPy, and the reference.
 
-A batch passes through the networks in blocks of rows, whose activations stay in the cache next to the processor. Matrix
-products are BLAS's. All arrays are float32.
+A batch passes through the networks in blocks of rows, so that activations stay in the processor's cache. BLAS computes
+the matrix products. All arrays are float32.
 
-Shapes: B rows of a batch, n of a block, I inputs and O outputs of a layer, A outputs of the actor, F action entries,
-K further parameters, P parameters.
+Shapes: B rows of a batch, n of a block, I inputs and O outputs of a layer, A outputs of the actor, F action entries, K
+further parameters, P parameters.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SIZES = types.int64[::1]
 
 @inlined
 def bent(x: np.float32) -> np.float32:
-    """tanh x to 4 units in the last place, by the quotient of polynomials that Eigen uses."""
+    """Compute tanh x to 4 units in the last place, by the rational approximation that Eigen uses."""
     x = min(max(x, -LARGEST_TANH), LARGEST_TANH)
     s = x * x
     p = np.float32(-2.76076847742355e-16)
@@ -53,7 +53,7 @@ def bent(x: np.float32) -> np.float32:
 
 @compiled
 def activate(y: Floats, bias: Floats, relu: bool) -> None:
-    """The activation of y + bias, in the place of y (n, O)."""
+    """Apply bias and activation to y (n, O) in place."""
     rows, columns = y.shape
     for i in range(rows):
         if relu:
@@ -66,7 +66,7 @@ def activate(y: Floats, bias: Floats, relu: bool) -> None:
 
 @compiled
 def through(slope: Floats, y: Floats, relu: bool) -> None:
-    """The derivative by what entered an activation, in the place of that by its output y (n, O)."""
+    """Multiply a derivative by the activation's derivative, in place. The activation's output is y (n, O)."""
     rows, columns = y.shape
     for i in range(rows):
         if relu:
@@ -79,7 +79,8 @@ def through(slope: Floats, y: Floats, relu: bool) -> None:
 
 @compiled
 def forward(parameters: Floats, sizes: Ints, relu: bool, x: Floats, passed: Floats) -> Floats:
-    """Outputs (n, O) of a network for inputs (n, I). ``passed`` takes the outputs of its layers, one behind another."""
+    """Return the outputs (n, O) of a network for inputs (n, I). ``passed`` receives the outputs of all layers,
+    concatenated."""
     rows, begin, at, last = len(x), 0, 0, sizes.size - 2
     for layer in range(last + 1):
         inputs, outputs = sizes[layer], sizes[layer + 1]
@@ -97,7 +98,7 @@ def forward(parameters: Floats, sizes: Ints, relu: bool, x: Floats, passed: Floa
 
 @compiled
 def turned(parameters: Floats, sizes: Ints) -> Floats:
-    """The parameters (P,) with the weights of each layer transposed: BLAS multiplies by them faster."""
+    """Return the parameters (P,) with each layer's weights transposed, because BLAS multiplies by them faster."""
     found, begin = np.empty_like(parameters), 0
     for layer in range(sizes.size - 1):
         inputs, outputs = sizes[layer], sizes[layer + 1]
@@ -114,7 +115,8 @@ def turned(parameters: Floats, sizes: Ints) -> Floats:
 def backward(
     transposed: Floats, gradient: Floats, sizes: Ints, relu: bool, x: Floats, passed: Floats, slope: Floats
 ) -> None:
-    """Add to the gradient (P,) of a loss whose derivative by the outputs of the last pass is ``slope`` (n, O)."""
+    """Add to ``gradient`` (P,) that of a loss whose derivative by the outputs of the last forward pass is ``slope``
+    (n, O)."""
     rows, end, at = len(x), len(gradient), len(x) * sizes[1:].sum()
     spare = np.empty((2, rows * sizes.max()), dtype=np.float32)
     product = np.empty(len(gradient), dtype=np.float32)
@@ -145,7 +147,7 @@ def add(total: Floats, more: Floats) -> None:
 
 @inlined
 def slope_of(log: np.float32, before: np.float32, advantage: np.float32, clip: np.float32) -> np.float32:
-    """The derivative of a row's loss by its log probability. Where the ratio is clipped, the loss is flat."""
+    """Return the derivative of a row's loss by its log probability. It is zero where the ratio is clipped."""
     ratio = np.float32(math.exp(log - before))
     free = ratio <= ONE + clip if advantage > NONE else ratio >= ONE - clip
     return -advantage * ratio if free else NONE
@@ -163,7 +165,8 @@ def bounded(
     further: Floats,
     by_further: Floats,
 ) -> None:
-    """Slopes of the loss in the place of outputs y (n, F), for continuous actions; adds to those by log deviations."""
+    """Replace outputs y (n, F) by the derivatives of the loss, for continuous actions. Adds to those by log
+    deviations."""
     inverse = np.empty_like(further)
     for j in range(further.size):
         inverse[j] = math.exp(-further[j])
@@ -182,7 +185,7 @@ def bounded(
 
 @compiled
 def log_softmax(scores: Floats) -> None:
-    """Log probabilities in the place of scores (O,)."""
+    """Replace scores (O,) by log probabilities."""
     largest, total = scores[0], NONE
     for score in scores:
         largest = max(largest, score)
@@ -195,7 +198,7 @@ def log_softmax(scores: Floats) -> None:
 
 @compiled
 def choices(y: Floats, actions: Floats, logs: Floats, advantages: Floats, clip: np.float32, counts: Ints) -> None:
-    """Slopes of the loss in the place of outputs y (n, A), for a choice for each entry of an action."""
+    """Replace outputs y (n, A) by the derivatives of the loss, for discrete actions."""
     for i in range(len(y)):
         log, begin = NONE, 0
         for k in range(counts.size):
@@ -213,7 +216,7 @@ def choices(y: Floats, actions: Floats, logs: Floats, advantages: Floats, clip: 
 
 @summing
 def normalised(advantages: Floats) -> Floats:
-    """Advantages (B,) with mean 0 and deviation 1, over B. One alone keeps its size."""
+    """Scale advantages (B,) to mean 0 and standard deviation 1 over B. A single advantage keeps its size."""
     size, mean, variance = advantages.size, 0.0, 0.0
     if size == 1:
         return advantages
@@ -231,7 +234,7 @@ def normalised(advantages: Floats) -> Floats:
 def adam(
     parameters: Floats, gradient: Floats, first: Floats, second: Floats, updates: int, largest: float, rate: float
 ) -> None:
-    """A step of Adam, the ``updates``-th, with a gradient (P,) whose norm is at most ``largest``."""
+    """Take step number ``updates`` of Adam, with a gradient (P,) that is scaled to a norm of at most ``largest``."""
     squares = NONE
     for i in range(gradient.size):
         squares += gradient[i] * gradient[i]
@@ -277,13 +280,13 @@ def update(
     max_grad_norm: float,
     rate: float,
 ) -> None:
-    """One step of Adam on the loss of a batch, in the place of the parameters (P,) and both moments (P,).
+    """Take one step of Adam on the loss of a batch. Changes the parameters (P,) and both moments (P,) in place.
 
     Args:
-        actor: numbers that enter, pass between the layers, and leave; the critic's likewise.
-        ends: of the actor's parameters, and of the critic's behind them; the further ones are the rest.
-        counts: choices of each entry of a discrete action; none for continuous ones.
-        relu: whether the hidden layers have it; else they have tanh.
+        actor: sizes of the actor's layers, from inputs to outputs; likewise ``critic``.
+        ends: where the actor's parameters end, and where the critic's end behind them; the others are further ones.
+        counts: numbers of choices of each entry of a discrete action; empty for continuous actions.
+        relu: whether the hidden layers use ReLU; otherwise tanh.
     """
     gradient, clip = np.zeros_like(parameters), np.float32(clip_range)
     ours, theirs = slice(0, ends[0]), slice(ends[0], ends[1])

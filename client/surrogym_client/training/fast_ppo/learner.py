@@ -34,7 +34,7 @@ from surrogym_shared.spec import EnvironmentSpec
 
 HIDDEN_GAIN, ACTION_GAIN, VALUE_GAIN = 2**0.5, 0.01, 1.0
 FIRST_DECAY, SECOND_DECAY, EPSILON = 0.9, 0.999, 1e-5  # of Adam
-LEARNER = "learner.npz"  # entry of a policy's file, for those who go on from it
+LEARNER = "learner.npz"  # entry of a policy's file from which training can continue
 VECTORS = ("parameters", "first", "second")
 
 
@@ -43,7 +43,7 @@ Update = Callable[..., None]
 
 @cache
 def compiled_update() -> Update | None:
-    """The update in compiled code; None where this installation can't compile it."""
+    """Return the update in compiled code; None if this installation can't compile it."""
     if not available():
         return None
     try:
@@ -55,7 +55,7 @@ def compiled_update() -> Update | None:
 
 @dataclass(frozen=True)
 class Objective:
-    """Constants of the loss, and of a step."""
+    """Constants of the loss and of one optimiser step."""
 
     clip_range: float = 0.2
     vf_coef: float = 0.5
@@ -64,21 +64,21 @@ class Objective:
 
 @dataclass(frozen=True)
 class Batch:
-    """Transitions that a policy learns from."""
+    """Transitions to learn from."""
 
     observations: Array  # (B, D) standardised
     actions: Array  # (B, F)
-    log_probabilities: Array  # (B,) when they were taken
+    log_probabilities: Array  # (B,) at the time of acting
     advantages: Array  # (B,)
-    returns: Array  # (B,) of the scaled rewards, what the critic learns
+    returns: Array  # (B,) targets of the critic, from scaled rewards
 
     def at(self, rows: NDArray[np.int64] | slice) -> Batch:
-        """Some of them."""
+        """Return the batch of these rows."""
         return Batch(*(getattr(self, one.name)[rows] for one in fields(self)))
 
 
 class Learner:
-    """All parameters in one vector, so that Adam and the norm of the gradient are a few operations."""
+    """Actor, critic and Adam, with all parameters in one vector so that each update is a few operations."""
 
     def __init__(
         self,
@@ -121,17 +121,17 @@ class Learner:
         return x
 
     def acting(self) -> ActingPolicy:
-        """The actor and its noise as arrays, which are views of the parameters."""
+        """Return the actor and its noise as arrays, which are views of the parameters."""
         layers = tuple(Layer(*layer) for layer in self.actor.layers)
         log_deviations = self.further if len(self.further) else None
         return ActingPolicy(self.mean, self.deviation, layers, self.distribution.activation, log_deviations)
 
     def values(self, x: Array) -> Array:
-        """Of standardised observations (B, D), (B,)."""
+        """Return the critic's values (B,) of standardised observations (B, D)."""
         return self.critic.forward(x)[:, 0].copy()
 
     def update(self, batch: Batch, objective: Objective, rate: float) -> None:
-        """One step of Adam on the loss of a batch."""
+        """Take one step of Adam on the loss of a batch."""
         self._updates += 1
         if self._update is not None:
             moments = self._first, self._second
@@ -170,7 +170,7 @@ class Learner:
         self.parameters -= step * self._first / root
 
     def policy(self) -> Network:
-        """The actor's most probable actions as they are now."""
+        """Return the policy of the actor's most probable actions, with the present parameters."""
         layers = self.actor.layers
         return Network(
             self.mean.astype(np.float64),
@@ -182,18 +182,22 @@ class Learner:
         )
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """What a later training needs beside the policy: all parameters, and the moments of Adam."""
+        """Return the arrays that a later training needs besides the policy: all parameters, and the moments of Adam."""
         vectors = zip(VECTORS, (self.parameters, self._first, self._second), strict=True)
         return {"updates": np.array(self._updates), **{name: vector.copy() for name, vector in vectors}}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Go back to what ``state`` gave."""
+        """Restore the arrays that ``state`` returned."""
         for name, vector in zip(VECTORS, (self.parameters, self._first, self._second), strict=True):
             vector[:] = state[name]
         self._updates = int(state["updates"])
 
     def require(self, headers: Mapping[str, Header]) -> None:
-        """Raise ValueError unless these are the arrays of a state of this network."""
+        """Check that these arrays are a state of this network.
+
+        Raises:
+            ValueError: an array is missing, or has another shape or type.
+        """
         shapes = {**dict.fromkeys(VECTORS, self.parameters.shape), "updates": ()}
         found = {name: header.shape for name, header in headers.items()}
         if found != shapes:
@@ -202,13 +206,13 @@ class Learner:
 
 @dataclass(frozen=True)
 class LearnedNetwork:
-    """A policy, and the state of its learner."""
+    """A policy together with the state of its learner."""
 
     policy: Network
     state: Mapping[str, NDArray[Any]]
 
     def save(self, path: Path) -> None:
-        """Write the network of arrays, and beside it in the same file the learner's."""
+        """Write the policy and the learner's state to one file."""
         self.policy.save(path)
         file = io.BytesIO()
         arrays: dict[str, Any] = dict(self.state)
@@ -218,10 +222,10 @@ class LearnedNetwork:
 
 
 def restored(path: Path, spec: EnvironmentSpec, units: tuple[int, ...]) -> Learner:
-    """The learner in a policy's file.
+    """Restore the learner from a policy's file.
 
     Raises:
-        UnusablePolicy: the file holds none, or one of another network.
+        UnusablePolicy: the file contains no learner, or one of another network.
     """
     policy = _policy(path)
     learner = Learner(spec, policy.mean, policy.deviation, units, np.random.default_rng(0))
@@ -230,7 +234,8 @@ def restored(path: Path, spec: EnvironmentSpec, units: tuple[int, ...]) -> Learn
 
 
 def noisy(path: Path) -> Predict:
-    """A saved policy that acts with its noise, the same each time it is read. Raises as ``restored``."""
+    """Load a policy that acts with its noise. The noise is the same each time the file is read. Raises as
+    ``restored``."""
     policy = _policy(path)
     distribution = distribution_of(policy.counts, policy.low, policy.high)
     parameters, rng = _state(path, _require_parameters)["parameters"], np.random.default_rng(0)

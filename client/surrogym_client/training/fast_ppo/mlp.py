@@ -1,4 +1,4 @@
-"""Layers with a bias each, forwards and backwards, on arrays that are made once."""
+"""A multilayer perceptron with forward and backward passes, on arrays that are reused."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ Array = NDArray[np.floating[Any]]  # float32
 
 
 class Mlp:
-    """A network of hidden layers and a linear last one.
+    """Network of hidden layers and a linear last layer.
 
-    ``parameters`` and ``gradient`` are vectors that somebody else may own; the layers are views of them.
+    ``parameters`` and ``gradient`` are vectors that the caller owns; the layers are views of them.
 
     Args:
-        sizes: numbers that enter, pass between the layers, and leave.
-        activation: of the hidden layers.
-        parameters: where the parameters are, ``count(sizes)`` of them.
-        gradient: where their gradient goes.
+        sizes: numbers of inputs, of units in each hidden layer, and of outputs.
+        activation: activation of the hidden layers.
+        parameters: vector of the parameters, with ``count(sizes)`` entries.
+        gradient: vector that receives their gradient.
     """
 
     def __init__(self, sizes: Sequence[int], activation: Activation, parameters: Array, gradient: Array) -> None:
         self.activation = activation
         self.layers = layers_of(sizes, parameters)
         self._gradients = layers_of(sizes, gradient)
-        self._passed: list[Array] = []  # what entered each layer in the last pass that was kept
+        self._passed: list[Array] = []  # inputs of each layer in the last pass that was kept
         self._made: dict[tuple[int, int], Array] = {}
 
     @staticmethod
@@ -39,7 +39,7 @@ class Mlp:
         return sum((inputs + 1) * outputs for inputs, outputs in pairwise(sizes))
 
     def forward(self, x: Array) -> Array:
-        """Outputs (B, O) of inputs (B, I). The array is used again by the next pass of as many rows."""
+        """Return the outputs (B, O) for inputs (B, I). The next pass with as many rows reuses the array."""
         self._passed = [x]
         for number, (weights, bias) in enumerate(self.layers):
             y = self._array(2 * number, len(x), weights.shape[1])
@@ -66,7 +66,7 @@ class Mlp:
                 slope = self._through(before, x, number)
 
     def _through(self, slope: Array, y: Array, number: int) -> Array:
-        """The derivative by what entered an activation, from that by its output y."""
+        """Return the derivative by the activation's input, given that by its output y."""
         if self.activation == "relu":
             slope *= y > 0
             return slope
@@ -77,7 +77,8 @@ class Mlp:
         return slope
 
     def _array(self, place: int, rows: int, columns: int) -> Array:
-        """An array of one place in the passes: new memory for every batch would cost as much as the products."""
+        """Return the reusable array of one place in the passes. New memory for each batch would take as long as the
+        products."""
         key = (place, rows)
         if key not in self._made:
             self._made[key] = np.empty((rows, columns), dtype=np.float32)
@@ -85,7 +86,7 @@ class Mlp:
 
 
 def orthogonal(rng: np.random.Generator, inputs: int, outputs: int, gain: float) -> Array:
-    """Weights (I, O) whose columns or rows are orthogonal, times a gain (Saxe et al., 2014)."""
+    """Return weights (I, O) with orthogonal columns or rows, times a gain (Saxe et al., 2014)."""
     drawn = rng.normal(size=(max(inputs, outputs), min(inputs, outputs)))
     q, r = np.linalg.qr(drawn)
     q *= np.sign(np.diag(r))

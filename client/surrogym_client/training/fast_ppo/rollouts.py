@@ -1,4 +1,4 @@
-"""Rollouts of N lanes for T steps, with rewards scaled and advantages estimated."""
+"""Rollouts of N lanes for T steps, with scaled rewards and estimated advantages."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ LATEST_EPISODES = 100
 
 @dataclass(frozen=True)
 class Rollout:
-    """What T steps of N lanes gave; rows are T N transitions, lane by lane within a step."""
+    """Result of T steps of N lanes. Its T N rows are transitions, ordered by step and then by lane."""
 
     rows: Batch
-    earned: list[float]  # by the episodes that ended, not scaled
-    penalty_share: float  # of the reward's size
+    earned: list[float]  # unscaled returns of the episodes that ended
+    penalty_share: float  # size of the penalty as a share of the reward's size
     lost: int  # episodes cut because the server lost the session
 
 
 class Collector:
-    """The lanes between two rollouts: where they stand, and what their running episodes earned.
+    """Collects rollouts from lanes, and keeps their observations and running returns between two rollouts.
 
     Args:
-        lanes: of an open session with autoreset in the same step.
+        lanes: lanes of an open session with autoreset in the same step.
         gamma: discount.
         gae_lambda: lambda of the generalised advantage estimate (Schulman et al. 2016).
-        seed: of the actions' noise.
+        seed: seed of the actions' noise.
     """
 
     def __init__(self, lanes: Lanes, gamma: float, gae_lambda: float, seed: int) -> None:
@@ -45,17 +45,17 @@ class Collector:
         self._lanes, self._penalised = ActingLanes(lanes), lanes.view.penalty > 0
         self._lanes.reset()
         self._scale = RewardScale(lanes.num_envs, gamma)
-        self._earned = np.zeros(lanes.num_envs)  # by the running episodes
-        self._penalty = np.zeros(lanes.num_envs)  # taken off them
+        self._earned = np.zeros(lanes.num_envs)  # returns of the running episodes
+        self._penalty = np.zeros(lanes.num_envs)  # penalties subtracted from them
         self._penalties: deque[float] = deque(maxlen=LATEST_EPISODES)
 
     @property
     def episode_penalty(self) -> float | None:
-        """What the penalty took off an episode's return, mean of the last ones; None in a session without."""
+        """Mean penalty of the last episodes, summed over an episode; None in a session without a penalty."""
         return float(np.mean(self._penalties)) if self._penalties else None
 
     def collect(self, learner: Learner, steps: int) -> Rollout:
-        """Take ``steps`` steps with every lane; the policy acts with its noise."""
+        """Step every lane ``steps`` times. The policy acts with its noise."""
         taken = self._lanes.take(learner.acting(), steps, self._noise)
         self._noise = self._noise.later(steps)
         rollout = taken.rollout
@@ -90,7 +90,7 @@ class Collector:
         )
 
     def _end(self, ended: NDArray[np.bool_], lost: NDArray[np.bool_]) -> list[float]:
-        """End the episodes of these lanes (N,); what they earned, but for those that were lost."""
+        """End the episodes of these lanes (N,), and return their returns, except for lost ones."""
         earned: list[float] = self._earned[ended & ~lost].tolist()
         if self._penalised:
             self._penalties.extend(self._penalty[ended].tolist())
@@ -99,7 +99,7 @@ class Collector:
         return earned
 
     def _bootstrap(self, learner: Learner, rewards: Array, rollout: PolicyRollout) -> None:
-        """Add to the last reward of a truncated episode what the critic expects beyond it."""
+        """Add the critic's value of the last observation to the last reward of each truncated episode."""
         at = rollout.final_steps, rollout.final_lanes
         short = (rollout.truncated & ~rollout.terminated)[at]
         if not short.any():
@@ -119,7 +119,8 @@ class Collector:
 
 
 class RewardScale:
-    """Rewards over the running deviation of discounted returns, as Stable-Baselines3's ``VecNormalize`` has it."""
+    """Divide rewards by the running standard deviation of discounted returns, as Stable-Baselines3's
+    ``VecNormalize`` does."""
 
     def __init__(self, lanes: int, gamma: float) -> None:
         self._gamma = gamma
@@ -127,7 +128,7 @@ class RewardScale:
         self._mean, self._variance, self._count = 0.0, 1.0, 1e-4
 
     def __call__(self, reward: NDArray[Any], ended: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Scaled rewards (N,); episodes that ``ended`` (N,) begin anew."""
+        """Return scaled rewards (N,). Discounted returns of episodes that ``ended`` (N,) restart at zero."""
         self._returns = self._returns * self._gamma + reward
         self._learn()
         scaled = np.clip(reward / np.sqrt(self._variance + 1e-8), -LARGEST_REWARD, LARGEST_REWARD)
@@ -135,7 +136,7 @@ class RewardScale:
         return np.asarray(scaled, dtype=np.float64)
 
     def _learn(self) -> None:
-        """Mean and variance of all returns so far and these (Chan et al. 1979)."""
+        """Update mean and variance by the present returns (Chan et al. 1979)."""
         new, n = self._returns, len(self._returns)
         delta, count = float(new.mean()) - self._mean, self._count + n
         between = delta**2 * self._count * n / count

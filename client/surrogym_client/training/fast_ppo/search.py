@@ -1,4 +1,4 @@
-"""Proximal policy optimisation without torch as a policy search."""
+"""Proximal policy optimisation without torch, as a policy search."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ RANGES = {  # whole numbers have whole bounds
 
 @dataclass(frozen=True)
 class FastPpo(PolicySearch):
-    """PPO as ``PPO`` of Stable-Baselines3 is set here, at a sixth of the cost of an update.
+    """Policy search by PPO in NumPy, with updates that take a sixth of the time of Stable-Baselines3's.
 
-    The same networks, loss, Adam, scaled rewards and advantages. A network that has learned nothing after a quarter of
-    the steps is given up; then ``PPO`` of Stable-Baselines3 takes the steps that are left, for continuous actions with
-    noise by the state.
+    Networks, loss, Adam, scaled rewards and advantages are those of the search ``PPO``. A network that has learned
+    nothing after a quarter of the steps is abandoned. For continuous actions, the ``PPO`` of Stable-Baselines3 then
+    takes the remaining steps, with state-dependent noise.
     """
 
-    n_steps: int = 64  # of a lane in a rollout
+    n_steps: int = 64  # steps of each lane in a rollout
     n_epochs: int = 10
     batch_size: int | None = None  # None: about 1,024
-    learning_rate: float | None = None  # None: falls from 3e-3 to a fiftieth of it
-    gamma: float | None = None  # None: by the time limit
+    learning_rate: float | None = None  # None: decreases from 3e-3 to a fiftieth of it
+    gamma: float | None = None  # None: derived from the time limit
     gae_lambda: float = 0.97
     clip_range: float = 0.2
     vf_coef: float = 0.5
@@ -80,7 +80,7 @@ class FastPpo(PolicySearch):
         start = task.settings.start_from
         if start is not None and not Network.is_at(start):
             return _reference().search(task)  # only Stable-Baselines3 can train its own policies further
-        compiled_update()  # brings a library of linear algebra, whose threads are limited as well
+        compiled_update()  # loads a linear algebra library now, so that its threads are limited as well
         with threadpool_limits(limits=task.settings.threads), _lanes(task) as lanes:
             return _Training(self, task, lanes).run()
 
@@ -91,7 +91,7 @@ class FastPpo(PolicySearch):
 
 
 class _Training:
-    """The networks of one training, and the checks that compare them."""
+    """Networks of one training, and the checks that compare them."""
 
     def __init__(self, search: FastPpo, task: SearchTask, lanes: Lanes) -> None:
         self._search, self._task, self._spec = search, task, task.port.spec()
@@ -113,7 +113,7 @@ class _Training:
         self._collector = Collector(lanes, self._gamma, search.gae_lambda, settings.seed)
 
     def run(self) -> Found:
-        """Learn until a network comes to the end of its steps, or a person interrupts."""
+        """Train networks one after another until one completes its steps, or Ctrl-C is pressed."""
         verdicts, learner, whole = self._verdicts, self._new, True
         try:
             for learner in self._networks():
@@ -129,7 +129,7 @@ class _Training:
         return self._found(self._kept or _saved(learner), whole=whole)
 
     def _networks(self) -> Iterator[Learner]:
-        """A new network; when it is its turn the saved one, where that learned anything."""
+        """Iterate over networks to train: new ones, and in its turn the saved one if it had learned anything."""
         anew = self._task.settings.anew
         if anew or self._saved is None:
             yield self._new
@@ -143,7 +143,7 @@ class _Training:
                 yield self._new
 
     def _learn(self, learner: Learner, steps: int) -> None:
-        """Train one network for ``steps`` virtual steps. It stops early where the network is given up."""
+        """Train one network for ``steps`` virtual steps, or until it is abandoned."""
         verdicts, search = self._verdicts, self._search
         verdicts.begin()
         before = verdicts.own_steps
@@ -201,7 +201,7 @@ class _Training:
         )
 
     def _by_reference(self) -> Found:
-        """What ``PPO`` of Stable-Baselines3 finds in the steps that are left, or what is kept where that earns more."""
+        """Train ``PPO`` of Stable-Baselines3 for the remaining steps, and return its policy or the best earlier one."""
         verdicts, task = self._verdicts, self._task
         spent, left = verdicts.steps, max(verdicts.left, 1)
         chosen = _reference().exploring_by_state(self._spec)
@@ -220,7 +220,7 @@ class _Training:
 
 
 def units_of(spec: EnvironmentSpec) -> tuple[int, ...]:
-    """Units of the actor's hidden layers: the paper's for its preset, two wider ones otherwise."""
+    """Return the numbers of units in the actor's hidden layers: the paper's for its preset, else two wider layers."""
     return WIDER if spec.design.preset == "default" else (HIDDEN,)
 
 
@@ -229,7 +229,11 @@ def _saved(learner: Learner) -> LearnedNetwork:
 
 
 def _reference(**hyperparameters: Any) -> StableBaselinesSearch:
-    """``PPO`` of Stable-Baselines3. Raises ModuleNotFoundError where that is not installed."""
+    """Return the ``PPO`` search of Stable-Baselines3.
+
+    Raises:
+        ModuleNotFoundError: it is not installed.
+    """
     return cast("StableBaselinesSearch", SEARCHES.get(REFERENCE)(**hyperparameters))
 
 

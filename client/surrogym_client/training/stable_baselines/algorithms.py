@@ -1,6 +1,6 @@
-"""The algorithms of Stable-Baselines3 as policy searches.
+"""Policy searches by the algorithms of Stable-Baselines3.
 
-What differs between them follows from properties (on-policy or not, kind of action), never from a task's name.
+Their defaults depend on properties of an algorithm (on-policy or not, kind of action), never on a task's name.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from surrogym_shared.spec import EnvironmentSpec
 
 
 class OnPolicySearch(StableBaselinesSearch):
-    """Many lanes, the paper's policies."""
+    """Policy search by an on-policy algorithm: many lanes, and the paper's policy networks."""
 
     suggested_steps = 600_000
     lanes = LANES
@@ -30,7 +30,8 @@ class OnPolicySearch(StableBaselinesSearch):
 
 
 class OffPolicySearch(StableBaselinesSearch):
-    """Learns once for each step of all lanes, from every step it has seen, and takes far longer for each."""
+    """Policy search by an off-policy algorithm. It updates after each step of all lanes, so each step takes far
+    longer."""
 
     suggested_steps = 50_000
     lanes = 4
@@ -38,7 +39,7 @@ class OffPolicySearch(StableBaselinesSearch):
 
 
 class PPO(OnPolicySearch):
-    """In large batches, with a learning rate that falls: docs/decisions/0011."""
+    """PPO with large batches and a decreasing learning rate: docs/decisions/0011."""
 
     algorithm = stable_baselines3.PPO
 
@@ -54,28 +55,41 @@ class PPO(OnPolicySearch):
         }
 
     def exploring_by_state(self, spec: EnvironmentSpec) -> dict[str, Any]:
-        """Noise drawn anew at every step may never reach what takes many steps in one direction; noise that is a
-        function of the state, and stays for a rollout, pushes a lane its own way (gSDE, Raffin et al. 2022). For
-        continuous actions; the rollouts of the other algorithms are too short."""
+        """Return the hyperparameters of gSDE, which explores by a function of the state (Raffin et al. 2022).
+
+        Noise drawn anew at every step may never reach a goal that takes many steps in one direction. A noise function
+        that stays for a whole rollout pushes each lane its own way. It is for continuous actions, and for PPO alone,
+        because the rollouts of other algorithms are too short.
+        """
         able = not counts_of(spec) and spec.design.preset != "paper"
         return {"use_sde": True} if able else {}
 
 
 class A2C(OnPolicySearch):
+    """A2C of Stable-Baselines3."""
+
     algorithm = stable_baselines3.A2C
 
 
 class SAC(OffPolicySearch):
+    """SAC of Stable-Baselines3."""
+
     algorithm = stable_baselines3.SAC
 
 
 class TD3(OffPolicySearch):
+    """TD3 of Stable-Baselines3."""
+
     algorithm = stable_baselines3.TD3
 
 
 class DDPG(OffPolicySearch):
+    """DDPG of Stable-Baselines3."""
+
     algorithm = stable_baselines3.DDPG
 
 
 class DQN(OffPolicySearch):
+    """DQN of Stable-Baselines3."""
+
     algorithm = stable_baselines3.DQN

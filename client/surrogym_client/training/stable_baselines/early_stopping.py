@@ -16,15 +16,16 @@ from surrogym_client.training.verdicts import Imagined, Verdicts
 
 
 class Checks(BaseCallback):
-    """Measures the imagined return of what is learned, keeps the best policy, and reports progress and what the penalty
-    took of the reward. What follows from a check, ``verdicts`` say.
+    """Callback that measures the imagined return, keeps the best policy, and reports progress and the penalty's size.
+
+    ``verdicts`` decides what follows from a check.
 
     Args:
         total: virtual steps of the training.
         progress: called after every rollout.
-        imagine: what a learner earns in virtual episodes.
+        imagine: measures a learner's returns in virtual episodes.
         untrained: a learner that has learned nothing yet.
-        saved: a policy from before, for which a network is given up that does not come near it.
+        saved: policy of an earlier training; a network that does not come near it is abandoned.
     """
 
     def __init__(
@@ -39,7 +40,9 @@ class Checks(BaseCallback):
         self._progress = progress
         self._imagine = imagine
         self.verdicts = Verdicts(total, imagine(untrained), None if saved is None else imagine(saved))
-        self._kept: tuple[BaseAlgorithm, dict[str, Any]] | None = None  # whose, and its parameters then
+        self._kept: tuple[BaseAlgorithm, dict[str, Any]] | None = (
+            None  # the best learner, and its parameters at that check
+        )
         self._penalty = self._size = 0.0
         self._penalties: deque[float] = deque(maxlen=100)  # of the last episodes
         self.lost = 0
@@ -49,15 +52,18 @@ class Checks(BaseCallback):
         return float(np.mean(self._penalties)) if self._penalties else None
 
     def worth_keeping(self, known: BaseAlgorithm) -> bool:
-        """Whether a policy from before learned anything; it is kept as the best so far if it is."""
+        """Check a policy of an earlier training. If it had learned anything, it is kept as the best so far. Returns
+        whether it is."""
         best, learned = self.verdicts.knows(self._imagine(known))
         if best:
             self._keep(known)
         return learned
 
     def best_of(self, last: BaseAlgorithm) -> BaseAlgorithm:
-        """The learner that had the best imagined return of all checks, with its policy of then; without any check the
-        last one."""
+        """Return the learner with the best imagined return of all checks, with its parameters of that check.
+
+        Without any check, the last learner is returned.
+        """
         if self._kept is None:
             return last
         learner, parameters = self._kept

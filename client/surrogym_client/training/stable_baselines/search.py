@@ -1,4 +1,4 @@
-"""A training by an algorithm of Stable-Baselines3: networks one after another until one learns, the best one kept."""
+"""Training by an algorithm of Stable-Baselines3: networks are tried one after another, and the best policy is kept."""
 
 from __future__ import annotations
 
@@ -38,21 +38,22 @@ Statistics = tuple[Sequence[float], Sequence[float]]  # mean and deviation of ob
 
 @dataclass(frozen=True)
 class LearnedPolicy:
-    """The policy of a Stable-Baselines3 algorithm."""
+    """Policy of a Stable-Baselines3 algorithm."""
 
     learner: BaseAlgorithm
 
     def save(self, path: Path) -> None:
-        """Write the zip of Stable-Baselines3, with a description by which it is read without unpickling."""
+        """Write the zip of Stable-Baselines3, with a description from which it can be read without unpickling."""
         save_policy(self.learner, path)
 
 
 class StableBaselinesSearch(PolicySearch):
-    """A policy search by one algorithm. Its hyperparameters go to the algorithm's constructor, over the defaults."""
+    """Policy search by one algorithm. Its hyperparameters go to the algorithm's constructor and replace its
+    defaults."""
 
     algorithm: ClassVar[type[BaseAlgorithm]]
     policy: ClassVar[type[BasePolicy] | str]
-    lanes: ClassVar[int]  # of a session, where nobody says otherwise
+    lanes: ClassVar[int]  # default number of lanes
     prolongable = True
     tracked = True
 
@@ -73,15 +74,15 @@ class StableBaselinesSearch(PolicySearch):
         return lambda observation: learner.predict(observation, deterministic=False)[0]
 
     def defaults(self, env: VecNormalize) -> dict[str, Any]:  # noqa: ARG002  for algorithms that have some
-        """Hyperparameters in place of Stable-Baselines3's own."""
+        """Return the hyperparameters that replace Stable-Baselines3's own defaults."""
         return {}
 
     def network(self, spec: EnvironmentSpec) -> dict[str, Any]:  # noqa: ARG002
-        """Keywords of the policy beside its standardisation."""
+        """Return keywords of the policy network, except those of standardisation."""
         return {}
 
     def exploring_by_state(self, spec: EnvironmentSpec) -> dict[str, Any]:  # noqa: ARG002
-        """Hyperparameters of a network that follows one which was given up."""
+        """Return hyperparameters of the network that follows an abandoned one."""
         return {}
 
     @contextmanager
@@ -97,7 +98,7 @@ class StableBaselinesSearch(PolicySearch):
 
 
 class _Training:
-    """The networks of one training, and the checks that compare them."""
+    """Networks of one training, and the checks that compare them."""
 
     def __init__(self, search: StableBaselinesSearch, task: SearchTask, env: VecNormalize, gamma: float) -> None:
         self._search, self._task, self._env, self._gamma = search, task, env, gamma
@@ -115,7 +116,7 @@ class _Training:
         )
 
     def run(self) -> Found:
-        """Learn until a network comes to the end of its steps, or a person interrupts."""
+        """Train networks one after another until one completes its steps, or Ctrl-C is pressed."""
         settings, checks, verdicts = self._task.settings, self._checks, self._checks.verdicts
         with tracking(settings, self._task.out) as callbacks:
             last, whole = self._learned(callbacks)
@@ -136,7 +137,7 @@ class _Training:
         )
 
     def _learned(self, callbacks: Sequence[BaseCallback]) -> tuple[BaseAlgorithm, bool]:
-        """The network that learned last, and whether the training came to its end, and not to an interruption."""
+        """Return the last network, and whether the training was completed rather than interrupted."""
         verdicts = self._checks.verdicts
         learner: BaseAlgorithm | None = None
         for attempt in itertools.count():
@@ -156,14 +157,14 @@ class _Training:
         raise AssertionError("unreachable")
 
     def _learn(self, learner: BaseAlgorithm, callbacks: Sequence[BaseCallback]) -> None:
-        """Take what is left of the steps. A training that is prolonged continues with its learning rate from the
-        middle."""
+        """Take the remaining steps. In the prolonged part, the learning rate continues from the middle of its
+        schedule."""
         verdicts = self._checks.verdicts
         steps = _whole_rollouts(learner, verdicts.left)
         learner.learn(steps, callback=[self._checks, *callbacks], reset_num_timesteps=not verdicts.prolonged)
 
     def _network(self, attempt: int) -> BaseAlgorithm:
-        """A new network; when it is its turn the saved policy, where that earns more than an untrained one."""
+        """Return a new network, or in its turn the saved policy if it earns more than an untrained one."""
         saved, anew = self._saved, self._task.settings.anew
         if saved is not None and attempt == int(anew) and self._checks.worth_keeping(saved):
             return saved
@@ -186,11 +187,11 @@ def make_learner(
     statistics: Statistics,
     gamma: float,
 ) -> BaseAlgorithm:
-    """A new network, or the saved one to start from.
+    """Make a new network, or load the saved one to start from.
 
     Raises:
-        ValueError: the algorithm can't be trained here.
-        UnusablePolicy: the saved policy is none, or does not go with the surrogate.
+        ValueError: the algorithm does not support this surrogate.
+        UnusablePolicy: the saved policy can't be read, or does not fit the surrogate.
     """
     algorithm, tensorboard = search.algorithm, None if settings.tensorboard is None else str(settings.tensorboard)
     if settings.start_from is not None:
@@ -218,7 +219,7 @@ def make_learner(
 
 
 def imagined_return(port: SurrogatePort, learner: BaseAlgorithm, settings: TrainSettings) -> Imagined:
-    """What the policy earns as it is now, without exploration, on the same starts at every check."""
+    """Measure the present policy without exploration, on the same starts at every check."""
 
     def predict(observation: Any) -> Any:
         return learner.predict(observation, deterministic=True)[0]
@@ -227,7 +228,7 @@ def imagined_return(port: SurrogatePort, learner: BaseAlgorithm, settings: Train
 
 
 def effective(learner: BaseAlgorithm) -> dict[str, Any]:
-    """What the algorithm was made with, defaults included, as far as it is numbers and words; and the network."""
+    """Return the algorithm's settings that are numbers or text, defaults included, and those of the network."""
     names = inspect.signature(type(learner).__init__).parameters
     given = {name: getattr(learner, name, None) for name in names if name not in ("self", "seed", "verbose")}
     plain = {name: value for name, value in given.items() if isinstance(value, bool | int | float | str)}
@@ -235,6 +236,6 @@ def effective(learner: BaseAlgorithm) -> dict[str, Any]:
 
 
 def _whole_rollouts(learner: BaseAlgorithm, total: int) -> int:
-    """The steps of as many whole rollouts as the total allows, at least one: Stable-Baselines3 would round up."""
+    """Round the steps down to whole rollouts, at least one. Stable-Baselines3 would round up."""
     rollout = learner.n_envs * (learner.n_steps if isinstance(learner, OnPolicyAlgorithm) else 1)
     return max(total // rollout, 1) * rollout

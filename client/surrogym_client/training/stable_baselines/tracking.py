@@ -1,4 +1,4 @@
-"""Where the curves of a training go: TensorBoard, Weights & Biases or MLflow, each by what fits Stable-Baselines3."""
+"""Trackers of training curves: TensorBoard, Weights & Biases or MLflow."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from stable_baselines3.common.logger import KVWriter
 
 from surrogym_client.training.settings import TrainSettings
 
-PROJECT = "surrogym"  # where Weights & Biases and MLflow put the runs
+PROJECT = "surrogym"  # project or experiment of the runs in Weights & Biases and MLflow
 
 
 @contextmanager
 def tracking(settings: TrainSettings, out: Path) -> Iterator[list[BaseCallback]]:
-    """The callbacks of a training's tracker; its run ends with the context. TensorBoard's needs none.
+    """Context that returns the callbacks of a training's tracker. The tracker's run ends with the context.
 
-    Addresses and keys are those the trackers look for, such as ``WANDB_MODE`` and ``MLFLOW_TRACKING_URI``.
+    TensorBoard needs no callback. Addresses and keys come from the trackers' own variables, such as ``WANDB_MODE`` and
+    ``MLFLOW_TRACKING_URI``.
 
     Raises:
         ModuleNotFoundError: the tracker is not installed.
@@ -45,7 +46,7 @@ def tracking(settings: TrainSettings, out: Path) -> Iterator[list[BaseCallback]]
 
 
 class Mlflow(BaseCallback):
-    """Hands what the algorithm logs to the active run of MLflow."""
+    """Callback that sends the algorithm's logged numbers to the active run of MLflow."""
 
     def _on_training_start(self) -> None:
         self.logger.output_formats.append(MlflowWriter())
@@ -55,7 +56,7 @@ class Mlflow(BaseCallback):
 
 
 class MlflowWriter(KVWriter):
-    """An output format of Stable-Baselines3's logger: its numbers become metrics."""
+    """Output format of Stable-Baselines3's logger that logs numbers as metrics of MLflow."""
 
     def write(self, key_values: dict[str, Any], key_excluded: Mapping[str, Any], step: int = 0) -> None:
         import mlflow
@@ -68,4 +69,4 @@ class MlflowWriter(KVWriter):
         mlflow.log_metrics(numbers, step=step)
 
     def close(self) -> None:
-        """The context of the run closes it."""
+        """Do nothing: the context of the run closes it."""
