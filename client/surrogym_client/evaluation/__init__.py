@@ -1,4 +1,4 @@
-"""What a policy earns: in the original environment by real episodes, in the surrogate by imagined ones."""
+"""Measure what a policy earns: in real episodes of the original environment, or in imagined ones of the surrogate."""
 
 from surrogym_client.evaluation.evaluator import Evaluation, EvaluationInterrupted, EvaluationSettings, evaluate
 from surrogym_client.evaluation.imagined import imagined_returns, observation_statistics

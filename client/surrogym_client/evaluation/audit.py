@@ -1,4 +1,4 @@
-"""The audit of a policy: where on its imagined way to look, and what real steps there say of the model. Pure."""
+"""The audit of a policy: choose states on its imagined way, and judge the model by real steps there. Pure."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from surrogym_client.policies.evidence import Audit, Promise
 from surrogym_shared.spec import EnvironmentSpec
 
 AUDIT_STEPS = 8
-ALARM = 0.01  # chance that a right model is blamed for the errors of its outputs
-MISPLACED_ENDS = 2  # an audit fails where it predicted the ending of so many steps wrongly
-SLACK = 0.1  # of what a policy earns beyond an untrained one: a promise that moves out of its interval by less stands
-BIAS = 0.2  # of the same: what the errors of the rewards may add up to in an episode
+ALARM = 0.01  # probability that the test of output errors fails for a right model
+MISPLACED_ENDS = 2  # an audit fails if the model predicted the termination of this many steps wrongly
+SLACK = 0.1  # share of the gain over an untrained policy by which a promise may leave its former interval
+BIAS = 0.2  # share of the same gain that reward errors may add up to in an episode
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -25,17 +25,18 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Compared:
-    """Real steps beside their predictions.
+    """Real steps together with the model's predictions of them.
 
     Attributes:
-        names: of the outputs, (O,).
-        errors: (n, O) real less predicted, in each output's unit.
-        deviations: (n, O) that the model predicted for the function's value.
-        expected: (O,) error that the model claims beside: its tolerance, or its leave-one-out error where that is
-            larger, which holds the noise; for the reward at least what matters for the return.
-        misplaced: steps whose ending was predicted wrongly.
-        length: steps of an episode, on average; 0 where that is not known.
-        noise: (O,) deviation of the noise of a single step, which ``expected`` holds too; none where it is empty.
+        names: names of the outputs, (O,).
+        errors: real minus predicted values (n, O), in each output's unit.
+        deviations: predicted standard deviations of the function (n, O), without noise.
+        expected: error (O,) that the model allows in addition: its tolerance, or its leave-one-out error if that is
+            larger,
+            which includes the noise; for the reward at least the error that matters for the return.
+        misplaced: number of steps whose termination was predicted wrongly.
+        length: mean number of steps of an episode; 0 if unknown.
+        noise: standard deviation of the noise of a single step (O,), included in ``expected``; empty without noise.
     """
 
     names: Sequence[str]
@@ -48,15 +49,15 @@ class Compared:
 
     @property
     def claimed(self) -> Array:
-        """Deviation (n, O) of each error, as the model claims."""
+        """Standard deviation (n, O) of each error that the model claims."""
         scale: Array = np.sqrt(self.deviations**2 + self.expected**2)
         return scale
 
     def biased(self) -> Bools:
-        """Whether the mean error of an output, (O,), is beyond what noise, deviations and tolerance explain.
+        """Whether the mean error of an output, (O,), exceeds what noise, deviations and tolerance explain.
 
-        Noise hides an error in each step, and not in their mean. Deviations of neighbouring states are those of one
-        function, and don't become less in a mean.
+        Noise can hide an error in each single step, but not in their mean. Predicted deviations of neighbouring states
+        belong to one function, so they don't average out.
         """
         n, count = self.errors.shape
         if not len(self.noise):
@@ -69,17 +70,17 @@ class Compared:
 
 
 def judge(compared: Compared, before: Promise, after: Promise, floor: float | None) -> Audit:
-    """Hold real steps against the model, and the promise after them against the one before.
+    """Judge the model by an audit's real steps, and compare the promises before and after them.
 
-    An output is at fault where the sum of squared errors, each over its claimed deviation, is larger than chance
-    explains: beyond the 1 % quantile of the chi-squared distribution, shared between the outputs. A noisy output is at
-    fault where its mean error is, too. Errors within the tolerance are never a fault.
+    An output is at fault if the sum of squared errors, each divided by its claimed deviation, is larger than chance
+    explains: beyond the 1 % quantile of the chi-squared distribution, shared between the outputs. A noisy output is
+    also at fault if its mean error is. Errors within the tolerance are never a fault.
 
     Args:
-        compared: the real steps.
-        before: the promise before the audit.
-        after: that of the model that has learned from it.
-        floor: the return of an untrained policy; None where nobody measured it.
+        compared: the real steps with their predictions.
+        before: promise before the audit.
+        after: promise of the model that has learned from the audit.
+        floor: return of an untrained policy; None if it was not measured.
     """
     n, count = compared.errors.shape
     sums = ((compared.errors / compared.claimed) ** 2).sum(0)
@@ -129,21 +130,21 @@ def disappointed(audit: Audit, floor: float | None) -> bool:
 
 
 def earned(promise: Promise, floor: float | None) -> float:
-    """What a policy earns beyond an untrained one, of return ``floor``; beyond nothing where nobody measured that."""
+    """Gain of a policy over an untrained one of return ``floor``. Without ``floor``, the policy's whole return."""
     return abs(promise.median - (floor or 0.0))
 
 
 def chi_squared(degrees: int, above: float) -> float:
-    """The value that a chi-squared variable exceeds with chance ``above`` (Wilson and Hilferty 1931)."""
+    """Value that a chi-squared variable exceeds with probability ``above`` (Wilson and Hilferty 1931)."""
     z, c = NormalDist().inv_cdf(1 - above), 2 / (9 * degrees)
     return float(degrees * (1 - c + z * sqrt(c)) ** 3)
 
 
 def places(spec: EnvironmentSpec, q: Array, u: Array, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Which of the visited states q (m, C) with their actions u (m, F) to ask for, at most ``count``.
+    """Choose at most ``count`` of the visited states q (m, C) and their actions u (m, F) for an audit.
 
-    Half of them are drawn at random, so that they stand for the time that the policy spends. The others lie farthest
-    from all chosen before, so that they stand for its way; distances are in deviations over what was visited.
+    Half of them are drawn at random, so that they represent the policy's time. Each other one is the farthest from all
+    chosen before, so that they cover the policy's way. Distances are in standard deviations of the visited states.
     """
     settable = np.flatnonzero(_settable(spec, q))
     count = min(count, len(settable))
@@ -162,7 +163,7 @@ def places(spec: EnvironmentSpec, q: Array, u: Array, count: int, rng: np.random
 
 
 def differences(spec: EnvironmentSpec, real: Array, predicted: Array) -> Array:
-    """Real less predicted coordinates, (n, C); angles by the shorter way."""
+    """Real minus predicted coordinates, (n, C). Angles differ by the shorter way."""
     difference = real - predicted
     for index, coordinate in enumerate(spec.coordinates):
         if coordinate.kind == "angle":
@@ -171,8 +172,10 @@ def differences(spec: EnvironmentSpec, real: Array, predicted: Array) -> Array:
 
 
 def on_one_scale(spec: EnvironmentSpec, q: Array, u: Array, first: int | None = None) -> Array:
-    """States q (m, C) and actions u (m, F) as points whose distances mean something: angles as cosine and sine, each
-    column over its deviation, or over that of the ``first`` rows."""
+    """Scale states q (m, C) and actions u (m, F) to points whose distances are meaningful.
+
+    Angles become cosine and sine. Each column is divided by its standard deviation, or by that of the ``first`` rows.
+    """
     columns = [u]
     for index, coordinate in enumerate(spec.coordinates):
         column = q[:, index : index + 1]

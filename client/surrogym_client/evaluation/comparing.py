@@ -1,4 +1,4 @@
-"""Real steps beside what a model predicts of them, and the steps at which the two disagree.
+"""Compare real steps with a model's predictions, and find the steps at which the two disagree.
 
 Shapes: n steps, O outputs, C coordinates.
 """
@@ -18,12 +18,12 @@ from surrogym_client.transport.api import Api
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import OutputFidelity, SurrogateView
 
-MOST = 400  # real steps that are held against the model
-SHOWN = 3  # of the worst steps, and of the worst episodes
+MOST = 400  # most real steps to compare
+SHOWN = 3  # number of worst steps, and of worst episodes, to show
 
 
 class Step(Protocol):
-    """One real step: of a sample, or of an episode."""
+    """One real step, from a sample or an episode."""
 
     @property
     def coordinates(self) -> Any: ...
@@ -40,8 +40,10 @@ class Step(Protocol):
 def compared(
     api: Api, spec: EnvironmentSpec, view: SurrogateView, samples: Sequence[Step], matters: float = 0.0
 ) -> Compared:
-    """Real steps beside what the model of ``view``, which had not seen them, predicts. Errors of the reward count from
-    ``matters`` on."""
+    """Predict real steps with the model of ``view``, which had not seen them, and return both.
+
+    Errors of the reward below ``matters`` don't count.
+    """
     q, u = [list(sample.coordinates) for sample in samples], [list(sample.action) for sample in samples]
     predicted = api.predict(view.name, q, u, model=view.model_version)
     uncertain = api.query_uncertainty(view.name, q, u, model=view.model_version)
@@ -65,13 +67,14 @@ def compared(
 
 
 def _expected(claim: OutputFidelity, matters: float) -> float:
-    """The error of an output that is no fault: within its tolerance, as left-out samples show it, or without effect."""
+    """Error of an output that is not a fault: within its tolerance, explained by left-out samples, or without
+    effect."""
     return max(claim.tolerance, claim.leave_one_out_error or 0.0, matters)
 
 
 @dataclass(frozen=True)
 class StepOfEpisode:
-    """One real step, and where it is: the number of its episode, and its own there, from 0."""
+    """One real step with the number of its episode, and its own number there, both from 0."""
 
     episode: int
     number: int
@@ -83,7 +86,7 @@ class StepOfEpisode:
 
 
 def steps_of(traces: Sequence[Trace]) -> list[StepOfEpisode]:
-    """The steps of episodes, at most ``MOST`` of them, evenly spaced."""
+    """Return at most ``MOST`` steps of episodes, evenly spaced."""
     places = [(episode, t) for episode, trace in enumerate(traces) for t in range(len(trace.reward))]
     kept = np.unique(np.linspace(0, len(places) - 1, min(len(places), MOST)).astype(int))
     return [_step(traces[episode], episode, t) for episode, t in (places[i] for i in kept)]
@@ -104,7 +107,8 @@ def _step(trace: Trace, episode: int, t: int) -> StepOfEpisode:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """A real step that the model excludes: the output that is worst, its error, and the error that was claimed."""
+    """A real step that the model excludes, with its worst output, the error there, and the error that the model
+    claimed."""
 
     step: StepOfEpisode
     output: str
@@ -114,12 +118,12 @@ class Disagreement:
 
 @dataclass(frozen=True)
 class Disagreements:
-    """What real episodes say of the model.
+    """Disagreements between a model and real episodes.
 
     Attributes:
-        compared: real steps that were compared.
-        found: those beyond what the model claims, the worst first.
-        missing: real less predicted reward over the compared steps of each episode, by its number.
+        compared: number of real steps that were compared.
+        found: steps whose error exceeds the model's claim, the worst first.
+        missing: real minus predicted reward over the compared steps of each episode, by its number.
     """
 
     compared: int
@@ -127,7 +131,7 @@ class Disagreements:
     missing: dict[int, float]
 
     def by_episode(self) -> dict[int, int]:
-        """How many steps of each episode the model excludes, the most first."""
+        """Number of excluded steps of each episode, the largest first."""
         counts: dict[int, int] = {}
         for one in self.found:
             counts[one.step.episode] = counts.get(one.step.episode, 0) + 1
@@ -135,7 +139,7 @@ class Disagreements:
 
 
 def disagreements(steps: Sequence[StepOfEpisode], beside: Compared) -> Disagreements:
-    """The steps whose error is larger than chance explains, at 1 % for all of them together."""
+    """Find the steps whose error is larger than chance explains, at a level of 1 % for all of them together."""
     n, count = beside.errors.shape
     limit = sqrt(chi_squared(1, ALARM / (n * count)))
     ratio = np.abs(beside.errors) / beside.claimed

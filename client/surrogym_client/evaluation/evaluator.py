@@ -1,4 +1,4 @@
-"""What a policy is worth in the original environment: real episodes, counted and judged."""
+"""Evaluate a policy in the original environment, by real episodes that are counted."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from surrogym_shared.spec import EnvironmentSpec, Success
 from surrogym_shared.wire import TraceRank
 
 Array = NDArray[np.float64]
-Progress = Callable[[float, int], None]  # share done in [0, 1], episodes that terminated
+Progress = Callable[[float, int], None]  # arguments: share done in [0, 1], number of episodes that terminated
 
 FIRST_SEED = 10_000
 
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """How many episodes, from which starts, of how many machines.
+    """Settings of an evaluation: how many episodes, from which starts, in which environment.
 
-    ``wide`` starts anywhere in the sampling range, ``start_scale`` spreads the declared starts so many times as far
-    about their middle; ``perturb`` is the deviation of physical attributes. ``parallel`` is how many instances of the
-    environment are open at once; None takes one for each episode if the environment declares that it runs in parallel,
-    and a single one otherwise.
+    ``wide`` starts anywhere in the sampling range. ``start_scale`` widens the declared starts about their middle by
+    this factor. ``perturb`` is the standard deviation of random factors on physical attributes. ``parallel`` is the
+    number of instances of the environment that are open at once; None takes one for each episode if the environment
+    declares that it runs in parallel, and a single one otherwise.
     """
 
     episodes: int = 100
@@ -51,7 +51,7 @@ class EvaluationSettings:
 
     @property
     def declared(self) -> bool:
-        """Whether episodes start as the specification says, in the environment as it is."""
+        """Whether episodes start as the specification says, in the environment without perturbations."""
         return not self.wide and self.start_scale == 1 and not self.perturb
 
 
@@ -67,7 +67,7 @@ class Trace:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What N episodes gave."""
+    """Result of N real episodes."""
 
     returns: Array  # (N,)
     lengths: NDArray[np.int64]  # (N,)
@@ -76,17 +76,18 @@ class Evaluation:
 
     @property
     def trace(self) -> Trace:
-        """The first episode."""
+        """Trace of the first episode."""
         return self.traces[0]
 
     def ranked(self) -> dict[TraceRank, int]:
-        """Which episode was the best, the median and the worst by its return; of few episodes they may be the same."""
+        """Return the numbers of the best, the median and the worst episode by return. In few episodes they may
+        coincide."""
         order = np.argsort(self.returns, kind="stable")
         return {"best": int(order[-1]), "median": int(order[(len(order) - 1) // 2]), "worst": int(order[0])}
 
     @property
     def steps(self) -> int:
-        """Real steps taken."""
+        """Number of real steps taken."""
         return int(self.lengths.sum())
 
     @property
@@ -94,7 +95,7 @@ class Evaluation:
         return None if self.success is None else float(self.success.mean())
 
     def summary(self) -> dict[str, Any]:
-        """As JSON: statistics of the return, and every episode."""
+        """Return statistics of the return, and every episode, as JSON."""
         return {
             "mean": float(self.returns.mean()),
             "iqm": interquartile_mean(self.returns),
@@ -110,7 +111,7 @@ class Evaluation:
 
 
 class EvaluationInterrupted(KeyboardInterrupt):
-    """Ctrl-C came in an evaluation; ``steps`` real steps had been begun."""
+    """Ctrl-C interrupted an evaluation after ``steps`` real steps had begun."""
 
     def __init__(self, steps: int) -> None:
         super().__init__()
@@ -123,26 +124,27 @@ def evaluate(
     settings: EvaluationSettings | None = None,
     progress: Progress | None = None,
 ) -> Evaluation:
-    """Run N real episodes, each by one instance of the environment from its start to its end.
+    """Run N real episodes with a policy.
 
-    An environment that declares nothing has one instance, which runs the episodes one after the other. Where several
-    are open, the policy is asked once for all that are running. Ctrl-C takes effect between two steps, a second one at
-    once; every instance is closed on every way out.
+    Each episode runs in one instance of the environment. By default there is one instance, and the episodes run one
+    after the other. With several, the policy is called once for all running episodes. Ctrl-C takes effect between two
+    steps, a second Ctrl-C at once. Every instance is closed in any case.
 
     Args:
-        policy: observations (N, D) to actions.
-        open_episode: opens one instance.
-        settings: how many, from which starts.
+        policy: function from observations (N, D) to actions.
+        open_episode: opens one instance of the environment.
+        settings: number of episodes, their starts and the environment's perturbation.
         progress: called after every step.
 
     Returns:
-        returns and successes by episode, in the order of their seeds. How many instances ran changes them only as far
-        as the policy answers a batch of observations otherwise than one by one, usually in the last bits.
+        returns and successes of each episode, in the order of their seeds. The number of instances has an effect only
+            if
+        the policy answers a batch of observations differently from single ones, usually in the last bits.
 
     Raises:
         PolicyMisfit: the policy gave actions that are not the environment's; nothing was sent.
-        EvaluationFailed: the environment or the policy raised after real steps, which count all the same.
-        EvaluationInterrupted: Ctrl-C came; its real steps count all the same.
+        EvaluationFailed: the environment or the policy raised an error after real steps, which are counted.
+        EvaluationInterrupted: Ctrl-C was pressed; real steps so far are counted.
     """
     run = _Run(policy, settings or EvaluationSettings(), progress)
     try:
@@ -157,7 +159,7 @@ def evaluate(
 
 
 def _open(open_episode: Callable[[], Episode], settings: EvaluationSettings, instances: ExitStack) -> list[Episode]:
-    """As many instances as may be open at once, at most one for each episode; ``instances`` closes them."""
+    """Open as many instances as may be open at once, at most one for each episode. ``instances`` closes them."""
 
     def open_one() -> Episode:
         episode = open_episode()
@@ -170,14 +172,14 @@ def _open(open_episode: Callable[[], Episode], settings: EvaluationSettings, ins
 
 
 def interquartile_mean(values: Array) -> float:
-    """Mean of the middle half of values (n,)."""
+    """Mean of the middle half of the values (n,)."""
     cut = len(values) // 4
     return float(np.sort(values)[cut : len(values) - cut].mean())
 
 
 @dataclass
 class _Tally:
-    """One episode's account, begun where ``episode`` stands."""
+    """Running sums of one episode, which begins at the present state of ``episode``."""
 
     episode: Episode
     moment: Moment
@@ -209,17 +211,17 @@ class _Tally:
 
 
 class _Run:
-    """Episodes in the order of their seeds, each begun as soon as an instance is free."""
+    """Runs episodes in the order of their seeds, each as soon as an instance is free."""
 
     def __init__(self, policy: Predict, settings: EvaluationSettings, progress: Progress | None) -> None:
         self.settings = settings
-        self.begun = 0  # real steps: each was taken, or interrupted, or it failed
+        self.begun = 0  # real steps begun, including interrupted and failed ones
         self._policy = policy
         self._progress = progress
         self._tallies: list[_Tally] = []
 
     def on(self, instances: Sequence[Episode], between_steps: Callable[[], None]) -> Evaluation:
-        """Run all of them."""
+        """Run all episodes."""
         free, running = list(instances), list[_Tally]()
         while running or len(self._tallies) < self.settings.episodes:
             running += self._begin(free)
@@ -232,7 +234,7 @@ class _Run:
         return _account(self._tallies)
 
     def _begin(self, free: Sequence[Episode]) -> list[_Tally]:
-        """The next episodes, one by each free instance; none where all have begun."""
+        """Begin the next episodes, one in each free instance, until all have begun."""
         first = len(self._tallies)
         begun = [
             _Tally(episode, _start(episode, self.settings, first + i))
@@ -247,7 +249,7 @@ class _Run:
             tally.step(action)
 
     def _actions(self, running: Sequence[_Tally]) -> Array:
-        """The policy's actions (N, F)."""
+        """Return the policy's actions (N, F)."""
         observations = np.stack([tally.moment.observation for tally in running]).astype(np.float32)
         try:
             return decode_actions(running[0].episode.spec, self._policy(observations), len(running))
@@ -290,7 +292,7 @@ def _holds(spec: EnvironmentSpec, coordinates: Array) -> bool:
 
 
 def _succeeds(success: Success, tally: _Tally) -> bool:
-    """Every criterion that is given."""
+    """Whether the episode meets every criterion that the specification has."""
     return (
         (not success.hold or tally.held >= success.hold_steps)
         and (success.min_steps is None or tally.length >= success.min_steps)

@@ -1,4 +1,4 @@
-"""What a surrogate says of a policy, and of the observations it will see, without training."""
+"""Run policies in the surrogate without training: imagined returns, and statistics of observations."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from surrogym_shared.acting import ActingPolicy
 from surrogym_shared.network import Network, bounds_of, counts_of
 from surrogym_shared.port import PolicyPort, PolicyRollout, StepResult, SurrogatePort
 
-WHOLE = {"start_box": 0.0, "trust": None}  # an episode cut short would earn more where rewards are costs
-PAID_OUTSIDE = {"start_box": 0.0}  # an episode that leaves what is trusted pays for what it lacks
+WHOLE = {"start_box": 0.0, "trust": None}  # a shortened episode would earn more if rewards are costs
+PAID_OUTSIDE = {"start_box": 0.0}  # an episode that leaves the trusted range gets a penalty for its missing steps
 STATISTICS_LANES = 1_024
-STEPS_AT_ONCE = 1_000  # of an imagined episode: a bound on a reply, not on an episode
+STEPS_AT_ONCE = 1_000  # steps of an imagined episode in one reply; an episode may be longer
 
 
 @dataclass(frozen=True)
 class Imagined:
-    """Whole virtual episodes."""
+    """Result of whole virtual episodes."""
 
     returns: NDArray[np.float64]  # (episodes,) undiscounted, any penalty included
-    penalty_share: float  # of the reward's size
-    episode_penalty: float | None  # what it takes off a return, mean; None in a session without
+    penalty_share: float  # size of the penalty as a share of the reward's size
+    episode_penalty: float | None  # mean penalty of an episode; None in a session without a penalty
 
 
 def imagined_returns(
@@ -38,8 +38,10 @@ def imagined_returns(
     seed: int | Sequence[int],
     **options: Any,
 ) -> NDArray[np.float64]:
-    """The returns (episodes,) of ``imagine``. The imagined return of a policy is their mean: from the declared starts,
-    without exploration."""
+    """Return the returns (episodes,) of ``imagine``.
+
+    The imagined return of a policy is their mean: from the declared starts, without exploration.
+    """
     return imagine(port, predict, episodes, seed, **options).returns
 
 
@@ -50,16 +52,16 @@ def imagine(
     seed: int | Sequence[int],
     **options: Any,
 ) -> Imagined:
-    """Let a policy run through whole virtual episodes side by side, from the declared starts.
+    """Run a policy through whole virtual episodes side by side, from the declared starts.
 
-    Where the server loses the session they begin anew: cut short, they would earn more where rewards are costs.
-    A ``Network`` acts on the surrogate's side where that can, to the same returns.
+    If the server loses the session, all episodes begin again, because shortened ones would earn more if rewards are
+    costs. A ``Network`` acts on the surrogate's side if that is supported, with the same returns.
 
     Args:
         port: the surrogate.
-        predict: observations (N, D) to actions.
-        episodes: how many.
-        seed: of their starts, or one an episode; the same seed compares policies on the same starts.
+        predict: function from observations (N, D) to actions.
+        episodes: number of episodes.
+        seed: seed of their starts, or one for each episode; the same seed compares policies on the same starts.
         options: further fields of ``OpenSession``.
     """
     whole = WHOLE if port.spec().outside_reward is None else PAID_OUTSIDE
@@ -82,7 +84,7 @@ def imagine(
 
 
 class _Sums:
-    """What the first episode of each lane earned so far."""
+    """Sums over the first episode of each lane so far."""
 
     def __init__(self, episodes: int) -> None:
         self.returns, self.penalties = np.zeros(episodes), np.zeros(episodes)
@@ -101,7 +103,7 @@ class _Sums:
 
 
 class _Rewards(NamedTuple):
-    """Of T steps, (T, N) each."""
+    """Rewards of T steps, (T, N) each."""
 
     reward: NDArray[np.floating[Any]]
     mean: NDArray[np.floating[Any]]
@@ -116,7 +118,7 @@ class _Rewards(NamedTuple):
 def _stepped(
     lanes: Lanes, predict: Callable[[NDArray[Any]], NDArray[Any]], seed: int | Sequence[int]
 ) -> Iterator[_Rewards | None]:
-    """Steps one by one; None where the session was lost."""
+    """Step until all first episodes have ended. Returns None if the session was lost."""
     observation = lanes.reset(seed).observation
     while True:
         step = lanes.step(predict(observation))
@@ -125,7 +127,7 @@ def _stepped(
 
 
 def _rolled(lanes: Lanes, policy: ActingPolicy, seed: int | Sequence[int], sums: _Sums) -> Iterator[_Rewards | None]:
-    """Many steps at once, as long as an episode runs; None where the session was lost."""
+    """Take as many steps as an episode has in one request. Returns None if the session was lost."""
     acting, limit = ActingLanes(lanes), lanes.port.spec().time_limit or LONGEST_EPISODE
     acting.reset(seed)
     while True:
@@ -134,7 +136,7 @@ def _rolled(lanes: Lanes, policy: ActingPolicy, seed: int | Sequence[int], sums:
 
 
 def _as_arrays(predict: Callable[[NDArray[Any]], NDArray[Any]], port: SurrogatePort) -> ActingPolicy | None:
-    """A policy that the surrogate's side can act by; None for what is none, or acts within other bounds."""
+    """Return the policy as arrays for the surrogate's side; None if it has no such form or acts within other bounds."""
     if not isinstance(predict, Network) or not isinstance(port, PolicyPort):
         return None
     spec = port.spec()
@@ -144,17 +146,17 @@ def _as_arrays(predict: Callable[[NDArray[Any]], NDArray[Any]], port: SurrogateP
     try:
         return ActingPolicy.of(predict)
     except ValueError:
-        return None  # several policies at once, or one beyond the limits
+        return None  # several policies at once, or a policy beyond the limits
 
 
 def _added(sums: NDArray[np.float64], rows: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Sums (N,) and rows (T, N), added one after the other: to the same bits for any T."""
+    """Add rows (T, N) to sums (N,) one after the other, which gives the same bits for any T."""
     added: NDArray[np.float64] = np.cumsum(np.concatenate([sums[None], rows]), axis=0)[-1]
     return added
 
 
 def observation_statistics(port: SurrogatePort, seed: int) -> tuple[list[float], list[float]]:
-    """Mean and deviation, (D,) each, of observations over the sampling range."""
+    """Return mean and standard deviation, (D,) each, of observations over the sampling range."""
     lanes = Lanes(port, session_request(STATISTICS_LANES, "same_step", {"start_box": 1.0}))
     try:
         observation = np.asarray(lanes.reset(seed).observation, dtype=np.float64)

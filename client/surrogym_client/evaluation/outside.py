@@ -1,4 +1,4 @@
-"""How much of a policy's way lies where a log has never been. Pure.
+"""Measure how much of a policy's way lies where a log has no data. Pure.
 
 Shapes: n logged steps, m steps of the way, C coordinates, F action entries.
 """
@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from surrogym_client.evaluation.audit import on_one_scale
 from surrogym_shared.spec import EnvironmentSpec
 
-USUAL = 0.99  # quantile of the distances between logged steps: as far as a log is from itself
-FARTHER = 2.0  # times that distance: no logged step is near
-LITTLE = 0.05  # of a way: so much of it may lie outside
-MOST = 2_000  # logged steps, and steps of the way, that are compared
+USUAL = 0.99  # quantile of the distances from each logged step to its nearest one, as the log's own spacing
+FARTHER = 2.0  # a step is outside if no logged step is within this many times that distance
+LITTLE = 0.05  # share of a way that may lie outside
+MOST = 2_000  # most logged steps, and most steps of the way, to compare
 AT_ONCE = 256  # rows of a table of distances
 
 Array = NDArray[np.float64]
@@ -24,11 +24,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Outside:
-    """Attributes:
-    share: of the way's steps that are far from every logged one.
-    name: the coordinate that leaves the log in at least half of these steps; empty without one.
-    way: its smallest and largest value outside.
-    log: its smallest and largest logged value.
+    """How far a policy's way leaves a log.
+
+    Attributes:
+        share: share of the way's steps that are far from every logged one.
+        name: the coordinate that leaves the log in at least half of these steps; empty if there is none.
+        way: its smallest and largest value in these steps.
+        log: its smallest and largest logged value.
     """
 
     share: float
@@ -41,7 +43,7 @@ class Outside:
         return self.share > LITTLE
 
     def words(self) -> str:
-        """Where the way leaves the log, in a sentence."""
+        """Describe in a sentence where the way leaves the log."""
         where = ""
         if self.name:
             where = (
@@ -55,9 +57,9 @@ def outside_of(spec: EnvironmentSpec, q: Array, u: Array, way_q: Array, way_u: A
     """Compare a policy's way with a log.
 
     Args:
-        spec: of the environment.
+        spec: specification of the environment.
         q, u: logged states (n, C) and actions (n, F).
-        way_q, way_u: those of the policy, (m, C) and (m, F).
+        way_q, way_u: states (m, C) and actions (m, F) of the policy.
     """
     kept, walked = _thinned(len(q)), _thinned(len(way_q))
     logged_q, passed_q = q[kept], way_q[walked]
@@ -74,19 +76,19 @@ def outside_of(spec: EnvironmentSpec, q: Array, u: Array, way_q: Array, way_u: A
     worst = int(np.argmax(beyond))
     share = float(far.mean())
     if beyond[worst] < far.sum() / 2:
-        return Outside(share)  # in a gap of the log, by several of them together, or by the action
+        return Outside(share)  # no single coordinate leaves the log: a gap, several coordinates together, or the action
     values = passed_q[far, worst]
     ends = (float(values.min()), float(values.max()))
     return Outside(share, spec.coordinate_names[worst], ends, (float(low[worst]), float(high[worst])))
 
 
 def _thinned(count: int) -> NDArray[np.intp]:
-    """At most ``MOST`` of so many rows, evenly spaced."""
+    """Return at most ``MOST`` of ``count`` row numbers, evenly spaced."""
     return np.unique(np.linspace(0, count - 1, min(count, MOST)).astype(np.intp))
 
 
 def _nearest(points: Array, to: Array, *, itself: bool = False) -> Array:
-    """The distance of each point to the nearest of others, (points,); with ``itself`` both are the same."""
+    """Distance from each point to the nearest of ``to``, (points,). With ``itself`` both are the same points."""
     found = np.empty(len(points))
     for first in range(0, len(points), AT_ONCE):
         rows = points[first : first + AT_ONCE]

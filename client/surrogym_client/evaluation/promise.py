@@ -1,4 +1,4 @@
-"""The promise: what the surrogate says a policy will earn, as an interval."""
+"""The promise: the interval of the return that the surrogate predicts for a policy."""
 
 from __future__ import annotations
 
@@ -17,23 +17,25 @@ from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import OF_PARTICLES
 
 FUNCTIONS = 32  # drawn from the posterior
-STARTS = 8  # of each function
-EVALUATION_STARTS = 100  # the promise is for the mean return over so many real starts
+STARTS = 8  # starts along each function
+EVALUATION_STARTS = 100  # number of real starts whose mean return is promised
 LOW, HIGH = 0.05, 0.95
-NORMAL_POINTS = 201  # of a normal distribution, at equal probabilities
+NORMAL_POINTS = 201  # quantiles of a normal distribution, at equal probabilities
 
 Array = NDArray[np.float64]
 
 
 def promise_of(port: SurrogatePort, predict: Predict, seed: int, session: Mapping[str, Any] | None = None) -> Promise:
-    """Run a policy along functions drawn from the posterior, each from several starts, without any penalty.
+    """Compute a policy's promise along functions drawn from the posterior, each from several starts, without any
+    penalty.
 
     Args:
         port: the surrogate.
-        predict: the policy; observations (N, D) to actions.
-        seed: of functions and starts.
-        session: fields of ``OpenSession`` that the policy was trained with. Its variant, what belongs to that, and the
-            penalty are left out.
+        predict: the policy; function from observations (N, D) to actions.
+        seed: seed of functions and starts.
+        session: fields of ``OpenSession`` that the policy was trained with. Its variant with its options, and the
+            penalty,
+            are ignored.
     """
     left_out = {"variant", "penalty", *OF_PARTICLES}
     options = {name: value for name, value in (session or {}).items() if name not in left_out}
@@ -43,11 +45,11 @@ def promise_of(port: SurrogatePort, predict: Predict, seed: int, session: Mappin
 
 
 def interval(returns: Array) -> Promise:
-    """The promise of episodes' returns, (starts, functions).
+    """Compute the promise from episodes' returns, (starts, functions).
 
-    The mean returns of the functions differ by chance too, because each is over a few starts. So they are shrunk
-    towards their common mean, until their variance is what the functions alone explain (one-way analysis of
-    variance). Then the chance of 100 real starts, and that of the virtual starts, is added.
+    The functions' mean returns also differ by chance, because each is over a few starts. So they are shrunk towards
+    their common mean until their variance is what the functions alone explain (one-way analysis of variance). Then the
+    uncertainty of 100 real starts, and that of the virtual starts, is added.
     """
     parts = _parts(returns)
     starts, functions = returns.shape
@@ -58,6 +60,8 @@ def interval(returns: Array) -> Promise:
 
 
 class _Parts(NamedTuple):
+    """Variation of returns, split into that of functions and that of starts."""
+
     functions: Array  # (functions,) mean returns, with the variance that the functions explain
     within: float  # deviation of the returns of one function between starts
 
@@ -68,12 +72,12 @@ def _parts(returns: Array) -> _Parts:
     observed = float(means.var(ddof=1))
     explained = max(observed - within / len(returns), 0.0)
     scale = np.sqrt(explained / observed) if observed > 0 else 0.0
-    scale *= 1 + 1.5 / len(means)  # Student's t for one more function than were drawn, to first order
+    scale *= 1 + 1.5 / len(means)  # first-order correction to Student's t, for one further function than those drawn
     return _Parts(means.mean() + scale * (means - means.mean()), float(np.sqrt(within)))
 
 
 @cache
 def _normal_points() -> Array:
-    """Standard normal quantiles at equal probabilities."""
+    """Return standard normal quantiles at equal probabilities."""
     standard = NormalDist()
     return np.array([standard.inv_cdf((i + 0.5) / NORMAL_POINTS) for i in range(NORMAL_POINTS)])

@@ -1,6 +1,6 @@
-"""Real episodes as the server stores them: every return, and a few as traces.
+"""Convert real episodes to the form that the server stores: every return, and a few traces.
 
-One of them is paired: every controller that is compared has it from the same start.
+One trace is paired: it is from the same start for every controller in the comparison.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import numpy as np
 from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
 from surrogym_shared import wire
 
-MAX_POINTS = 2_000  # of a trace that is stored; longer ones are stored up to there
-MAX_NUMBERS = 30_000  # of a trace: a request of at most 4 MiB has four of them
+MAX_POINTS = 2_000  # most steps of a stored trace; longer ones are cut
+MAX_NUMBERS = 30_000  # most numbers of a trace: a request of at most 4 MiB has four traces
 
 
 def as_reported(
@@ -22,14 +22,14 @@ def as_reported(
     controller: wire.Controller = "policy",
     paired: int = 0,
 ) -> wire.AddEvaluation:
-    """An evaluation as a request.
+    """Convert an evaluation to a request.
 
     Args:
-        result: of the episodes.
-        settings: which starts, of which machine.
-        key: idempotency key: the same evaluation is stored once.
-        controller: who acted.
-        paired: number of the episode that is compared, see ``paired_start``.
+        result: the episodes.
+        settings: starts and perturbation of the episodes.
+        key: idempotency key, so that the same evaluation is stored once.
+        controller: what chose the actions.
+        paired: number of the episode to compare, see ``paired_start``.
     """
     shown: dict[wire.TraceRank, int] = {"paired": paired, **result.ranked()}
     return wire.AddEvaluation(
@@ -46,13 +46,13 @@ def as_reported(
 
 
 def paired_start(result: Evaluation, among: int) -> int:
-    """Which of the first ``among`` starts to compare: the one from which the policy had its median return."""
+    """Return which of the first ``among`` starts to compare: the one from which the policy had its median return."""
     order = np.argsort(result.returns[:among], kind="stable")
     return int(order[(len(order) - 1) // 2])
 
 
 def words_of(settings: EvaluationSettings) -> str:
-    """Which starts, of which machine."""
+    """Describe the starts and the environment's perturbation."""
     starts = "declared starts"
     if settings.wide:
         starts = "starts anywhere in the sampling range"

@@ -1,7 +1,6 @@
-"""What the environment does without a policy: the same action always, or random ones.
+"""Baselines without a policy: always the same action, or random ones.
 
-A policy's return says little by itself. Beside that of an environment that is left alone, from the same starts, it says
-what the policy is worth.
+A policy's return means little by itself. The return without a policy, from the same starts, shows what the policy adds.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from surrogym_shared.wire import Controller
 
 
 def default_baseline(spec: EnvironmentSpec) -> Controller:
-    """Zero where an action of zero is one of the environment's; random actions where actions are choices."""
+    """Return the default baseline: an action of zero if the environment allows it, else random actions."""
     action = spec.action
     if not isinstance(action, BoxAction):
         return "random"
@@ -27,10 +26,10 @@ def default_baseline(spec: EnvironmentSpec) -> Controller:
 
 
 def baseline(spec: EnvironmentSpec, controller: Controller, seed: int = 0) -> Predict:
-    """A function of observations (N, D) that does not look at them.
+    """Return a function of observations (N, D) that ignores them.
 
     Raises:
-        ValueError: ``zero`` where an action of zero is none of the environment's, or another controller.
+        ValueError: the controller is unknown, or ``zero`` for an environment without an action of zero.
     """
     if controller == "random":
         return _random(spec, np.random.default_rng(seed))

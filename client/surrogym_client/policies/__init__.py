@@ -1,4 +1,5 @@
-"""A policy: its file, the card beside it, its networks, and its export. Importing this room needs no torch."""
+"""Policies: their files, the cards beside them, their networks, and their export. Importing this package needs no
+torch."""
 
 from typing import Any
 
@@ -7,7 +8,7 @@ from surrogym_client.policies.files import load_policy
 
 __all__ = ["PolicyCard", "UnusablePolicy", "load_policy", "read_card"]
 
-NETWORKS = ("PaperPolicy", "Standardise", "decaying")  # found here by the files that Stable-Baselines3 wrote before
+NETWORKS = ("PaperPolicy", "Standardise", "decaying")  # older files of Stable-Baselines3 refer to these names here
 
 
 def __getattr__(name: str) -> Any:

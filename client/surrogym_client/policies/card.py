@@ -1,4 +1,4 @@
-"""The card beside a policy's file, which says what the policy is for."""
+"""The card beside a policy's file: what the policy was trained for, and with which result."""
 
 from __future__ import annotations
 
@@ -17,12 +17,15 @@ MAX_CARD_BYTES = 1024 * 1024
 
 
 class UnusablePolicy(SurrogymClientError):
-    """The file is no policy of the algorithm, or its card is none."""
+    """The file is not a policy of the algorithm, or its card is invalid."""
 
 
 class NotedAddress(RootModel[str]):
-    """A server's address that a file names. It is no ``str``, so that nothing connects to it: only a person gives the
-    address to which a token goes."""
+    """Address of a server that a file names.
+
+    It is not a ``str``, so that no code connects to it by mistake. Only a person chooses the address that receives a
+    token.
+    """
 
     model_config = ConfigDict(frozen=True)
 
@@ -31,9 +34,10 @@ class NotedAddress(RootModel[str]):
 
 
 class PolicyCard(BaseModel):
-    """What a policy is for and how it came about; a JSON file of the same name beside it."""
+    """What a policy was trained for, its settings and its results. Stored in a JSON file of the same name beside the
+    policy."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True)  # train() notes more than is read here
+    model_config = ConfigDict(extra="ignore", frozen=True)  # the file has fields that are not read here
 
     algorithm: str = DEFAULT_ALGORITHM
     surrogate: SurrogateName | None = None
@@ -47,16 +51,16 @@ class PolicyCard(BaseModel):
     untrained: float | None = None  # imagined return of a network that has learned nothing
     promise: Promise | None = None
     audit: Audit | None = None
-    trusted: bool | None = None  # None: nobody judged the promise
-    reason: str = ""  # why it is trusted, or not
-    curve: tuple[CurvePoint, ...] = ()  # of its training
-    networks: int = 1  # that learned in the last training
+    trusted: bool | None = None  # None: the promise was not judged
+    reason: str = ""  # why the promise is trusted, or not
+    curve: tuple[CurvePoint, ...] = ()  # training curve
+    networks: int = 1  # networks of the last training
     settings: dict[str, Any] = Field(default_factory=dict)
     versions: dict[str, str] = Field(default_factory=dict)
 
 
 def card_path(policy: Path) -> Path:
-    """Where the card of a policy lies."""
+    """Return the path of a policy's card."""
     return policy.with_suffix(".json")
 
 
@@ -66,7 +70,7 @@ def write_card(policy: Path, card: PolicyCard) -> None:
 
 
 def read_card(policy: Path) -> PolicyCard:
-    """The card of a policy; an empty one where there is none.
+    """Read the card of a policy. Without a card, return an empty one.
 
     Raises:
         UnusablePolicy: the card is invalid, or has more than ``MAX_CARD_BYTES``.

@@ -1,4 +1,4 @@
-"""What speaks for a policy, as its card has it: a promise, and an audit of it."""
+"""Evidence for a policy, as its card has it: a promise, and an audit."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ from pydantic import BaseModel, ConfigDict
 
 
 class Promise(BaseModel):
-    """Mean return over 100 real starts, as the surrogate predicts it: a distribution over functions that the samples
-    allow, and over starts.
+    """Interval of the mean return over 100 real starts, as the surrogate predicts it.
+
+    It is a distribution over starts, and over functions that agree with the samples.
 
     Attributes:
-        median: of that distribution.
+        median: median of this distribution.
         low: its 5 % quantile.
         high: its 95 % quantile.
-        functions: how many functions were drawn.
-        episodes: how many virtual episodes were run, over all functions.
+        functions: number of drawn functions.
+        episodes: number of virtual episodes, over all functions.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -27,16 +28,16 @@ class Promise(BaseModel):
 
 
 class Audit(BaseModel):
-    """What an audit found.
+    """Result of an audit.
 
     Attributes:
-        steps: real steps that it took.
+        steps: number of real steps.
         passed: whether the promise stands.
-        faults: what was wrong, a sentence each; empty where it passed.
-        errors: root mean square of the prediction errors, by output, in its unit.
-        expected: the same, as the model expected it.
-        before: the promise before the audit.
-        after: the promise of the model that has learned from the audit's steps.
+        faults: what was wrong, one sentence each; empty if the audit passed.
+        errors: root mean square of the prediction errors of each output, in the output's unit.
+        expected: the errors that the model expected, in the same form.
+        before: promise before the audit.
+        after: promise of the model that has learned from the audit's steps.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")

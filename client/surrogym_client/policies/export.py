@@ -1,8 +1,8 @@
-"""A policy without Stable-Baselines3: its most probable action as one function, in ONNX or as a program of
-``torch.export``.
+"""Export of a policy for use without Stable-Baselines3: its most probable action, in ONNX or as a ``torch.export``
+program.
 
 Input ``observation`` (N, D) float32, output ``action``: (N, F) float32 within the bounds, or the chosen numbers, (N,)
-or (N, F) int64. Standardisation and clipping are inside, N is free.
+or (N, F) int64. Standardisation and clipping are included, and N is free.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from surrogym_client.policies.onnx_files import from_onnx
 from surrogym_client.policies.predict import Predict
 from surrogym_shared.network import Network
 
-CHECKS = 1_000  # random observations that both forms are asked for
-TOLERANCE = 1e-5  # of the range of an action
+CHECKS = 1_000  # random observations on which both forms are compared
+TOLERANCE = 1e-5  # largest difference, as a share of an action's range
 Form = Callable[[ExportedProgram], bytes]
 
 
 class NotExportable(SurrogymClientError):
-    """The policy can't be written in this form."""
+    """The policy can't be converted to this form."""
 
 
 class MostProbable(nn.Module):
-    """The most probable action of a Stable-Baselines3 policy, as its ``predict`` gives it."""
+    """Most probable action of a Stable-Baselines3 policy, equal to its ``predict``."""
 
     low: Tensor
     high: Tensor
@@ -63,7 +63,7 @@ class MostProbable(nn.Module):
 
 
 class ArrayNetwork(nn.Module):
-    """A ``Network`` of arrays in torch; computes in float64, as it does."""
+    """Torch module of a ``Network`` of arrays. It computes in float64, as the network does."""
 
     mean: Tensor
     deviation: Tensor
@@ -93,20 +93,20 @@ class ArrayNetwork(nn.Module):
 
 
 def export_policy(policy: Path, out: Path, algorithm: str, *, trust: bool = False) -> float:
-    """Write a policy in the form that the ending of ``out`` says, ``.onnx`` or ``.pt2``, and check it.
+    """Convert a policy to the format of the ending of ``out``, ``.onnx`` or ``.pt2``, and check the file.
 
-    The file is read back and asked for the actions of random observations; it is kept only if they are those of the
-    policy. Returns the largest difference that was seen, 0 for discrete actions.
+    The file is read back, and kept only if its actions on random observations are those of the policy. Returns the
+    largest difference, which is 0 for discrete actions.
 
     Args:
-        policy: what ``surrogym train``, or Stable-Baselines3, wrote.
-        out: the file.
+        policy: policy file from ``surrogym train`` or Stable-Baselines3.
+        out: file to write.
         algorithm: name of the Stable-Baselines3 class; a network of arrays needs none.
         trust: unpickle the policy's objects, which runs any code that is in them.
 
     Raises:
         NotExportable: another ending, or actions that differ.
-        UnusablePolicy: the file is no policy of the algorithm, or it needs ``trust``.
+        UnusablePolicy: the file is not a policy of the algorithm, or it needs ``trust``.
         ModuleNotFoundError: ONNX needs the extra ``export``.
     """
     forms: dict[str, tuple[Form, Callable[[bytes], Predict]]] = {
@@ -127,7 +127,11 @@ def export_policy(policy: Path, out: Path, algorithm: str, *, trust: bool = Fals
 
 
 def to_onnx(program: ExportedProgram) -> bytes:
-    """The program in ONNX. Raises ``ModuleNotFoundError`` without the extra ``export``."""
+    """Convert the program to ONNX.
+
+    Raises:
+        ModuleNotFoundError: the extra ``export`` is missing.
+    """
     import onnx  # noqa: F401  said to be missing before torch says that its own converter is
     import onnxscript  # noqa: F401
 
@@ -155,7 +159,7 @@ def _from_program(content: bytes) -> Predict:
 
 
 def _loaded(policy: Path, algorithm: str, *, trust: bool) -> tuple[MostProbable | ArrayNetwork, Predict]:
-    """A policy as a module, and as the function it has to agree with."""
+    """Load a policy as a torch module, and as the function that it is compared with."""
     if Network.is_at(policy):
         network = Network.load(policy)
         return ArrayNetwork(network), network
@@ -164,10 +168,10 @@ def _loaded(policy: Path, algorithm: str, *, trust: bool) -> tuple[MostProbable 
 
 
 def _difference(ours: Predict, theirs: Predict, size: int) -> float:
-    """Largest difference of actions over random observations (CHECKS, D).
+    """Return the largest difference of actions over random observations (CHECKS, D).
 
     Raises:
-        NotExportable: beyond the tolerance.
+        NotExportable: the difference exceeds the tolerance.
     """
     observations = (3 * np.random.default_rng(0).standard_normal((CHECKS, size))).astype(np.float32)
     expected, got = ours(observations), theirs(observations)
@@ -182,8 +186,8 @@ def _difference(ours: Predict, theirs: Predict, size: int) -> float:
 
 @contextmanager
 def _quietly() -> Iterator[None]:
-    """The exporters warn of their own future, and of what they were not asked for; distributions would check numbers
-    that are not known yet."""
+    """Silence warnings of the exporters, and turn off the checks of distributions, whose numbers are not known
+    during export."""
     checked = torch.distributions.Distribution._validate_args
     logging.disable(logging.WARNING)
     torch.distributions.Distribution.set_default_validate_args(False)

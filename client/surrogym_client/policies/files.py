@@ -1,4 +1,4 @@
-"""A policy's file, read without running anything in it: of Stable-Baselines3, a network of arrays, or ONNX."""
+"""Read policy files without running code from them: those of Stable-Baselines3, networks of arrays, and ONNX."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ from surrogym_shared.network import Network
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-BUFFERLESS = {"n_envs": 1, "n_steps": 1, "buffer_size": 1}  # what only acts needs no room for experience
+BUFFERLESS = {"n_envs": 1, "n_steps": 1, "buffer_size": 1}  # a policy that only acts needs no memory for experience
 ONNX = ".onnx"
 
 
 def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM, *, trust: bool = False) -> Predict:
-    """The policy as a function of observations, its most probable action each. Nothing is unpickled without ``trust``.
+    """Load a policy as a function from observations to the most probable actions. Nothing is unpickled without
+    ``trust``.
 
     Args:
-        path: what ``surrogym train``, ``Network.save`` or ``surrogym export-policy`` wrote, or, with ``trust``,
+        path: file from ``surrogym train``, ``Network.save`` or ``surrogym export-policy``; or, with ``trust``, from
             ``save`` of a Stable-Baselines3 algorithm.
-        algorithm: name of its class; a network of arrays and ONNX need none.
+        algorithm: name of the Stable-Baselines3 class; a network of arrays and ONNX need none.
         trust: unpickle a policy's objects, which runs any code that is in them.
 
     Raises:
-        UnusablePolicy: no such algorithm, the file is none of its policies, or it needs ``trust``.
-        UnusableOnnx: the file is no policy in ONNX, or it could ask for more memory than a policy needs.
+        UnusablePolicy: the algorithm is unknown, the file is not one of its policies, or it needs ``trust``.
+        UnusableOnnx: the file is not a policy in ONNX, or it could need more memory than a policy should.
     """
     if Network.is_at(path):
         return _network(path)
@@ -48,7 +49,8 @@ def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM, *, trust: bool =
 
 
 def save_policy(learner: BaseAlgorithm, path: Path) -> None:
-    """Write what ``learner.save`` writes, with a description by which ``load_learner`` reads it without unpickling."""
+    """Save a policy as ``learner.save`` does, with a description from which ``load_learner`` reads it without
+    unpickling."""
     from surrogym_client.policies.structure import save
 
     save(learner, path)
@@ -57,17 +59,17 @@ def save_policy(learner: BaseAlgorithm, path: Path) -> None:
 def load_learner(
     path: Path, algorithm: str = DEFAULT_ALGORITHM, /, *, trust: bool = False, **changes: Any
 ) -> BaseAlgorithm:
-    """An algorithm of Stable-Baselines3 from its file. Nothing is unpickled without ``trust``.
+    """Load an algorithm of Stable-Baselines3 from its file. Nothing is unpickled without ``trust``.
 
     Args:
-        path: what ``save_policy`` wrote, or, with ``trust``, ``save`` of the algorithm.
+        path: file from ``save_policy``; or, with ``trust``, from ``save`` of the algorithm.
         algorithm: name of its class.
         trust: unpickle its objects, which runs any code that is in them.
-        changes: environment, seed and hyperparameters, in the place of those that it was saved with; with an
-            environment the algorithm can learn on.
+        changes: environment, seed and hyperparameters that replace the saved ones; the algorithm can only learn with an
+            environment.
 
     Raises:
-        UnusablePolicy: no such algorithm, the file is none of its policies, or it needs ``trust``.
+        UnusablePolicy: the algorithm is unknown, the file is not one of its policies, or it needs ``trust``.
     """
     import stable_baselines3
 
@@ -80,7 +82,7 @@ def load_learner(
         raise
     except pickle.UnpicklingError as error:
         raise UnusablePolicy(f"{path}: expected numbers alone as weights, got other pickled objects") from error
-    except Exception as error:  # somebody's file can raise anything
+    except Exception as error:  # a malformed file can raise anything
         if changes:
             load_learner(path, algorithm, trust=trust)
             given = [f"{name}={value!r}" for name, value in changes.items() if name not in ("env", "seed")]
@@ -104,7 +106,7 @@ def _loaded(kind: type[BaseAlgorithm], path: Path, trust: bool, changes: dict[st
 
 
 def _num_envs(env: object) -> int:
-    """How many environments step at once; 0 without an environment."""
+    """Return the number of environments that step at once; 0 without an environment."""
     return 0 if env is None else getattr(env, "num_envs", 1)
 
 

@@ -1,8 +1,8 @@
-"""The paper's policies (section 4) for Stable-Baselines3: one hidden layer of 32; by default two of 64.
+"""Policy networks for Stable-Baselines3: the paper's (section 4), with one hidden layer of 32; by default two of 64.
 
-Continuous: tanh after each layer, the output scaled to the action bounds. Discrete: ReLU, a softmax for each dimension;
-``deterministic=True`` takes the most probable action. Both see observations standardised by fixed statistics, so that a
-saved policy is complete in itself.
+Continuous actions: tanh after each layer, the output scaled to the action bounds. Discrete actions: ReLU, and a softmax
+for each dimension; ``deterministic=True`` takes the most probable action. Both standardise observations by fixed
+statistics, so that a saved policy needs nothing else.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ __all__ = [
     "PaperPolicy",
     "Standardise",
     "decaying",
-]  # files name ``decaying`` as of this module
+]  # older files refer to ``decaying`` in this module
 
 
 class Standardise(BaseFeaturesExtractor):
-    """(observation - mean) / deviation with fixed mean and deviation, (D,) each."""
+    """Layer that computes (observation - mean) / deviation with fixed mean and deviation, (D,) each."""
 
     mean: Tensor
     deviation: Tensor
@@ -56,7 +56,7 @@ class Standardise(BaseFeaturesExtractor):
 
 
 class Bounded(nn.Module):
-    """tanh of the input, scaled to the action bounds."""
+    """Layer that scales the tanh of its input to the action bounds."""
 
     centre: Tensor
     reach: Tensor
@@ -73,7 +73,7 @@ class Bounded(nn.Module):
 
 
 class PaperPolicy(ActorCriticPolicy):
-    """The paper's actor, beside a critic that only training needs."""
+    """The paper's actor, with a critic that only training needs."""
 
     def __init__(
         self,

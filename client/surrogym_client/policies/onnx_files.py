@@ -1,4 +1,5 @@
-"""A policy in ONNX as a function of observations; its memory is bounded by the file's shapes, before anything runs."""
+"""Load a policy in ONNX as a function of observations. Its memory is bounded from the file's shapes before anything
+runs."""
 
 from __future__ import annotations
 
@@ -13,35 +14,35 @@ from numpy.typing import NDArray
 from surrogym_client.errors import SurrogymClientError
 from surrogym_client.policies.predict import Predict
 
-MAX_BYTES = 256 * 1024 * 1024  # of a file
-LANES = 1_024  # observations in one call of the network; more are split
-MAX_NUMBERS = 64 * 1024 * 1024  # in all arrays of one call together, the weights included
+MAX_BYTES = 256 * 1024 * 1024  # largest file
+LANES = 1_024  # most observations in one call of the network; more are split
+MAX_NUMBERS = 64 * 1024 * 1024  # most numbers in all arrays of one call together, the weights included
 INPUT, OUTPUT = "observation", "action"
 
 
 class UnusableOnnx(SurrogymClientError):
-    """The file is no policy in ONNX, or it could ask for more memory than a policy needs."""
+    """The file is not a policy in ONNX, or it could need more memory than a policy should."""
 
 
 def load_onnx(path: Path) -> Predict:
-    """Read a policy from its file. Raises as ``from_onnx``, and ``OSError`` where the file can't be read."""
+    """Load a policy from its file. Raises as ``from_onnx``, and ``OSError`` if the file can't be read."""
     with path.open("rb") as file:
         return from_onnx(file.read(MAX_BYTES + 1))
 
 
 def from_onnx(content: bytes) -> Predict:
-    """Turn an ONNX model into a function of observations. Nothing in it is Python code, and no other file is read.
+    """Turn an ONNX model into a function of observations. No Python code in it is run, and no other file is read.
 
     Raises:
-        ModuleNotFoundError: without the extra ``export``.
-        UnusableOnnx: it is no policy, or it is larger than ``MAX_BYTES`` or ``MAX_NUMBERS`` allow.
+        ModuleNotFoundError: the extra ``export`` is missing.
+        UnusableOnnx: the model is not a policy, or is larger than ``MAX_BYTES`` or ``MAX_NUMBERS`` allow.
     """
     import onnxruntime
 
     try:
         _check(content)
         session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    except Exception as error:  # those of onnx and onnxruntime have no common base
+    except Exception as error:  # errors of onnx and onnxruntime have no common base class
         raise UnusableOnnx(f"expected a policy in ONNX, got {len(content)} bytes: {error}") from error
 
     def predict(observations: NDArray[np.float32]) -> NDArray[Any]:
@@ -53,7 +54,11 @@ def from_onnx(content: bytes) -> Predict:
 
 
 def _check(content: bytes) -> None:
-    """Raise ValueError unless the shape of every array follows from the file, and all of them together are small."""
+    """Check that the shape of every array follows from the file, and that all of them together are small.
+
+    Raises:
+        ValueError: a shape is unknown, or the arrays are too large.
+    """
     import onnx
 
     if len(content) > MAX_BYTES:
@@ -68,7 +73,8 @@ def _check(content: bytes) -> None:
 
 
 def _check_self_contained(model: Any) -> None:
-    """Refuse what would read another file, and what has no shape of its own: subgraphs, functions, sparse arrays."""
+    """Refuse models that read another file, and parts without shapes of their own: subgraphs, functions, sparse
+    arrays."""
     import onnx
 
     if model.functions:
@@ -84,7 +90,7 @@ def _check_self_contained(model: Any) -> None:
 
 
 def _messages(message: Any) -> Iterator[Any]:
-    """All messages within a protobuf message, at any depth."""
+    """Iterate over all messages within a protobuf message, at any depth."""
     for field, value in message.ListFields():
         if field.message_type is not None:
             for inner in value if field.is_repeated else [value]:
@@ -93,7 +99,7 @@ def _messages(message: Any) -> Iterator[Any]:
 
 
 def _for_lanes(graph: Any) -> None:
-    """Fix the number of observations, and remove the shapes that the file claims: they are inferred."""
+    """Fix the number of observations, and remove the shapes that the file claims. They are inferred instead."""
     weights = {array.name for array in graph.initializer}
     inputs = [given for given in graph.input if given.name not in weights]
     if [given.name for given in inputs] != [INPUT] or len(inputs[0].type.tensor_type.shape.dim) != 2:
@@ -105,7 +111,7 @@ def _for_lanes(graph: Any) -> None:
 
 
 def _numbers(graph: Any) -> int:
-    """Numbers in all arrays of a graph whose shapes have been inferred."""
+    """Count the numbers in all arrays of a graph whose shapes have been inferred."""
     known = {value.name: value.type.tensor_type for value in (*graph.input, *graph.value_info, *graph.output)}
     weights = sum(math.prod(map(int, array.dims)) for array in graph.initializer)
     made = [name for node in graph.node for name in node.output if name]

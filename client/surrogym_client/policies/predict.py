@@ -1,4 +1,4 @@
-"""What a policy is to whoever asks it."""
+"""Type of a policy as a function: observations in, actions out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A policy and what was found out about it, sent to the server; what can't be sent waits beside the policy's file."""
+"""Send a policy and its evaluations to the server. Evaluations that can't be sent wait beside the policy's file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _WAITING = TypeAdapter(list[wire.AddEvaluation])
 
 @dataclass(frozen=True)
 class Pushed:
-    """A policy that the server has, and how many evaluations were sent with it."""
+    """A policy that the server has stored, and the number of evaluations sent with it."""
 
     surrogate: str
     policy: wire.PushedPolicy
@@ -30,32 +30,32 @@ class Pushed:
 
 
 def thinned(curve: Sequence[wire.CurvePoint]) -> tuple[wire.CurvePoint, ...]:
-    """A curve of at most ``CURVE_POINTS`` points, evenly chosen, with its last."""
+    """Reduce a curve to at most ``CURVE_POINTS`` evenly chosen points, including its last."""
     every = max(1, -(-len(curve) // CURVE_POINTS))
     return tuple(curve[(len(curve) - 1) % every :: every]) if curve else ()
 
 
 def keep(policy: Path, evaluation: wire.AddEvaluation) -> None:
-    """Note an evaluation beside the policy, until ``push`` has sent it."""
+    """Write an evaluation to a file beside the policy, where it waits for ``push``."""
     _write(policy, [*_read(policy), evaluation])
 
 
 def waiting_path(policy: Path) -> Path:
-    """Where evaluations wait that the server does not have yet."""
+    """Return the path of the evaluations that the server does not have yet."""
     return policy.with_suffix(".evaluations.json")
 
 
 def push(api: Api, policy: Path, surrogate: str | None = None) -> Pushed:
-    """Send a policy's file and card, and the evaluations that wait beside it. A repeat is harmless.
+    """Send a policy's file and card, and the evaluations that wait beside it. Repeating it is harmless.
 
     Args:
         api: the server.
-        policy: the file.
-        surrogate: whose policy it is; None: as the card says.
+        policy: the policy's file.
+        surrogate: surrogate that the policy belongs to; None takes the card's.
 
     Raises:
-        UnusablePolicy: no surrogate is known, the file is of no known form, or the card is none that a server takes.
-        SpecConflict: it was made for other observations or actions than the surrogate's.
+        UnusablePolicy: no surrogate is known, the file has an unknown form, or the server does not accept the card.
+        SpecConflict: the policy was made for other observations or actions than the surrogate's.
         SurrogymClientError: the server can't be reached, or refuses; everything stays as it was.
     """
     card, form = read_card(policy), _form(policy)
@@ -75,7 +75,7 @@ def push(api: Api, policy: Path, surrogate: str | None = None) -> Pushed:
 
 
 def as_pushed(card: PolicyCard) -> wire.PushedCard:
-    """A card without the address that it notes, which is nobody else's business."""
+    """Return a card without the server's address in it, which is private."""
     return wire.PushedCard.model_validate(card.model_dump(mode="json", exclude={"server", "curve"}))
 
 

@@ -1,7 +1,7 @@
-"""The settings and counters that a policy's file may give to an algorithm of Stable-Baselines3.
+"""Settings and counters that a policy's file may set on an algorithm of Stable-Baselines3.
 
-Stable-Baselines3 makes every entry of a file an attribute of the algorithm, methods included. Only the entries here
-pass, each of its type; all others are ignored, and the algorithm's defaults apply.
+Stable-Baselines3 makes every entry of a file an attribute of the algorithm, even methods. Only the entries here are
+accepted, each of its type. All others are ignored, and the algorithm's defaults apply.
 """
 
 from __future__ import annotations
@@ -16,12 +16,14 @@ MAX_EXPERIENCE_BYTES = 2 * 1024**3
 Count = Annotated[int, Field(ge=0, le=2**53)]
 Positive = Annotated[int, Field(ge=1, le=2**53)]
 Batch = Annotated[int, Field(ge=1, le=2**20)]
-Passes = Annotated[int, Field(ge=-1, le=10_000)]  # over the experience or by gradient; -1 for as many as steps
+Passes = Annotated[
+    int, Field(ge=-1, le=10_000)
+]  # passes over the experience, or gradient steps; -1 for as many as environment steps
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class ReplaySettings(BaseModel):
-    """Keywords of the replay buffer; the others follow from the algorithm's settings."""
+    """Accepted keywords of the replay buffer. The others follow from the algorithm's settings."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, strict=True)
 
@@ -29,7 +31,7 @@ class ReplaySettings(BaseModel):
 
 
 class PolicySettings(BaseModel):
-    """Entries of a file by the names of the algorithms' attributes. An entry that is None or absent is the default."""
+    """Accepted entries of a file, by the names of the algorithm's attributes. None or absent means the default."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, strict=True, allow_inf_nan=False)
 
@@ -78,13 +80,17 @@ class PolicySettings(BaseModel):
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """Attributes of the algorithm that the file gives, by name."""
+        """Return the attributes that the file sets on the algorithm, by name."""
         return self.model_dump(by_alias=True, exclude_none=True)
 
     def require_memory(
         self, num_envs: int, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
     ) -> None:
-        """Raise ValueError if the experience for learning needs more than ``MAX_EXPERIENCE_BYTES``."""
+        """Check that the experience for learning fits ``MAX_EXPERIENCE_BYTES``.
+
+        Raises:
+            ValueError: the experience needs more memory.
+        """
         numbers = 2 * _size(observation_space) + _size(action_space) + 4  # rewards, ends, values and the like
         steps = max(self.buffer_size or 0, (self.n_steps or 0) * num_envs)
         if (needed := 4 * numbers * steps) > MAX_EXPERIENCE_BYTES:

@@ -1,7 +1,7 @@
-"""A policy of ``surrogym train`` described by data alone, so that it is built and loaded without unpickling.
+"""Description of a policy as data, from which a policy of ``surrogym train`` is rebuilt without unpickling.
 
-Stable-Baselines3 pickles what JSON can't hold: spaces, classes, schedules. A policy's file gets an entry that describes
-them, and reading builds them anew from there. Weights are read as numbers alone, and nothing is unpickled.
+Stable-Baselines3 pickles what JSON can't represent: spaces, classes, schedules. The file of a policy gets an entry that
+describes them, and reading rebuilds them from it. Weights are read as plain numbers. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from surrogym_shared.archives import read_entries, stored
 from surrogym_shared.wire import ActionSpace, BoxSpace, DiscreteSpace, MultiDiscreteSpace
 
 ENTRY = "surrogym-policy.json"
-MAX_BYTES = 256 * 1024 * 1024  # of a file's contents
+MAX_BYTES = 256 * 1024 * 1024  # largest contents of a file
 WEIGHTS = ".pth"
 PICKLED = ":serialized:"
 DECAYING = "decaying"
@@ -42,7 +42,7 @@ EXTRACTOR = {"features_extractor_class", "features_extractor_kwargs"}
 OPTIMIZER = {"optimizer_class", "optimizer_kwargs"}
 DESCRIBED = EXTRACTOR | OPTIMIZER | {"net_arch", "n_critics", "use_sde"}
 NEEDED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
-REMADE = (  # by Stable-Baselines3, when it builds the algorithm and when that begins to learn
+REMADE = (  # Stable-Baselines3 makes these when it builds the algorithm, and when learning begins
     *("lr_schedule", "exploration_schedule", "rollout_buffer_class", "replay_buffer_class"),
     *("_last_obs", "_last_original_obs", "_last_episode_starts", "ep_info_buffer", "ep_success_buffer"),
 )
@@ -53,7 +53,7 @@ Layers = Annotated[list[Annotated[int, Field(ge=1)]], Field(max_length=64)]
 
 
 class PickledObjects(ValueError):
-    """The file holds pickled objects that nothing describes; ``names`` are theirs."""
+    """The file contains pickled objects without a description. ``names`` lists them."""
 
     def __init__(self, names: list[str]) -> None:
         super().__init__(names)
@@ -61,7 +61,8 @@ class PickledObjects(ValueError):
 
 
 class Structure(BaseModel):
-    """What Stable-Baselines3 needs beside the weights. The last four are for learning alone; None is not described."""
+    """Description of what Stable-Baselines3 needs besides the weights. The last four fields are for learning only;
+    None means not described."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -79,7 +80,7 @@ class Structure(BaseModel):
     train_freq: tuple[int, Literal["step", "episode"]] | None = None
 
     def objects(self) -> dict[str, Any]:
-        """The attributes of the algorithm that it describes."""
+        """Return the attributes of the algorithm that this describes."""
         chosen = {
             "features_extractor_class": Standardise,
             "net_arch": self.net_arch,
@@ -102,7 +103,7 @@ class Structure(BaseModel):
 
     @property
     def weights(self) -> int:
-        """Numbers that a network of these layers has at least."""
+        """Smallest number of weights that a network of these layers has."""
         inputs, arch = len(self.observation_space.low), self.net_arch
         parts = {"pi": arch} if isinstance(arch, list) else dict(arch)
         actor, others = parts.pop("pi", []), parts.values()
@@ -111,7 +112,7 @@ class Structure(BaseModel):
 
 
 def save(learner: BaseAlgorithm, path: Path) -> None:
-    """Write what ``learner.save`` writes, and beside it the description, where the policy is one that has one."""
+    """Save a policy as ``learner.save`` does, and add the description if the policy can be described."""
     file = io.BytesIO()
     learner.save(file)
     if (structure := describe(learner)) is not None:
@@ -121,7 +122,7 @@ def save(learner: BaseAlgorithm, path: Path) -> None:
 
 
 def describe(learner: BaseAlgorithm) -> Structure | None:
-    """The description of a policy as ``surrogym train`` makes them; None for any other."""
+    """Describe a policy made by ``surrogym train``; None for any other."""
     kwargs, kind = learner.policy_kwargs, type(learner.policy)
     if POLICIES.get(kind.__name__) is not kind or set(kwargs) - DESCRIBED:
         return None
@@ -148,19 +149,20 @@ def describe(learner: BaseAlgorithm) -> Structure | None:
 
 
 def read(path: Path, *, num_envs: int, replaced: set[str]) -> tuple[io.BytesIO, dict[str, Any]]:
-    """A policy's file without anything pickled, and the objects that belong in the place of what was.
+    """Read a policy's file without its pickled objects, and rebuild these from the description.
 
-    Both are for ``load`` of a Stable-Baselines3 algorithm: the file, and ``custom_objects``.
+    Both results are arguments for ``load`` of a Stable-Baselines3 algorithm: the file, and ``custom_objects``.
 
     Args:
-        path: what ``save`` wrote.
-        num_envs: of the environment on which the algorithm continues to learn; 0 if it only acts, which leaves out the
-            objects that only learning needs.
+        path: file from ``save``.
+        num_envs: number of environments on which the algorithm continues to learn; 0 if it only acts, which leaves out
+            the objects that only learning needs.
         replaced: attributes that the caller sets, so that the file's are not needed.
 
     Raises:
-        PickledObjects: something that is needed is neither described nor replaced.
-        OSError, ValueError: no such file, or none of this form.
+        PickledObjects: a needed object is neither described nor replaced.
+        OSError: the file can't be read.
+        ValueError: the file does not have this form.
     """
     entries = read_entries(path, MAX_BYTES)
     data = dict(json.loads(_entry(entries, "data")))
@@ -175,7 +177,7 @@ def read(path: Path, *, num_envs: int, replaced: set[str]) -> tuple[io.BytesIO, 
     settings = _settings(data, {*objects, *pickled, *NEEDED})
     if num_envs and structure is not None:
         settings.require_memory(num_envs, objects["observation_space"], objects["action_space"])
-    placeholders = dict.fromkeys(({*pickled} - replaced) | {*NEEDED})  # load takes the objects for them
+    placeholders = dict.fromkeys(({*pickled} - replaced) | {*NEEDED})  # load replaces them by the objects
     data = {"verbose": 0, **settings.attributes, **placeholders}
     weights = {name: _plain(content) for name, content in entries.items() if name.endswith(WEIGHTS)}
     _require_variables(weights.get("pytorch_variables" + WEIGHTS))
@@ -183,7 +185,7 @@ def read(path: Path, *, num_envs: int, replaced: set[str]) -> tuple[io.BytesIO, 
 
 
 def _settings(data: Mapping[str, Any], replaced: set[str]) -> PolicySettings:
-    """The settings of a file, without those that something else replaces."""
+    """Return the settings of a file, except those that are replaced."""
     try:
         return PolicySettings.model_validate({name: value for name, value in data.items() if name not in replaced})
     except ValidationError as error:
@@ -198,19 +200,20 @@ def _entry(entries: Mapping[str, bytes], name: str) -> bytes:
 
 
 def _plain(weights: bytes) -> bytes:
-    """The zip that ``torch.save`` wrote, packed anew: torch inflates nothing that was not counted here."""
+    """Repack the zip that ``torch.save`` wrote, so that torch only inflates what was counted here."""
     return stored(read_entries(weights, len(weights)))
 
 
 def _require_weights(structure: Structure, file: bytes) -> None:
-    """Layers far larger than the weights that came would fill the memory before torch compares them."""
+    """Refuse layers that are far larger than the weights in the file: they would fill the memory before torch
+    compares them."""
     came = len(file) // np.dtype(np.float32).itemsize
     if structure.weights > came:
         raise ValueError(f"expected weights for layers of {structure.weights} numbers, got {came} numbers at most")
 
 
 def _require_variables(file: bytes | None) -> None:
-    """Stable-Baselines3 sets each of these tensors wherever in the algorithm its name points to."""
+    """Refuse unknown tensors, because Stable-Baselines3 sets each one wherever in the algorithm its name points to."""
     found = {} if file is None else torch.load(io.BytesIO(file), map_location="cpu", weights_only=True)
     if unknown := {*(found or {})} - VARIABLES:
         raise ValueError(f"expected no variables but {', '.join(VARIABLES)}, got {', '.join(map(str, unknown))}")
@@ -231,7 +234,7 @@ def _outputs(action: BoxSpace | DiscreteSpace | MultiDiscreteSpace) -> int:
 
 
 def _wire(given: Space[Any]) -> BoxSpace | DiscreteSpace | MultiDiscreteSpace | None:
-    """The space as data; None where it would not be the same again."""
+    """Return the space as data; None if it can't be rebuilt exactly."""
     described: BoxSpace | DiscreteSpace | MultiDiscreteSpace
     match given:
         case spaces.Box(shape=(_,)):

@@ -1,4 +1,4 @@
-"""The worker beside the original environment, which answers the queries of a design by real steps."""
+"""The sampler, a process beside the original environment that answers queries with real steps."""
 
 from surrogym_client.sampler.worker import Outcome, Sampler, SamplerReport, SamplerSettings
 

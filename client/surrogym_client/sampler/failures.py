@@ -1,4 +1,5 @@
-"""When failures are the machine's and not the queries': one fault of it must not use up the attempts of every query."""
+"""Tell failures of the machine from failures of queries, so that one broken machine does not use up every query's
+attempts."""
 
 from __future__ import annotations
 
@@ -6,22 +7,22 @@ from collections.abc import Iterable
 
 from surrogym_client.original.errors import MachineFails
 
-FIRST_FEW = 4  # different queries, of which a machine that never answered has answered none
-MANY = 8  # different queries in a row, of a machine that has answered others before
+FIRST_FEW = 4  # different failed queries after which a machine that has never answered counts as broken
+MANY = 8  # different failed queries in a row after which a machine that has answered before counts as broken
 FIRST_DELAY, LONGEST_DELAY = 1.0, 30.0  # seconds
 
 
 class Failures:
-    """The failures of one worker since its last answer.
+    """Failures of one sampler since its last answer.
 
-    A query that lies where the machine can't go fails again and again, and others are answered meanwhile. A machine
-    that is broken fails at all of them.
+    A query that the machine can't reach fails again and again, while others succeed. A broken machine fails at every
+    query.
     """
 
     def __init__(self) -> None:
         self._queries: set[int] = set()  # ids
         self._later = 0  # failures since the FIRST_FEW-th different query failed; each lengthens the delay
-        self._answered = False  # anything, ever
+        self._answered = False  # whether any query was ever answered
         self._last = ""
 
     def answered(self) -> None:
@@ -33,14 +34,15 @@ class Failures:
         self._later += len(self._queries) >= FIRST_FEW
 
     def delay(self) -> float:
-        """Seconds to wait before the next query, so that a short fault of the machine has time to pass."""
+        """Seconds to wait before the next query, so that a short fault of the machine can pass."""
         return min(FIRST_DELAY * 2 ** (self._later - 1), LONGEST_DELAY) if self._later else 0.0
 
     def check(self, waiting: Iterable[int]) -> None:
-        """Call before queries of these ids are begun.
+        """Check the machine before queries of these ids begin.
 
         Raises:
-            MachineFails: it failed at too many different queries, or never answered and failed at all there are.
+            MachineFails: it failed at too many different queries, or it never answered and failed at all queries there
+                are.
         """
         failed = len(self._queries)
         only_these = failed > 1 and self._queries.issuperset(waiting)

@@ -1,4 +1,4 @@
-"""The leases of the queries that a sampler holds: what is left of each, and their renewal."""
+"""Leases of the queries that a sampler holds: the remaining time of each, and their renewal."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from surrogym_client.transport.connection import Retries
 from surrogym_shared.wire import Query
 
 AWAY = (ServerUnreachable, Unavailable)
-ONE_ATTEMPT = Retries(seconds=0)  # at a renewal, which the next one repeats
-NEARLY_OVER = 0.1  # of a lease
+ONE_ATTEMPT = Retries(seconds=0)  # for a renewal, because the next renewal repeats it
+NEARLY_OVER = 0.1  # remaining share of a lease that counts as nearly over
 
 
 class LeaseEnded(Exception):
-    """No real step may be begun for a query: another sampler may have answered it."""
+    """The lease has ended, so no real step may begin: another sampler may have answered the query."""
 
 
 def seconds_awake_or_asleep() -> float:
-    """A clock that nobody sets. Where the system has such a one, it counts the time for which it was suspended."""
+    """Return the seconds of a clock that is never set. If the system has such a clock, it includes suspended time."""
     if not hasattr(time, "clock_gettime"):
         return time.monotonic()
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
@@ -32,18 +32,20 @@ def seconds_awake_or_asleep() -> float:
 
 @dataclass
 class _Held:
+    """A query that the sampler holds, with its lease."""
+
     query: Query
-    ends: float  # by the clock here, and by the server's no earlier
+    ends: float  # by the local clock; on the server's clock it ends no earlier
 
 
 class Leases:
-    """What a worker holds. A thread of its own renews it at a third of the leases' length.
+    """Leases that a sampler holds. A thread renews them after each third of their length.
 
     Args:
         api: the server.
-        surrogate: its name there.
+        surrogate: name of the surrogate.
         lease_seconds: length of every lease.
-        clock: seconds.
+        clock: returns the time in seconds.
     """
 
     def __init__(
@@ -69,7 +71,7 @@ class Leases:
         self._thread.join(timeout=5.0)
 
     def hold(self, queries: Sequence[Query], since: float) -> None:
-        """Keep queries that were claimed no earlier than ``since``, by the clock."""
+        """Add the leases of queries that were claimed no earlier than ``since``, by the clock."""
         with self._lock:
             self._held.update({query.id: _Held(query, since + self._lease_seconds) for query in queries})
 
@@ -78,10 +80,11 @@ class Leases:
             self._held.pop(query.id, None)
 
     def check(self, query: Query) -> None:
-        """Call before each real step of a query; the server is asked only where the lease is over or nearly so.
+        """Check the lease before each real step of a query. The server is contacted only if the lease is over or nearly
+        over.
 
         Raises:
-            LeaseEnded: the lease is over, or the server that could say so is away.
+            LeaseEnded: the lease is over, or the server could not confirm it.
         """
         if self._left(query) <= NEARLY_OVER * self._lease_seconds:
             self._renew(query)
@@ -110,6 +113,6 @@ class Leases:
             self._api.renew(self._surrogate, query.id, query.lease_token, lease_seconds=seconds, retries=ONE_ATTEMPT)
             held.ends = asked + seconds
         except AWAY:
-            return  # the next beat tries again
+            return  # the next renewal tries again
         except SurrogymClientError:
-            self.release(query)  # a late answer is still a true observation, so the step under way is finished
+            self.release(query)  # the running step is finished, because a late sample is still a true observation

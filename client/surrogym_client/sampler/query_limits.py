@@ -1,4 +1,4 @@
-"""What a server may have the original environment do: the limits of the environment's own specification."""
+"""Check the server's queries against the limits of the original environment's own specification."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from surrogym_shared.spec import MAX_ROLLOUT_QUERY, BoxAction, DiscreteAction, E
 from surrogym_shared.spec import limits as sampled
 from surrogym_shared.wire import Query, StepQuery
 
-ROUNDING = 1e-6  # of the larger limit: float32 rounds by less
+ROUNDING = 1e-6  # share of the larger limit; float32 rounds by less
 
 Range: TypeAlias = tuple[float, float]
 
@@ -19,7 +19,7 @@ def check_environment(surrogate: str, asked: EnvironmentSpec, own: EnvironmentSp
     """Check that an environment fits a surrogate: coordinates, action, kind of query, and ranges within its own.
 
     Raises:
-        UnknownEnvironment: it does not.
+        UnknownEnvironment: the environment does not fit.
     """
     expected, got = _shape(asked), _shape(own)
     if expected != got:
@@ -31,12 +31,12 @@ def check_environment(surrogate: str, asked: EnvironmentSpec, own: EnvironmentSp
 
 
 def check_query(own: EnvironmentSpec, query: Query) -> None:
-    """Check everything that a query asks for against the environment's own specification; call before the first step.
+    """Check a query against the environment's own specification, before its first step.
 
     A coordinate may be anywhere within its bounds or, on a side without a bound, within its sampling range.
 
     Raises:
-        QueryRefused: the environment does not allow it.
+        QueryRefused: the environment does not allow the query.
     """
     if query.kind != own.query:
         raise QueryRefused(f"expected a {own.query} query, got a {query.kind} query")
@@ -75,7 +75,7 @@ def _check_ranges(what: str, asked: Sequence[Range], own: Sequence[Range]) -> No
 
 
 def _within(asked: Range, allowed: Range) -> bool:
-    """Whether a range lies in another one, but for rounding; NaN lies in none."""
+    """Whether a range lies in another one, apart from rounding. A range with NaN lies in none."""
     slack = ROUNDING * max(map(abs, allowed))
     return allowed[0] - slack <= asked[0] and asked[1] <= allowed[1] + slack
 

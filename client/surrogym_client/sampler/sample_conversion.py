@@ -1,4 +1,4 @@
-"""From a real step to the sample that answers a query."""
+"""Convert a real step to the sample that answers a query."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from surrogym_shared.wire import NewSample, Query, StepQuery
 
 
 def reset_seed(query: Query, design_seed: int) -> int:
-    """The seed of a rollout's reset: one of its own for each attempt, the same on any server that asks the same."""
+    """Seed of a rollout's reset. Each attempt has its own; it is the same on any server for the same query and
+    design."""
     return int(np.random.SeedSequence([design_seed, query.number, query.attempt]).generate_state(1)[0])
 
 
 def sample_of(query: Query, step: RealStep, size: int, number: int = 0) -> NewSample:
-    """The sample that step ``number`` gives a query of ``size`` coordinates.
+    """Return the sample of step ``number`` of a query with ``size`` coordinates.
 
     Raises:
         StepFailed: the step has numbers that are not finite, or of the wrong shape.
@@ -42,7 +43,7 @@ def sample_of(query: Query, step: RealStep, size: int, number: int = 0) -> NewSa
 
 
 def _requested_actions(query: Query) -> list[list[float]]:
-    """The actions (T, F) of a query."""
+    """Return the actions (T, F) of a query."""
     return [query.action] if isinstance(query, StepQuery) else query.actions
 
 

@@ -1,4 +1,4 @@
-"""The worker beside the original environment: claims queries, takes the real step, hands in what happened."""
+"""The sampler: claims queries, takes the real steps, and sends the samples."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from surrogym_client.transport.connection import Retries
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, StepQuery
 
-PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)  # with a server or a storage that is away
-LOOK_SECONDS = 0.1  # how often a worker that waits looks whether it was stopped
-LAST_SECONDS = 5.0  # a sampler that was stopped asks on for so long, with a real step that is not handed in yet
-END_SECONDS = 2.0  # at most, until a worker that waits for the end of a design sees one that came before it asked
-AGAIN_SECONDS = 1.0  # until the next claim, after one in which no query could be begun
+PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)  # for a server or a storage that does not answer
+LOOK_SECONDS = 0.1  # how often a waiting sampler checks whether it was stopped
+LAST_SECONDS = 5.0  # how long a stopped sampler retries to send its last real step
+END_SECONDS = 2.0  # longest time until a waiting sampler notices that the design had ended before its claim
+AGAIN_SECONDS = 1.0  # pause after a claim in which no query could begin
 STOPPED = "the sampler was stopped"
 
 T = TypeVar("T")
@@ -38,17 +38,17 @@ Outcome = Literal["answered", "failed", "dropped", "refused"]
 
 
 def worker_name() -> str:
-    """A name that tells this worker from others in the ledger."""
+    """Return a name that distinguishes this sampler from others in the ledger."""
     return f"{socket.gethostname()}-{os.getpid()}"[:128]
 
 
 @dataclass(frozen=True)
 class SamplerSettings:
-    """How a worker works.
+    """Settings of a sampler.
 
-    ``batch``: queries claimed at once. ``until_done``: stop when the design has reached its target or its budget;
-    ``once``: stop after the first claim that gives any; ``max_queries`` and ``time_limit`` (seconds) stop it too. No
-    query is begun beyond either of them.
+    ``batch``: queries to claim at once. ``until_done``: stop when the design is ready or over its budget. ``once``:
+    stop after the first claim that returns queries. ``max_queries`` and ``time_limit`` (seconds): begin no query beyond
+    either of them.
     """
 
     name: str = field(default_factory=worker_name)
@@ -63,39 +63,42 @@ class SamplerSettings:
 
 @dataclass(frozen=True)
 class SamplerReport:
-    """What a worker did. ``dropped`` counts queries whose lease ended before a real step, ``refused`` those that the
-    environment's own specification does not allow; ``phase`` is the last that the server gave."""
+    """Result of a sampler's run.
+
+    ``dropped`` counts queries whose lease ended before a real step, ``refused`` those that the environment's own
+    specification does not allow. ``phase`` is the design's last known phase.
+    """
 
     answered: int
     failed: int
     dropped: int
     refused: int
-    steps: int  # real ones, handed in
+    steps: int  # real steps that were sent
     seconds: float
     phase: Phase | None
 
 
 class Sampler:
-    """Answers the queries of one surrogate.
+    """Answers the queries of one surrogate with real steps.
 
-    A step that fails gives its query back with the error; in a rollout, the steps before it are the answer. A server
-    that is away is waited for, and an answer is not given up meanwhile.
+    If a step fails, its query is returned with the error; in a rollout, the steps before it are the answer. If the
+    server does not answer, the sampler waits and keeps its samples.
 
-    No real step is begun after the lease of its query has ended, as it has when the machine was suspended: another
-    sampler may have taken it. A step that is under way then is finished and handed in.
+    No real step begins after the lease of its query has ended, for example while the machine was suspended: another
+    sampler may have taken the query. A step that is running then is finished and sent.
 
-    After failures at several different queries in a row it waits longer and longer, and then it ends: a fault of the
-    machine is not a fault of the queries, which have three attempts each.
+    After failures at several different queries in a row, the sampler waits longer and longer, and then ends. So a fault
+    of the machine does not use up the three attempts that each query has.
 
-    The server is not trusted with the environment: each query is checked against the environment's own specification,
-    and one that lies outside is given back as not begun before anything is sent to the environment.
+    The server is not trusted with the environment. Each query is checked against the environment's own specification,
+    and one outside of it is returned as not begun before anything is sent to the environment.
 
     Args:
         api: the server.
-        surrogate: its name there.
-        environment: the original environment; wrap it into ``IsolatedEnvironment`` where it may hang or crash.
-        settings: when to stop, how much to claim.
-        report: called after every query with it, what became of it, and the error if there was one.
+        surrogate: name of the surrogate.
+        environment: the original environment; wrap it in ``IsolatedEnvironment`` if it may hang or crash.
+        settings: when to stop, and how many queries to claim.
+        report: called after every query with the query, its outcome, and the error if there was one.
 
     Examples:
         >>> with Api("http://127.0.0.1:8000") as api:
@@ -116,7 +119,7 @@ class Sampler:
         self._settings = settings or SamplerSettings()
         self._report = report
         self._counts: dict[Outcome, int] = {"answered": 0, "failed": 0, "dropped": 0, "refused": 0}
-        self._refused: set[int] = set()  # ids; the server offers these queries again
+        self._refused: set[int] = set()  # ids of refused queries, which the server offers again
         self._failures = Failures()
         self._steps = 0
         self._phase: Phase | None = None
@@ -124,22 +127,24 @@ class Sampler:
         self._own: EnvironmentSpec
         self._leases: Leases
         self._started = time.monotonic()
-        self._stopping = False  # no Event: a signal handler that sets one may wait for itself
+        self._stopping = False  # not an Event, because a signal handler that sets one can deadlock
 
     def stop(self) -> None:
-        """End ``run`` after the step that is under way; for another thread, or a signal handler. A server that is away
-        is waited for no longer, but some seconds with a real step that it has not got yet; what ``api`` itself repeats
-        of one request (``Retries``) comes on top."""
+        """End ``run`` after the running step. Call it from another thread or a signal handler.
+
+        The sampler then no longer waits for a server that does not answer, except for ``LAST_SECONDS`` to send its last
+        real step. Retries of a single request by ``api`` add to that.
+        """
         self._stopping = True
 
     def run(self) -> SamplerReport:
-        """Work until a setting says stop, ``stop`` is called, or Ctrl-C comes.
+        """Answer queries until a setting ends it, ``stop`` is called, or Ctrl-C is pressed.
 
         Raises:
-            UnknownSurrogate: there is none of this name, or it was deleted.
-            ServerUnreachable, Unavailable: the server, or its storage, stayed away for too long.
-            UnknownEnvironment: the environment can't be made, or is another one than the surrogate's.
-            MachineFails: it failed at one query after the other.
+            UnknownSurrogate: there is no surrogate of this name, or it was deleted.
+            ServerUnreachable, Unavailable: the server, or its storage, did not answer for too long.
+            UnknownEnvironment: the environment can't be made, or does not fit the surrogate.
+            MachineFails: the machine failed at several queries in a row.
         """
         self._started = time.monotonic()
         self._check()
@@ -160,7 +165,7 @@ class Sampler:
         return self.summary()
 
     def summary(self) -> SamplerReport:
-        """What was done so far."""
+        """Return the report of the work so far."""
         seconds = time.monotonic() - self._started
         return SamplerReport(**self._counts, steps=self._steps, seconds=seconds, phase=self._phase)
 
@@ -171,7 +176,7 @@ class Sampler:
         check_environment(self._surrogate, self._spec, self._own)
 
     def _claim(self, limit: int) -> tuple[ClaimedQueries, float]:
-        """Queries, and when they were asked for by the leases' clock."""
+        """Claim queries. Returns them with the time of the claim on the leases' clock."""
         s, since = self._settings, self._leases.clock()
         waits = not (s.until_done and (self._phase is None or self._phase in ENDED))
         left = self._within_time(min(s.wait_seconds, END_SECONDS) if s.until_done else s.wait_seconds)
@@ -185,7 +190,7 @@ class Sampler:
         return claimed, since
 
     def _work(self, queries: list[Query], since: float) -> None:
-        """Answer queries one by one; those left when a person interrupts or the time is over are given back."""
+        """Answer queries one by one. Queries that are left after Ctrl-C or the time limit are returned to the queue."""
         left, begun = list(queries), None
         self._leases.hold(left, since)
         try:
@@ -205,7 +210,7 @@ class Sampler:
     def _answer(self, query: Query) -> None:
         taken: list[NewSample] = []
         error = ""
-        outcome: Outcome = "failed"  # where no step was taken
+        outcome: Outcome = "failed"  # if no step was taken
         try:
             check_query(self._own, query)
             self._take(query, taken)
@@ -217,7 +222,7 @@ class Sampler:
             error = str(failed) or "no reason given"
         except Exception as raised:  # an environment that is not isolated may raise anything
             error = f"{type(raised).__name__}: {raised}"
-        except BaseException:  # a person interrupts: what was done to the original environment is told all the same
+        except BaseException:  # Ctrl-C: real steps that were taken are reported all the same
             self._hand_in(taken)
             raise
         try:
@@ -230,7 +235,7 @@ class Sampler:
         self._count(query, "answered" if taken else outcome, error)
 
     def _take(self, query: Query, taken: list[NewSample]) -> None:
-        """Take the real steps of a query, and put each into ``taken`` as soon as it is done."""
+        """Take the real steps of a query, and append each to ``taken`` as soon as it is done."""
         environment, size = self._environment, len(self._spec.coordinates)
         if isinstance(query, StepQuery):
             assert isinstance(environment, OriginalEnvironment)
@@ -256,11 +261,12 @@ class Sampler:
             self._steps += len(samples)
 
     def _patiently(self, request: Callable[[], T], once_stopped: float = 0.0) -> T:
-        """Ask until the server and its storage are back; every request here may be repeated.
+        """Repeat a request until the server and its storage answer. Every request here is safe to repeat.
 
         Raises:
-            ServerUnreachable, Unavailable: they stayed away for longer than ``PATIENCE``, or than ``once_stopped``
-                seconds after ``stop``.
+            ServerUnreachable, Unavailable: no answer for longer than ``PATIENCE``, or than ``once_stopped`` seconds
+                after
+                ``stop``.
         """
         delays, stopped = PATIENCE.delays(), None
         while True:
@@ -281,7 +287,7 @@ class Sampler:
         return self._stopping
 
     def _pause(self, seconds: float) -> None:
-        """Wait for so long, or until this worker is stopped."""
+        """Wait for ``seconds``, or until the sampler is stopped."""
         until = time.monotonic() + seconds
         while not self._stopped() and (left := until - time.monotonic()) > 0:
             time.sleep(min(left, LOOK_SECONDS))
@@ -290,7 +296,7 @@ class Sampler:
         try:
             self._api.fail(self._surrogate, query.id, query.lease_token, error[:4_000], begun=begun)
         except (LeaseExpired, NotThere):
-            return  # the query has gone to the next one already
+            return  # another sampler has the query already
 
     def _count(self, query: Query, outcome: Outcome, error: str) -> None:
         if outcome == "refused":
@@ -306,7 +312,8 @@ class Sampler:
             self._report(query, outcome, error)
 
     def _limit(self) -> int:
-        """How many queries to claim next; 0 when it is time to stop. Dropped ones were not this worker's to answer."""
+        """Number of queries to claim next; 0 if it is time to stop. Dropped queries don't count, as others answer
+        them."""
         s = self._settings
         if self._out_of_time():
             return 0
@@ -331,5 +338,5 @@ class Sampler:
         return self._settings.until_done and self._none_allowed(claimed) and claimed.phase in ENDED
 
     def _none_allowed(self, claimed: ClaimedQueries) -> bool:
-        """Whether a claim gave nothing but queries that the environment does not allow, or nothing."""
+        """Whether a claim returned nothing, or only queries that the environment does not allow."""
         return all(query.id in self._refused for query in claimed.queries)

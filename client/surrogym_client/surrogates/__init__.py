@@ -1,1 +1,1 @@
-"""What is done with a whole surrogate: wait for its design, ask what its budget holds, move it into a file and back."""
+"""Operations on a whole surrogate: wait for its design, check its budget, move it to a file and back."""

@@ -1,4 +1,4 @@
-"""How sure a design is of its model, in words by degree, and the one next step that is worth most."""
+"""The design's verdict in words by degree, and the most useful next step."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from statistics import NormalDist
 from surrogym_client.surrogates.phases import COMPLETED
 from surrogym_shared.wire import ModelView, OutputFidelity, SurrogateView
 
-NEARLY = 0.9  # of the target
-MOST_STEPS = 10.0  # times the samples there are: a forecast beyond that is none
-FEWEST_MODELS = 4  # that show a rate
-NOISY_SLACK = 1.25  # of a leave-one-out error where noise is established
-TOLERABLE = 1e-6  # of the leave-one-out error: a smaller tolerance comes from samples that were all alike
+NEARLY = 0.9  # share of the target that counts as nearly reached
+MOST_STEPS = 10.0  # longest forecast, as a multiple of the present samples
+FEWEST_MODELS = 4  # fewest models from which to estimate a rate
+NOISY_SLACK = 1.25  # factor on the allowed leave-one-out error once noise is confirmed
+TOLERABLE = 1e-6  # share of the leave-one-out error: a smaller tolerance comes from samples that were all alike
 
 
 def verdict(view: SurrogateView) -> str:
-    """How sure the design is of its model: ready, ready but for one output, nearly, or not; empty without a model."""
+    """Describe how certain the model is: ready, ready but for one output, nearly, or not. Empty without a model."""
     if view.fidelity is None:
         return ""
     outputs = view.fidelity.outputs
@@ -34,11 +34,12 @@ def verdict(view: SurrogateView) -> str:
 
 
 def advice(view: SurrogateView, models: Sequence[ModelView]) -> str:
-    """The next step for a design that has ended unsure, with its cost in real steps; empty where there is none.
+    """Describe the next step for a design that has ended without being ready, with its cost in real steps. Empty if
+    there is none.
 
     Args:
         view: the surrogate.
-        models: its fits, oldest first, which show at what rate it learns.
+        models: its fits, oldest first, which show how fast it learns.
     """
     doubtful = _doubtful(view)
     if view.phase not in COMPLETED or view.phase in ("ready", "from_log") or not doubtful:
@@ -69,7 +70,7 @@ def advice(view: SurrogateView, models: Sequence[ModelView]) -> str:
 
 
 def _doubtful(view: SurrogateView) -> list[OutputFidelity]:
-    """Outputs that keep the design from being ready, least sure first."""
+    """Return the outputs that keep the design from being ready, the least certain first."""
     outputs = [] if view.fidelity is None else view.fidelity.outputs
     unsure = [output for output in outputs if output.confidence_index < view.target or not _agrees(output)]
     return sorted(unsure, key=lambda output: output.confidence_index)
@@ -80,7 +81,7 @@ def _agrees(output: OutputFidelity) -> bool:
 
 
 def _largest_error(output: OutputFidelity) -> float:
-    """The leave-one-out error up to which the server counts an output as known."""
+    """Return the largest leave-one-out error with which the server counts an output as known."""
     return output.tolerance * (NOISY_SLACK if output.noise else 1.0)
 
 
@@ -93,8 +94,10 @@ def _named(output: OutputFidelity, target: float) -> str:
 
 
 def _steps_to_go(view: SurrogateView, worst: OutputFidelity, models: Sequence[ModelView]) -> int | None:
-    """Real steps until the output has its target, if what it lacks shrinks as it did over the last half of the fits;
-    None where it does not shrink."""
+    """Forecast the real steps until the output reaches its target; None if it does not improve.
+
+    The gap to the target is assumed to shrink as it did over the last half of the fits.
+    """
     late = models[len(models) // 2 :]
     seen = [(model.samples, output) for model in late for output in model.fidelity.outputs if output.name == worst.name]
     samples = [float(count) for count, _ in seen]
@@ -111,7 +114,8 @@ def _steps_to_go(view: SurrogateView, worst: OutputFidelity, models: Sequence[Mo
 
 
 def _forecast(samples: Sequence[float], values: Sequence[float], limit: float) -> float | None:
-    """How many samples are missing until values that fall exponentially are at the limit; None where they don't."""
+    """Forecast how many samples are missing until values that decrease exponentially reach the limit; None if they
+    don't."""
     if values[-1] <= limit:
         return 0.0
     logs = [log(max(value, 1e-300)) for value in values]
@@ -124,7 +128,7 @@ def _forecast(samples: Sequence[float], values: Sequence[float], limit: float) -
 
 
 def _within_reach(view: SurrogateView, output: OutputFidelity) -> float:
-    """The tolerance with which an output would be sure, if its deviations were all alike."""
+    """Return the tolerance with which the output would be certain, assuming the same deviation everywhere."""
     z = NormalDist().inv_cdf
     index = min(max(output.confidence_index, 0.5 + 1e-9), 1 - 1e-12)
     by_deviation = output.tolerance * z(view.target) / z(index) if output.confidence_index < view.target else 0.0

@@ -1,4 +1,4 @@
-"""Whether a budget of real steps holds what somebody is about to ask for."""
+"""Check that the budget of real steps is large enough for the rounds of a training."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from surrogym_client.transport.api import Api
 
 
 class BudgetTooSmall(SurrogymClientError):
-    """The budget does not hold the rounds, and the token may not raise it."""
+    """The budget has too few steps for the rounds, and the token may not raise it."""
 
 
 def words_of_rounds(api: Api, name: str, queries: int, rounds: int) -> str:
-    """What rounds of real queries may cost a surrogate, before the first is asked for.
+    """Describe how many real steps the rounds may cost, before the first query.
 
     Raises:
-        BudgetTooSmall: more than its budget has left, with a token that may not raise it.
+        BudgetTooSmall: the budget has fewer steps left, and the token may not raise it.
     """
     view = api.surrogate(name)
     if view.phase == "ready":

@@ -1,10 +1,10 @@
-"""The phases in which a design asks for nothing more."""
+"""Phases in which a design has ended."""
 
 from __future__ import annotations
 
 from surrogym_shared.wire import Phase
 
-COMPLETED: tuple[Phase, ...] = ("ready", "over_budget", "from_log")  # its model is as good as it gets
+COMPLETED: tuple[Phase, ...] = ("ready", "over_budget", "from_log")  # the model will not improve by itself
 ENDED: tuple[Phase, ...] = (*COMPLETED, "failed")  # a sampler has nothing left to do
 IN_WORDS: dict[Phase, str] = {
     "ready": "the design is ready",

@@ -1,4 +1,4 @@
-"""A surrogate from a server into one file, and from a file into a server."""
+"""Export a surrogate from a server to one file, and import it from a file to a server."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from surrogym_client.transport.api import Api
 from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
 from surrogym_shared.wire import NewSample, SurrogateView
 
-BATCH = 1_024  # samples in a request
+BATCH = 1_024  # samples of one request
 PURPOSES = ("initial", "adaptive", "manual", "audit", "logged", "evaluation")
 
 
 class NotImportable(SurrogymClientError):
-    """The surrogate can't go where it should."""
+    """The surrogate can't be imported under this name."""
 
 
 def export_surrogate(api: Api, name: str) -> SurrogateFile:
-    """A surrogate with its latest model and all its samples.
+    """Return a surrogate with its latest model and all its samples.
 
     Raises:
-        NoModel: nothing has been fitted yet.
+        NoModel: there was no fit yet.
         SurrogymClientError: as every request.
     """
     latest, view = api.model(name), api.surrogate(name)
@@ -43,20 +43,20 @@ def export_surrogate(api: Api, name: str) -> SurrogateFile:
 def import_surrogate(
     api: Api, file: SurrogateFile, name: str | None = None, progress: Callable[[float], None] = lambda _: None
 ) -> SurrogateView:
-    """Make a surrogate of a file: it serves the same model at once, judged by the same tolerances.
+    """Create a surrogate from a file. It serves the same model at once, with the same tolerances.
 
-    Its design is paused, and its samples count as manual ones, those of a log as logged. Where anything fails, or
-    Ctrl-C is pressed, nothing of it stays; a surrogate that another request created is never touched.
+    Its design is paused. Its samples count as manual ones, and those of a log as logged. If anything fails, or Ctrl-C
+    is pressed, the new surrogate is deleted again. A surrogate that another request created is never changed.
 
     Args:
-        api: the server; needs the role admin.
+        api: the server; the token needs the role admin.
         file: the surrogate.
-        name: of the new surrogate; None takes the file's.
-        progress: called with the share of the samples that has been taken, in [0, 1].
+        name: name of the new surrogate; None takes the file's.
+        progress: called with the share of the samples that has been sent, in [0, 1].
 
     Raises:
         NotImportable: there is a surrogate of this name.
-        InvalidInput: the model is none of the specification.
+        InvalidInput: the model does not fit the specification.
         SurrogymClientError: as every request.
     """
     name = name or file.name
@@ -77,7 +77,8 @@ def import_surrogate(
 
 
 def _created(api: Api, name: str, file: SurrogateFile) -> bool:
-    """Create the surrogate; whether the name was free. The server decides, so that of two imports one creates it."""
+    """Create the surrogate, and return whether the name was free. The server decides, so only one of two imports
+    succeeds."""
     try:
         return api.create_surrogate(name, file.spec).created
     except SpecConflict:
@@ -99,7 +100,7 @@ def _samples(api: Api, name: str) -> RealSamples:
 
 
 def _batches(samples: RealSamples) -> Iterator[list[int]]:
-    """Rows in their order, in batches of one purpose each."""
+    """Iterate over the rows in order, in batches with one purpose each."""
     for _, group in groupby(range(len(samples)), partial(_is_logged, samples)):
         rows = list(group)
         yield from (rows[first : first + BATCH] for first in range(0, len(rows), BATCH))

@@ -1,4 +1,4 @@
-"""Waiting for what another process brings about: a surrogate that is registered, a design that is done."""
+"""Wait for other processes: for a surrogate to be registered, for queries to be answered, for a design to end."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from surrogym_client.transport.api import Api
 from surrogym_shared.wire import SurrogateView
 
 LOOK_SECONDS = 0.25
-FIRST_LEASE_SECONDS = 5.0  # a sampler that waits for queries begins within a second
+FIRST_LEASE_SECONDS = 5.0  # a running sampler begins queries within a second
 
 
 def share_of_design(view: SurrogateView) -> float:
-    """How much of a design is done, in [0, 1]: all of it when it ended, else by its budget."""
+    """Return how much of a design is done, in [0, 1]: 1 if it has ended, else the share of its budget."""
     return 1.0 if view.phase in COMPLETED else min(1.0, view.ledger.total / max(1, view.budget))
 
 
 def words_of_design(view: SurrogateView) -> str:
-    """One look at a design."""
+    """Describe the present state of a design."""
     ledger = view.ledger
     fidelity = "" if view.fidelity is None else f", confidence index {view.fidelity.confidence_index:.4f}"
     taken = f"{ledger.total} of {view.budget} real steps ({ledger.adaptive} adaptive)"
@@ -31,18 +31,18 @@ def words_of_design(view: SurrogateView) -> str:
 
 
 class DesignUnfinished(SurrogymClientError):
-    """The design has failed, or was not done in time; ``surrogym status`` says more."""
+    """The design has failed, or did not end in time. ``surrogym status`` says more."""
 
 
 class NobodyAnswers(SurrogymClientError):
-    """No sampler takes the queries that were asked."""
+    """No sampler has begun the queries."""
 
 
 def wait_for_surrogate(api: Api, name: str, seconds: float) -> SurrogateView:
-    """The surrogate, once it is registered.
+    """Wait until the surrogate is registered, and return it.
 
     Raises:
-        UnknownSurrogate: it was not within ``seconds``.
+        UnknownSurrogate: it was not registered within ``seconds``.
     """
     deadline = time.monotonic() + seconds
     while True:
@@ -62,18 +62,18 @@ def wait_for_design(
     *,
     after_round: int = 0,
 ) -> SurrogateView:
-    """The surrogate, once its design has reached the target or the budget.
+    """Wait until the design is ready or over its budget, and return the surrogate.
 
     Args:
-        api: the server; it may be away for a while.
-        name: the surrogate.
-        seconds: how long to wait.
-        progress: called with every look.
-        after_round: the design counts as done only when it has had more rounds than these.
+        api: the server; it may be unreachable for a while.
+        name: name of the surrogate.
+        seconds: longest time to wait.
+        progress: called each time the surrogate is polled.
+        after_round: the design must have completed more rounds than this.
 
     Raises:
-        DesignUnfinished: the design failed, or was not done within ``seconds``.
-        UnknownSurrogate: there is none of this name.
+        DesignUnfinished: the design failed, or did not end within ``seconds``.
+        UnknownSurrogate: there is no surrogate of this name.
     """
     view = None
     for view in _looks(api, name, seconds, progress):
@@ -94,7 +94,7 @@ def wait_for_answers(
     Raises:
         NobodyAnswers: no sampler has begun any of them after ``FIRST_LEASE_SECONDS``.
         DesignUnfinished: some were still open after ``seconds``.
-        UnknownSurrogate: there is none of this name.
+        UnknownSurrogate: there is no surrogate of this name.
     """
     started, begun = time.monotonic(), False
     for view in _looks(api, name, seconds, progress):
@@ -112,7 +112,8 @@ def wait_for_answers(
 def wait_for_model(
     api: Api, name: str, seconds: float, progress: Callable[[SurrogateView], None] | None = None
 ) -> SurrogateView:
-    """The surrogate, once it has a model of all its samples. Arguments and errors as of ``wait_for_design``."""
+    """Wait until the surrogate has a model of all its samples, and return it. Arguments and errors as
+    ``wait_for_design``."""
     view = None
     for view in _looks(api, name, seconds, progress):
         if view is None:
@@ -127,7 +128,7 @@ def wait_for_model(
 def _looks(
     api: Api, name: str, seconds: float, progress: Callable[[SurrogateView], None] | None
 ) -> Iterator[SurrogateView | None]:
-    """Look at a surrogate again and again for ``seconds``, and show it; None where the server was away."""
+    """Poll a surrogate for ``seconds``, report each state and yield it; yield None if the server did not answer."""
     deadline = time.monotonic() + seconds
     while True:
         view = _look(api, name, deadline)
@@ -153,5 +154,5 @@ def _look(api: Api, name: str, deadline: float) -> SurrogateView | None:
 
 
 def _under_way(view: SurrogateView) -> bool:
-    """Queries that were asked for after the design was done."""
+    """Number of open queries that were added after the design had ended."""
     return view.queries.pending + view.queries.leased > 0
