@@ -1,1 +1,1 @@
-"""The language both sides of Surrogym speak: specification, wire models, error codes, and the port."""
+"""Code that client and server share: specification, wire models, error codes, and the port of surrogates."""

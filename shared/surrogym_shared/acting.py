@@ -1,4 +1,4 @@
-"""A policy as plain arrays, and how it acts: the same NumPy code wherever the lanes are stepped.
+"""A policy as plain arrays, and the code by which it acts, which is the same on client and server.
 
 Shapes: N lanes, D observation entries, A outputs of the network, F action entries.
 """
@@ -17,41 +17,43 @@ from numpy.typing import NDArray
 from surrogym_shared.distributions import Bounded, Choices, Sampled, middle_and_reach
 from surrogym_shared.network import MAX_LAYERS, Activation, Layer, Network, forward, most_probable
 
-MAX_UNITS = 1_024  # of a layer
-MAX_PARAMETERS = 262_144  # of all layers
-MAX_ROLLOUT = 100_000  # steps of one request
-MAX_LANE_STEPS = 1_000_000  # steps of all lanes in one request
-MAX_ACTIVATIONS = 2**24  # of all lanes in the widest layer: 128 MiB
+MAX_UNITS = 1_024  # most units of a layer
+MAX_PARAMETERS = 262_144  # most parameters of all layers together
+MAX_ROLLOUT = 100_000  # most steps of one request
+MAX_LANE_STEPS = 1_000_000  # most steps of all lanes together in one request
+MAX_ACTIVATIONS = 2**24  # most numbers of all lanes in the widest layer: 128 MiB
 MAX_LOG_DEVIATION = 80  # float32 holds its exponential
 
 Array = NDArray[np.floating[Any]]
 
 
 class NoiseKey(NamedTuple):
-    """Which noise actions have: a seed, and the number of the first step, from which a rollout counts on."""
+    """Key of the actions' noise: a seed, and the number of the rollout's first step."""
 
     seed: int
     step: int = 0
 
     def later(self, steps: int) -> NoiseKey:
-        """The key of the noise that begins ``steps`` later."""
+        """Return the key of the noise that begins ``steps`` later."""
         return NoiseKey(self.seed, self.step + steps)
 
 
 class KeyedGenerator:
-    """One generator that is set to the noise of a key: to make another for each step asks the system for entropy."""
+    """A single random generator that is set to the noise of each key. A new generator for each step would read
+    system entropy."""
 
     def __init__(self) -> None:
         self._bits = np.random.Philox(0)
         self._generator = np.random.Generator(self._bits)
 
     def at(self, key: NoiseKey) -> np.random.Generator:
-        """The generator of one step. Lane i reads behind lane i - 1, so no lane depends on how many follow it."""
+        """Return the generator, set to one step. Lane i reads after lane i - 1, so no lane depends on how many
+        follow it."""
         self._bits.state = {
             "bit_generator": "Philox",
             "state": {"counter": _words(0, 0, key.step, 0), "key": _words(key.seed, 0)},
             "buffer": _words(0, 0, 0, 0),
-            "buffer_pos": 4,  # nothing is left of what was drawn before
+            "buffer_pos": 4,  # discards buffered numbers of earlier draws
             "has_uint32": 0,
             "uinteger": 0,
         }
@@ -60,12 +62,12 @@ class KeyedGenerator:
 
 @dataclass(frozen=True)
 class ActingPolicy:
-    """A network that acts; what its outputs mean is the action space's.
+    """Network that acts. The action space determines what its outputs mean.
 
-    All arrays are float32 or all are float64, and the network computes in that.
+    All arrays are float32 or all are float64, and the network computes in this precision.
 
     Raises:
-        ValueError: arrays that don't fit together, that are too large, or that hold NaN or infinity.
+        ValueError: arrays that don't fit together, that are too large, or that contain NaN or infinity.
     """
 
     mean: Array  # (D,) subtracted from an observation
@@ -93,7 +95,7 @@ class ActingPolicy:
 
     @classmethod
     def of(cls, network: Network) -> Self:
-        """The most probable actions of a network."""
+        """Make a policy of a network's most probable actions."""
         return cls(network.mean, network.deviation, network.layers, network.activation)
 
     @property
@@ -102,12 +104,12 @@ class ActingPolicy:
 
     @property
     def units(self) -> tuple[int, ...]:
-        """How many numbers each layer gives; the last is A."""
+        """Number of outputs of each layer; the last is A."""
         return tuple(len(layer.bias) for layer in self.layers)
 
     @property
     def vector(self) -> Array:
-        """Weights and bias of each layer, one after the other."""
+        """Return weights and bias of each layer as one vector."""
         return np.concatenate([part.ravel() for layer in self.layers for part in layer])
 
     def _named(self) -> dict[str, Array]:
@@ -136,10 +138,10 @@ class ActingPolicy:
 
 @dataclass(frozen=True)
 class PolicyRun:
-    """A policy that is to act for T steps; see ``surrogym_shared.port.PolicyPort.rollout_policy``.
+    """Request to let a policy act for T steps; see ``surrogym_shared.port.PolicyPort.rollout_policy``.
 
     Raises:
-        ValueError: steps or a key outside what a request can hold.
+        ValueError: the number of steps or the key is out of range.
     """
 
     policy: ActingPolicy
@@ -155,19 +157,19 @@ class PolicyRun:
 
 
 class Acted(NamedTuple):
-    """What a policy did in one step."""
+    """Actions of a policy in one step."""
 
     action: Array  # (N, F) before it is clipped to its bounds
-    log_probability: Array | None  # (N,) of it; None without noise
+    log_probability: Array | None  # (N,) of the action; None without noise
     sent: NDArray[Any]  # the action as a surrogate takes it
 
 
 @dataclass(frozen=True)
 class Actor:
-    """A policy in an action space.
+    """Policy in an action space.
 
     Raises:
-        ValueError: a policy of other observations or of another action space.
+        ValueError: the policy was made for other observations or another action space.
     """
 
     policy: ActingPolicy
@@ -192,7 +194,7 @@ class Actor:
             raise ValueError(f"policy: expected log_deviations of {len(self.low)} entries, got {log.size}")
 
     def act(self, observation: NDArray[Any], noise: NoiseKey | None) -> Acted:
-        """The actions for observations (N, D) in one step, with the noise of a key or the most probable ones.
+        """Return the actions for observations (N, D) in one step, with the noise of a key, or the most probable ones.
 
         Raises:
             ValueError: the network's outputs are not finite.
@@ -221,7 +223,7 @@ class Actor:
 
 
 def layers_of(sizes: Sequence[int], vector: Array) -> tuple[Layer, ...]:
-    """The layers in a vector, as views of it; ``sizes`` are the numbers that enter, pass between them, and leave."""
+    """Split a vector into layers, as views of it. ``sizes`` are the numbers of inputs, hidden units and outputs."""
     layers, begin = [], 0
     for inputs, outputs in pairwise(sizes):
         middle, end = begin + inputs * outputs, begin + (inputs + 1) * outputs
@@ -231,7 +233,7 @@ def layers_of(sizes: Sequence[int], vector: Array) -> tuple[Layer, ...]:
 
 
 def parameters_of(observation: int, units: Sequence[int]) -> int:
-    """How many weights and biases layers of so many units have."""
+    """Number of weights and biases of layers with these numbers of units."""
     return sum((inputs + 1) * outputs for inputs, outputs in pairwise((observation, *units)))
 
 

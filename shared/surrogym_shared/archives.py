@@ -1,4 +1,4 @@
-"""Zips and arrays made by somebody else: their sizes are read from headers and bounded before anything is inflated."""
+"""Read zip and npz files of unknown origin: sizes are read from headers and limited before anything is decompressed."""
 
 from __future__ import annotations
 
@@ -13,27 +13,30 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-INFLATED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what numpy and torch write; others inflate without a bound
+INFLATED = (
+    zipfile.ZIP_STORED,
+    zipfile.ZIP_DEFLATED,
+)  # methods that numpy and torch write; others can't be limited while they decompress
 ARRAY = ".npy"
 
 
 class Header(NamedTuple):
-    """Shape and type of an array in an npz file, known before the array is made."""
+    """Shape and type of an array in an npz file, read before the array is made."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
 
 
 def read_entries(zipped: Path | bytes, limit: int) -> dict[str, bytes]:
-    """Contents of a zip by name.
+    """Return the contents of a zip by name.
 
     Args:
-        zipped: a file, or what is in it.
-        limit: bytes that all entries together may have.
+        zipped: path of the file, or its contents.
+        limit: most bytes that all entries together may have.
 
     Raises:
         OSError: the file can't be read.
-        ValueError: no zip, too large, or not of the sizes that its headers name.
+        ValueError: the file is not a zip, is too large, or contradicts the sizes in its headers.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(zipped) if isinstance(zipped, bytes) else zipped) as archive:
@@ -46,7 +49,7 @@ def read_entries(zipped: Path | bytes, limit: int) -> dict[str, bytes]:
 
 
 def stored(entries: Mapping[str, bytes]) -> bytes:
-    """A zip of these contents, not compressed."""
+    """Return an uncompressed zip of these contents."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         for name, content in entries.items():
@@ -57,15 +60,15 @@ def stored(entries: Mapping[str, bytes]) -> bytes:
 def read_arrays(
     npz: bytes, limit: int, require: Callable[[Mapping[str, Header]], None] = lambda _: None
 ) -> dict[str, NDArray[Any]]:
-    """The arrays of an npz file by name. Nothing is unpickled.
+    """Return the arrays of an npz file by name. Nothing is unpickled.
 
     Args:
-        npz: what is in the file.
-        limit: bytes that all arrays together may have.
+        npz: contents of the file.
+        limit: most bytes that all arrays together may have.
         require: called with all headers by name before any array is made; raises ValueError to refuse them.
 
     Raises:
-        ValueError: as ``read_entries`` and ``require``, or an array is not of the size that its header names.
+        ValueError: as ``read_entries`` and ``require``, or an array contradicts the size in its header.
     """
     entries = {name.removesuffix(ARRAY): content for name, content in read_entries(npz, limit).items()}
     require({name: _header(name, content) for name, content in entries.items()})
@@ -75,7 +78,7 @@ def read_arrays(
 
 
 def _content(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
-    """An entry, inflated to the size that its header names and no further."""
+    """Decompress an entry to the size in its header, and no further."""
     if entry.compress_type not in INFLATED:
         raise ValueError(f"expected {entry.filename!r} stored or deflated, got compression {entry.compress_type}")
     with archive.open(entry) as file:
@@ -86,7 +89,7 @@ def _content(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
 
 
 def _header(name: str, content: bytes) -> Header:
-    """The header of an array of numbers, if it names as many bytes as follow it."""
+    """Return the header of an array of numbers. Its size must match the bytes that follow it."""
     file = io.BytesIO(content)
     version = np.lib.format.read_magic(file)
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

@@ -1,4 +1,4 @@
-"""Base of models that strangers fill: checking one costs no more than reading it."""
+"""Base class of models of untrusted data, whose validation takes no longer than reading it."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def _stop_at_first(node: Any) -> None:
 
 
 class FailFast(BaseModel):
-    """A model whose sequences stop at their first wrong entry.
+    """Model whose sequences are validated up to the first wrong entry.
 
-    pydantic otherwise collects an error for each entry. A hundred thousand wrong ones would take seconds.
+    By default pydantic collects an error for each entry, and a hundred thousand wrong ones would take seconds.
     """
 
     @classmethod

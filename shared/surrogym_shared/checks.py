@@ -1,4 +1,5 @@
-"""Numbers and names as a specification may hold them: told apart in float64, and neither text nor truth values."""
+"""Types of numbers and names in a specification: distinct in float64, and neither text nor booleans in place of
+numbers."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from typing import Annotated
 from pydantic import Field
 
 LARGEST, NARROWEST = 1e12, 1e-12  # so that squares, products and float32 observations stay finite
-RESOLUTION = 1e-9  # a range narrower than this, beside the size of its numbers, drowns in rounding
+RESOLUTION = 1e-9  # narrowest range relative to the size of its numbers; rounding errors dominate below
 
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False, strict=True)]
 Width = Annotated[float, Field(ge=NARROWEST, le=LARGEST, allow_inf_nan=False, strict=True)]

@@ -10,12 +10,12 @@ PROBLEM_MEDIA_TYPE = "application/problem+json"
 
 
 class Code(StrEnum):
-    """What went wrong, one word for one thing. The HTTP status stands beside each code in ``STATUS``."""
+    """Error codes, one for each kind of error. ``STATUS`` has the HTTP status of each."""
 
     INVALID_REQUEST = "invalid_request"  # malformed body, unknown field, wrong shape or type, NaN, out of bounds
     INVALID_SPEC = "invalid_spec"  # a specification that contradicts itself
     UNAUTHENTICATED = "unauthenticated"  # no token, or an unknown one
-    FORBIDDEN = "forbidden"  # a token whose role does not allow this
+    FORBIDDEN = "forbidden"  # the token's role does not allow this
     BEYOND_BUDGET = "beyond_budget"  # more real steps than the budget has left; an admin's token raises it
     NOT_FOUND = "not_found"  # no such route
     UNKNOWN_SURROGATE = "unknown_surrogate"
@@ -36,10 +36,10 @@ class Code(StrEnum):
     UNSUPPORTED_MEDIA_TYPE = "unsupported_media_type"
     REQUEST_TIMEOUT = "request_timeout"  # the request itself did not arrive in time
     TOO_MANY_REQUESTS = "too_many_requests"  # a queue or a cap is full
-    DEADLINE_EXCEEDED = "deadline_exceeded"  # it would have been late, so it was not computed
+    DEADLINE_EXCEEDED = "deadline_exceeded"  # the reply would have been late, so it was not computed
     UNAVAILABLE = "unavailable"
-    DAMAGED = "damaged"  # what the server has stored can't be read as it was written
-    NOT_INSTALLED = "not_installed"  # what is stored needs a plug-in that the server lacks
+    DAMAGED = "damaged"  # stored data can't be read as it was written
+    NOT_INSTALLED = "not_installed"  # stored data needs a plug-in that the server lacks
     INTERNAL = "internal"
 
 
@@ -77,7 +77,7 @@ STATUS: dict[Code, int] = {
 
 
 class Problem(BaseModel):
-    """A problem body (RFC 9457): every error reply of the service has this form."""
+    """Problem body (RFC 9457), which is the form of every error reply."""
 
     model_config = ConfigDict(extra="allow")
 

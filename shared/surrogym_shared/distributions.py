@@ -1,6 +1,6 @@
-"""What the outputs of an actor mean: a normal distribution within bounds, or a choice for each entry of an action.
+"""Action distributions: how the outputs of an actor become a bounded normal distribution, or a choice for each entry.
 
-Shapes: B rows, A outputs of the actor, F action entries, K further parameters, which no network gives.
+Shapes: B rows, A outputs of the actor, F action entries, K further parameters, which do not depend on the state.
 """
 
 from __future__ import annotations
@@ -17,29 +17,31 @@ Array = NDArray[np.floating[Any]]  # float32 in a training
 
 
 class Sampled(Protocol):
-    """A distribution of actions (B, F), given the outputs of an actor (B, A) and further parameters (K,)."""
+    """Distribution of actions (B, F), given the outputs of an actor (B, A) and further parameters (K,)."""
 
     @property
     def outputs(self) -> int:
-        """How many numbers an actor gives, A."""
+        """Number of outputs of an actor, A."""
         ...
 
     def sample(self, outputs: Array, further: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Draw actions (B, F) as a policy learns from them, and give their log probabilities (B,)."""
+        """Draw actions (B, F) in the form that a policy learns from, and return them with their log probabilities
+        (B,)."""
         ...
 
     def sent(self, actions: Array) -> NDArray[Any]:
-        """These actions as a surrogate takes them."""
+        """Convert actions to the form that a surrogate takes."""
         ...
 
     def log_probability(self, outputs: Array, further: Array, actions: Array) -> Array:
-        """Log probabilities (B,) of actions (B, F)."""
+        """Return the log probabilities (B,) of actions (B, F)."""
         ...
 
 
 @dataclass(frozen=True)
 class Bounded:
-    """Continuous actions: normal around centre + reach tanh(y). The further parameters are log deviations (F,)."""
+    """Continuous actions: normal around centre + reach tanh(y). The further parameters are log standard deviations
+    (F,)."""
 
     centre: Array  # (F,)
     reach: Array  # (F,)
@@ -65,7 +67,7 @@ class Bounded:
 
 @dataclass(frozen=True)
 class Choices:
-    """Discrete actions: one choice for each entry, independent of one another. There are no further parameters."""
+    """Discrete actions: an independent choice for each entry. There are no further parameters."""
 
     counts: tuple[int, ...]
 
@@ -74,9 +76,11 @@ class Choices:
         return sum(self.counts)
 
     def sample(self, outputs: Array, further: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        with np.errstate(divide="ignore"):  # one draw in millions is 0: that choice wins, as it should
+        with np.errstate(divide="ignore"):  # one draw in millions is 0, and its choice wins correctly
             gumbel = -np.log(rng.standard_exponential(outputs.shape, dtype=_kind(outputs)))
-        chosen = [part.argmax(1) for part in self.parts(outputs + gumbel)]  # Gumbel's maximum draws by softmax
+        chosen = [
+            part.argmax(1) for part in self.parts(outputs + gumbel)
+        ]  # the maximum with Gumbel noise is a draw from the softmax
         actions = np.stack(chosen, 1).astype(np.float32)
         return actions, self.log_probability(outputs, further, actions)
 
@@ -91,12 +95,12 @@ class Choices:
         return log
 
     def parts(self, outputs: Array) -> list[Array]:
-        """The outputs of each entry."""
+        """Split the outputs by entry of the action."""
         return np.split(outputs, np.cumsum(self.counts)[:-1], axis=1)
 
 
 def middle_and_reach(low: NDArray[np.float64], high: NDArray[np.float64], dtype: np.dtype[Any]) -> tuple[Array, Array]:
-    """Centre and half width (F,) of bounds (F,)."""
+    """Return centre and half width (F,) of bounds (F,)."""
     return ((low + high) / 2).astype(dtype), ((high - low) / 2).astype(dtype)
 
 

@@ -63,7 +63,8 @@ Units = Annotated[int, msgspec.Meta(ge=1, le=MAX_UNITS)]
 
 
 class FrameError(ValueError):
-    """Bytes that are no frame, or arrays that don't fit the session; says what was expected and what came."""
+    """Bytes that are not a frame, or arrays that don't fit the session. The message says what was expected and what
+    came."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +87,7 @@ class Shape:
 
 
 class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, tag_field="op"):
-    """Base of all frames."""
+    """Base class of all frames."""
 
 
 class ResetRequest(Frame, frozen=True, tag="reset"):
@@ -113,7 +114,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PolicyRequest(Frame, frozen=True, tag="policy", kw_only=True):
-    """A rollout of a policy; ``units`` are the numbers that each layer gives."""
+    """Request of a policy's rollout. ``units`` are the numbers of outputs of each layer."""
 
     seq: Seq | None = None
     steps: Annotated[int, msgspec.Meta(ge=1, le=MAX_ROLLOUT)]
@@ -177,7 +178,7 @@ class PolicyReply(Frame, frozen=True, tag="policy", kw_only=True):
 
 
 class ProblemReply(Frame, frozen=True, tag="problem"):
-    """A problem body (RFC 9457) on the stream; ``seq`` is that of the refused request, if it had one."""
+    """Problem body (RFC 9457) on the stream. ``seq`` is that of the refused request, if it had one."""
 
     status: int
     code: Code
@@ -197,17 +198,17 @@ _REPLY: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
 
 
 def encode(frame: Frame) -> bytes:
-    """A frame as bytes."""
+    """Return a frame as bytes."""
     return _ENCODER.encode(frame)
 
 
 def read_request(content: bytes) -> Request:
-    """A request from bytes; its arrays are views of them. Raises ``FrameError``."""
+    """Parse a request. Its arrays are views of the bytes. Raises ``FrameError``."""
     return _read(_REQUEST, content)
 
 
 def read_reply(content: bytes) -> Reply:
-    """A reply from bytes; its arrays are views of them. Raises ``FrameError``."""
+    """Parse a reply. Its arrays are views of the bytes. Raises ``FrameError``."""
     return _read(_REPLY, content)
 
 
@@ -215,27 +216,31 @@ def read_reply(content: bytes) -> Reply:
 
 
 def reset_request(seq: int | None, seed: int | Sequence[int] | None, mask: Bools | None) -> ResetRequest:
-    """Seed: one integer or one for each lane. Raises ``FrameError`` for a seed that int64 can't hold."""
+    """Build the request of a reset. The seed is one integer, or one for each lane.
+
+    Raises:
+        FrameError: int64 can't represent a seed.
+    """
     packed = None if seed is None else _seeds(seed)
     sent = int(seed) if isinstance(seed, int) else packed
     return ResetRequest(seq, sent, None if mask is None else _flat(mask, BOOL))
 
 
 def step_request(seq: int | None, action: Array, mask: Bools | None, deviations: bool) -> StepRequest:
-    """Action (N, F)."""
+    """Build the request of a step with an action (N, F)."""
     packed = None if mask is None else _flat(mask, BOOL)
     return StepRequest(seq=seq, action=_flat(action, FLOAT64), mask=packed, deviations=deviations)
 
 
 def rollout_request(seq: int | None, actions: Array) -> RolloutRequest:
-    """Actions (T, N, F)."""
+    """Build the request of a rollout with actions (T, N, F)."""
     return RolloutRequest(seq=seq, actions=_flat(actions, FLOAT64))
 
 
 def policy_request(
     seq: int | None, policy: ActingPolicy, steps: int, noise: NoiseKey | None, until: Bools | None
 ) -> PolicyRequest:
-    """Lanes ``until`` (N,)."""
+    """Build the request of a policy's rollout, with a mask ``until`` (N,)."""
     dtype = FLOAT32 if policy.dtype == np.float32 else FLOAT64
     return PolicyRequest(
         seq=seq,
@@ -253,7 +258,7 @@ def policy_request(
 
 
 def seed_of(request: ResetRequest, shape: Shape) -> int | list[int] | None:
-    """One seed, or those of the N lanes. Raises ``FrameError``."""
+    """Return the seed of a request, or the seeds of the N lanes. Raises ``FrameError``."""
     if not isinstance(request.seed, memoryview):
         return request.seed
     seeds: list[int] = _array("seed", request.seed, INT64, (shape.lanes,)).tolist()
@@ -261,17 +266,17 @@ def seed_of(request: ResetRequest, shape: Shape) -> int | list[int] | None:
 
 
 def mask_of(request: ResetRequest | StepRequest, shape: Shape) -> Bools | None:
-    """The mask (N,). Raises ``FrameError``."""
+    """Return the mask (N,) of a request. Raises ``FrameError``."""
     return None if request.mask is None else _array("mask", _checked("mask", request.mask), BOOL, (shape.lanes,))
 
 
 def action_of(request: StepRequest, shape: Shape) -> NDArray[np.float64]:
-    """The action (N, F), a view of the frame. Raises ``FrameError``."""
+    """Return the action (N, F) of a request, as a view of the frame. Raises ``FrameError``."""
     return _array("action", request.action, FLOAT64, (shape.lanes, shape.action))
 
 
 def actions_of(request: RolloutRequest, shape: Shape) -> NDArray[np.float64]:
-    """The actions (T, N, F), a view of the frame. Raises ``FrameError``."""
+    """Return the actions (T, N, F) of a request, as a view of the frame. Raises ``FrameError``."""
     lanes, size, got = shape.lanes, shape.action, request.actions.nbytes
     steps, rest = divmod(got, lanes * size * FLOAT64.itemsize)
     if rest or not 1 <= steps <= MAX_ROLLOUT:
@@ -280,7 +285,7 @@ def actions_of(request: RolloutRequest, shape: Shape) -> NDArray[np.float64]:
 
 
 def policy_of(request: PolicyRequest, shape: Shape) -> ActingPolicy:
-    """The policy, as views of the frame. Raises ``FrameError``."""
+    """Return the policy of a request, as views of the frame. Raises ``FrameError``."""
     dtype, size = FLOAT32 if request.precision == "float32" else FLOAT64, shape.observation
     if (count := parameters_of(size, request.units)) > MAX_PARAMETERS:
         raise FrameError(f"policy: expected at most {MAX_PARAMETERS} weights and biases, got {count}")
@@ -305,7 +310,7 @@ def noise_of(request: PolicyRequest) -> NoiseKey | None:
 
 
 def until_of(request: PolicyRequest, shape: Shape) -> Bools | None:
-    """The lanes (N,) whose ends are awaited. Raises ``FrameError``."""
+    """Return the mask (N,) of the lanes whose episodes have to end before the rollout stops. Raises ``FrameError``."""
     return None if request.until is None else _array("until", _checked("until", request.until), BOOL, (shape.lanes,))
 
 
@@ -349,7 +354,7 @@ def policy_reply(seq: int, result: PolicyRollout) -> PolicyReply:
 
 
 def policy_rollout(reply: PolicyReply, shape: Shape) -> PolicyRollout:
-    """Arrays of their own: aligned and writable, as a caller expects them. Raises ``FrameError``."""
+    """Convert the reply of a policy's rollout. Its arrays are aligned and writable copies. Raises ``FrameError``."""
     steps, log, untrusted = reply.reward.nbytes // (8 * shape.lanes), reply.log_probability, reply.untrusted
     each, dtype = (steps, shape.lanes), FLOAT32 if reply.precision == "float32" else FLOAT64
     final_lanes, final_observation = _final(reply, shape)
@@ -372,7 +377,7 @@ def policy_rollout(reply: PolicyReply, shape: Shape) -> PolicyRollout:
 
 
 def _versions(view: memoryview, each: tuple[int, int]) -> Array:
-    """Model versions (T, N), also where the frame has those of the lanes alone."""
+    """Return model versions (T, N), also if the frame has one for each lane only."""
     one = each[1] * INT64.itemsize
     if view.nbytes == one:
         return np.repeat(_own("model_version", view, INT64, each[1:])[None], each[0], 0)
@@ -380,7 +385,7 @@ def _versions(view: memoryview, each: tuple[int, int]) -> Array:
 
 
 def reset_result(reply: ResetReply, shape: Shape) -> ResetResult:
-    """Arrays of their own: aligned and writable, as a caller expects them. Raises ``FrameError``."""
+    """Convert the reply of a reset. Its arrays are aligned and writable copies. Raises ``FrameError``."""
     lanes = shape.lanes
     return ResetResult(
         observation=_own("observation", reply.observation, FLOAT32, (lanes, shape.observation)),
@@ -389,7 +394,7 @@ def reset_result(reply: ResetReply, shape: Shape) -> ResetResult:
 
 
 def step_result(step: Step, shape: Shape) -> StepResult:
-    """Arrays of their own: aligned and writable, as a caller expects them. Raises ``FrameError``."""
+    """Convert the reply of a step. Its arrays are aligned and writable copies. Raises ``FrameError``."""
     each = (shape.lanes,)
     final_lanes, final_observation = _final(step, shape)
     deviation = None
@@ -429,7 +434,7 @@ def _step(result: StepResult) -> Step:
 
 
 def _final_steps(reply: PolicyReply, steps: int, count: int) -> Array:
-    """The steps (K,) of the final lanes, in order."""
+    """Return the steps (K,) of the final lanes, in order."""
     ended = _own("final_steps", memoryview(b"") if reply.final_steps is None else reply.final_steps, INT64, (count,))
     if count and (ended[0] < 0 or ended[-1] >= steps or (np.diff(ended) < 0).any()):
         raise FrameError(f"final_steps: expected some of 0..{steps - 1} in order, got {ended[:8].tolist()}")
@@ -437,7 +442,7 @@ def _final_steps(reply: PolicyReply, steps: int, count: int) -> Array:
 
 
 def _final(step: Step | PolicyReply, shape: Shape) -> tuple[Array, Array]:
-    """final_lanes (K,) and final_observation (K, D); a frame without them has none."""
+    """Return final_lanes (K,) and final_observation (K, D). They are empty if the frame has none."""
     if step.final_lanes is None or step.final_observation is None:
         if step.final_lanes is not step.final_observation:
             raise FrameError("expected final_lanes and final_observation together, got one of them")
@@ -463,24 +468,25 @@ def _size(space: ActionSpace) -> int:
 
 
 def _flat(array: Array, dtype: np.dtype[Any]) -> memoryview:
-    """The array's own memory where it is contiguous and of this dtype; else a copy's."""
+    """Return the memory of a contiguous array of this dtype, or that of a converted copy."""
     return np.ascontiguousarray(array, dtype).data
 
 
 def _array(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
-    """A view of the frame."""
+    """Return an array as a view of the frame."""
     _require_size(name, view, dtype, shape)
     return np.ndarray(shape, dtype, view)
 
 
 def _own(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
-    """An array with memory of its own."""
+    """Return an array as a copy."""
     _require_size(name, view, dtype, shape)
     return np.ndarray(shape, dtype, bytearray(view))
 
 
 def _aligned(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
-    """An array with memory of its own, which products read faster, and whose bits no address changes."""
+    """Return an array as an aligned copy. Matrix products read it faster, and its address has no effect on their
+    bits."""
     return _array(name, view, dtype, shape).copy()
 
 
@@ -491,7 +497,7 @@ def _require_size(name: str, view: memoryview, dtype: np.dtype[Any], shape: tupl
 
 
 def _checked(name: str, view: memoryview) -> memoryview:
-    if bytes(view).strip(b"\x00\x01"):  # what is left begins with a byte that is neither
+    if bytes(view).strip(b"\x00\x01"):  # any remaining byte is neither 0 nor 1
         raise FrameError(f"{name}: expected bytes 0 and 1, got others")
     return view
 

@@ -1,4 +1,4 @@
-"""Intervals of 95 % for what episodes measure: the mean of a return, and a share of successes."""
+"""95 % intervals of what episodes measure: the mean of a return, and a share of successes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 RESAMPLES = 2_000
 QUANTILES = (0.025, 0.975)
-Z = 1.959964  # of a normal distribution: 95 % lie within
+Z = 1.959964  # 95 % of a standard normal distribution lie within plus and minus this value
 
 
 class Interval(NamedTuple):
@@ -19,7 +19,7 @@ class Interval(NamedTuple):
 
 
 def of_mean(values: Sequence[float]) -> Interval | None:
-    """The mean of new values, by a bootstrap with a fixed seed; None for fewer than two values.
+    """Return the interval of the mean, by a bootstrap with a fixed seed; None for fewer than two values.
 
     Returns of episodes are often skewed, so no normal distribution is assumed.
     """
@@ -39,7 +39,8 @@ def of_mean(values: Sequence[float]) -> Interval | None:
 
 
 def of_share(successes: int, trials: int) -> Interval | None:
-    """A share of successes, by Wilson's score; None without trials. 100 of 100 gives 0.963 to 1."""
+    """Return the interval of a share of successes, by Wilson's score; None without trials. 100 of 100 gives 0.963 to
+    1."""
     if not trials:
         return None
     share, spread = successes / trials, Z**2 / trials

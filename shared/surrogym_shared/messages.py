@@ -1,7 +1,7 @@
-"""Where one WebSocket frame ends and the next begins (RFC 6455, section 5.2), for the one message that is all traffic.
+"""Find where one WebSocket frame ends and the next begins (RFC 6455, section 5.2), for whole binary messages.
 
-A step is one whole, uncompressed binary message each way. Both sides take such a message apart themselves, and leave
-every other frame, whole, to the library that speaks the protocol.
+A step is one whole, uncompressed binary message in each direction. Client and server parse such messages themselves,
+and pass every other frame to the library that implements the protocol.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 try:
     from websockets.speedups import apply_mask
-except ImportError:  # a platform without compiled parts
+except ImportError:  # a platform without the compiled extension
     from websockets.utils import apply_mask
 
 __all__ = ["KEY_BYTES", "MASKED", "WHOLE_BINARY", "Extent", "FrameSplitter", "apply_mask", "extent_of", "header"]
@@ -25,15 +25,15 @@ KEY_BYTES = 4
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """Where a frame's key and payload begin, and where it ends, from its first byte on."""
+    """Positions in a frame, from its first byte on: where its key and its payload begin, and where it ends."""
 
-    key: int  # of the mask; equal to ``payload`` where there is none
+    key: int  # position of the mask's key; equal to ``payload`` without a mask
     payload: int
     end: int
 
 
 def extent_of(content: bytes | bytearray) -> Extent | None:
-    """Extent of the frame that the content begins with; None while its header is not all there."""
+    """Return the extent of the frame at the beginning of the content; None if its header is incomplete."""
     if len(content) < 2:
         return None
     size, key = content[1] & 0x7F, 2
@@ -50,7 +50,8 @@ def extent_of(content: bytes | bytearray) -> Extent | None:
 
 
 def header(size: int, masked: int = 0) -> bytes:
-    """Header of a whole binary message of so many bytes; ``masked`` is 0 or ``MASKED``, and then a key follows."""
+    """Return the header of a whole binary message of ``size`` bytes. ``masked`` is 0, or ``MASKED`` if a key
+    follows."""
     if size < _TWO_BYTES:
         return bytes((WHOLE_BINARY, masked | size))
     if size < 65_536:
@@ -59,26 +60,27 @@ def header(size: int, masked: int = 0) -> bytes:
 
 
 class FrameSplitter:
-    """Gathers chunks, as they come, into whole frames.
+    """Joins incoming chunks into whole frames.
 
-    ``max_bytes`` is the longest payload worth gathering: beyond it the chunks so far are given back as they are, for
-    the library to refuse. ``max_frames`` is how many frames of one chunk are taken apart: one more says that there are
-    too many, and the rest is dropped.
+    ``max_bytes`` is the longest payload to join. The chunks of a longer one are returned unchanged, so that the library
+    refuses it. ``max_frames`` is the most frames of one chunk; one frame more is returned as a sign that there are too
+    many, and the rest is dropped.
     """
 
     def __init__(self, max_bytes: float = float("inf"), max_frames: float = float("inf")) -> None:
         self._max_bytes = max_bytes
         self._max_frames = max_frames
         self._held = bytearray()
-        self._due = 0  # nothing is whole before so many bytes are held
+        self._due = 0  # number of bytes needed before the next frame can be complete
 
     @property
     def held(self) -> int:
-        """Bytes of a frame that is not whole yet."""
+        """Bytes of the frame that is not complete yet."""
         return len(self._held)
 
     def split(self, chunk: bytes) -> list[tuple[bytes, Extent | None]]:
-        """The frames that are whole with this chunk, in order, each with its extent; None marks what is too long."""
+        """Return the frames that this chunk completes, in order, each with its extent. None marks one that is too
+        long."""
         if self._held:
             self._held += chunk
             if len(self._held) < self._due:
@@ -94,6 +96,6 @@ class FrameSplitter:
                 self._held += chunk
                 self._due = 0 if extent is None else extent.end
                 break
-            found.append((chunk[: extent.end], extent))  # the whole chunk is not copied by this
+            found.append((chunk[: extent.end], extent))  # slicing a whole chunk does not copy it
             chunk = chunk[extent.end :]
         return found

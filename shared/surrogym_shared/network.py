@@ -1,4 +1,4 @@
-"""A policy as plain arrays: layers of tanh or ReLU. Made by searches that need no trainer's library.
+"""A policy network as plain arrays, with layers of tanh or ReLU, for policy searches without a deep-learning library.
 
 Leading dimensions (...) stand for several policies at once. D observation entries, H hidden units, A outputs.
 """
@@ -25,21 +25,21 @@ Array = NDArray[np.float64]
 Activation = Literal["tanh", "relu"]
 HEAD = "surrogym-network.json"
 ARRAYS = "network.npz"
-MAX_BYTES = 16 * 1024 * 1024  # of a file's contents
+MAX_BYTES = 16 * 1024 * 1024  # largest contents of a file
 MAX_HEAD_BYTES = 64 * 1024
 MAX_LAYERS = 8
 OUTSIDE = ("mean", "deviation", "low", "high")  # arrays of a policy beside its layers
 
 
 class Layer(NamedTuple):
-    """Inputs to outputs: x @ weights + bias."""
+    """One layer of a network: x @ weights + bias."""
 
     weights: NDArray[np.floating[Any]]  # (..., I, O)
     bias: NDArray[np.floating[Any]]  # (..., O)
 
 
 class _Head(BaseModel):
-    """The JSON head of a file. Version 1 had one hidden layer of tanh."""
+    """JSON head of a file. Version 1 had one hidden layer of tanh."""
 
     version: Literal[1, 2]
     counts: tuple[PositiveInt, ...]
@@ -48,7 +48,7 @@ class _Head(BaseModel):
 
     @property
     def names(self) -> list[tuple[str, str]]:
-        """The names of the weights and the bias of each layer."""
+        """Return the names of the weights and the bias of each layer."""
         if self.version == 1:
             return [("hidden", "hidden_bias"), ("output", "output_bias")]
         return [(f"weights{i}", f"bias{i}") for i in range(self.layers)]
@@ -56,10 +56,11 @@ class _Head(BaseModel):
 
 @dataclass(frozen=True)
 class Network:
-    """Standardised observations, hidden layers, then tanh scaled to the action's bounds, or the most probable choice.
+    """Policy network: it standardises observations, and returns tanh outputs scaled to the bounds, or the most probable
+    choice.
 
-    ``counts`` are the choices of each entry of a discrete action, empty for a continuous one, whose bounds are
-    ``low`` and ``high`` (F,).
+    ``counts`` are the numbers of choices of each entry of a discrete action. They are empty for a continuous action,
+    whose bounds are ``low`` and ``high`` (F,).
     """
 
     mean: Array  # (D,)
@@ -74,7 +75,8 @@ class Network:
     def of(
         cls, spec: EnvironmentSpec, mean: Array, deviation: Array, units: int | Sequence[int], vector: Array
     ) -> Self:
-        """The policies whose parameters are vectors (..., ``size``), layer weights in units of 1 / sqrt(inputs)."""
+        """Make policies from parameter vectors (..., ``size``), in which layer weights have the unit 1 /
+        sqrt(inputs)."""
         layers, begin = [], 0
         for inputs, outputs in pairwise(_sizes(spec, units)):
             middle, end = begin + inputs * outputs, begin + (inputs + 1) * outputs
@@ -85,26 +87,27 @@ class Network:
 
     @staticmethod
     def size(spec: EnvironmentSpec, units: int | Sequence[int]) -> int:
-        """How many parameters a policy has; ``units`` of its hidden layer, or of each."""
+        """Number of parameters of a policy; ``units`` of its hidden layer, or of each."""
         return sum((inputs + 1) * outputs for inputs, outputs in pairwise(_sizes(spec, units)))
 
     @property
     def vector(self) -> Array:
-        """The parameters of one policy, as ``of`` takes them."""
+        """Return the parameters of one policy, in the form that ``of`` takes."""
         parts = [(layer.weights * np.sqrt(len(layer.weights)), layer.bias) for layer in self.layers]
         return np.concatenate([part.ravel() for layer in parts for part in layer])
 
     def __call__(self, observation: NDArray[Any]) -> NDArray[Any]:
-        """Actions (..., N, F) of observations (..., N, D); int64 (..., N) where there is one discrete choice."""
+        """Return actions (..., N, F) for observations (..., N, D); int64 (..., N) for a single discrete choice."""
         return most_probable(self.outputs(observation), self.low, self.high, self.counts)
 
     def outputs(self, observation: NDArray[Any]) -> NDArray[np.floating[Any]]:
-        """The last layer's (..., N, A), before the tanh of a continuous action: scores of discrete choices."""
+        """Return the last layer's outputs (..., N, A), before the tanh of a continuous action; scores of discrete
+        choices."""
         x = (np.asarray(observation, dtype=np.float64) - self.mean) / self.deviation
         return forward(self.layers, self.activation, x)
 
     def save(self, path: Path) -> None:
-        """Write one policy: a zip of arrays and a JSON head, nothing in it is code."""
+        """Write one policy to a zip of arrays with a JSON head. It contains no code."""
         head = _Head(version=2, counts=self.counts, activation=self.activation, layers=len(self.layers))
         arrays = {name: getattr(self, name) for name in OUTSIDE}
         for names, layer in zip(head.names, self.layers, strict=True):
@@ -116,7 +119,11 @@ class Network:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read what ``save`` wrote. Raises ValueError where it is something else, or has more than ``MAX_BYTES``."""
+        """Read a file that ``save`` wrote.
+
+        Raises:
+            ValueError: the file has another form, or more than ``MAX_BYTES``.
+        """
         try:
             entries = read_entries(path, MAX_BYTES)
             head = _read_head(entries[HEAD])
@@ -129,7 +136,7 @@ class Network:
 
     @staticmethod
     def is_at(path: Path) -> bool:
-        """Whether a file looks like what ``save`` writes."""
+        """Whether a file looks like one that ``save`` wrote."""
         try:
             with zipfile.ZipFile(path) as file:
                 return HEAD in file.namelist()
@@ -138,7 +145,7 @@ class Network:
 
 
 def forward(layers: Sequence[Layer], activation: Activation, x: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """Outputs (..., N, A) of inputs (..., N, D)."""
+    """Return outputs (..., N, A) for inputs (..., N, D)."""
     *hidden, last = layers
     for weights, bias in hidden:
         x = x @ weights + bias[..., None, :]
@@ -148,7 +155,7 @@ def forward(layers: Sequence[Layer], activation: Activation, x: NDArray[np.float
 
 
 def most_probable(y: NDArray[np.floating[Any]], low: Array, high: Array, counts: tuple[int, ...]) -> NDArray[Any]:
-    """Actions (..., N, F) of outputs y (..., N, A); int64 (..., N) where there is one discrete choice."""
+    """Return actions (..., N, F) for outputs y (..., N, A); int64 (..., N) for a single discrete choice."""
     if not counts:
         centre, reach = (low + high) / 2, (high - low) / 2
         return np.asarray(centre + reach * np.tanh(y), dtype=np.float32)
@@ -158,7 +165,7 @@ def most_probable(y: NDArray[np.floating[Any]], low: Array, high: Array, counts:
 
 
 def counts_of(spec: EnvironmentSpec) -> tuple[int, ...]:
-    """The choices of each entry of a policy's action; empty for a continuous one."""
+    """Numbers of choices of each entry of a policy's action; empty for a continuous one."""
     match spec.action:
         case BoxAction(bins=bins):
             return bins or ()
@@ -169,14 +176,14 @@ def counts_of(spec: EnvironmentSpec) -> tuple[int, ...]:
 
 
 def bounds_of(spec: EnvironmentSpec) -> tuple[Array, Array]:
-    """Bounds (F,) of a continuous action, empty for a discrete one."""
+    """Return the bounds (F,) of a continuous action; empty for a discrete one."""
     if isinstance(spec.action, BoxAction):
         return np.array(spec.action.low), np.array(spec.action.high)
     return np.zeros(0), np.zeros(0)
 
 
 def _sizes(spec: EnvironmentSpec, units: int | Sequence[int]) -> list[int]:
-    """Numbers that enter, pass between the layers, and leave."""
+    """Return the numbers of inputs, hidden units and outputs."""
     hidden = [units] if isinstance(units, int) else units
     return [len(spec.observation), *hidden, sum(counts_of(spec)) or spec.action.size]
 
@@ -192,9 +199,12 @@ def _read_head(content: bytes) -> _Head:
 
 
 def _require_chain(head: _Head, headers: Mapping[str, Header]) -> None:
-    """Raise ValueError unless the arrays are those of one policy, whose layers and bounds fit together.
+    """Check that the arrays are those of one policy, with layers and bounds that fit together.
 
-    Shapes that merely broadcast are refused: a call would compute far larger arrays than the file holds.
+    Shapes that would only broadcast are refused, because a call would compute far larger arrays than the file contains.
+
+    Raises:
+        ValueError: the arrays don't fit.
     """
     names = {*OUTSIDE, *(name for names in head.names for name in names)}
     if names != set(headers):
@@ -209,7 +219,7 @@ def _require_chain(head: _Head, headers: Mapping[str, Header]) -> None:
 
 
 def _chained(head: _Head, headers: Mapping[str, Header]) -> dict[str, tuple[int, ...]]:
-    """The shapes of one policy with as many observation entries, units of each layer and bounds as the headers name."""
+    """Return the shapes of one policy with the observation entries, layer units and bounds that the headers name."""
 
     def length(name: str) -> int:
         return (headers[name].shape or (0,))[0]

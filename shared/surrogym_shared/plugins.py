@@ -1,11 +1,11 @@
-"""Families that others may add to: built-in members, and those of installed packages, found by entry points.
+"""Registries of named classes: built-in ones, and those of installed packages, found by entry points.
 
-A package adds a member by an entry point in the group of the registry. It is loaded on the machine of the person who
-installed it, when a name that is not built in is first looked up or the names are listed.
+A package adds a class by an entry point in the group of the registry. The entry point is loaded in the process that
+looks for a name that is not built in, or that lists the names.
 
-Whatever a package raises while it is loaded is kept as one sentence, and all else works: ``sys.exit`` too, and the
-exceptions of tools that end what they run. ``KeyboardInterrupt`` alone goes on: one that a module raised by itself
-can't be told from a real Ctrl-C, which must end the program.
+Any exception while a package is loaded, even ``sys.exit``, is kept as one sentence, and everything else continues to
+work. Only ``KeyboardInterrupt`` is raised, because one from a module can't be told from a real Ctrl-C, which must end
+the program.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
-MOST_CHARACTERS = 500  # of what an exception of anybody's code says
+MOST_CHARACTERS = 500  # most characters of the message of a package's exception
 
 
 class UnknownMember(ValueError):
-    """No member has this name, or its package is broken; the message lists the names that there are."""
+    """No class has this name, or its package is broken. The message lists the known names."""
 
 
 class _Unfit(ValueError):
-    """An entry point that breaks a rule of its group; the message says all."""
+    """An entry point breaks a rule of its group. The message explains it."""
 
 
 def one_line(error: BaseException, *, typed: bool = True) -> str:
-    """An exception in one line, which says its type where it is ``typed``, or says nothing else: ``SystemExit: 1``.
+    """Return an exception as one line, with its type if ``typed`` or if it has no message: ``SystemExit: 1``.
 
     Never raises, whatever the exception's own code does.
     """
@@ -43,15 +43,15 @@ def one_line(error: BaseException, *, typed: bool = True) -> str:
 
 
 class Registry(Generic[T]):
-    """Classes by name; upper and lower case are the same.
+    """Classes by name, without regard to upper and lower case.
 
     Args:
-        kind: what its members are, for messages: "algorithm".
-        noun: the same where it stands before a name, if that is not ``kind``: "model family".
-        group: of the entry points of other packages.
-        base: what each member is a subclass of.
-        built_in: classes by name, or ``module:class``, imported when it is first asked for; no other package may take
-            these names.
+        kind: what the classes are, for messages: "algorithm".
+        noun: the same in front of a name, if it differs from ``kind``: "model family".
+        group: group of the entry points of other packages.
+        base: base class of all classes.
+        built_in: classes by name, or ``module:class``, which is imported on first use; no other package may take these
+            names.
     """
 
     def __init__(
@@ -67,24 +67,24 @@ class Registry(Generic[T]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All names, the built-in ones first."""
+        """Return all names, the built-in ones first."""
         return (*self._built_in, *sorted(self._others()))
 
     @property
     def broken(self) -> Mapping[str, str]:
-        """One sentence for each entry point that can't be used, by its name."""
+        """Return one sentence for each entry point that can't be used, by its name."""
         self._others()
         return self._broken
 
     def why_broken(self, name: str) -> str | None:
-        """The sentence of an entry point that can't be used; None where there is none of this name."""
+        """Return why an entry point can't be used; None if it can, or if there is none of this name."""
         return next((why for known, why in self.broken.items() if known.casefold() == name.casefold()), None)
 
     def name_of(self, name: str) -> str:
-        """A name as the registry has it. Other packages are loaded only if it is not built in.
+        """Return a name in the registry's spelling. Other packages are loaded only if it is not built in.
 
         Raises:
-            UnknownMember: no member has it.
+            UnknownMember: no class has this name.
         """
         member = _same(name, self._built_in) or _same(name, self._others())
         if member is None:
@@ -94,7 +94,7 @@ class Registry(Generic[T]):
         return member
 
     def get(self, name: str) -> type[T]:
-        """The class of a name. Raises as ``name_of``."""
+        """Return the class of a name. Raises as ``name_of``."""
         known = self.name_of(name)
         if known not in self._built_in:
             return self._others()[known]
@@ -120,14 +120,14 @@ class Registry(Generic[T]):
         return self._installed
 
     def _described(self, entries: list[EntryPoint]) -> str:
-        """Where the entry points of a name come from: "package 'a', entry point x = 'a:X' of surrogym.models"."""
+        """Describe the origin of a name's entry points: "package 'a', entry point x = 'a:X' of surrogym.models"."""
         parts = [f"{_package(entry)}, entry point {entry.name} = {entry.value!r}" for entry in entries]
         return f"{'; '.join(parts)} of {self._group}"
 
     def _load(self, entries: list[EntryPoint]) -> type[T]:
-        """The class of a name. Raises what its module does, or ``_Unfit``.
+        """Load the class of a name. Raises the module's own error, or ``_Unfit``.
 
-        Of several packages none is taken: which one came first on the search path is nobody's choice.
+        If several packages add the same name, none is loaded, because the order of the search path must not decide.
         """
         if len(entries) > 1:
             raise _Unfit("they have the same name, and none of them is used: uninstall all but one")
@@ -143,12 +143,12 @@ class Registry(Generic[T]):
 
 
 def _same(name: str, known: Iterable[str]) -> str | None:
-    """The one of these names that this is, in upper or lower case."""
+    """Return the known name that equals ``name`` apart from upper and lower case."""
     return next((member for member in known if member.casefold() == name.casefold()), None)
 
 
 def _by_name(entries: Iterable[EntryPoint]) -> list[list[EntryPoint]]:
-    """Entry points that have the same name together, in an order that no search path decides."""
+    """Group entry points by name, in an order that does not depend on the search path."""
     together = defaultdict[str, list[EntryPoint]](list)
     for entry in sorted(entries, key=lambda entry: (entry.name.casefold(), _package(entry), entry.name, entry.value)):
         together[entry.name.casefold()].append(entry)

@@ -1,7 +1,8 @@
-"""SurrogatePort: what a trainer needs of a surrogate, whatever carries it.
+"""SurrogatePort: what a trainer needs of a surrogate, however it is reached.
 
-JSON and frames over HTTP, the stream of frames and the in-process surrogate implement it; one suite tests them all.
-Arrays are numpy: observation (N, D) float32, action (N, F) or (N,), reward (N,) float64, flags (N,) bool.
+It is implemented by JSON and frames over HTTP, by the stream of frames, and by the surrogate in this process; one suite
+tests them all. Arrays are numpy: observation (N, D) float32, action (N, F) or (N,), reward (N,) float64, flags (N,)
+bool.
 """
 
 from __future__ import annotations
@@ -25,12 +26,16 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class ResetResult:
+    """Result of a reset of N lanes."""
+
     observation: Floats  # (N, D)
     model_version: Ints  # (N,)
 
 
 @dataclass(frozen=True)
 class StepResult:
+    """Result of one step of N lanes."""
+
     observation: Floats  # (N, D)
     reward: Floats  # (N,), penalised
     terminated: Bools  # (N,)
@@ -40,21 +45,23 @@ class StepResult:
     model_version: Ints  # (N,)
     reward_mean: Floats  # (N,), before the penalty
     deviation: Floats | None  # (N, O) when asked for
-    untrusted: Bools | None = None  # (N,) lanes truncated for leaving the trusted range; None in a session without one
+    untrusted: Bools | None = (
+        None  # (N,) lanes truncated because they left the trusted range; None in a session without one
+    )
 
 
 @dataclass(frozen=True)
 class PolicyRollout:
-    """T steps of N lanes under a policy: what it did in each, and what came of that."""
+    """Result of T steps of N lanes under a policy, with the policy's actions."""
 
     action: Floats  # (T, N, F) float64, before it is clipped to its bounds
-    log_probability: Floats | None  # (T, N) float64 of it; None without noise
-    observation: Floats  # (T, N, D) after the step; the first action is for what the lanes showed before
+    log_probability: Floats | None  # (T, N) float64, of the action; None without noise
+    observation: Floats  # (T, N, D) after the step; the first action is for the observations before the rollout
     reward: Floats  # (T, N), penalised
     terminated: Bools  # (T, N)
     truncated: Bools  # (T, N)
-    final_steps: Ints  # (K,) steps in which a lane ended and was reset, in order
-    final_lanes: Ints  # (K,) that lane
+    final_steps: Ints  # (K,) steps in which a lane's episode ended and the lane was reset, in order
+    final_lanes: Ints  # (K,) the lane of each of these steps
     final_observation: Floats  # (K, D)
     model_version: Ints  # (T, N)
     reward_mean: Floats  # (T, N), before the penalty
@@ -65,7 +72,7 @@ class PolicyRollout:
 
     @classmethod
     def of(cls, steps: Sequence[StepResult], action: Floats, log_probability: Floats | None) -> Self:
-        """One from its steps, at least one, and what the policy did in them."""
+        """Combine the results of at least one step, and the policy's actions in them."""
         untrusted = [step.untrusted for step in steps if step.untrusted is not None]
         return cls(
             action=action,
@@ -83,7 +90,7 @@ class PolicyRollout:
         )
 
     def steps(self) -> list[StepResult]:
-        """Each step as ``SurrogatePort.step`` gives it; views of these arrays."""
+        """Return each step as ``SurrogatePort.step`` does, as views of these arrays."""
         ends = np.searchsorted(self.final_steps, np.arange(len(self) + 1))
         return [
             StepResult(
@@ -103,7 +110,8 @@ class PolicyRollout:
 
 
 def quick(kind: type[T], **fields: Any) -> T:
-    """A frozen dataclass of all its fields, at half the cost of its constructor, which every step pays twice."""
+    """Make a frozen dataclass from all its fields, in half the time of its constructor. Every step makes two of
+    them."""
     made = object.__new__(kind)
     made.__dict__.update(fields)
     return made
@@ -111,15 +119,15 @@ def quick(kind: type[T], **fields: Any) -> T:
 
 @runtime_checkable
 class SurrogatePort(Protocol):
-    """One surrogate, seen by a trainer.
+    """One surrogate, as a trainer uses it.
 
-    Laws: a step happens once, however often the transport repeats it; a repeat gives the same reply, bit for bit;
-    results of one session depend on its seed and its requests alone; an error has the same class name in every
-    implementation's tree (``surrogym_client.errors``, ``surrogym_server.errors``).
+    Laws: a step happens once, however often the transport repeats it. A repeat gives the same reply, bit for bit.
+    Results of a session depend only on its seed and its requests. An error has the same class name in the error tree of
+    every implementation (``surrogym_client.errors``, ``surrogym_server.errors``).
     """
 
     def spec(self) -> EnvironmentSpec:
-        """The specification of the original environment."""
+        """Return the specification of the original environment."""
         ...
 
     def open(self, request: OpenSession) -> SessionView:
@@ -127,35 +135,38 @@ class SurrogatePort(Protocol):
         ...
 
     def reset(self, session: str, *, seed: int | Sequence[int] | None = None, mask: Bools | None = None) -> ResetResult:
-        """Start new episodes in all lanes, or those of the mask."""
+        """Start new episodes in all lanes, or only in those of the mask (N,)."""
         ...
 
     def step(
         self, session: str, action: Floats | Ints, *, mask: Bools | None = None, deviations: bool = False
     ) -> StepResult:
-        """Step all lanes, or those of the mask."""
+        """Step all lanes, or only those of the mask (N,), with an action (N, F)."""
         ...
 
     def rollout(self, session: str, actions: Floats | Ints) -> list[StepResult]:
-        """Step T times with actions (T, N, F), in one request."""
+        """Step all lanes T times with actions (T, N, F), in one request."""
         ...
 
     def submit_occupancy(self, session: str, checkpoint: str) -> SubmittedOccupancy:
-        """Store the states this session visited under a name, for the design to weigh its queries by, and say how well
-        the model is known there."""
+        """Submit the states that the session visited as the occupancy of a checkpoint, for the design to choose queries
+        by.
+
+        Returns how well the model is known over these states.
+        """
         ...
 
     def close(self, session: str) -> None:
-        """End the session; closing twice is harmless."""
+        """Close the session. Closing it twice is harmless."""
         ...
 
 
 @runtime_checkable
 class PolicyPort(SurrogatePort, Protocol):
-    """A surrogate that lets a policy act where the lanes are stepped.
+    """A surrogate that also lets a policy act where the lanes are stepped, so that a rollout is one request.
 
-    Law: the same as stepping all lanes one by one with the actions of ``surrogym_shared.acting.Actor``, bit for bit
-    where both run the same NumPy on the same kind of processor.
+    Law: the result equals stepping all lanes one by one with the actions of ``surrogym_shared.acting.Actor``, bit for
+    bit if both run the same NumPy on the same kind of processor.
     """
 
     def rollout_policy(
@@ -167,13 +178,13 @@ class PolicyPort(SurrogatePort, Protocol):
         noise: NoiseKey | None = None,
         until: Bools | None = None,
     ) -> PolicyRollout:
-        """Let a policy act in all lanes, in one request; all steps or none.
+        """Step all lanes with a policy, in one request. Either all steps are taken or none.
 
         Args:
-            session: its lanes have been reset.
-            policy: what acts.
-            steps: how many at most, T.
-            noise: of its actions; the most probable ones without.
-            until: (N,) lanes; the rollout stops after the step by which an episode has ended in each of them.
+            session: id of a session whose lanes have been reset.
+            policy: the policy.
+            steps: largest number of steps, T.
+            noise: key of the actions' noise; None takes the most probable actions.
+            until: mask (N,) of lanes; the rollout stops after the step by which an episode has ended in each of them.
         """
         ...

@@ -1,4 +1,4 @@
-"""Files that hold secrets: the tokens in them, and who may read them."""
+"""Files with secrets: read tokens from them, and check who else can read them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ OTHERS = stat.S_IRGRP | stat.S_IROTH
 
 
 def open_to_others(path: Path) -> str | None:
-    """A warning about a file that other users of this machine may read, and what closes it; None where they may not."""
+    """Return a warning, with its remedy, if other users of this machine can read a file; else None."""
     try:
         mode = stat.S_IMODE(path.stat().st_mode)
     except OSError:
@@ -24,11 +24,11 @@ def open_to_others(path: Path) -> str | None:
 
 
 def tokens_in(path: Path) -> dict[str, Role]:
-    """The tokens of a file, one a line, with their roles.
+    """Return the tokens of a file with their roles, one per line.
 
     Raises:
-        OSError: it can't be read.
-        ValueError: no token, or an unknown role; names no token.
+        OSError: the file can't be read.
+        ValueError: the file has no token, or an unknown role; the message contains no token.
     """
     lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
     if not any(lines):
@@ -37,10 +37,10 @@ def tokens_in(path: Path) -> dict[str, Role]:
 
 
 def parse_token(entry: str) -> tuple[str, Role]:
-    """A token and its role, from ``role:token``, or from a token alone, which is an admin's.
+    """Split ``role:token`` into token and role. A token without a role is an admin's.
 
     Raises:
-        ValueError: an unknown role; names no token.
+        ValueError: an unknown role; the message contains no token.
     """
     role, colon, token = entry.partition(":")
     if not colon:

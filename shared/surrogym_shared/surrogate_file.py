@@ -1,9 +1,10 @@
-"""A whole surrogate as one file: specification, model and real samples. Nothing in it is code, nothing is pickled.
+"""Read and write a whole surrogate as one file: specification, model and real samples. It contains no code and no
+pickles.
 
 The file is safetensors: eight bytes with the length of a JSON header, the header, then arrays as raw bytes. The model's
-arrays and its own metadata stand as the server exports them; beside them are ``samples.*`` arrays and, as metadata
-``surrogate``, format, name, specification, tolerances and ledger. So any reader of safetensors opens it, and the
-server's reader of models takes what ``model`` gives back.
+arrays and metadata are stored as the server exports them. In addition there are ``samples.*`` arrays and, as metadata
+``surrogate``, format, name, specification, tolerances and ledger. So any reader of safetensors can open the file, and
+the server reads ``model`` as an exported model.
 
 Shapes: n samples, C coordinates, F action entries.
 """
@@ -30,7 +31,7 @@ LENGTH_BYTES = 8
 METADATA = "__metadata__"
 OWN = "surrogate"  # key of this file's own metadata
 SAMPLES = "samples."
-LOGGED = "logged"  # of the samples; files without a log have no such array
+LOGGED = "logged"  # array of the samples; absent in files without a log
 DTYPES: dict[str, np.dtype[Any]] = {"F64": np.dtype("<f8"), "BOOL": np.dtype("?")}
 UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError)
 
@@ -40,12 +41,12 @@ Header = dict[str, Any]
 
 
 class NotASurrogateFile(ValueError):
-    """The bytes are no surrogate's file; says what was expected and what came."""
+    """The bytes are not a surrogate's file. The message says what was expected and what came."""
 
 
 @dataclass(frozen=True)
 class RealSamples:
-    """The real steps that the model was learned from, and any since."""
+    """Real steps that the model was fitted to, and any later ones."""
 
     coordinates: Floats  # (n, C)
     action: Floats  # (n, F)
@@ -53,7 +54,7 @@ class RealSamples:
     reward: Floats  # (n,)
     terminated: Bools  # (n,)
     truncated: Bools  # (n,)
-    logged: Bools | None = None  # (n,) those of a log, which cost no budget; None: none is
+    logged: Bools | None = None  # (n,) whether a sample is from a log, and so not from the budget; None: no sample is
 
     def __len__(self) -> int:
         return len(self.reward)
@@ -61,7 +62,8 @@ class RealSamples:
 
 @dataclass(frozen=True)
 class SurrogateFile:
-    """``model`` is a model's own safetensors file, as the server exports it and takes it back.
+    """Contents of a surrogate's file. ``model`` is a safetensors file of the model, as the server exports and imports
+    it.
 
     Examples:
         >>> SurrogateFile.load("pendulum.surrogate").spec.environment
@@ -72,11 +74,15 @@ class SurrogateFile:
     spec: EnvironmentSpec
     model: bytes
     samples: RealSamples
-    tolerances: dict[str, float] = field(default_factory=dict)  # by output, as the model was judged
-    ledger: dict[str, int] = field(default_factory=dict)  # real steps by purpose, where it comes from
+    tolerances: dict[str, float] = field(default_factory=dict)  # by output, as used to judge the model
+    ledger: dict[str, int] = field(default_factory=dict)  # real steps by purpose, on the server that exported the file
 
     def to_bytes(self) -> bytes:
-        """The whole as one file. Raises ``NotASurrogateFile`` where ``model`` is no safetensors file."""
+        """Return the contents of the file.
+
+        Raises:
+            NotASurrogateFile: ``model`` is not a safetensors file.
+        """
         header, body = _split(self.model)
         given = {name: getattr(self.samples, name) for name in RealSamples.__dataclass_fields__}
         arrays = {SAMPLES + name: array for name, array in given.items() if array is not None}
@@ -98,12 +104,12 @@ class SurrogateFile:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Read what ``to_bytes`` gave.
+        """Read what ``to_bytes`` returned.
 
-        The model's arrays are left to the reader of models, who checks them against the specification.
+        The model's arrays are not checked here. The reader of models checks them against the specification.
 
         Raises:
-            NotASurrogateFile: too large, or not of this form.
+            NotASurrogateFile: the bytes are too many, or not of this form.
         """
         header, body = _split(data)
         try:
@@ -135,8 +141,8 @@ class SurrogateFile:
         """Read a file.
 
         Raises:
-            OSError: it can't be read.
-            NotASurrogateFile: it is none.
+            OSError: the file can't be read.
+            NotASurrogateFile: the file is not a surrogate's.
         """
         with Path(path).open("rb") as file:
             try:
@@ -146,7 +152,7 @@ class SurrogateFile:
 
 
 def _split(data: bytes) -> tuple[Header, bytes]:
-    """Header and arrays of a safetensors file."""
+    """Split a safetensors file into header and arrays."""
     if len(data) > MAX_FILE_BYTES:
         raise NotASurrogateFile(f"expected a file of at most {MAX_FILE_BYTES} bytes, got more")
     length = int.from_bytes(data[:LENGTH_BYTES], "little")
@@ -164,12 +170,12 @@ def _split(data: bytes) -> tuple[Header, bytes]:
 
 def _joined(header: Header, body: bytes) -> bytes:
     text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % LENGTH_BYTES)  # arrays begin at a multiple of eight, as the format wants it
+    text += b" " * (-len(text) % LENGTH_BYTES)  # the format requires that arrays begin at a multiple of eight
     return len(text).to_bytes(LENGTH_BYTES, "little") + text + body
 
 
 def _array(entry: Any, body: bytes) -> NDArray[Any]:
-    """An array of the header's entry; raises one of ``UNREADABLE`` where it does not describe one."""
+    """Return the array that an entry of the header describes. Raises one of ``UNREADABLE`` if the entry is invalid."""
     dtype, shape, (start, stop) = DTYPES[entry["dtype"]], [int(n) for n in entry["shape"]], entry["data_offsets"]
     if min(shape, default=0) < 0 or not 0 <= start <= stop <= len(body):
         raise ValueError(f"an array of shape {shape} at {start} to {stop} of {len(body)} bytes")

@@ -1,4 +1,4 @@
-"""How commands speak: the result on standard output, everything else on standard error."""
+"""Output of commands: results on standard output, everything else on standard error."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from typing import Any
 
 import typer
 
-PLAIN_SECONDS = 5.0  # between lines of progress where no bar can be drawn
-FIRST_SECONDS = 2.0  # before the first of them: what is over by then, or refused, needs none
-WATCH_SECONDS = 1.0  # between looks at what is watched
+PLAIN_SECONDS = 5.0  # time between lines of progress if no bar can be drawn
+FIRST_SECONDS = 2.0  # time before the first line, so that short or refused work shows none
+WATCH_SECONDS = 1.0  # time between two updates of a watched output
 
-Update = Callable[[float | None, str], None]  # share done in [0, 1], None for as before; a few words
+Update = Callable[[float | None, str], None]  # arguments: share done in [0, 1], None if unchanged; a few words
 
 
 _CONTROLS = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"}
 
 
 def visible(text: str) -> str:
-    """The text with control characters written out: names and errors of others must not steer a terminal."""
+    """Replace control characters by escapes, so that names and errors from others can't control the terminal."""
     return text.translate(_CONTROLS)
 
 
 def say(text: str, *, quiet: bool = False) -> None:
-    """A remark for the person, on standard error."""
+    """Print a remark for a person on standard error."""
     if not quiet:
         typer.echo(visible(text), err=True)
 
 
 def give(result: dict[str, Any], text: Callable[[], str], *, as_json: bool, quiet: bool = False) -> None:
-    """The result, on standard output: as JSON, or in words; ``quiet`` leaves out words that are a mere remark."""
+    """Print the result on standard output, as JSON or as text. ``quiet`` suppresses text that is only a remark."""
     if as_json:
         typer.echo(json.dumps(result, indent=2))
     elif not quiet:
@@ -44,7 +44,7 @@ def give(result: dict[str, Any], text: Callable[[], str], *, as_json: bool, quie
 
 
 def watch(look: Callable[[], str], seconds: float = WATCH_SECONDS) -> None:
-    """Show what ``look`` says until Ctrl-C: in place on a terminal, elsewhere anew whenever it has changed."""
+    """Show the output of ``look`` until Ctrl-C: in place on a terminal, elsewhere again whenever it has changed."""
     with suppress(KeyboardInterrupt), _screen() as show:
         while True:
             show(look())
@@ -77,7 +77,7 @@ def _screen() -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def _interrupt_afterwards() -> Iterator[None]:
-    """Let Ctrl-C wait for the end of what is within: half a drawing would be drawn again below itself."""
+    """Delay Ctrl-C until the block ends, because a half-drawn output would be drawn again below itself."""
     came: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
     try:
@@ -90,7 +90,7 @@ def _interrupt_afterwards() -> Iterator[None]:
 
 @contextmanager
 def on_interrupt(words: Callable[[], str]) -> Iterator[None]:
-    """Say after Ctrl-C what was saved and how to go on; the interruption goes on."""
+    """Context that says after Ctrl-C what was saved and how to continue. It raises the interruption again."""
     try:
         yield
     except KeyboardInterrupt:
@@ -100,7 +100,8 @@ def on_interrupt(words: Callable[[], str]) -> Iterator[None]:
 
 @contextmanager
 def progress(title: str, *, quiet: bool = False) -> Iterator[Update]:
-    """A bar on a terminal, plain lines elsewhere for what takes longer than ``FIRST_SECONDS``, nothing when quiet."""
+    """Context that shows progress: a bar on a terminal, lines elsewhere after ``FIRST_SECONDS``, nothing if
+    ``quiet``."""
     if quiet:
         yield _silent
     elif sys.stderr.isatty():
@@ -134,7 +135,7 @@ def _bar(title: str) -> Iterator[Update]:
 
 
 class _Lines:
-    """Progress as lines, not too many of them, and none before ``begin``; the end is said in any case."""
+    """Progress as a limited number of lines, none before ``begin``. The last state is always shown."""
 
     def __init__(self, title: str) -> None:
         self._title = title
@@ -147,7 +148,7 @@ class _Lines:
             self.begin()
 
     def begin(self) -> None:
-        """Say what is known by now; the first time from another thread."""
+        """Show the present state. The first call comes from another thread."""
         if self._words != self._last:
             self._last = self._words
             say(f"{self._title}: {self._words}")

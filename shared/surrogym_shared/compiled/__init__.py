@@ -1,7 +1,7 @@
 """Functions compiled by numba, kept on disk for the next process.
 
-``jit`` imports numba, and so do files and folders named ``compiled`` of server and client. Everything else imports them
-lazily, where ``available`` says so: numba is not there for every platform.
+``jit`` imports numba, and so do files and folders named ``compiled`` of server and client. All other code imports them
+lazily, if ``available`` says so, because numba does not exist for every platform.
 """
 
 from __future__ import annotations
@@ -15,6 +15,6 @@ SWITCH = "SURROGYM_COMPILED"  # environment variable: 0 turns compiled code off
 
 @cache
 def available() -> bool:
-    """Whether code can be compiled in this process. Numba is not imported to find out."""
+    """Whether this process can compile code. This does not import numba."""
     wanted = os.environ.get(SWITCH, "1") != "0" and os.environ.get("NUMBA_DISABLE_JIT", "0") == "0"
     return wanted and find_spec("numba") is not None

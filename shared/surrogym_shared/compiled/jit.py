@@ -1,4 +1,4 @@
-"""Functions in machine code, kept on disk for the next process."""
+"""Compile functions to machine code, and keep them on disk for the next process."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from surrogym_shared.compiled import kept
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-settings: Any = config  # numba fills it from its environment variables
+settings: Any = config  # numba sets its attributes from environment variables
 logger = logging.getLogger(__name__)
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}
@@ -24,17 +24,17 @@ INNER: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, *
 
 
 def compiled(function: F) -> F:
-    """Compile a function that compiled code calls. A product and a sum may round once together."""
+    """Compile a function that compiled code calls. A product and a sum may be rounded together."""
     return cast(F, njit(fastmath={"contract"}, **INNER)(function))
 
 
 def inlined(function: F) -> F:
-    """The same for a function that is called from one place: it is compiled there and nowhere else."""
+    """Compile a function into its only caller."""
     return cast(F, njit(fastmath={"contract"}, inline="always", **INNER)(function))
 
 
 def summing(function: F) -> F:
-    """The same, where a sum may be taken in the order that the processor likes best, always the same one."""
+    """Compile a function whose sums may be reordered for speed. The order is always the same."""
     return cast(F, njit(fastmath={"contract", "reassoc"}, **INNER)(function))
 
 
@@ -50,7 +50,7 @@ def entry(*arguments: Any) -> Callable[[F], F]:
                     return cast(F, njit([arguments], cache=True, **chosen)(function))
             except NumbaError:
                 raise  # it would fail again
-            except Exception as error:  # numba reads its files with pickle, and writes them where it may
+            except Exception as error:  # numba unpickles its cache files, and its cache folder may be unwritable
                 logger.warning("compiled code can't be kept in %s, so they are compiled again: %s", folder, error)
         return cast(F, njit([arguments], **chosen)(function))
 
@@ -59,7 +59,7 @@ def entry(*arguments: Any) -> Callable[[F], F]:
 
 @contextmanager
 def _kept_in(folder: Path) -> Iterator[None]:
-    """Numba chooses the place when a function is declared."""
+    """Set numba's cache folder. Numba reads it when a function is declared."""
     before, settings.CACHE_DIR = settings.CACHE_DIR, str(folder)
     try:
         yield

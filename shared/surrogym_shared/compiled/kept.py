@@ -1,4 +1,4 @@
-"""Where compiled functions are kept on disk. Needs no numba, so that a server can look before it imports that."""
+"""The disk cache of compiled functions. It needs no numba, so that a server can check it before the import."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from pathlib import Path
 
 @cache
 def folder(package: str) -> Path | None:
-    """Where a package's compiled functions are kept, by the version of their sources; None where nothing can be.
+    """Return the cache folder of a package for the present version of its sources; None if nothing can be stored.
 
-    Numba reads its files with pickle, so the folder has to be the user's own.
+    Numba reads its files with pickle, so the folder has to belong to the user.
 
     Args:
-        package: a top-level package that is imported.
+        package: an imported top-level package.
     """
     chosen = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
     try:
@@ -25,18 +25,19 @@ def folder(package: str) -> Path | None:
         state = found.stat()
         own = not hasattr(os, "getuid") or (state.st_uid == os.getuid() and not state.st_mode & 0o022)
         return found if own and os.access(found, os.W_OK) else None
-    except (OSError, RuntimeError):  # no home, or a read-only one
+    except (OSError, RuntimeError):  # no home folder, or a read-only one
         return None
 
 
 def has_any(package: str) -> bool:
-    """Whether an earlier process has kept something there."""
+    """Whether an earlier process has stored a compiled function."""
     found = folder(package)
     return found is not None and any(found.glob("*/*.nbi"))
 
 
 def _digest_of_sources(package: str) -> str:
-    """Of a package's compiled files and these: numba looks at the file of the function that is called alone."""
+    """Return the digest of a package's compiled files and of these. Numba itself only checks the file of the called
+    function."""
     files = set(Path(__file__).parent.glob("*.py"))
     if source := getattr(sys.modules[package], "__file__", None):
         root = Path(source).parent

@@ -1,8 +1,8 @@
 """EnvironmentSpec: what is known of an original environment before the first query.
 
-Symbols: coordinates ``q`` (n, C), observation ``o`` (n, D), action ``u`` (n, F). A specification is data: adapters make
-it for known environments, people write it as JSON or Python for their own, and no part of it is ever evaluated as code.
-Every contradiction is refused here, with what was expected and what came.
+Symbols: coordinates ``q`` (n, C), observation ``o`` (n, D), action ``u`` (n, F). A specification is data. Adapters make
+it for known environments, and people write it as JSON or Python for their own. No part of it is ever evaluated as code.
+Contradictions are refused, with what was expected and what came.
 """
 
 from __future__ import annotations

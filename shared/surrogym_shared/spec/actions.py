@@ -1,4 +1,4 @@
-"""What can be done in an environment."""
+"""Actions of an environment: continuous, discrete, or several discrete ones."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_DISCRETE_ACTIONS, Froz
 
 
 class BoxAction(Frozen):
-    """A continuous action in [low, high]. ``bins`` offers it to the policy as so many equally spaced discrete values a
-    dimension (the paper's discretised control); the model and the sampler always see the continuous value."""
+    """Continuous action in [low, high].
+
+    ``bins`` offers each dimension to the policy as this many equally spaced values (the paper's discretised control).
+    The model and the sampler always get the continuous value.
+    """
 
     kind: Literal["box"] = "box"
     low: tuple[Number, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
@@ -37,7 +40,7 @@ class BoxAction(Frozen):
 
 
 class DiscreteAction(Frozen):
-    """One of n actions, 0 to n - 1."""
+    """Discrete action: one of n, numbered 0 to n - 1."""
 
     kind: Literal["discrete"] = "discrete"
     n: int = Field(ge=2, le=MAX_DISCRETE_ACTIONS, strict=True)
@@ -48,7 +51,7 @@ class DiscreteAction(Frozen):
 
 
 class MultiDiscreteAction(Frozen):
-    """Several discrete actions at once; entry i is 0 to nvec[i] - 1."""
+    """Several discrete actions at once; entry i is between 0 and nvec[i] - 1."""
 
     kind: Literal["multi_discrete"] = "multi_discrete"
     nvec: tuple[Annotated[int, Field(ge=2, le=MAX_DISCRETE_ACTIONS, strict=True)], ...] = Field(

@@ -1,4 +1,4 @@
-"""What every model of a specification is built on, and how many entries one may have."""
+"""Base class and limits of all models of a specification."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ MAX_TERM_PARTS = 64
 MAX_DISCRETE_ACTIONS = 4096
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 NAME_IN_WORDS = "1 to 64 letters, digits, '.', '_' or '-', the first a letter or a digit"
-MAX_INEQUALITIES = 16  # in a group, and groups
-MAX_ROLLOUT_QUERY = 4_096  # real steps that one query may ask for
+MAX_INEQUALITIES = 16  # most inequalities in a group, and most groups
+MAX_ROLLOUT_QUERY = 4_096  # most real steps of one query
 MAX_STARTS = 256
 REWARD = "reward"
 
@@ -22,6 +22,6 @@ Name = Annotated[str, Field(min_length=1, max_length=64)]
 
 
 class Frozen(FailFast):
-    """Base of every model here: immutable, and unknown fields are refused."""
+    """Base class of all models of a specification: immutable, and without unknown fields."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="null")

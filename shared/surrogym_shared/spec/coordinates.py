@@ -1,4 +1,4 @@
-"""Coordinates of the state q, their distributions and bounds."""
+"""Coordinates of the state q, with their distributions and bounds."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from surrogym_shared.spec.base import Frozen, Name
 
 
 class Uniform(Frozen):
-    """Uniform on [low, high]."""
+    """Uniform distribution on [low, high]."""
 
     kind: Literal["uniform"] = "uniform"
     low: Number
@@ -24,7 +24,7 @@ class Uniform(Frozen):
 
 
 class Normal(Frozen):
-    """Normal, truncated to [low, high]; without limits it is truncated at three standard deviations."""
+    """Normal distribution, truncated to [low, high], or at three standard deviations if there are no limits."""
 
     kind: Literal["normal"] = "normal"
     mean: Number
@@ -48,7 +48,7 @@ class Normal(Frozen):
 
 
 class Fixed(Frozen):
-    """One value; only for the start distribution."""
+    """A single value, for the start distribution only."""
 
     kind: Literal["fixed"] = "fixed"
     value: Number
@@ -59,7 +59,7 @@ StartDistribution = Annotated[Uniform | Normal | Fixed, Field(discriminator="kin
 
 
 def limits(distribution: Uniform | Normal | Fixed) -> tuple[float, float]:
-    """Smallest and largest value a distribution can give."""
+    """Return the smallest and the largest value of a distribution."""
     match distribution:
         case Uniform():
             return distribution.low, distribution.high
@@ -72,7 +72,8 @@ def limits(distribution: Uniform | Normal | Fixed) -> tuple[float, float]:
 class Bounds(Frozen):
     """Saturation: the environment clips the coordinate to [low, high].
 
-    ``stops`` names a coordinate that is set to zero when this one runs into the bound (a wall; MountainCar's left end).
+    ``stops`` names a coordinate that becomes zero when this one reaches the bound, as at a wall (MountainCar's left
+    end).
     """
 
     low: Number | None = None
@@ -88,10 +89,10 @@ class Bounds(Frozen):
 
 
 class Coordinate(Frozen):
-    """One entry of q: part of the state that the original environment is set to.
+    """One entry of q: a part of the state that the original environment is set to.
 
-    ``linear`` and ``angle`` (wrapped to [-pi, pi)) move with the dynamics; ``constant`` is drawn at the start of an
-    episode and stays (Reacher's target). ``sampling`` is the distribution of design queries.
+    The dynamics move ``linear`` and ``angle`` coordinates; an angle is wrapped to [-pi, pi). A ``constant`` is drawn at
+    the start of an episode and does not change (Reacher's target). ``sampling`` is the distribution of design queries.
     """
 
     name: Name
@@ -118,7 +119,8 @@ class Coordinate(Frozen):
 
     @property
     def settable(self) -> tuple[float, float]:
-        """What the original environment can be set to: its bounds, or the sampling range where it has none."""
+        """Range that the original environment can be set to: the coordinate's bounds, or its sampling range without
+        them."""
         low, high = limits(self.sampling)
         if self.bounds is None:
             return low, high

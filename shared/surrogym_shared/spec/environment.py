@@ -1,4 +1,4 @@
-"""One environment as a whole, and the contradictions that are refused."""
+"""Specification of a whole environment, and the check for contradictions."""
 
 from __future__ import annotations
 
@@ -17,37 +17,46 @@ from surrogym_shared.spec.terms import AllOf, ObservationEntry, Term, Terminatio
 
 
 class Choice(Frozen):
-    """One of several, by its name, with settings of its own."""
+    """Choice of one of several named parts, with settings of its own."""
 
     name: Name
     settings: dict[Name, StrictBool | StrictInt | StrictFloat | StrictStr] = Field(default_factory=dict, max_length=64)
 
 
 class AcquisitionChoice(Choice):
-    """An acquisition with settings of its own."""
+    """Choice of an acquisition, with its settings."""
 
 
 class ModelChoice(Choice):
-    """A family of models with settings of its own."""
+    """Choice of a family of models, with its settings."""
 
 
 class Design(Frozen):
-    """The adaptive design of queries: what is chosen before the first one.
+    """Settings of the adaptive design of queries. A field of None takes the preset's value.
 
-    ``preset``: ``default`` or ``paper`` (the method as printed, repaired only where it cannot work). Every None takes
-    the preset's value. ``budget`` counts every real step of the design, initial ones included;
-    0 asks for none, and the model is that of a log. ``tolerance`` is what
-    eq. 9 divides by the deviation where none is declared: ``relative``, 5 % of the output's deviation over the initial
-    design, or ``raw``, 1 in the output's own unit, as printed. ``symmetry``: ``auto`` looks whether the environment is
-    its own mirror image, every coordinate and the action with their signs changed, ``none`` does not; preset ``paper``
-    never does. ``initial`` of the budget are a Latin hypercube, before the first model. ``acquisition`` chooses the
-    others, by its name or with settings of its own: ``integrated_variance``, the default's, the query that lowers the
-    variance most over the range and where policies went; ``variance``, where the deviation is largest;
-    ``uncertainty_index``, the paper's (eq. 12); ``latin_hypercube``: the whole budget is one, whatever ``initial``
-    says, and only what is asked for beyond it is chosen, in the largest gaps; or one of a package that is installed
-    beside the server. ``model`` is the family of models that is learned: ``gaussian_process``, the default,
-    ``ensemble`` (of networks), or one of a package that is installed beside the server. ``monte_carlo`` points estimate
-    the confidence index (eq. 8).
+    ``preset``: ``default``, or ``paper``, the method as published, changed only where it can't work.
+
+    ``budget``: real steps of the design, initial ones included. With 0 the design takes none, and the model is that of
+    a log.
+
+    ``initial``: how many of them form a Latin hypercube, before the first model.
+
+    ``acquisition``: criterion that chooses the other queries, by name or with settings. ``integrated_variance``, the
+    default's, takes the query that lowers the variance most, over the range and where policies went. ``variance`` takes
+    the largest standard deviation. ``uncertainty_index`` is the paper's (eq. 12). ``latin_hypercube`` takes the whole
+    budget as one hypercube, whatever ``initial`` is; steps beyond the budget go to the largest gaps. A package on the
+    server may add others.
+
+    ``model``: family of models: ``gaussian_process``, the default, ``ensemble`` (of networks), or one from a package on
+    the server.
+
+    ``tolerance``: numerator of eq. 9 for outputs without a declared tolerance. ``relative`` is 5 % of the output's
+    standard deviation over the initial design, ``raw`` is 1 in the output's own unit, as published.
+
+    ``symmetry``: ``auto`` tests whether the environment is its own mirror image, with the signs of all coordinates and
+    the action changed; ``none`` does not. Preset ``paper`` never does.
+
+    ``monte_carlo``: number of points that estimate the confidence index (eq. 8).
     """
 
     preset: Literal["default", "paper"] = "default"
@@ -63,7 +72,8 @@ class Design(Frozen):
 
 
 class EnvironmentSpec(Frozen):
-    """One original environment: coordinates, observation, action, start, termination, and the design of queries."""
+    """Specification of one original environment: coordinates, observation, action, start, termination, and design of
+    queries."""
 
     environment: str = Field(default="", max_length=256, description="Gymnasium id, or free text for one's own")
     coordinates: tuple[Coordinate, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
@@ -103,7 +113,7 @@ class EnvironmentSpec(Frozen):
 
     @property
     def termination_groups(self) -> tuple[AllOf, ...]:
-        """Declared terminations; none where termination is learned."""
+        """Groups of inequalities that declare terminations; empty if termination is learned."""
         return () if self.termination == "learned" else self.termination
 
     @property

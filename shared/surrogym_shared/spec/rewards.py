@@ -1,4 +1,4 @@
-"""What steps and episodes are worth: a reward that is learned or declared, and when an episode is a success."""
+"""Reward, learned or declared, and the criterion for a successful episode."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from surrogym_shared.spec.terms import Inequality, Term
 
 
 class Reward(Frozen):
-    """How the reward is learned, which is the rule.
+    """Settings of a learned reward, which is the usual case.
 
-    ``timing``: ``before`` reads (q, u), as Gymnasium's Pendulum does; ``after`` reads (q', u), as the paper says;
-    ``auto`` takes, at each fit, the one that the evidence favours.
-    ``penalty``: k of eq. 14, reward = mean - k * deviation; None takes the preset's (default 0, paper 3).
+    ``timing``: the state that the reward depends on. ``before`` is (q, u), as in Gymnasium's Pendulum; ``after`` is
+    (q', u), as in the paper; ``auto`` chooses at each fit the one that the data favour.
+
+    ``penalty``: k of eq. 14, reward = mean - k * deviation. None takes the preset's (default 0, paper 3).
     """
 
     kind: Literal["learned"] = "learned"
@@ -25,7 +26,7 @@ class Reward(Frozen):
 
 
 class Quantity(Frozen):
-    """What a declared reward measures: x = term(q) + action . u, ``action`` a weight for each entry of u."""
+    """Quantity of a declared reward: x = term(q) + action . u, where ``action`` has a weight for each entry of u."""
 
     term: Term | None = None
     action: tuple[Number, ...] = Field(default=(), max_length=MAX_DIMENSIONS)
@@ -37,7 +38,7 @@ class Quantity(Frozen):
 
 
 class RewardTerm(Frozen):
-    """weight * shape(of), where every inequality in ``when`` holds, else 0.
+    """Term of a declared reward: weight * shape(of) if every inequality in ``when`` holds, else 0.
 
     ``one``: 1. ``linear``: sum of x. ``absolute``: sum of |x|. ``square``: sum of x^2. ``bump``: exp(-1/2 sum of x^2).
     """
@@ -57,9 +58,10 @@ class RewardTerm(Frozen):
 
 
 class DeclaredReward(Frozen):
-    """A reward that is known: the sum of its terms, so no query is spent on it. Data, never evaluated as code.
+    """A known reward, the sum of its terms, on which no query is spent. It is data, never evaluated as code.
 
-    ``timing`` says which state the terms read; ``terminal`` is what a step that ends the episode pays beyond them.
+    ``timing`` chooses the state that the terms depend on. ``terminal`` is added to the reward of a step that ends the
+    episode.
     """
 
     kind: Literal["declared"]
@@ -78,10 +80,11 @@ AnyReward = Annotated[
 
 
 class Success(Frozen):
-    """When an evaluation episode counts as a success. Every criterion given must hold.
+    """Criteria of a successful evaluation episode. All given ones must hold.
 
-    ``hold``: all inequalities hold through the last ``hold_steps`` steps; ``min_steps``: at least so many steps;
-    ``max_steps``: at most; ``terminated``: the episode ended (or did not end) by termination; ``min_return``.
+    ``hold``: inequalities that all hold in each of the last ``hold_steps`` steps. ``min_steps``, ``max_steps``: limits
+    on the episode's length. ``terminated``: whether the episode has to end by termination. ``min_return``: smallest
+    return.
     """
 
     hold: tuple[Inequality, ...] = Field(default=(), max_length=MAX_INEQUALITIES)

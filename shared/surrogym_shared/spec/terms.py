@@ -1,4 +1,4 @@
-"""Terms of the state, and what they give: observations, inequalities, terminations."""
+"""Terms of the state, and their uses: observations, inequalities and terminations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from surrogym_shared.spec.base import MAX_INEQUALITIES, MAX_TERM_PARTS, Frozen, 
 
 
 class Part(Frozen):
-    """coefficient * phi(q), phi one of: ``one`` = 1, ``linear`` = a.q, ``sin`` = sin(a.q), ``cos`` = cos(a.q)."""
+    """Part of a term: coefficient * phi(q), where phi is ``one`` = 1, ``linear`` = a.q, ``sin`` = sin(a.q) or
+    ``cos`` = cos(a.q)."""
 
     function: Literal["one", "linear", "sin", "cos"]
     coefficient: Number = 1.0
@@ -27,7 +28,7 @@ class Part(Frozen):
 
 
 class Term(Frozen):
-    """A sum of parts, optionally clipped to [low, high]. Terms add with ``+`` and scale with ``*``."""
+    """Sum of parts, optionally clipped to [low, high]. Terms can be added with ``+`` and scaled with ``*``."""
 
     parts: tuple[Part, ...] = Field(min_length=1, max_length=MAX_TERM_PARTS)
     low: Number | None = None
@@ -45,7 +46,7 @@ class Term(Frozen):
 
     @classmethod
     def linear(cls, **weights: float) -> Term:
-        """``Term.linear(x=1)`` is the coordinate x."""
+        """Make a linear term of coordinates: ``Term.linear(x=1)`` is the coordinate x."""
         return cls(parts=(Part(function="linear", weights=weights),))
 
     @classmethod
@@ -75,7 +76,7 @@ class Term(Frozen):
 
 
 class ObservationEntry(Frozen):
-    """One entry of the observation: a name, the term that gives it, and the limits of the observation space."""
+    """One entry of the observation: its name, the term that computes it, and its limits in the observation space."""
 
     name: Name
     term: Term
@@ -84,7 +85,7 @@ class ObservationEntry(Frozen):
 
 
 class Inequality(Frozen):
-    """``term relation value``, for instance height > 1."""
+    """Condition ``term relation value``, for instance height > 1."""
 
     term: Term
     relation: Literal["<", "<=", ">", ">="]

@@ -1,4 +1,4 @@
-"""What all requests and replies share: limits, words, base classes."""
+"""Base classes, limits and common types of all requests and replies."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from surrogym_shared.acting import MAX_ROLLOUT as MAX_ROLLOUT  # for those who know the wire alone
+from surrogym_shared.acting import MAX_ROLLOUT as MAX_ROLLOUT  # for modules that only import the wire
 from surrogym_shared.bounded import FailFast
 from surrogym_shared.spec import MAX_DIMENSIONS, NAME_PATTERN
 
@@ -15,9 +15,9 @@ MAX_LANES = 65_536
 MAX_PARTICLES = 1_000_000
 MAX_CLAIM = 256
 MAX_BATCH = 65_536
-MAX_IMAGINED = 500  # steps of an imagined episode
+MAX_IMAGINED = 500  # most steps of an imagined episode
 MAX_DRAWS = 64
-MAX_MEASURED = 1e30  # beyond it variances overflow, and one such sample would leave no model to serve
+MAX_MEASURED = 1e30  # variances overflow beyond it, so one larger sample would prevent every fit
 
 Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "from_log", "failed"]
 Purpose = Literal["initial", "adaptive", "manual", "audit"]
@@ -29,7 +29,7 @@ AutoresetMode = Literal["next_step", "same_step", "disabled"]
 Role = Literal["read", "train", "sample", "admin"]
 
 SurrogateName = Annotated[str, Field(pattern=NAME_PATTERN)]
-VISIBLE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"  # no control characters: it is shown to people
+VISIBLE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"  # no control characters, because people see the text
 Key = Annotated[str, Field(min_length=1, max_length=128, pattern=VISIBLE)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Seq = Annotated[int, Field(ge=1)]
@@ -39,12 +39,13 @@ Matrix = Annotated[list[Vector], Field(min_length=1, max_length=MAX_BATCH)]
 
 
 class Request(FailFast):
-    """Base of what a client sends: unknown fields are refused, booleans and strings are not numbers."""
+    """Base class of what a client sends. Unknown fields are refused; booleans and strings are not accepted as
+    numbers."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
 
 class Reply(BaseModel):
-    """Base of what the server sends."""
+    """Base class of what the server sends."""
 
     model_config = ConfigDict(extra="forbid")

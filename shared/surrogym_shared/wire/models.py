@@ -1,4 +1,4 @@
-"""Models: predictions and history."""
+"""Wire models of models: predictions and history."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ class Points(Request):
 
 
 class Uncertainty(Reply):
-    """Per point and output: posterior mean of the output, latent deviation, U_m (eq. 10), P_i (eq. 11), U (eq. 12)."""
+    """For each point and output: posterior mean, standard deviation without noise, U_m (eq. 10), P_i (eq. 11), U
+    (eq. 12)."""
 
     model_version: int
     outputs: list[str]
@@ -39,8 +40,8 @@ class Prediction(Reply):
 
 
 class Imagine(Request):
-    """An episode from ``coordinates`` under ``actions``: the mean's, and those of ``draws`` functions drawn
-    from its posterior."""
+    """Episodes from ``coordinates`` with ``actions``: along the mean, and along ``draws`` functions from the
+    posterior."""
 
     coordinates: Vector
     actions: Annotated[list[Vector], Field(min_length=1, max_length=MAX_IMAGINED)] = Field(description="(T, F)")

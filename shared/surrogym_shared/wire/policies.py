@@ -1,4 +1,4 @@
-"""Policies of a surrogate: versions with their files, evaluations and aliases."""
+"""Wire models of policies: versions with their files, evaluations and aliases."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire.base import VISIBLE, Key, Measured, Reply, Request, Vector
 
-PolicyForm = Literal["zip", "onnx", "pt2", "mp4", "gif"]  # how a file of a policy ends
+PolicyForm = Literal["zip", "onnx", "pt2", "mp4", "gif"]  # endings of policy files
 Controller = Literal["policy", "zero", "random", "reference"]
-TraceRank = Literal["paired", "best", "median", "worst"]  # paired: from the same start, whoever acts
+TraceRank = Literal["paired", "best", "median", "worst"]  # paired: from the same start for every controller
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="SHA-256 of the file, as hex")]
 AliasName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
 Count = Annotated[int, Field(ge=0, le=2**53)]
@@ -19,12 +19,12 @@ Text = Annotated[str, Field(max_length=2_000, pattern=VISIBLE)]
 
 MAX_CURVE = 500
 MAX_EPISODES = 10_000
-MAX_TRACE = 10_000  # steps of one episode's trace
+MAX_TRACE = 10_000  # most steps of one episode's trace
 MAX_TRACES = 16
 
 
 class PolicyPromise(BaseModel):
-    """The mean return over 100 real starts that the surrogate predicts: median, 5 % and 95 % quantile."""
+    """Mean return over 100 real starts that the surrogate predicts: median, 5 % and 95 % quantile."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
@@ -36,7 +36,7 @@ class PolicyPromise(BaseModel):
 
 
 class PolicyAudit(BaseModel):
-    """What a comparison of the model with real steps on the policy's way found."""
+    """Result of comparing the model with real steps on the policy's way."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
@@ -50,7 +50,7 @@ class PolicyAudit(BaseModel):
 
 
 class PushedCard(BaseModel):
-    """What a policy is for and how it came about. Fields that are not known here are left out."""
+    """What a policy was trained for, and how. Unknown fields are dropped."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
@@ -81,7 +81,7 @@ class CurvePoint(BaseModel):
 
 
 class FileNotice(Request):
-    """A file that is to come: it is accepted if it is exactly this one."""
+    """Announcement of a file. The upload is accepted only if it is exactly this file."""
 
     form: PolicyForm
     bytes: Annotated[int, Field(ge=1)]
@@ -89,12 +89,12 @@ class FileNotice(Request):
 
 
 class AddPolicy(Request):
-    """A policy: its card, the curve of its training, and which file is to come.
+    """A policy: its card, its training curve, and the announcement of its file.
 
-    A policy whose file is there already keeps its version; its card and curve are replaced.
+    If the server has this file already, the policy keeps its version, and its card and curve are replaced.
     """
 
-    model_config = ConfigDict(extra="forbid", strict=False)  # the card brings its own strictness
+    model_config = ConfigDict(extra="forbid", strict=False)  # the card validates its own types
 
     card: PushedCard
     curve: list[CurvePoint] = Field(default=[], max_length=MAX_CURVE)
@@ -114,8 +114,10 @@ class EpisodeTrace(Request):
 
 
 class AddEvaluation(Request):
-    """Real episodes of a policy, or of what it is compared with, from the same starts. ``returns``, ``lengths`` and
-    ``success`` have one entry for each episode."""
+    """Real episodes of a policy, or of a baseline from the same starts.
+
+    ``returns``, ``lengths`` and ``success`` have one entry for each episode.
+    """
 
     controller: Controller = Field(
         default="policy",
@@ -176,7 +178,7 @@ class EvaluationView(Reply):
 
 
 class EvaluationDetail(EvaluationView):
-    """With its episodes, and traces of some."""
+    """An evaluation with all its episodes, and traces of some."""
 
     returns: list[float]
     lengths: list[int]
@@ -206,7 +208,7 @@ class PolicyView(Reply):
 
 
 class PolicyDetail(PolicyView):
-    """With the settings and the curve of its training."""
+    """A policy with the settings and the curve of its training."""
 
     seed: int | None
     seconds: float | None

@@ -1,4 +1,4 @@
-"""Queries, samples and the ledger."""
+"""Wire models of queries, samples and the ledger."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class ClaimQueries(Request):
 
 
 class LeasedQuery(Reply):
-    """What every query to answer has."""
+    """Fields of every query that a sampler has claimed."""
 
     id: int
     number: int = Field(description="how many queries of the surrogate came before it")
@@ -46,7 +46,7 @@ class LeasedQuery(Reply):
 
 
 class StepQuery(LeasedQuery):
-    """Set the original environment to ``coordinates``, apply ``action``, report one sample."""
+    """Query of one step: set the original environment to ``coordinates``, apply ``action``, report one sample."""
 
     kind: Literal["step"] = "step"
     coordinates: list[float]
@@ -54,8 +54,10 @@ class StepQuery(LeasedQuery):
 
 
 class RolloutQuery(LeasedQuery):
-    """Reset the original environment, apply ``actions`` one after the other, report a sample of each step taken: fewer
-    where the episode ends, or the environment fails, before the last."""
+    """Query of a rollout: reset the original environment, apply ``actions`` in order, and report a sample of each step.
+
+    There are fewer samples if the episode ends, or the environment fails, before the last action.
+    """
 
     kind: Literal["rollout"] = "rollout"
     actions: list[list[float]] = Field(description="(T, F)")
@@ -102,8 +104,7 @@ class QueryList(Reply):
 
 
 class AddQueries(Request):
-    """Queries by hand: steps from ``coordinates`` under ``action``, or, where the original environment can only be
-    reset, ``rollouts`` of action sequences."""
+    """Queries by hand: steps from ``coordinates`` with ``action``; or ``rollouts``, action sequences from a reset."""
 
     coordinates: Matrix | None = None
     action: Matrix | None = None
@@ -112,8 +113,11 @@ class AddQueries(Request):
 
 
 class AuditModel(AddQueries):
-    """Real steps that test a model where a policy goes. They cost none of the design's budget; all audits of a
-    surrogate together have as many steps as that, at most."""
+    """Real steps that compare the model with reality where a policy goes.
+
+    They don't count towards the design's budget. All audits of a surrogate together have at most as many steps as this
+    budget.
+    """
 
 
 class WithdrawQueries(Request):
@@ -125,7 +129,7 @@ class WithdrawnQueries(Reply):
 
 
 class NewSample(Request):
-    """One real step. ``coordinates`` and ``action`` are what was achieved, not what was asked for."""
+    """One real step. ``coordinates`` and ``action`` are the achieved values, not the requested ones."""
 
     query_id: Annotated[int, Field(ge=1)] | None = None
     lease_token: Key | None = None
@@ -160,7 +164,7 @@ class AddSamples(Request):
 
 
 class AddedSamples(Reply):
-    """Sent after the commit."""
+    """Reply after the samples are committed."""
 
     sample_ids: list[int]
     duplicates: int = Field(description="how many of them were already there")
@@ -192,7 +196,7 @@ class SamplePage(Reply):
 
 
 class ReportSteps(Request):
-    """Real steps taken outside the design: evaluation."""
+    """Real steps taken outside the design, in an evaluation."""
 
     purpose: Literal["evaluation"] = "evaluation"
     steps: Annotated[int, Field(ge=1, le=1_000_000_000)]
@@ -202,8 +206,10 @@ class ReportSteps(Request):
 
 
 class Improve(Request):
-    """Ask the design for more queries, chosen by the acquisition. The budget has to hold them; a token of role admin
-    raises it to."""
+    """Add queries to the design, chosen by the acquisition.
+
+    The budget must have enough steps left; with a token of role admin it is raised as needed.
+    """
 
     queries: Annotated[int, Field(ge=1, le=10_000, description="real steps: a rollout's count one by one")]
     checkpoint: Key | None = Field(default=None, description="weigh by the occupancy submitted under this name")

@@ -1,4 +1,4 @@
-"""The service itself: health and events."""
+"""Wire models of the server itself: health, access and events."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class Ready(Reply):
 
 
 class Access(Reply):
-    """What the caller may do."""
+    """Role of the caller, and what it may do."""
 
     role: Role
     tokens: bool = Field(description="whether the server has any tokens; where it has none, everybody is admin")
 
 
 class Event(Reply):
-    """One server-sent event of a surrogate; ``id`` grows, so a reader goes on with Last-Event-ID."""
+    """Server-sent event of a surrogate. Its ``id`` increases, so that a reader can continue with Last-Event-ID."""
 
     id: int
     kind: Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged", "policy"]

@@ -1,4 +1,4 @@
-"""Sessions: open, reset, step, rollout, occupancy."""
+"""Wire models of sessions: open, reset, step, rollout, occupancy."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OF_PARTICLES = ("particles", "propagation", "weighting", "spread")
 
 
 class OpenSession(Request):
-    """One trainer's virtual environment. None takes the preset's value."""
+    """Options of a session, one trainer's virtual environment. None takes the preset's value."""
 
     num_envs: Annotated[int, Field(ge=1, le=MAX_LANES)] = 1
     variant: Variant = "deterministic"
@@ -67,7 +67,7 @@ class OpenSession(Request):
 
     @model_validator(mode="after")
     def _particles_are_the_probabilistic_variants(self) -> Self:
-        """What another variant would ignore is refused."""
+        """Refuse options that the chosen variant would ignore."""
         for name in () if self.variant == "probabilistic" else OF_PARTICLES:
             if getattr(self, name) != type(self).model_fields[name].default:
                 raise ValueError(f"{name}: expected with variant probabilistic alone, got with {self.variant}")
@@ -120,7 +120,7 @@ class SessionView(Reply):
 
 
 class SessionActivity(Reply):
-    """What a session did since this process knows it."""
+    """Activity of a session since this server process knows it."""
 
     id: str
     num_envs: int
@@ -168,7 +168,8 @@ class StepSession(Request):
 
 
 class StepReply(Reply):
-    """``final`` holds the last observation of lanes that ended and were reset within this very step (same_step)."""
+    """Result of a step. ``final`` has the last observation of lanes that ended and were reset in this step (mode
+    same_step)."""
 
     seq: int
     observation: list[list[float]]
@@ -189,17 +190,18 @@ Numbers = Annotated[list[FiniteFloat], Field(min_length=1, max_length=MAX_UNITS)
 
 
 class PolicyLayer(Request):
-    """Inputs to outputs: x @ weights + bias."""
+    """One layer of a network: x @ weights + bias."""
 
     weights: Annotated[list[Numbers], Field(min_length=1, max_length=MAX_UNITS)] = Field(description="(I, O)")
     bias: Numbers = Field(description="(O,)")
 
 
 class PolicyArrays(Request):
-    """A network that acts on standardised observations; the session's action space says what its outputs mean.
+    """Network that acts on standardised observations. The session's action space determines what its outputs mean.
 
-    Continuous: the centre of the bounds plus half their width times tanh(y), plus noise, clipped to the bounds.
-    Discrete: scores of the choices of each entry. They are drawn by softmax with noise; the highest wins without.
+    Continuous actions: the centre of the bounds plus half their width times tanh(y), plus noise, clipped to the bounds.
+    Discrete actions: scores of the choices of each entry. With noise, choices are drawn by softmax; without, the
+    highest score wins.
     """
 
     mean: Numbers = Field(description="(D,) subtracted from an observation")
@@ -213,14 +215,14 @@ class PolicyArrays(Request):
 
 
 class ActionNoise(Request):
-    """The key of the noise of actions: the same key, lane and entry give the same number."""
+    """Key of the actions' noise. The same key, lane and entry give the same number."""
 
     seed: Seed
     step: Seed = Field(default=0, description="number of the rollout's first step; the next has the next number")
 
 
 class RolloutSession(Request):
-    """Either ``actions``, or a ``policy`` and ``steps``."""
+    """Rollout of given ``actions``, or of a ``policy`` for a number of ``steps``."""
 
     seq: Seq | None = None
     actions: Annotated[list[Actions], Field(min_length=1, max_length=MAX_ROLLOUT)] | None = Field(

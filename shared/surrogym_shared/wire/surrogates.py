@@ -1,4 +1,4 @@
-"""Surrogates: what is created, listed, changed."""
+"""Wire models of surrogates: create, list, change."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from surrogym_shared.wire.base import Phase, Reply, Request, SurrogateName
 
 
 class CreateSurrogate(Request):
-    model_config = ConfigDict(extra="forbid", strict=False)  # the specification brings its own strictness
+    model_config = ConfigDict(extra="forbid", strict=False)  # the specification validates its own types
 
     name: SurrogateName
     spec: EnvironmentSpec
 
 
 class PatchSurrogate(Request):
-    """What may change while the design runs; None leaves a field as it is. A budget of 0 asks for no real step."""
+    """Changes of a running design. None leaves a field as it is. With a budget of 0, the design takes no real step."""
 
     paused: bool | None = None
     budget: Annotated[int, Field(ge=0, le=100_000)] | None = None
@@ -31,7 +31,7 @@ class PatchSurrogate(Request):
 
 
 class OutputFidelity(Reply):
-    """How good the model of one output is; ``unit`` is the output's own."""
+    """How well one output is predicted. ``unit`` is the output's own."""
 
     name: str
     structure: str = Field(description="Chosen inputs and kernel, in words.")
@@ -63,11 +63,13 @@ class Fidelity(Reply):
 
 
 class Ledger(Reply):
-    """Acknowledged real steps by purpose. ``total`` is what the design cost: initial + adaptive + manual. Evaluation is
-    apart, and so are ``logged`` steps, which somebody recorded before: they cost no budget. ``unresolved`` counts the
-    steps that leases which ended without an answer may have taken, so the true number of real steps lies between total
-    and total + unresolved. ``failed`` of the unresolved ones were under leases that a sampler gave back with an error;
-    the rest ran out."""
+    """Acknowledged real steps by purpose.
+
+    ``total`` is the cost of the design: initial + adaptive + manual. It excludes evaluation, and ``logged`` steps,
+    which were recorded before and don't count towards the budget. ``unresolved`` counts steps that may have been taken
+    under leases that ended without an answer, so the true number of real steps is between total and total + unresolved.
+    ``failed`` of the unresolved ones were returned by a sampler with an error; the leases of the others expired.
+    """
 
     initial: int = 0
     adaptive: int = 0
@@ -117,13 +119,13 @@ class SurrogateView(SurrogateSummary):
 
 
 class CreatedSurrogate(SurrogateView):
-    """A surrogate that was registered."""
+    """Reply to a registration: the surrogate, and whether it is new."""
 
     created: bool = Field(description="whether this request made it; false: it was there, with the same specification")
 
 
 class ImprovedSurrogate(SurrogateView):
-    """A surrogate that was asked for more queries."""
+    """Reply to a request for more queries: the surrogate, and by how much its budget was raised."""
 
     budget_raised_by: int = Field(description="real steps that the request added to the budget; 0: it held them")
 
@@ -132,6 +134,6 @@ class SurrogateList(Reply):
     surrogates: list[SurrogateSummary]
     next_after: int | None = Field(
         default=None,
-        exclude_if=lambda after: after is None,  # a list that is whole is what clients know that follow no pages
+        exclude_if=lambda after: after is None,  # left out of a complete list, because older clients don't know pages
         description="give it as ``after`` for the next page; left out where this is the last",
     )
