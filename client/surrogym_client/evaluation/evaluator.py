@@ -185,7 +185,7 @@ class _Tally:
     moment: Moment
     total: float = 0.0
     length: int = 0
-    held: int = 0  # steps in a row for which the success criterion has held
+    held: int = 0  # number of last steps in a row that met the success criterion
     limit: int = field(init=False)
     path: list[Array] = field(default_factory=list)
     actions: list[Array] = field(default_factory=list)

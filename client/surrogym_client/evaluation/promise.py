@@ -63,7 +63,7 @@ class _Parts(NamedTuple):
     """Variation of returns, split into that of functions and that of starts."""
 
     functions: Array  # (functions,) mean returns, with the variance that the functions explain
-    within: float  # deviation of the returns of one function between starts
+    within: float  # standard deviation between starts of the returns along one function
 
 
 def _parts(returns: Array) -> _Parts:

@@ -1,8 +1,8 @@
-"""SessionEngine: where live sessions are. Compute: where rounds of designs are computed.
+"""SessionEngine: the port of live sessions. Compute: the port of computing rounds of designs.
 
 Requests and replies are data; an engine owns everything between them.
 
-The laws that stand in the docstrings are functions of ``surrogym_server.testing``.
+The laws in the docstrings are functions of ``surrogym_server.testing``.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from surrogym_server.engine.tallies import Counts, SessionActivity
 
 
 class SessionEngine(ABC):
-    """Sessions by id. The engine owns their models, locks, deadlines, visited states and tallies.
+    """Live sessions by id. The engine owns their models, locks, deadlines, visited states and tallies.
 
-    Laws: a request is carried out once. The same seq with the same body gets the same reply, bit for bit, also while
-    the first is being carried out; another seq, or another body, is a ``SeqConflict`` that names the expected seq. A
-    request that is refused takes no seq and changes nothing. Replies of a session depend on how it was opened, on its
-    seed and on its requests alone. Requests, replies and errors pickle.
+    Laws: a request is carried out once. The same seq with the same body gets the same reply, bit for bit, even while
+    the first is still running. Another seq, or another body, is a ``SeqConflict`` that names the expected seq. A
+    refused request uses no seq and changes nothing. Replies of a session depend only on how it was opened, on its seed
+    and on its requests. Requests, replies and errors pickle.
 
-    Every method that names a session raises ``UnknownSession`` or ``SessionExpired`` where there is none.
+    Every method that names a session raises ``UnknownSession`` or ``SessionExpired`` if the session does not exist.
     """
 
-    idle_seconds: float  # a session that is not used for so long expires
-    lasting: bool = False  # whether sessions live on when this process ends, and other processes find them
+    idle_seconds: float  # a session without requests for this long expires
+    lasting: bool = False  # whether sessions outlive this process, and other processes can use them
 
     @abstractmethod
     async def open(self, request: Open) -> SessionInfo:
-        """Open a session; the same idempotency key and opening again give the session that they opened.
+        """Open a session. The same idempotency key with the same opening returns the session that was opened first.
 
         Raises:
             NoModel, UnknownModel, NotInstalled, IdempotencyConflict, Overloaded: as the classes say.
@@ -51,17 +51,17 @@ class SessionEngine(ABC):
         """Reset, step or roll out.
 
         Raises:
-            SeqConflict: neither the next seq nor a repeat.
-            InvalidInput: wrong shape, not finite, out of bounds.
+            SeqConflict: the seq is neither the next one nor a repeat.
+            InvalidInput: the action has the wrong shape, is not finite, or is out of bounds.
             NotReset: a lane to step has not been reset.
             TooLarge: a rollout of too many steps.
             DeadlineExceeded: it would take longer than the caller waits, and was not begun.
-            Overloaded: too many requests are at work or waiting.
-            PluginFailed, NotInstalled: of the model's family.
+            Overloaded: too many requests are running or waiting.
+            PluginFailed, NotInstalled: from the model's family.
         """
 
     def try_now(self, request: Advance) -> Reply | None:
-        """The reply where it needs no waiting, not even for the event loop; else None, and nothing was done.
+        """Return the reply if that needs no waiting, not even for the event loop. Otherwise do nothing and return None.
 
         Raises as ``advance``.
         """
@@ -70,24 +70,24 @@ class SessionEngine(ABC):
 
     @abstractmethod
     async def describe(self, session: str) -> SessionInfo:
-        """A session as it is now."""
+        """Return the present state of a session."""
 
     @abstractmethod
     async def coordinates(self, session: str) -> Array:
-        """The coordinates of its lanes, (N, C)."""
+        """Return the coordinates of a session's lanes, (N, C)."""
 
     @abstractmethod
     async def submit(self, session: str) -> Visited:
-        """The states that a session visited, judged by its model.
+        """Return the states that a session visited, with the model's confidence over them.
 
         Raises:
-            InvalidInput: it was opened without occupancy.
-            NotReset: nothing was visited yet.
+            InvalidInput: the session was opened without occupancy.
+            NotReset: the session has visited no state yet.
         """
 
     @abstractmethod
     async def close(self, session: str) -> None:
-        """End a session; harmless where there is none."""
+        """End a session. An unknown session is ignored."""
 
     @abstractmethod
     async def forget(self, surrogate: int) -> None:
@@ -95,62 +95,62 @@ class SessionEngine(ABC):
 
     @abstractmethod
     async def activity(self, surrogate: str) -> list[SessionActivity]:
-        """What the open sessions of a surrogate are doing, oldest first."""
+        """Return the activity of a surrogate's open sessions, oldest first."""
 
     @abstractmethod
     def counts(self) -> Counts:
-        """What all sessions are doing together. Any thread may call."""
+        """Return counts over all sessions. Any thread may call this."""
 
     @abstractmethod
     async def sweep(self) -> None:
-        """Expire idle sessions, see which models were stored elsewhere, and end sessions of deleted surrogates."""
+        """Expire idle sessions, look for models stored by other processes, and end sessions of deleted surrogates."""
 
     @abstractmethod
     async def start(self) -> None:
-        """Get ready: called once, before the first request."""
+        """Prepare the engine. Called once, before the first request."""
 
     @abstractmethod
     async def stop(self) -> None:
-        """Carry out nothing more. What is being carried out ends, as ``Unavailable`` where it is long."""
+        """Refuse further requests. Running ones are completed; long ones end as ``Unavailable``."""
 
     @abstractmethod
     async def save(self) -> list[Saved]:
-        """All sessions as bytes; usually after ``stop``."""
+        """Return all sessions as bytes. Usually called after ``stop``."""
 
     @abstractmethod
     async def restore(self, request: Restore) -> None:
-        """Take a saved session back; its next reply is the same, bit for bit, as without the pause.
+        """Restore a saved session. Its next reply is the same, bit for bit, as without the interruption.
 
         Raises:
-            InvalidInput: saved by another version of this program.
+            InvalidInput: the session was saved by another version of this program.
             UnknownSession: its surrogate was deleted, and another one has its name.
-            Damaged: these are not the bytes that were saved.
-            TooLarge, Overloaded: it does not fit in.
+            Damaged: the bytes differ from those that were saved.
+            TooLarge, Overloaded: the session exceeds a limit of the engine.
         """
 
 
 class Compute(ABC):
-    """Where rounds of designs are computed, apart from sessions.
+    """Computation of design rounds, separate from sessions.
 
-    Laws: a result is that of ``run_design_job``, bit for bit. Jobs that are run at the same time do not wait for each
-    other. Whatever a job raises comes back as words, and ends nothing else. Cancelling ends the job, whatever it is
-    doing, and no other one.
+    Laws: a result equals that of ``run_design_job``, bit for bit. Jobs that run at the same time do not wait for each
+    other. Any error of a job returns as text, and ends nothing else. Cancelling ends the job at any point, and no other
+    one.
     """
 
     @abstractmethod
     def start(self) -> None:
-        """Get ready before the first job comes."""
+        """Prepare for the first job."""
 
     @abstractmethod
     async def run(self, job: DesignJob) -> DesignResult:
-        """Do a job.
+        """Run a job, and return its result.
 
         Raises:
-            Unavailable: it was lost and can't be done now: a process or machine that died.
-            PluginFailed: the job raised, whatever it was; notes have the traceback of what nobody raised on purpose.
-            ChoiceFailed: the job did.
+            Unavailable: the job was lost and can't run now, because a process or machine died.
+            PluginFailed: the job raised an error of any kind; notes have the traceback of unexpected ones.
+            ChoiceFailed: the job itself raised this.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """End all jobs; harmless when they have ended. In a thread."""
+        """End all jobs. Harmless if they have ended. Runs in a thread."""

@@ -1,6 +1,6 @@
-"""What only some families of models can do: each a class of its own that a model inherits beside ``DynamicsModel``.
+"""Abilities that only some families of models have. Each is a class that a model inherits besides ``DynamicsModel``.
 
-Who wants one asks ``offers``, and has a fallback, stated in the docstring of the ability.
+Code that uses an ability calls ``offers``, and has a fallback for models without it. The ability's docstring states it.
 
 Shapes as in ``models.port``; r reference points, b paths of T steps, N lanes, W numbers of a drawn function.
 """
@@ -24,26 +24,29 @@ A = TypeVar("A")
 
 
 def offers(model: DynamicsModel, ability: type[A]) -> A | None:
-    """The model as something that has this ability; None where its family has not."""
+    """Return the model as an object with this ability; None if its family lacks the ability."""
     return model if isinstance(model, ability) else None
 
 
 class FunctionDraws(ABC):
-    """Whole functions drawn from what the model believes, each consistent for a whole episode.
+    """Ability to draw whole functions from the posterior, each consistent for a whole episode.
 
-    Fallback of ``virtual``: one standard normal number for each transition output, kept for the episode, moves it by
-    as many deviations everywhere: the draws of outputs whose errors are the same wherever they are asked.
+    Fallback of ``virtual``: one standard normal number for each transition output is kept for the episode, and shifts
+    this output everywhere by as many standard deviations. These are the draws of outputs whose errors are the same at
+    all states.
     """
 
     @property
     @abstractmethod
     def path_size(self) -> int:
-        """How many standard normal numbers a draw takes, and how many it is, W."""
+        """Number of standard normal numbers that a draw takes, which is also the size of the draw, W."""
 
     @abstractmethod
     def draw(self, noise: Tensor) -> Tensor:
-        """Functions, one a row of standard normal ``noise`` (N, W): (N, W). A pure function of each row, but for the
-        last bits."""
+        """Draw functions (N, W), one from each row of standard normal ``noise`` (N, W).
+
+        Each draw is a pure function of its row, except for the last bits.
+        """
 
     @abstractmethod
     def transition_along(
@@ -56,89 +59,98 @@ class FunctionDraws(ABC):
         deviations: bool = False,
         reward_deviation: bool = False,
     ) -> Transition:
-        """``transition``, where every output follows a function of its own in each row: those of ``paths`` (m, W), of
-        which the first ``path_size`` columns count."""
+        """Predict as ``transition`` does, with each row along a drawn function of its own.
+
+        ``paths`` (m, W) are the functions; the first ``path_size`` columns are used.
+        """
 
 
 class UncertainHyperparameters(ABC):
-    """Functions drawn as if the hyperparameters were uncertain too, which few samples leave them.
+    """Ability to draw functions with uncertain hyperparameters. Few samples leave these uncertain.
 
-    Fallback of ``virtual``: the functions of ``FunctionDraws``, which take one optimum of them for certain.
+    Fallback of ``virtual``: the functions of ``FunctionDraws``, which are drawn with the optimal hyperparameters.
     """
 
     @property
     @abstractmethod
     def uncertain_functions(self) -> FunctionDraws:
-        """What draws them; the first call in a model's life may take as long as a fit of so few samples. Its compiled
-        steps, if any, are those of its own ``CompiledSteps``."""
+        """Return the object that draws these functions.
+
+        The model's first call may take as long as a fit. If the object has compiled steps, they are those of its own
+        ``CompiledSteps``.
+        """
 
 
 @dataclass(frozen=True)
 class LeaveOneOutErrors:
-    """How one output, learned without each sample in turn, foretells it."""
+    """Errors of one output when each sample in turn is predicted from all others."""
 
     error: float  # root mean square, in the output's unit
-    within_one: float  # share of the samples within one predictive deviation: 0.68 if it tells the truth
-    within_two: float  # 0.95
+    within_one: float  # share of the samples within one predictive deviation: 0.68 if the deviations are right
+    within_two: float  # the same within two: 0.95
 
 
 class LeaveOneOut(ABC):
-    """Errors on samples that are left out one by one.
+    """Ability to compute leave-one-out errors on the samples.
 
-    Fallback of ``sampling``: the errors are unknown, None in the fidelity. A design that stops by tested confidence
-    then never counts as ready, and spends its budget.
+    Fallback of ``sampling``: the errors are unknown, None in the fidelity. A design that requires tests on left-out
+    samples then never counts as ready, and spends its budget.
     """
 
     @abstractmethod
     def leave_one_out(self) -> tuple[LeaveOneOutErrors, ...]:
-        """Of each output, (O,). One that never varied makes no error."""
+        """Return the errors of each output, (O,). They are zero for an output that never varied."""
 
 
 class LearnedNoise(ABC):
-    """The noise of a single step that the model has learned beside the function.
+    """Ability to learn the noise of a single step together with the function.
 
-    Fallback of ``sampling``: there is none, and no step is taken twice.
+    Fallback of ``sampling``: the environment counts as noiseless, and no step is repeated.
     """
 
     @property
     @abstractmethod
     def noise_deviations(self) -> tuple[float, ...]:
-        """Its deviation for each output, in the output's unit, (O,)."""
+        """Standard deviation of each output's noise, in the output's unit, (O,)."""
 
 
 class OutputOutlook(ABC):
-    """One output at m candidates, in its own unit, as if some queries had been answered."""
+    """Forecast of one output's deviations at m candidates after some further queries, in the output's unit."""
 
-    learns: Tensor  # (m,) bool: whether a candidate's answer would teach this output anything
+    learns: Tensor  # (m,) bool: whether a sample at the candidate would improve this output
 
     @property
     @abstractmethod
     def deviation(self) -> Tensor:
-        """At the candidates, (m,)."""
+        """Return the standard deviations at the candidates, (m,)."""
 
     @abstractmethod
     def reduction(self, weights: Tensor) -> Tensor:
-        """How much each candidate's answer lowers the variance over the reference, weighted by weights (r,): (m,)."""
+        """Return how much a sample at each candidate lowers the variance over the reference points, weighted by
+        weights (r,): (m,)."""
 
     @abstractmethod
     def observe(self, index: int) -> OutputOutlook:
-        """As if the candidate ``index`` had been answered as well."""
+        """Assume that the candidate ``index`` has been sampled as well."""
 
 
 class PathOutlook(ABC):
-    """One output along b predicted paths of T steps."""
+    """Forecast of one output along b predicted paths of T steps."""
 
-    learns: Tensor  # (b, T) bool: whether a real step there would teach this output anything
+    learns: Tensor  # (b, T) bool: whether a real step there would improve this output
 
     @property
     @abstractmethod
     def deviation(self) -> Tensor:
-        """At each step, in the output's unit, (b, T)."""
+        """Return the standard deviation at each step, in the output's unit, (b, T)."""
 
     @abstractmethod
     def information(self, weight: Tensor, tolerance: float) -> Tensor:
-        """What the steps up to each one tell, in nats, (b, T), for weights (b, T) of the steps and a tolerance in the
-        output's unit. A step counts after those before it, so that a repeat tells little."""
+        """Return the information of the steps up to each one, in nats, (b, T).
+
+        The steps have weights (b, T), and the tolerance is in the output's unit. A step is evaluated given those before
+        it, so a repeated state adds little.
+        """
 
 
 @dataclass(frozen=True)
@@ -151,58 +163,63 @@ class PredictedSteps:
 
     @property
     def flat(self) -> PredictedSteps:
-        """The same steps in one row."""
+        """Return the same steps with a single leading dimension."""
         return PredictedSteps(*(tensor.flatten(0, -2) for tensor in (self.q, self.u, self.q_next)))
 
 
 class Lookahead(ABC):
-    """What further real steps would do to the deviations, before any of them is answered.
+    """Ability to forecast how further real steps would change the deviations, before they are taken.
 
-    Fallback of ``sampling``: an answer is taken to be correlated with what lies near it, by the distance in deviations
-    of the sampling range; along paths the steps count as if they were independent, and a plan does not change the
-    model for the next one.
+    Fallback of ``sampling``: a sample is assumed to be correlated with nearby points, by their distance in deviations
+    of the sampling range. Along paths the steps count as independent, and a planned path does not change the model for
+    the next one.
     """
 
     @abstractmethod
     def outlook(self, candidates: Points, reference: Points, assumed: Points) -> tuple[OutputOutlook | None, ...]:
-        """Every output (O,) at m candidates and r reference points, once the queries ``assumed`` are answered; None for
-        an output that never varied."""
+        """Forecast every output (O,) at m candidates and r reference points, once the queries ``assumed`` are answered.
+
+        An output that never varied has None.
+        """
 
     @abstractmethod
     def along(self, steps: PredictedSteps, column: int) -> PathOutlook | None:
-        """The output ``column`` along steps (b, T, ...); None for one that never varied."""
+        """Forecast the output ``column`` along steps (b, T, ...); None for an output that never varied."""
 
     @abstractmethod
     def as_if_answered(self, steps: PredictedSteps) -> DynamicsModel:
-        """The model as if real steps (T, ...) had been taken as predicted: deviations shrink, means stay."""
+        """Return the model as if real steps (T, ...) had been taken as predicted: deviations shrink, means stay."""
 
 
 class RewardEdges(ABC):
-    """Sets of states at whose edges the reward jumps.
+    """Ability to find sets of states at whose edges the reward jumps.
 
-    Fallback of ``sampling``: there are none, and no query is spent on them.
+    Fallback of ``sampling``: no edges are known, and no query is spent on them.
     """
 
     @abstractmethod
     def reward_edge_doubts(self, q: Tensor, q_next: Tensor) -> Iterator[Tensor]:
-        """For each edge the chance that the model errs about the side of steps from q (m, C) to q_next (m, C), (m,)."""
+        """Return for each edge the probability (m,) that the model has steps from q (m, C) to q_next (m, C) on the
+        wrong side."""
 
 
 class RewardPeaks(ABC):
-    """Rewards that are next to nothing nearly everywhere, learned so that where they are highest can be looked for.
+    """Ability to learn rewards that are nearly zero almost everywhere, so that the design can search for their peaks.
 
-    Fallback of ``sampling``: no query is spent on looking.
+    Fallback of ``sampling``: no query is spent on the search.
     """
 
     @property
     @abstractmethod
     def reward_hides(self) -> bool:
-        """Whether the reward is learned so, here."""
+        """Whether this model's reward was learned in this way."""
 
     @abstractmethod
     def promise(self, q: Tensor, u: Tensor) -> Tensor:
-        """How high the reward of steps from q (m, C) under u (m, F) may be, given what is not known, (m,): in any unit
-        that keeps the order, and tells points apart that are paid next to nothing."""
+        """Return how high the reward of steps from q (m, C) under u (m, F) may be, given the uncertainty, (m,).
+
+        The unit is free. The values keep the order of rewards, and distinguish points whose rewards are nearly zero.
+        """
 
 
 Floats = NDArray[np.float64]
@@ -210,16 +227,16 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ArrayTransition:
-    """Predicted step of m points, in arrays."""
+    """Predicted step from m points, as arrays."""
 
     q_next: Floats  # (m, C)
     reward: Floats  # (m,) as in ``Transition``
-    deviation: Floats  # (m, O) of what was asked for, the reward's last
+    deviation: Floats  # (m, O) of the requested outputs, the reward's last
     terminated: NDArray[np.bool_]  # (m,)
 
 
 class ArraySteps(ABC):
-    """``transition`` and ``terminated`` of one model, at once. Compared and hashed by identity."""
+    """``transition`` and ``terminated`` of one model in one call. Compared and hashed by identity."""
 
     definition: EnvironmentDefinition
 
@@ -235,20 +252,27 @@ class ArraySteps(ABC):
         deviations: bool,
         reward_deviation: bool,
     ) -> ArrayTransition:
-        """The step from q (m, C) under u (m, F), in rows; arguments as those of ``transition``, and ``paths``
-        (m, W) as in ``transition_along``, for a family that draws functions."""
+        """Predict the step from q (m, C) under u (m, F).
+
+        The arguments are those of ``transition``, and ``paths`` (m, W) as in ``transition_along`` for a family that
+        draws functions.
+        """
 
 
 class CompiledSteps(ABC):
-    """Steps by compiled code on arrays of the CPU: the same but for the last bits, in a tenth of the time of few rows.
+    """Ability to step by compiled code on CPU arrays. Results are the same except for the last bits. A few rows take a
+    tenth of the time.
 
     Fallback of ``virtual``: ``transition`` and ``terminated``.
     """
 
     @abstractmethod
     def compiled(self) -> ArraySteps | None:
-        """The model's compiled steps; None where this installation can't compile them, or the model is on another
-        device. The first call in a process loads compiled code, the first on a machine compiles it."""
+        """Return the model's compiled steps; None if this installation can't compile, or if the model is on another
+        device.
+
+        The first call in a process loads compiled code. The first call on a machine compiles it.
+        """
 
     @abstractmethod
     def compiled_pays(self, *, deviations: bool) -> bool:
@@ -256,7 +280,7 @@ class CompiledSteps(ABC):
 
 
 class Differentiable:
-    """Nothing to call: ``transition`` can be differentiated by autograd with respect to q and u.
+    """Mark of a model whose ``transition`` autograd can differentiate with respect to q and u. It has no methods.
 
     Fallback of ``gradients``: the search by gradients is refused in one sentence.
     """

@@ -1,8 +1,9 @@
-"""The port of dynamics models: what sampling, virtual, engine and services may know of a model.
+"""The port of dynamics models: all that sampling, virtual, engine and services know of a model.
 
-A family of models is three classes: a ``DynamicsModel``, the ``Learner`` that makes it from samples, and the
+A family of models is three classes: a ``DynamicsModel``, the ``Learner`` that fits it to samples, and the
 ``ModelCodec`` that turns it into named arrays and back. Their docstrings are the laws that every family keeps;
-``surrogym_server.testing`` checks them. What only some families can do is a class of its own in ``models.abilities``.
+``surrogym_server.testing`` checks them. Abilities of some families only are classes of their own in
+``models.abilities``.
 
 Shapes: m points, n samples, C coordinates, F action entries, M transition outputs, O = M + 1 outputs in the order of
 ``definition.outputs``: the increments, then the reward. Every tensor is float64 and lives on ``definition.device``.
@@ -24,37 +25,37 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples
 from surrogym_server.tensors import to_device
 
-Warm = Mapping[str, NDArray[np.float64]]  # what one fit leaves for the next, as named arrays
+Warm = Mapping[str, NDArray[np.float64]]  # named arrays that one fit leaves for a warm start of the next
 
 
 @dataclass(frozen=True)
 class Transition:
-    """Predicted step of m points."""
+    """Predicted step from m points."""
 
     q_next: Tensor  # (m, C)
-    reward: Tensor  # (m,) mean, without penalty and without what a step that ends the episode pays; see ``paid``
-    deviation: Tensor | None  # (m, M) of each transition output, if asked for
-    reward_deviation: Tensor | None  # (m,) if asked for
+    reward: Tensor  # (m,) mean, without the penalty and without the terminal reward; see ``paid``
+    deviation: Tensor | None  # (m, M) of each transition output, if requested
+    reward_deviation: Tensor | None  # (m,) if requested
 
 
 class DynamicsModel(ABC):
-    """One fit of one environment, ready to predict.
+    """Model of one environment, fitted and ready to predict.
 
     Laws:
 
-    - It is immutable, and a pure function of what it was learned from: the same call gives the same numbers.
-    - Predictions of a point do not depend on the points beside it, but for the last bits.
-    - Next states are where the environment can be: they have passed ``step_rules.settle``.
-    - Deviations are those of what the model does not know, in each output's own unit: finite, not negative, and
+    - It is immutable, and a pure function of its samples and settings: the same call gives the same numbers.
+    - Predictions of a point do not depend on the points beside it, except for the last bits.
+    - Next states are within the environment's limits: they have passed ``step_rules.settle``.
+    - Deviations are standard deviations of the unknown function, in each output's own unit: finite, not negative, and
       without the noise of a single step.
-    - What the definition declares is not learned: a declared reward is exact and deviates by 0.
+    - What the definition declares is not learned: a declared reward is exact and has a deviation of 0.
     - A frozen dataclass of tensors, tuples, mappings and dataclasses moves to a device by itself; other classes
       override ``on``.
     """
 
     definition: EnvironmentDefinition
-    terminal_reward: float  # what a step that ends the episode pays beyond the reward of ``transition``
-    samples: int  # how many it was learned from
+    terminal_reward: float  # added to the reward of ``transition`` in a step that ends the episode
+    samples: int  # number of samples of the fit
     digest: str  # ``Samples.digest`` of them
 
     @abstractmethod
@@ -68,30 +69,33 @@ class DynamicsModel(ABC):
         deviations: bool = False,
         reward_deviation: bool = False,
     ) -> Transition:
-        """The step from q (m, C) under u (m, F): the mean's, or one draw with noise.
+        """Predict the step from q (m, C) under u (m, F): by the mean, or as a draw if ``noise`` is given.
 
         Args:
-            q: where it begins.
-            u: the action, in the model's units.
-            noise: (m, M), standard normal: each transition output is mean + deviation * noise, instead of its mean;
-                one that reads the prediction of another reads its draw.
-            process: (m, M), standard normal: each is moved by its learned noise as well (w of eq. 2). A family that
-                learns no noise ignores it.
-            deviations: whether to give the deviations of the transition outputs.
-            reward_deviation: whether to give that of the reward.
+            q: coordinates before the step.
+            u: action, in the model's units.
+            noise: standard normal numbers (m, M). Each transition output is mean + deviation * noise instead of its
+                mean. An output that depends on the prediction of another uses the other's draw.
+            process: standard normal numbers (m, M). Each output is also moved by its learned noise (w of eq. 2). A
+                family that learns no noise ignores them.
+            deviations: whether to return the deviations of the transition outputs.
+            reward_deviation: whether to return the deviation of the reward.
         """
 
     @abstractmethod
     def means(self, q: Tensor, u: Tensor) -> Tensor:
-        """Mean of every output at q (m, C) and u (m, F), (m, O): increments before any limit, and the reward with what
-        an end pays."""
+        """Predict the mean of every output at q (m, C) and u (m, F), (m, O).
+
+        These are the increments before any limit is applied, and the reward including the terminal reward.
+        """
 
     @abstractmethod
     def learned_termination(self, q: Tensor) -> Tensor:
-        """How likely an episode ends on arriving at q (m, C), (m,), where that is learned; not called elsewhere."""
+        """Predict the probability (m,) that an episode ends on arriving at q (m, C). Only called if termination is
+        learned."""
 
     def termination_probability(self, q: Tensor) -> Tensor:
-        """How likely an episode ends on arriving at q (m, C), (m,): 0 or 1 where termination is declared."""
+        """Probability (m,) that an episode ends on arriving at q (m, C): 0 or 1 if termination is declared."""
         return self.learned_termination(q) if self.definition.learns_termination else self.terminated(q).to(q.dtype)
 
     def terminated(self, q: Tensor) -> Tensor:
@@ -103,26 +107,27 @@ class DynamicsModel(ABC):
     @property
     @abstractmethod
     def scales(self) -> Tensor:
-        """Deviation of each output's targets over the samples, (O,), in its own unit; 1 for one that never varied."""
+        """Standard deviation of each output over the samples, (O,), in its own unit; 1 for an output that never
+        varied."""
 
     @property
     @abstractmethod
     def structures(self) -> tuple[str, ...]:
-        """What represents each output, in a few words for people, (O,)."""
+        """Describe the structure of each output's model in a few words, (O,)."""
 
     @property
     @abstractmethod
     def description(self) -> dict[str, Any]:
-        """The model in detail, for people, as JSON: ``outputs``, one entry each, and whatever else there is to say."""
+        """Describe the model in detail as JSON: ``outputs`` with one entry each, and further fields of the family."""
 
     def on(self, device: torch.device) -> DynamicsModel:
-        """The same model with its arrays on a device."""
+        """Return the same model with its arrays on a device."""
         return self if device == self.definition.device else to_device(self, device)
 
 
 @dataclass(frozen=True)
 class Learned:
-    """A model, and named arrays for the next fit's warm start."""
+    """A fitted model, and named arrays for the warm start of the next fit."""
 
     model: DynamicsModel
     warm: dict[str, NDArray[np.float64]]
@@ -130,56 +135,64 @@ class Learned:
 
 @dataclass(frozen=True)
 class StoredModel:
-    """A model as data: a header that JSON can carry, and named tensors."""
+    """A model as data: a header that JSON can represent, and named tensors."""
 
     header: dict[str, Any]
     tensors: dict[str, Tensor]
 
 
 class ModelCodec(ABC):
-    """A model as data and back. Never a pickle, never code.
+    """Conversion of a family's models to data and back, without pickles and without code.
 
     Laws:
 
-    - ``decode(definition, encode(model))`` predicts what the model does, bit for bit, and recomputes nothing that
-      takes long.
-    - Names of the header are not ``family`` nor ``checksum``, which ``models.files`` writes; names of tensors do not
-      begin with ``samples.``, which files of whole surrogates use. Tensors are float64.
+    - ``decode(definition, encode(model))`` predicts the same as the model, bit for bit, and repeats no long
+      computation.
+    - The header has no entry ``family`` or ``checksum``, which ``models.files`` adds. Names of tensors do not begin
+      with ``samples.``, which files of whole surrogates use. Tensors are float64.
     """
 
     @abstractmethod
     def encode(self, model: DynamicsModel) -> StoredModel:
-        """All of a model but its definition. Raises TypeError for a model of another family."""
+        """Return all of a model except its definition.
+
+        Raises:
+            TypeError: the model belongs to another family.
+        """
 
     @abstractmethod
     def decode(self, definition: EnvironmentDefinition, stored: StoredModel) -> DynamicsModel:
-        """The model of a definition. What comes may be anybody's: every number and shape is checked.
+        """Rebuild the model of a definition. The data may come from anybody, so every number and shape is checked.
 
         Raises:
-            InvalidInput: well formed, and no model of this environment.
-            LookupError, TypeError, ValueError, AttributeError, OverflowError: malformed; the caller says so in words.
+            InvalidInput: the data are well formed, but not a model of this environment.
+            LookupError, TypeError, ValueError, AttributeError, OverflowError: the data are malformed; the caller turns
+                this
+                into a message.
         """
 
 
 class Learner(ABC):
-    """How a family learns. Its settings are the fields of a frozen dataclass: numbers, booleans and strings, as the
-    specification carries them; a setting that it can't take is a ValueError that says what it takes.
+    """Learning algorithm of a family of models.
+
+    Its settings are the fields of a frozen dataclass: numbers, booleans and strings, as in the specification. An
+    invalid setting raises a ValueError that says what is allowed.
 
     Laws:
 
-    - ``learn`` is a pure function of its arguments and the settings: what is random in it is seeded.
-    - A warm start changes how long a fit takes and which optimum it finds, not what it means; an empty one always
-      works. What is in it is named arrays of an earlier fit of the same definition, with fewer samples.
+    - ``learn`` is a pure function of its arguments and the settings: any randomness in it is seeded.
+    - A warm start changes how long a fit takes and which optimum it finds, not what the result means. An empty one
+      always works. It consists of named arrays of an earlier fit of the same definition, with fewer samples.
     """
 
     @property
     @abstractmethod
     def codec(self) -> ModelCodec:
-        """What stores this family's models."""
+        """Codec of this family's models."""
 
     @abstractmethod
     def learn(self, definition: EnvironmentDefinition, samples: Samples, warm: Warm | None = None) -> Learned:
-        """Fit transition and reward to samples, and where episodes end if that is not declared.
+        """Fit transition and reward to samples, and termination if that is not declared.
 
         Raises:
             InvalidInput: too few samples to learn from.

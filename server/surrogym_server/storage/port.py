@@ -1,17 +1,17 @@
-"""The storage port: everything Surrogym remembers. Its docstrings are laws that every adapter is tested by.
+"""The storage port: all data that the server keeps. Its docstrings are laws, by which every adapter is tested.
 
 For all of it:
 - an operation is atomic, and what it changed is durable when it returns;
 - any thread may call, and on PostgreSQL any number of servers;
-- time is the database's clock, and a lease ends by that clock alone, whoever died; where the clock was set back, no
-  lease lasts longer for it than it was given out for;
-- an operation on a surrogate that is not there raises ``UnknownSurrogate``;
+- time is the database's clock, and a lease ends by that clock alone, whichever process dies; if the clock is set back,
+  no lease lasts longer than it was given;
+- an operation on a surrogate that does not exist raises ``UnknownSurrogate``;
 - an operation that raises has changed nothing;
-- a repeat with the same idempotency ``key`` and the same arguments changes nothing and returns what the first
-  returned; with other arguments it raises ``IdempotencyConflict``;
+- a repeat with the same idempotency ``key`` and the same arguments changes nothing and returns the first result;
+  with other arguments it raises ``IdempotencyConflict``;
 - a database that can't be reached raises ``Unavailable``;
-- what is stored and can't be what was written raises ``Damaged``, which names it;
-- events are appended by the operations themselves; their ids grow in the order in which they become visible.
+- stored data that differ from what was written raise ``Damaged``, which names them;
+- events are appended by the operations themselves; their ids increase in the order in which they become visible.
 """
 
 from __future__ import annotations
@@ -54,9 +54,10 @@ class Surrogates(ABC):
 
     @abstractmethod
     def create(self, new: NewSurrogate) -> tuple[SurrogateRecord, bool]:
-        """Create a surrogate in phase ``collecting`` with its initial queries; says whether it is new.
+        """Create a surrogate in phase ``collecting`` with its initial queries, and return whether it is new.
 
-        A name that is taken returns what is there, unchanged, and False; whether it is the same is for the caller.
+        If the name is taken, return the existing surrogate unchanged, and False. The caller checks whether it is the
+        same.
         """
 
     @abstractmethod
@@ -64,17 +65,17 @@ class Surrogates(ABC):
 
     @abstractmethod
     def name_of(self, id: int) -> str:
-        """Raises ``UnknownSurrogate`` when it was deleted."""
+        """Return the name of a surrogate by its id. Raises ``UnknownSurrogate`` if it was deleted."""
 
     @abstractmethod
     def summary(self, name: str) -> SurrogateSummary: ...
 
     @abstractmethod
     def summaries(self, after: int = 0, limit: int | None = None) -> list[SurrogateSummary]:
-        """Up to ``limit`` surrogates with an id above ``after``, oldest first.
+        """Return up to ``limit`` surrogates with an id above ``after``, oldest first.
 
-        The number of statements does not depend on the number of surrogates. No model is loaded, and no specification
-        is parsed beyond the name of its environment.
+        The number of statements does not depend on the number of surrogates. No model is loaded, and of a specification
+        only the environment's name is parsed.
         """
 
     @abstractmethod
@@ -87,13 +88,16 @@ class Surrogates(ABC):
         target: float | None = None,
         tolerances: dict[str, float | None] | None = None,
     ) -> SurrogateRecord:
-        """Change what is not None; of ``tolerances`` those of the outputs named, of which None takes one back. Another
-        budget, target or tolerance, or resuming a failed design, makes a fit due. Resuming (``paused`` False, even
-        where it was not paused) asks the queries that were set aside again, each with ``MAX_ATTEMPTS`` more.
+        """Change the fields that are not None; of ``tolerances`` those of the named outputs.
 
-        What the design chose by another target or tolerance, or by a larger budget, is withdrawn as far as no sampler
-        has begun it, and a fit that is running loses its right: the next one judges and chooses anew. What ``ask``
-        asked for is asked for again, unless the budget is smaller; initial queries go only where they are beyond that.
+        A tolerance of None returns that output to its default. Another budget, target or tolerance, or resuming a
+        failed design, makes a fit due. Resuming (``paused`` False, even if it was not paused) retries the queries that
+        were set aside, each with ``MAX_ATTEMPTS`` more.
+
+        Queries that the design chose by another target or tolerance, or by a larger budget, are withdrawn if no sampler
+        has begun them. A running fit loses its right, and the next fit judges and chooses anew. Queries added by
+        ``improve`` are chosen again, unless the budget is smaller. Initial queries are withdrawn only if they exceed
+        the budget.
         """
 
     @abstractmethod
@@ -101,11 +105,11 @@ class Surrogates(ABC):
 
     @abstractmethod
     def delete(self, name: str) -> None:
-        """Remove the surrogate and all that belongs to it."""
+        """Delete the surrogate and everything that belongs to it."""
 
 
 class Designs(ABC):
-    """The right to fit: at any time at most one server fits a surrogate."""
+    """Right to fit: at any time at most one server fits a surrogate."""
 
     @abstractmethod
     def improve(
@@ -117,74 +121,80 @@ class Designs(ABC):
         key: str | None = None,
         raise_budget: bool = False,
     ) -> Granted:
-        """Ask the next fit for ``queries`` more, whatever its verdict; a fit becomes due.
+        """Let the next fit add ``queries`` more, even if the design is ready. A fit becomes due.
 
-        Counted in real steps: a rollout's are as many as its actions.
+        The number counts real steps: a rollout has as many as actions.
 
         Args:
-            raise_budget: raise the budget by what it has not ``left``.
+            raise_budget: raise the budget by the steps that are not ``left``.
 
         Raises:
-            BeyondBudget: the budget has not as many left, and may not be raised.
+            BeyondBudget: the budget has fewer steps left, and may not be raised.
         """
 
     @abstractmethod
     def left(self, name: str) -> int:
-        """Real steps of the budget that are neither taken, nor asked for by a query without an answer (open or set
-        aside), nor promised by ``ask``; 0 where there are more of these than the budget holds."""
+        """Return the number of real steps that the budget has left.
+
+        Steps that were taken, that unanswered queries (open or set aside) need, or that ``improve`` has promised are
+        subtracted. The result is 0 if they exceed the budget.
+        """
 
     @abstractmethod
     def due(self) -> list[str]:
-        """Names of the surrogates to fit now, oldest first.
+        """Return the names of the surrogates to fit now, oldest first.
 
-        Such a surrogate has samples, no pending or leased query, and something new since its last fit
-        (a sample, a query set aside, an ask, another budget or target, a damaged model). Where a log came in since,
-        it does not wait for queries. It isn't paused, and
-        nobody holds the right; one with more time left than it was given, as the clock was set back, is nobody's.
+        Such a surrogate has samples, no pending or leased query, and a change since its last fit (a sample, a query set
+        aside, an ``improve``, another budget or target, a damaged model). After a log has been imported, it does not
+        wait for queries. It is not paused, and no server holds the right to fit. A right with more time left than it
+        was given, because the clock was set back, counts as free.
         """
 
     @abstractmethod
     def hopeless(self) -> list[str]:
-        """Names of the surrogates that collect, are not paused, have neither samples nor open queries, and whose
-        queries were set aside: there is nothing to fit, and nothing to wait for. Oldest first."""
+        """Return the names of surrogates that can't continue, oldest first.
+
+        Such a surrogate is collecting and not paused, has neither samples nor open queries, and its queries were set
+        aside. So there is nothing to fit, and nothing to wait for.
+        """
 
     @abstractmethod
     def begin(self, name: str, owner: str, seconds: float) -> FitLease | None:
-        """Take the right to fit; the phase becomes ``fitting``. None when the surrogate is not due."""
+        """Take the right to fit. The phase becomes ``fitting``. Returns None if the surrogate is not due."""
 
     @abstractmethod
     def renew(self, lease: FitLease, seconds: float) -> FitLease:
-        """Hold the right until ``seconds`` from now.
+        """Extend the right to ``seconds`` from now. A right that has expired unnoticed is valid again.
 
         Raises:
-            LeaseExpired: another has taken it since. One that ended unnoticed comes back to life.
+            LeaseExpired: another server has taken the right since.
         """
 
     @abstractmethod
     def commit(self, lease: FitLease, design: NewDesign) -> int:
-        """Store model, state, phase and next queries together, and end the right; returns the version.
+        """Store model, state, phase and next queries together, and release the right. Returns the model's version.
 
-        The error is cleared. Queries get the new round and purpose ``adaptive``. What came in since ``begin``
-        makes the next fit due.
+        The error is cleared. Queries get the new round and purpose ``adaptive``. Samples that arrived since ``begin``
+        make the next fit due.
 
         Raises:
-            LeaseExpired: another has taken the right since.
+            LeaseExpired: another server has taken the right since.
         """
 
     @abstractmethod
     def abort(self, lease: FitLease, error: str | None) -> None:
-        """End the right without a model; harmless when it is gone.
+        """Release the right without a model. Harmless if the right is gone.
 
-        With an error the phase becomes ``failed``, and the next fit is due when something new comes. Without
-        one (a shutdown) the fit stays due.
+        With an error, the phase becomes ``failed``, and the next fit is due once something changes. Without one (a
+        shutdown), the fit stays due.
         """
 
 
 class Queries(ABC):
     """The queue of queries and their leases.
 
-    A query is pending, leased, answered or set_aside. A lease that fails or expires makes it pending again,
-    and the last of ``MAX_ATTEMPTS`` sets it aside. One that is given back unbegun is no attempt: no step was taken.
+    A query is pending, leased, answered or set_aside. A lease that fails or expires makes it pending again; after
+    ``MAX_ATTEMPTS`` it is set aside. A query that is returned before a real step does not count as an attempt.
     """
 
     @abstractmethod
@@ -198,8 +208,9 @@ class Queries(ABC):
         purpose: Purpose = "manual",
         key: str | None = None,
     ) -> list[int]:
-        """Queue queries by hand, or of an audit: steps from coordinates (m, C) under action (m, F), and rollouts of
-        action sequences, each (T, F); returns their ids.
+        """Queue queries by hand, or of an audit, and return their ids.
+
+        They are steps from coordinates (m, C) under action (m, F), and rollouts of action sequences, each (T, F).
 
         Raises:
             BeyondBudget: all audits of the surrogate together would have more steps than its budget, and than 64.
@@ -209,12 +220,12 @@ class Queries(ABC):
     def claim(self, name: str, sampler: str, limit: int, seconds: float) -> list[LeasedQuery]:
         """Lease up to ``limit`` pending queries for ``seconds``, oldest first, each to one caller only.
 
-        Expired leases are swept first. A paused surrogate hands out nothing.
+        Expired leases are ended first. A paused surrogate gives out no queries.
         """
 
     @abstractmethod
     def renew(self, name: str, query_id: int, token: str, seconds: float) -> float:
-        """Let the lease end ``seconds`` from now; returns when.
+        """Extend the lease to ``seconds`` from now, and return its end.
 
         Raises:
             UnknownQuery, ForeignLease: as the class says.
@@ -223,41 +234,41 @@ class Queries(ABC):
 
     @abstractmethod
     def fail(self, name: str, query_id: int, token: str, error: str, *, begun: bool = True) -> QueryRecord:
-        """End the lease with an error; the query goes to the next one or is set aside. A repeat is harmless.
+        """End the lease with an error. The query becomes pending again, or is set aside. A repeat is harmless.
 
-        ``begun``: a real step may have been taken, so that the ledger counts it as unresolved.
+        ``begun`` says that a real step may have been taken, so that the ledger counts it as unresolved.
 
         Raises:
-            UnknownQuery: no such query.
+            UnknownQuery: there is no such query.
             ForeignLease: the token was never given out for this query.
             LeaseExpired: the lease ended by its time or an answer.
         """
 
     @abstractmethod
     def withdraw(self, name: str, query_ids: Sequence[int]) -> int:
-        """Remove those of these queries that are pending and that no sampler has begun; returns how many."""
+        """Remove those of the queries that are pending and that no sampler has begun. Returns how many were removed."""
 
     @abstractmethod
     def get(self, name: str, query_id: int) -> QueryRecord:
-        """Raises ``UnknownQuery`` when there is none."""
+        """Return a query. Raises ``UnknownQuery`` if it does not exist."""
 
     @abstractmethod
     def list(self, name: str, statuses: Sequence[QueryStatus] = (), limit: int = 10_000) -> list[QueryRecord]:
-        """The queries of these statuses (none: all), oldest first."""
+        """Return the queries with these statuses (all if empty), oldest first."""
 
     @abstractmethod
     def counts(self, name: str) -> QueryCounts: ...
 
     @abstractmethod
     def sweep_expired(self) -> int:
-        """End the leases whose time has come, of all surrogates; returns how many.
+        """End the expired leases of all surrogates, and return how many there were.
 
-        One that has more time left than it was given has that time from now: the clock was set back.
+        A lease with more time left than it was given, because the clock was set back, gets that time from now.
         """
 
 
 class Samples(ABC):
-    """Samples: never changed, never lost once acknowledged."""
+    """Samples, which are never changed, and never lost once acknowledged."""
 
     @abstractmethod
     def add(
@@ -270,93 +281,99 @@ class Samples(ABC):
         logged: bool = False,
         complete: bool = True,
     ) -> AddedSamples:
-        """Store a batch, all or nothing, and answer the queries it names; committed when it returns.
+        """Store a batch of samples, all or nothing, and answer the queries that it names. It is committed when this
+        returns.
 
-        A sample takes the purpose of its query, or ``manual``. Under a lease that has ended (by its time or a
-        failure) it is kept and flagged late; it still answers the query unless another lease of it is live.
-        Under one lease there is one answer: a sample, or the first samples of a rollout, ``step`` 0, 1, ... up to the
-        query's ``steps``. The same again is a duplicate and gets the same id.
+        A sample takes the purpose of its query, or ``manual``. Under a lease that has ended (by its time or a failure)
+        it is kept and flagged late. It still answers the query unless another lease of the query is live. Each lease
+        has one answer: a sample, or the first samples of a rollout, with ``step`` 0, 1, ... up to the query's
+        ``steps``. Sending it again is a duplicate and gets the same id.
 
-        ``logged`` samples answer no query, and count apart from the budget. One that equals a logged sample of the
-        surrogate in every number is a duplicate, whatever batch it came in. While a log is not ``complete``, no fit
-        becomes due for what has come of it.
+        ``logged`` samples answer no query, and don't count towards the budget. One that equals a logged sample of the
+        surrogate in every number is a duplicate, even from another batch. Until a log is ``complete``, its samples make
+        no fit due.
 
         Raises:
-            UnknownQuery: no such query.
-            ForeignLease: a lease token that was never given out for the query, or none.
-            InvalidInput: a logged sample that names a query, or an answer that lacks a step or has more than the query
-                asked for.
-            IdempotencyConflict: the same lease token, or key, with another sample.
+            UnknownQuery: there is no such query.
+            ForeignLease: a lease token is missing, or was never given out for the query.
+            InvalidInput: a logged sample names a query, or an answer lacks a step or has more steps than the query.
+            IdempotencyConflict: the same lease token, or key, came with another sample.
         """
 
     @abstractmethod
     def arrays(self, name: str) -> SampleArrays:
-        """All samples, in order of arrival."""
+        """Return all samples, in order of arrival."""
 
     @abstractmethod
     def page(self, name: str, after: int, limit: int) -> list[SampleRecord]:
-        """Up to ``limit`` samples with an id above ``after``, in order."""
+        """Return up to ``limit`` samples with an id above ``after``, in order."""
 
     @abstractmethod
     def count(self, name: str) -> int: ...
 
     @abstractmethod
     def reward_range(self, name: str) -> tuple[float, float] | None:
-        """The least and the largest reward; None without samples."""
+        """Return the smallest and the largest reward; None without samples."""
 
 
 class Ledger(ABC):
-    """Real steps by purpose."""
+    """Counts of real steps by purpose."""
 
     @abstractmethod
     def report(self, name: str, steps: int, *, key: str, episodes: int = 0, note: str = "") -> LedgerRecord:
-        """Count evaluation steps, once per key; returns the ledger as it is now."""
+        """Count evaluation steps, once per key, and return the updated ledger."""
 
     @abstractmethod
     def read(self, name: str) -> LedgerRecord: ...
 
 
 class Models(ABC):
-    """Models by version: 1, 2, ... of each surrogate. ``None`` is the latest that is not set aside."""
+    """Models by version: 1, 2, ... for each surrogate. ``None`` is the latest that is not set aside."""
 
     @abstractmethod
     def list(self, name: str) -> list[ModelRecord]:
-        """All of them, oldest first."""
+        """Return all models of a surrogate, oldest first."""
 
     @abstractmethod
     def get(self, name: str, version: int | None = None) -> ModelRecord:
-        """Raises ``UnknownModel`` for a version that is not there, ``NoModel`` when there is none at all."""
+        """Return a model's record.
+
+        Raises:
+            UnknownModel: there is no such version.
+            NoModel: there is no model at all.
+        """
 
     @abstractmethod
     def newest(self) -> dict[int, int]:
-        """The newest version that is not set aside of each surrogate that has one, by the surrogate's id."""
+        """Return the newest version that is not set aside, for each surrogate that has one, by the surrogate's id."""
 
     @abstractmethod
     def blob(self, name: str, version: int | None = None) -> bytes:
-        """The model itself, as it was given. Raises as ``get``.
+        """Return the stored bytes of a model. Raises as ``get``.
 
         Raises:
-            Damaged: it is no longer what was given.
+            Damaged: the bytes differ from those that were stored.
         """
 
     @abstractmethod
     def set_aside(self, name: str, version: int, damage: str) -> bool:
-        """Note that a version is damaged: the one before it is the newest then, and a fit becomes due.
+        """Mark a version as damaged. The version before it becomes the newest, and a fit becomes due.
 
-        Says whether that was new; a repeat changes nothing, and no version's number is used again.
+        Returns whether the mark is new. A repeat changes nothing, and no version number is used again.
         """
 
     @abstractmethod
     def add(self, name: str, model: NewModel) -> int:
-        """Import a model as the newest version; returns it. The design is not touched."""
+        """Store an imported model as the newest version, and return it. The design is not changed."""
 
 
 class Occupancy(ABC):
-    """States that policies visited, by checkpoint."""
+    """Occupancies: states that policies visited, by checkpoint."""
 
     @abstractmethod
     def put(self, name: str, checkpoint: str, states: Array) -> None:
-        """Store states (m, C) under a name; the same name again replaces them and makes them the latest."""
+        """Store states (m, C) under a checkpoint. Storing the same checkpoint again replaces them and makes them the
+        latest."""
 
     @abstractmethod
     def get(self, name: str, checkpoint: str) -> OccupancyRecord | None: ...
@@ -370,23 +387,23 @@ class Sessions(ABC):
 
     @abstractmethod
     def save(self, sessions: Sequence[SavedSession]) -> None:
-        """Store them; the same id again replaces."""
+        """Store sessions. One with the same id is replaced."""
 
     @abstractmethod
     def take(self) -> list[SavedSession]:
-        """Return and remove them: each is given out once."""
+        """Return all saved sessions and remove them, so that each is given out once."""
 
 
 class Events(ABC):
-    """What happened to a surrogate."""
+    """Events of a surrogate."""
 
     @abstractmethod
     def list(self, name: str, after: int = 0, limit: int = 1_000) -> list[EventRecord]:
-        """Up to ``limit`` events with an id above ``after``, in order."""
+        """Return up to ``limit`` events with an id above ``after``, in order."""
 
 
 class Storage(ABC):
-    """All of it. ``open_storage`` makes one."""
+    """All parts of the storage. ``open_storage`` makes one."""
 
     surrogates: Surrogates
     designs: Designs
@@ -402,12 +419,12 @@ class Storage(ABC):
 
     @abstractmethod
     def ping(self) -> None:
-        """Return when all tables are there and the database takes writes; costs a caller little, however often it asks.
+        """Check that all tables exist and that the database accepts writes. Frequent calls cost little.
 
         Raises:
-            Unavailable: it does not, or a write takes longer than a caller should wait.
+            Unavailable: the check fails, or a write takes longer than a caller should wait.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Give up connections and locks; closing twice is harmless."""
+        """Release connections and locks. Closing twice is harmless."""

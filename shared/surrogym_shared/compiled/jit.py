@@ -59,7 +59,7 @@ def entry(*arguments: Any) -> Callable[[F], F]:
 
 @contextmanager
 def _kept_in(folder: Path) -> Iterator[None]:
-    """Set numba's cache folder. Numba reads it when a function is declared."""
+    """Context in which numba caches in this folder. Numba reads the setting when a function is declared."""
     before, settings.CACHE_DIR = settings.CACHE_DIR, str(folder)
     try:
         yield
