@@ -34,7 +34,7 @@ class NoiseKey(NamedTuple):
     step: int = 0
 
     def later(self, steps: int) -> NoiseKey:
-        """Return the key of the noise that begins ``steps`` later."""
+        """Return the key of a rollout that begins ``steps`` steps after this one."""
         return NoiseKey(self.seed, self.step + steps)
 
 
@@ -62,7 +62,7 @@ class KeyedGenerator:
 
 @dataclass(frozen=True)
 class ActingPolicy:
-    """Network that acts. The action space determines what its outputs mean.
+    """Policy network as plain arrays. The action space determines what its outputs mean.
 
     All arrays are float32 or all are float64, and the network computes in this precision.
 
@@ -233,7 +233,7 @@ def layers_of(sizes: Sequence[int], vector: Array) -> tuple[Layer, ...]:
 
 
 def parameters_of(observation: int, units: Sequence[int]) -> int:
-    """Number of weights and biases of layers with these numbers of units."""
+    """Number of weights and biases of a network, given its observation entries and the units of each layer."""
     return sum((inputs + 1) * outputs for inputs, outputs in pairwise((observation, *units)))
 
 

@@ -16,12 +16,13 @@ model_version                             (N,)         int64
 deviation                                 (N, O)       float64
 ========================================  ===========  ==============================
 
-A rollout of a policy, ``op`` policy, carries the policy in its precision, float32 or float64: mean and deviation (D,),
-``parameters``, which are weights (I, O) and bias (O,) of each layer one after the other, and log_deviations (F,); and
-``until`` (N,) as bool. Its reply has the arrays above with T in front, action (T, N, F) and log_probability (T, N), and
-final_steps (K,) as int64 beside final_lanes. It leaves out what follows from the rest, and loses no bit by that: action
-and log_probability are float32 where that holds them (``precision``), reward_mean comes where it is not the reward, and
-model_version is (N,) where it never changes.
+A rollout of a policy has ``op`` policy. Its arrays of the policy have the policy's precision, float32 or float64: mean
+and deviation (D,), log_deviations (F,), and ``parameters``: weights (I, O) and bias (O,) of each layer in order.
+``until`` (N,) is bool.
+
+The reply has the arrays above with a leading T, action (T, N, F), log_probability (T, N), and final_steps (K,) as int64
+beside final_lanes. To save bytes without a loss, action and log_probability are float32 if that represents them exactly
+(``precision``), reward_mean is left out if it equals the reward, and model_version is (N,) if it never changes.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ class Layer(NamedTuple):
 
 
 class _Head(BaseModel):
-    """JSON head of a file. Version 1 had one hidden layer of tanh."""
+    """JSON header in the file of a policy network. Version 1 has one hidden layer of tanh."""
 
     version: Literal[1, 2]
     counts: tuple[PositiveInt, ...]

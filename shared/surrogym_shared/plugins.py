@@ -81,7 +81,7 @@ class Registry(Generic[T]):
         return next((why for known, why in self.broken.items() if known.casefold() == name.casefold()), None)
 
     def name_of(self, name: str) -> str:
-        """Return a name in the registry's spelling. Other packages are loaded only if it is not built in.
+        """Return the registered spelling of a name. Other packages are loaded only if the name is not built in.
 
         Raises:
             UnknownMember: no class has this name.

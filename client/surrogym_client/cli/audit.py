@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add ``surrogym audit`` to the app."""
     add(app, "audit", command)
 
 

@@ -17,7 +17,7 @@ USUAL = "=usual"  # returns an output to its default tolerance
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add ``surrogym change`` to the app."""
     add(app, "change", command)
 
 

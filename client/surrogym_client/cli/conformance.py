@@ -10,7 +10,7 @@ from surrogym_client.cli.groups import Output, Service, add
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add ``surrogym conformance`` to the app."""
     add(app, "conformance", command)
 
 

@@ -11,7 +11,7 @@ from surrogym_client.cli.options import Surrogate
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add ``surrogym delete`` to the app."""
     add(app, "delete", command)
 
 

@@ -29,7 +29,7 @@ Algorithm = Annotated[str | None, typer.Option(help="Policy search, as in surrog
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add ``surrogym demo`` to the app."""
     app.command("demo")(command)
 
 

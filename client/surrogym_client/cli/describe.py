@@ -11,7 +11,7 @@ from surrogym_client.cli.options import AsJson, Quiet
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add ``surrogym describe`` to the app."""
     add(app, "describe", command)
 
 

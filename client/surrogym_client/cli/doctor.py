@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add ``surrogym doctor`` to the app."""
     add(app, "doctor", command)
 
 

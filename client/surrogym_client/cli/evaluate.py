@@ -58,7 +58,7 @@ Compared = Annotated[
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add ``surrogym evaluate`` to the app."""
     add(app, "evaluate", command)
 
 

@@ -11,7 +11,7 @@ from surrogym_client.cli.groups import Output, PolicyReading, add
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add ``surrogym export-policy`` to the app."""
     add(app, "export-policy", command)
 
 

@@ -70,7 +70,7 @@ class OfLogs:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add ``surrogym import`` to the app."""
     add(app, "import", command)
 
 
@@ -189,9 +189,8 @@ def _draw(log: ReadLog, file: Path) -> None:
 
 
 def _again(context: typer.Context, log: OfLogs) -> str:
-    """Return the command that stores the log, with the options of this one. It reads the drafted specification, as
-    edited.
-    """
+    """Return the command line that repeats this import and stores the log. It reads the drafted specification, as
+    edited."""
     without = ["token", "as_json", "quiet", *(["draft"] if log.draft is not None else [])]
     drafted = "" if log.draft is None else f" --spec {shlex.quote(str(log.draft))}"
     if drafted:

@@ -17,7 +17,7 @@ HEADING = ("policy", "aliases", "algorithm", "promise", "trusted", "real return 
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add ``surrogym policies`` to the app."""
     add(app, "policies", command)
 
 

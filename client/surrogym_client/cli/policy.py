@@ -36,7 +36,7 @@ class PolicyGroup(TyperGroup):
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command and its subcommands."""
+    """Add ``surrogym policy`` and its subcommands to the app."""
     parts = typer.Typer(
         cls=PolicyGroup,
         help="Show, store, download, name or delete a policy.\n\nExample: surrogym policy pendulum@3",

@@ -12,7 +12,7 @@ from surrogym_client.cli.options import Surrogate
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add ``surrogym report`` to the app."""
     add(app, "report", command)
 
 

@@ -47,7 +47,7 @@ TimeLimit = Annotated[
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add ``surrogym sample`` to the app."""
     add(app, "sample", command)
 
 

@@ -26,7 +26,7 @@ FIDELITY = (
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add ``surrogym status`` to the app."""
     add(app, "status", command)
 
 

@@ -40,7 +40,7 @@ NOTHING_YET = "interrupted before there was a policy; nothing was saved, and the
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add ``surrogym train`` to the app."""
     add(app, "train", command)
 
 
@@ -117,7 +117,7 @@ def _settings(search: SearchOptions, session: SessionOptions, start: StartOption
 
 
 def _import(algorithm: str, *, quiet: bool) -> None:
-    """Import the packages of the search, and show on the terminal what takes the time."""
+    """Import the packages of the policy search, and show on the terminal what takes the time."""
     from surrogym_client.training.search import SEARCHES
     from surrogym_shared.terminal import on_interrupt, progress
 

@@ -14,8 +14,8 @@ ENTRY_POINTS = "surrogym.ports"  # implementations that step a surrogate in this
 
 
 def open_file(path: str | Path) -> SurrogatePort:
-    """Open a surrogate's file and step it in this process. The same seeds give the same steps as on a server, bit for
-    bit.
+    """Open a surrogate's file and step it in this process, without a server. The same seeds give the same steps, bit
+    for bit.
 
     Raises:
         ImportError: the extra ``server`` is missing.

@@ -212,7 +212,7 @@ class Lanes:
         )
 
     def _ended(self, result: StepResult, cut: Bools) -> StepResult:
-        """End the episodes of the cut lanes as truncated, as the autoreset mode says."""
+        """End the episodes of the lanes in ``cut`` as truncated, in the form of the session's autoreset mode."""
         if self.mode == "same_step":
             lanes = np.concatenate([result.final_lanes, np.flatnonzero(cut)])
             final = np.concatenate([result.final_observation, self._observation[cut]])

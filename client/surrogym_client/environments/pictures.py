@@ -55,7 +55,7 @@ class Pictures:
 
 
 def pictures_for(render_mode: str | None, spec: EnvironmentSpec, original: str | None) -> Pictures | None:
-    """Return an object that draws in this render mode; None without a render mode.
+    """Return an object that draws in the given render mode; None without a render mode.
 
     Raises:
         ValueError: an unknown render mode.

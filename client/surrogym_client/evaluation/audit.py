@@ -32,8 +32,7 @@ class Compared:
         errors: real minus predicted values (n, O), in each output's unit.
         deviations: predicted standard deviations of the function (n, O), without noise.
         expected: error (O,) that the model allows in addition: its tolerance, or its leave-one-out error if that is
-            larger,
-            which includes the noise; for the reward at least the error that matters for the return.
+            larger, which includes the noise; for the reward at least the error that matters for the return.
         misplaced: number of steps whose termination was predicted wrongly.
         length: mean number of steps of an episode; 0 if unknown.
         noise: standard deviation of the noise of a single step (O,), included in ``expected``; empty without noise.

@@ -40,7 +40,7 @@ class Step(Protocol):
 def compared(
     api: Api, spec: EnvironmentSpec, view: SurrogateView, samples: Sequence[Step], matters: float = 0.0
 ) -> Compared:
-    """Predict real steps with the model of ``view``, which had not seen them, and return both.
+    """Return real steps together with the predictions of the model of ``view``, which was not fitted to them.
 
     Errors of the reward below ``matters`` don't count.
     """
@@ -67,8 +67,7 @@ def compared(
 
 
 def _expected(claim: OutputFidelity, matters: float) -> float:
-    """Error of an output that is not a fault: within its tolerance, explained by left-out samples, or without
-    effect."""
+    """Error of an output that the model allows: its tolerance, its error on left-out samples, or one without effect."""
     return max(claim.tolerance, claim.leave_one_out_error or 0.0, matters)
 
 

@@ -136,7 +136,8 @@ def _rolled(lanes: Lanes, policy: ActingPolicy, seed: int | Sequence[int], sums:
 
 
 def _as_arrays(predict: Callable[[NDArray[Any]], NDArray[Any]], port: SurrogatePort) -> ActingPolicy | None:
-    """Return the policy as arrays for the surrogate's side; None if it has no such form or acts within other bounds."""
+    """Return the policy in the form of arrays, with which the surrogate's side can act; None if it has no such form
+    or acts within other bounds."""
     if not isinstance(predict, Network) or not isinstance(port, PolicyPort):
         return None
     spec = port.spec()
@@ -150,7 +151,7 @@ def _as_arrays(predict: Callable[[NDArray[Any]], NDArray[Any]], port: SurrogateP
 
 
 def _added(sums: NDArray[np.float64], rows: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Add rows (T, N) to sums (N,) one after the other, which gives the same bits for any T."""
+    """Add rows (T, N) to sums (N,) one row at a time, so that rounding does not depend on T."""
     added: NDArray[np.float64] = np.cumsum(np.concatenate([sums[None], rows]), axis=0)[-1]
     return added
 

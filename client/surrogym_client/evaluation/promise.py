@@ -34,8 +34,7 @@ def promise_of(port: SurrogatePort, predict: Predict, seed: int, session: Mappin
         predict: the policy; function from observations (N, D) to actions.
         seed: seed of functions and starts.
         session: fields of ``OpenSession`` that the policy was trained with. Its variant with its options, and the
-            penalty,
-            are ignored.
+            penalty, are ignored.
     """
     left_out = {"variant", "penalty", *OF_PARTICLES}
     options = {name: value for name, value in (session or {}).items() if name not in left_out}

@@ -35,7 +35,7 @@ Form = Callable[[ExportedProgram], bytes]
 
 
 class NotExportable(SurrogymClientError):
-    """The policy can't be converted to this form."""
+    """The policy can't be converted to ONNX or torch.export."""
 
 
 class MostProbable(nn.Module):
@@ -186,8 +186,8 @@ def _difference(ours: Predict, theirs: Predict, size: int) -> float:
 
 @contextmanager
 def _quietly() -> Iterator[None]:
-    """Silence warnings of the exporters, and turn off the checks of distributions, whose numbers are not known
-    during export."""
+    """Silence warnings of the exporters. Also turn off the checks of distributions, whose numbers are unknown in an
+    export."""
     checked = torch.distributions.Distribution._validate_args
     logging.disable(logging.WARNING)
     torch.distributions.Distribution.set_default_validate_args(False)

@@ -31,7 +31,8 @@ class ReplaySettings(BaseModel):
 
 
 class PolicySettings(BaseModel):
-    """Accepted entries of a file, by the names of the algorithm's attributes. None or absent means the default."""
+    """Accepted entries of a policy's file, by the names of the algorithm's attributes. None or absent means the
+    default."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, strict=True, allow_inf_nan=False)
 

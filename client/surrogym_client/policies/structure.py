@@ -80,7 +80,7 @@ class Structure(BaseModel):
     train_freq: tuple[int, Literal["step", "episode"]] | None = None
 
     def objects(self) -> dict[str, Any]:
-        """Return the attributes of the algorithm that this describes."""
+        """Attributes of the algorithm that the description contains."""
         chosen = {
             "features_extractor_class": Standardise,
             "net_arch": self.net_arch,
@@ -103,7 +103,7 @@ class Structure(BaseModel):
 
     @property
     def weights(self) -> int:
-        """Smallest number of weights that a network of these layers has."""
+        """Smallest number of weights of a network with the described layers."""
         inputs, arch = len(self.observation_space.low), self.net_arch
         parts = {"pi": arch} if isinstance(arch, list) else dict(arch)
         actor, others = parts.pop("pi", []), parts.values()
@@ -185,7 +185,7 @@ def read(path: Path, *, num_envs: int, replaced: set[str]) -> tuple[io.BytesIO, 
 
 
 def _settings(data: Mapping[str, Any], replaced: set[str]) -> PolicySettings:
-    """Return the settings of a file, except those that are replaced."""
+    """Return the settings in a policy's file, except those that the caller or the description replaces."""
     try:
         return PolicySettings.model_validate({name: value for name, value in data.items() if name not in replaced})
     except ValidationError as error:

@@ -38,7 +38,7 @@ class Failures:
         return min(FIRST_DELAY * 2 ** (self._later - 1), LONGEST_DELAY) if self._later else 0.0
 
     def check(self, waiting: Iterable[int]) -> None:
-        """Check the machine before queries of these ids begin.
+        """Check that the machine is not broken, before queries with the given ids begin.
 
         Raises:
             MachineFails: it failed at too many different queries, or it never answered and failed at all queries there

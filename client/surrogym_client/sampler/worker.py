@@ -265,8 +265,7 @@ class Sampler:
 
         Raises:
             ServerUnreachable, Unavailable: no answer for longer than ``PATIENCE``, or than ``once_stopped`` seconds
-                after
-                ``stop``.
+                after ``stop``.
         """
         delays, stopped = PATIENCE.delays(), None
         while True:

@@ -89,7 +89,7 @@ def wait_for_design(
 def wait_for_answers(
     api: Api, name: str, queries: set[int], seconds: float, progress: Callable[[SurrogateView], None] | None = None
 ) -> None:
-    """Wait until samplers have answered these queries, or given up on them.
+    """Wait until samplers have answered the given queries, or given up on them.
 
     Raises:
         NobodyAnswers: no sampler has begun any of them after ``FIRST_LEASE_SECONDS``.

@@ -1,4 +1,4 @@
-"""A training that audits its policy, and continues if the audit fails."""
+"""A training that audits its policy, and continues if the audit fails or lowers the promise clearly."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class AuditedTraining:
     candidates: Candidates = field(default_factory=Candidates, init=False)
 
     def train(self) -> tuple[TrainResult, Handover]:
-        """Train, audit, and train further if the audit fails.
+        """Train and audit, and train further if the audit fails or lowers the promise clearly.
 
         Raises:
             DesignUnfinished: queries were not answered in time.

@@ -60,7 +60,8 @@ class Gradients(PolicySearch):
         return Found(found.policy, found.virtual_steps, found.imagined_return, ran_with, whole=found.whole)
 
     def _settings(self, library: Any, task: SearchTask) -> Any:
-        """Return settings with as many updates as the steps allow, after those of the checks."""
+        """Return settings with as many updates as the steps of the task allow. The steps of checks are subtracted
+        first."""
         limit = task.port.spec().time_limit or LONGEST_EPISODE
         third = min(max(limit // 3, library.SHORTEST_HORIZON), library.LONGEST_HORIZON)
         horizon = min(self.horizon or third, limit)
@@ -77,7 +78,7 @@ def _require_plain(task: SearchTask) -> None:
 
 
 def _library() -> Any:
-    """Return the module of the server's package that contains the search.
+    """Return the module of the server's package that contains the search by gradients.
 
     Raises:
         ModuleNotFoundError: the extra ``server`` is not installed.
@@ -87,7 +88,7 @@ def _library() -> Any:
 
 
 def _with_model(port: SurrogatePort) -> Any:
-    """Return a surrogate whose model is in this process. It is fetched from the server if necessary."""
+    """Return a surrogate whose model is in this process. The model is fetched from the server if necessary."""
     if not isinstance(port, HttpSurrogate):
         if hasattr(port, "model"):
             return port

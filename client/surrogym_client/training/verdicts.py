@@ -93,7 +93,8 @@ class Verdicts:
 
     @property
     def saturated(self) -> bool:
-        """Whether no further gain is possible: in the last checks, each episode earned as much as the best one ever."""
+        """Whether no further gain is possible: in the last checks, each episode's return equalled the best one so
+        far."""
         return self._full >= SATURATED
 
     def prolong(self) -> bool:

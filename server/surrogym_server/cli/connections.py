@@ -157,5 +157,6 @@ class Patient(HttpToolsProtocol):
 
 
 def patient(seconds: float, most: int) -> type[HttpToolsProtocol]:
-    """Return the class ``Patient`` with these limits set, as uvicorn expects a class."""
+    """Return a subclass of ``Patient`` with limits on time (s) and connections. uvicorn takes a class, not an
+    object."""
     return type("Patient", (Patient,), {"seconds": seconds, "most": most})

@@ -153,4 +153,4 @@ class Compute(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """End all jobs. Harmless if they have ended. Runs in a thread."""
+        """End all jobs. Harmless if they have ended. Callers run it in a thread, because it may block."""

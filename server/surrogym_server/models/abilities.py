@@ -66,7 +66,7 @@ class FunctionDraws(ABC):
 
 
 class UncertainHyperparameters(ABC):
-    """Ability to draw functions with uncertain hyperparameters. Few samples leave these uncertain.
+    """Ability to draw functions with uncertain hyperparameters, because few samples don't determine them.
 
     Fallback of ``virtual``: the functions of ``FunctionDraws``, which are drawn with the optimal hyperparameters.
     """
@@ -74,7 +74,7 @@ class UncertainHyperparameters(ABC):
     @property
     @abstractmethod
     def uncertain_functions(self) -> FunctionDraws:
-        """Return the object that draws these functions.
+        """Return the object that draws functions with uncertain hyperparameters.
 
         The model's first call may take as long as a fit. If the object has compiled steps, they are those of its own
         ``CompiledSteps``.
@@ -99,7 +99,7 @@ class LeaveOneOut(ABC):
 
     @abstractmethod
     def leave_one_out(self) -> tuple[LeaveOneOutErrors, ...]:
-        """Return the errors of each output, (O,). They are zero for an output that never varied."""
+        """Return the leave-one-out errors of each output, (O,). They are zero for an output that never varied."""
 
 
 class LearnedNoise(ABC):
@@ -155,7 +155,7 @@ class PathOutlook(ABC):
 
 @dataclass(frozen=True)
 class PredictedSteps:
-    """Steps of predicted paths, of shapes (..., C), (..., F) and (..., C)."""
+    """Steps of predicted paths: coordinates (..., C), actions (..., F), and coordinates after the step (..., C)."""
 
     q: Tensor
     u: Tensor
@@ -212,7 +212,8 @@ class RewardPeaks(ABC):
     @property
     @abstractmethod
     def reward_hides(self) -> bool:
-        """Whether this model's reward was learned in this way."""
+        """Whether this model's reward is nearly zero almost everywhere, and was learned in the way that finds its
+        peaks."""
 
     @abstractmethod
     def promise(self, q: Tensor, u: Tensor) -> Tensor:

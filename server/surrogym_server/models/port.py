@@ -167,8 +167,7 @@ class ModelCodec(ABC):
         Raises:
             InvalidInput: the data are well formed, but not a model of this environment.
             LookupError, TypeError, ValueError, AttributeError, OverflowError: the data are malformed; the caller turns
-                this
-                into a message.
+                this into a message.
         """
 
 

@@ -246,7 +246,7 @@ class Queries(ABC):
 
     @abstractmethod
     def withdraw(self, name: str, query_ids: Sequence[int]) -> int:
-        """Remove those of the queries that are pending and that no sampler has begun. Returns how many were removed."""
+        """Remove the given queries that are pending and that no sampler has begun. Returns how many were removed."""
 
     @abstractmethod
     def get(self, name: str, query_id: int) -> QueryRecord:
@@ -254,7 +254,7 @@ class Queries(ABC):
 
     @abstractmethod
     def list(self, name: str, statuses: Sequence[QueryStatus] = (), limit: int = 10_000) -> list[QueryRecord]:
-        """Return the queries with these statuses (all if empty), oldest first."""
+        """Return queries, oldest first: those with one of the ``statuses``, or all if there are none."""
 
     @abstractmethod
     def counts(self, name: str) -> QueryCounts: ...

@@ -113,7 +113,7 @@ class AddQueries(Request):
 
 
 class AuditModel(AddQueries):
-    """Real steps that compare the model with reality where a policy goes.
+    """Request for the real steps of an audit, which compare the model with reality where a policy goes.
 
     They don't count towards the design's budget. All audits of a surrogate together have at most as many steps as this
     budget.

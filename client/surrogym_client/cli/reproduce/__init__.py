@@ -10,7 +10,7 @@ STUDIES = (efficiency, paper, trust, table)
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command and its studies."""
+    """Add ``surrogym reproduce`` and its studies to the app."""
     studies = typer.Typer(
         help="Repeat the experiments of the documentation.\n\nExample: surrogym reproduce efficiency --seeds 3",
         no_args_is_help=True,

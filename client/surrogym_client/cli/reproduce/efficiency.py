@@ -19,7 +19,7 @@ STUDY = "study"
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add ``surrogym reproduce efficiency`` to the app."""
     app.command("efficiency")(command)
 
 

@@ -11,7 +11,7 @@ from surrogym_client.cli.options import AsJson, Quiet
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add ``surrogym reproduce paper`` to the app."""
     app.command("paper")(command)
 
 

@@ -80,7 +80,7 @@ class Choices(distributions.Choices):
 
 
 def distribution_of(counts: tuple[int, ...], low: NDArray[np.float64], high: NDArray[np.float64]) -> Distribution:
-    """Return the distribution for these numbers of choices, or for continuous actions within these bounds (F,)."""
+    """Return the action distribution for numbers of choices, or for continuous actions within bounds (F,)."""
     if counts:
         return Choices(counts)
     return Bounded(*middle_and_reach(low, high, np.dtype(np.float32)))

@@ -73,7 +73,7 @@ class Batch:
     returns: Array  # (B,) targets of the critic, from scaled rewards
 
     def at(self, rows: NDArray[np.int64] | slice) -> Batch:
-        """Return the batch of these rows."""
+        """Return the batch of the selected rows."""
         return Batch(*(getattr(self, one.name)[rows] for one in fields(self)))
 
 
@@ -193,7 +193,7 @@ class Learner:
         self._updates = int(state["updates"])
 
     def require(self, headers: Mapping[str, Header]) -> None:
-        """Check that these arrays are a state of this network.
+        """Check that arrays, given by their headers, are a state of this network.
 
         Raises:
             ValueError: an array is missing, or has another shape or type.

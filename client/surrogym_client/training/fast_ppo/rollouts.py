@@ -90,7 +90,7 @@ class Collector:
         )
 
     def _end(self, ended: NDArray[np.bool_], lost: NDArray[np.bool_]) -> list[float]:
-        """End the episodes of these lanes (N,), and return their returns, except for lost ones."""
+        """End the episodes of the lanes in ``ended`` (N,). Returns their returns, except those of lost episodes."""
         earned: list[float] = self._earned[ended & ~lost].tolist()
         if self._penalised:
             self._penalties.extend(self._penalty[ended].tolist())
