@@ -77,6 +77,7 @@ OTHERWISE = {
     "docs/how-to/trust.md": "tests/training/test_handover.py audits beside a sampler that stays",
     "docs/results/efficiency.md": "tests/cli runs its studies, in short",
     "docs/results/fresh-seeds.md": "tests/cli runs its studies, in short",
+    "docs/results/fastppo.md": "tests/cli runs its studies, in short",
     "docs/results/acquisition.md": "tests/cli runs its studies, in short",
     "docs/results/paper.md": "tests/cli runs its studies, in short",
 }
