@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 
+from surrogym_client.errors import ServerUnreachable
 from surrogym_client.transport import HttpSurrogate
 from surrogym_shared.wire import OpenSession
 
@@ -21,5 +24,6 @@ def trajectory(port: HttpSurrogate, steps: int) -> list[np.ndarray]:
         seen += [result.observation, result.reward, result.truncated]
     for result in port.rollout(session, actions[:PLANNED]):
         seen += [result.observation, result.reward, result.truncated]
-    port.close(session)
+    with suppress(ServerUnreachable):  # closing is not repeated: what nobody closes expires
+        port.close(session)
     return seen
