@@ -29,6 +29,7 @@ def test_the_tables_are_those_of_the_rows(page, name, pictures):
         ("older", "before-noise"),
         ("fresh-seeds", "fresh"),
         ("fastppo", "fastppo"),
+        ("fastppo", "fastppo-mountaincar"),
     ],
 )
 def test_tables_from_before_a_change_or_of_fresh_seeds_are_those_of_their_rows(page, name):
