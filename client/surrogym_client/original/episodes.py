@@ -24,11 +24,9 @@ from surrogym_client.original.protocol import (
     runs_in_parallel,
 )
 from surrogym_client.original.rollouts import answering
-from surrogym_client.original.simulator import Simulated
+from surrogym_client.original.simulator import Simulated, random_factor
 from surrogym_client.original.terms import observe
 from surrogym_shared.spec import EnvironmentSpec, Fixed, Normal, Uniform, limits
-
-SMALLEST_FACTOR = 0.05  # a mass or a length stays positive, however large the perturbation
 
 
 @dataclass(frozen=True)
@@ -120,7 +118,7 @@ class GymnasiumEpisode(Episode):
 
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
         for name, value in self._physics.items():
-            setattr(self._env, name, value * _factor(rng, sigma))
+            setattr(self._env, name, value * random_factor(rng, sigma))
         if self._task.settle is not None:
             self._task.settle(self._env)
 
@@ -281,10 +279,6 @@ def _draw_one(distribution: Uniform | Normal | Fixed, rng: np.random.Generator) 
             while not low <= (value := float(rng.normal(distribution.mean, distribution.std))) <= high:
                 pass
             return value
-
-
-def _factor(rng: np.random.Generator, sigma: float) -> float:
-    return max(SMALLEST_FACTOR, 1.0 + sigma * float(rng.standard_normal()))
 
 
 def _shows_the_same(spec: EnvironmentSpec) -> bool:

@@ -18,7 +18,13 @@ from surrogym_client.original.protocol import Array, RealStep
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.spec.actions import Action
 
+SMALLEST_FACTOR = 0.05  # a mass or a length stays positive, however large the perturbation
 Motion = Literal["slide", "turn", "speed", "held", "other"]
+
+
+def random_factor(rng: np.random.Generator, sigma: float) -> float:
+    """A factor around 1 for a mass or a length, with standard deviation ``sigma``."""
+    return max(SMALLEST_FACTOR, 1.0 + sigma * float(rng.standard_normal()))
 
 
 @dataclass(frozen=True)

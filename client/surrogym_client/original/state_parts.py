@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,6 +14,7 @@ VELOCITY = "_velocity"
 AXES = ("x", "y", "z")
 QUATERNION = ("qw", "qx", "qy", "qz")
 FREE, BALL, SLIDE, HINGE = range(4)  # mjtJoint
+RESETS = 4  # that are compared for what they draw into a model
 DRAWN = ("body_pos", "geom_pos", "geom_size", "site_pos")  # of a model: what tasks draw at a reset
 
 
@@ -174,6 +175,18 @@ class DrawnIntoModel:
     def write(self, values: Array) -> None:
         for (field, i, k), value in zip(self._places, values, strict=True):
             getattr(self._model, field)[i, k] = value
+
+
+def mujoco_parts(model: Native, data: Native, reset: Callable[[int], object]) -> list[StatePart]:
+    """MuJoCo's state, and what ``reset`` with a seed draws into the model, if anything."""
+    seen = []
+    for seed in range(RESETS):
+        reset(seed)
+        seen.append(drawable(model))
+    reset(0)
+    places = drawn_between(seen)
+    parts: list[StatePart] = [MujocoState(model, data)]
+    return [*parts, DrawnIntoModel(model, places)] if places else parts
 
 
 def drawable(model: Native) -> dict[str, Array]:

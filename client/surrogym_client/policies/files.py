@@ -36,7 +36,7 @@ def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM, *, trust: bool =
         UnusableOnnx: the file is not a policy in ONNX, or it could need more memory than a policy should.
     """
     if Network.is_at(path):
-        return _network(path)
+        return load_network(path)
     if path.suffix.lower() == ONNX:
         return load_onnx(path)
     model = load_learner(path, algorithm, trust=trust)
@@ -110,7 +110,12 @@ def _num_envs(env: object) -> int:
     return 0 if env is None else getattr(env, "num_envs", 1)
 
 
-def _network(path: Path) -> Predict:
+def load_network(path: Path) -> Network:
+    """Load a network of arrays.
+
+    Raises:
+        UnusablePolicy: the file is none.
+    """
     try:
         return Network.load(path)
     except ValueError as error:

@@ -14,6 +14,7 @@ from surrogym_client.experiments.reproduce.paper_cases import ANYWHERE, Variatio
 from surrogym_client.original import OriginalEnvironment, make
 from surrogym_client.original.episodes import GymnasiumEpisode, Moment, draw
 from surrogym_client.original.protocol import RealStep
+from surrogym_client.original.simulator import SMALLEST_FACTOR
 from surrogym_client.original.terms import observe
 from surrogym_client.policies.predict import Predict
 from surrogym_client.transport.api import Api
@@ -23,7 +24,6 @@ from surrogym_shared.wire import ModelView
 Array = NDArray[np.float64]
 
 UNSEEN_SEED = 20_000
-SMALLEST_FACTOR = 0.05
 PENALTY = 3.0  # k of eq. 14
 
 

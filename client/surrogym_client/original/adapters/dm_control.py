@@ -12,10 +12,9 @@ from surrogym_client.original.adapters.parts import OfParts, flat
 from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.protocol import Array
 from surrogym_client.original.simulator import Simulator, Taken
-from surrogym_client.original.state_parts import DrawnIntoModel, MujocoState, StatePart, drawable, drawn_between
+from surrogym_client.original.state_parts import mujoco_parts
 from surrogym_shared.spec import BoxAction
 
-RESETS = 4  # that are compared for what they draw into the model
 NAME = re.compile(r"dm_control:([a-z0-9_]+)-([a-z0-9_]+)")
 
 
@@ -57,7 +56,7 @@ class ControlSuite(OfParts):
         self._name, self._env = name, env
         self._physics, self._task = env.physics, env.task
         model, data = self._physics.model.ptr, self._physics.data.ptr
-        super().__init__(self._state(model, data), model, data)
+        super().__init__(mujoco_parts(model, data, self.reset), model, data)
         self._substeps = round(env.control_timestep() / self._physics.timestep())
         bounds = env.action_spec()
         self.action = BoxAction(low=tuple(map(float, bounds.minimum)), high=tuple(map(float, bounds.maximum)))
@@ -85,16 +84,6 @@ class ControlSuite(OfParts):
 
     def action_taken(self, action: Array) -> Array:
         return np.array(action, dtype=np.float64)
-
-    def _state(self, model: Any, data: Any) -> list[StatePart]:
-        seen = []
-        for seed in range(RESETS):
-            self.reset(seed)
-            seen.append(drawable(model))
-        self.reset(0)
-        places = drawn_between(seen)
-        parts: list[StatePart] = [MujocoState(model, data)]
-        return [*parts, DrawnIntoModel(model, places)] if places else parts
 
     def _flat(self, observation: Any) -> Array:
         return np.concatenate([flat(self._name, np.ravel(entry)) for entry in observation.values()])

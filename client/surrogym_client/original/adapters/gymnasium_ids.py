@@ -17,16 +17,12 @@ from surrogym_client.original.protocol import Array
 from surrogym_client.original.simulator import Simulator, Taken, Variable
 from surrogym_client.original.state_parts import (
     Attribute,
-    DrawnIntoModel,
-    MujocoState,
     StatePart,
-    drawable,
-    drawn_between,
     holds_numbers,
+    mujoco_parts,
 )
 
 SYMBOLS = ("Discrete", "MultiDiscrete", "MultiBinary", "Text", "Graph", "Sequence")  # spaces without numbers
-RESETS = 4  # that are compared for what they draw into a model
 
 
 def open_simulator(name: str) -> Simulator:
@@ -83,7 +79,28 @@ def _way_out(name: str) -> str:
     return "(an id of another package is written package:Id-v0)"
 
 
-class GymnasiumSimulator(OfParts):
+class _Gymnasium(Simulator):
+    """Resets and steps of a Gymnasium environment; the latest observation is kept."""
+
+    def __init__(self, name: str, env: Any, limit: int | None) -> None:
+        self._name, self._env = name, env
+        self.action = action_of(name, env.action_space)
+        self.time_limit = limit
+
+    def reset(self, seed: int | None) -> Array:
+        self._last = flat(self._name, self._env.reset(seed=seed)[0])
+        return self._last
+
+    def step(self, action: Array) -> Taken:
+        observation, reward, terminated, truncated, _ = self._env.step(native_action(self.action, action))
+        self._last = flat(self._name, observation)
+        return Taken(self._last, float(reward), bool(terminated), bool(truncated))
+
+    def close(self) -> None:
+        self._env.close()
+
+
+class GymnasiumSimulator(_Gymnasium, OfParts):
     """One that can be set to a state; without wrappers, so without a time limit of its own."""
 
     def __init__(
@@ -96,54 +113,29 @@ class GymnasiumSimulator(OfParts):
         *,
         limit: int | None = None,
     ) -> None:
-        super().__init__(parts, model, data)
-        self._name, self._env = name, env
-        self.action = action_of(name, env.action_space)
-        self.time_limit = limit
+        OfParts.__init__(self, parts, model, data)
+        _Gymnasium.__init__(self, name, env, limit)
         self.shows = hasattr(env, "_get_obs") and not _needs_arguments(env._get_obs)
         if model is not None and hasattr(env, "init_qpos"):
             start = [np.ravel(env.init_qpos), np.ravel(env.init_qvel)]
             self.rest[: sum(map(len, start))] = np.concatenate(start)
         self.reset(0)
 
-    def reset(self, seed: int | None) -> Array:
-        self._last = flat(self._name, self._env.reset(seed=seed)[0])
-        return self._last
-
-    def step(self, action: Array) -> Taken:
-        observation, reward, terminated, truncated, _ = self._env.step(native_action(self.action, action))
-        self._last = flat(self._name, observation)
-        return Taken(self._last, float(reward), bool(terminated), bool(truncated))
-
     def observe(self) -> Array:
         return flat(self._name, self._env._get_obs()) if self.shows else self._last
 
-    def close(self) -> None:
-        self._env.close()
 
-
-class ResetOnly(Simulator):
+class ResetOnly(_Gymnasium):
     """One whose state can't be read: what it shows is taken for its state, and it can only be reset."""
 
     settable = False
     shows = False
 
     def __init__(self, name: str, env: Any, limit: int | None) -> None:
-        self._name, self._env = name, env
-        self.action = action_of(name, env.action_space)
-        self.time_limit = limit
+        super().__init__(name, env, limit)
         self._last = self.reset(0)
         self.rest = self._last
         self.variables = tuple(Variable(f"o{i}") for i in range(len(self._last)))
-
-    def reset(self, seed: int | None) -> Array:
-        self._last = flat(self._name, self._env.reset(seed=seed)[0])
-        return self._last
-
-    def step(self, action: Array) -> Taken:
-        observation, reward, terminated, truncated, _ = self._env.step(native_action(self.action, action))
-        self._last = flat(self._name, observation)
-        return Taken(self._last, float(reward), bool(terminated), bool(truncated))
 
     def read(self) -> Array:
         return self._last
@@ -154,21 +146,12 @@ class ResetOnly(Simulator):
     def observe(self) -> Array:
         return self._last
 
-    def close(self) -> None:
-        self._env.close()
-
 
 def _mujoco(env: Any) -> list[StatePart]:
-    seen = []
-    for seed in range(RESETS):
-        env.reset(seed=seed)
-        seen.append(drawable(env.model))
-    env.reset(seed=0)
-    parts: list[StatePart] = [MujocoState(env.model, env.data)]
+    parts = mujoco_parts(env.model, env.data, lambda seed: env.reset(seed=seed))
     if holds_numbers(env, "goal"):
-        parts.append(Attribute(env, "goal", "held"))
-    places = drawn_between(seen)
-    return [*parts, DrawnIntoModel(env.model, places)] if places else parts
+        parts.insert(1, Attribute(env, "goal", "held"))
+    return parts
 
 
 def _needs_arguments(function: Any) -> bool:

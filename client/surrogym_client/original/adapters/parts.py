@@ -9,12 +9,10 @@ import numpy as np
 
 from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.protocol import Array
-from surrogym_client.original.simulator import Simulator
+from surrogym_client.original.simulator import Simulator, random_factor
 from surrogym_client.original.state_parts import StatePart
 from surrogym_shared.spec import BoxAction, DiscreteAction, MultiDiscreteAction
 from surrogym_shared.spec.actions import Action
-
-SMALLEST_FACTOR = 0.05  # a mass stays positive, however large the perturbation
 
 
 class OfParts(Simulator):
@@ -43,7 +41,7 @@ class OfParts(Simulator):
             super().perturb(rng, sigma)
             return
         for body, mass in enumerate(self._masses):
-            self._model.body_mass[body] = mass * max(SMALLEST_FACTOR, 1.0 + sigma * float(rng.standard_normal()))
+            self._model.body_mass[body] = mass * random_factor(rng, sigma)
 
 
 def action_of(name: str, space: Any) -> Action:

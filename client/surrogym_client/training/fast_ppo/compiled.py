@@ -16,6 +16,7 @@ import scipy.linalg.cython_blas  # noqa: F401  # numba calls it; loaded here, it
 from numba import types
 from numpy.typing import NDArray
 
+from surrogym_client.training.fast_ppo.adam import EPSILON, FIRST_DECAY, SECOND_DECAY
 from surrogym_shared.compiled.jit import compiled, entry, inlined, summing
 from surrogym_shared.distributions import HALF_LOG_TAU
 
@@ -23,7 +24,6 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 BLOCK = 128  # rows; 64 and 256 were slower
-FIRST_DECAY, SECOND_DECAY, EPSILON = 0.9, 0.999, 1e-5  # of Adam
 LARGEST_TANH = np.float32(7.90531110763549805)  # from here on tanh is 1 in float32
 NONE, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 CONSTANT = np.float32(HALF_LOG_TAU)

@@ -23,8 +23,10 @@ from numpy.typing import NDArray
 
 from surrogym_client.policies.card import UnusablePolicy
 from surrogym_client.policies.defaults import CRITIC
+from surrogym_client.policies.files import load_network
 from surrogym_client.policies.predict import Predict
 from surrogym_client.training.fast_ppo.actions import distribution_of
+from surrogym_client.training.fast_ppo.adam import EPSILON, FIRST_DECAY, SECOND_DECAY
 from surrogym_client.training.fast_ppo.mlp import Array, Mlp, orthogonal
 from surrogym_shared.acting import ActingPolicy
 from surrogym_shared.archives import Header, read_arrays, read_entries
@@ -33,7 +35,6 @@ from surrogym_shared.network import MAX_BYTES, Layer, Network, bounds_of, counts
 from surrogym_shared.spec import EnvironmentSpec
 
 HIDDEN_GAIN, ACTION_GAIN, VALUE_GAIN = 2**0.5, 0.01, 1.0
-FIRST_DECAY, SECOND_DECAY, EPSILON = 0.9, 0.999, 1e-5  # of Adam
 LEARNER = "learner.npz"  # entry of a policy's file from which training can continue
 VECTORS = ("parameters", "first", "second")
 
@@ -227,7 +228,7 @@ def restored(path: Path, spec: EnvironmentSpec, units: tuple[int, ...]) -> Learn
     Raises:
         UnusablePolicy: the file contains no learner, or one of another network.
     """
-    policy = _policy(path)
+    policy = load_network(path)
     learner = Learner(spec, policy.mean, policy.deviation, units, np.random.default_rng(0))
     learner.restore(_state(path, learner.require))
     return learner
@@ -236,7 +237,7 @@ def restored(path: Path, spec: EnvironmentSpec, units: tuple[int, ...]) -> Learn
 def noisy(path: Path) -> Predict:
     """Load a policy that acts with its noise. The noise is the same each time the file is read. Raises as
     ``restored``."""
-    policy = _policy(path)
+    policy = load_network(path)
     distribution = distribution_of(policy.counts, policy.low, policy.high)
     parameters, rng = _state(path, _require_parameters)["parameters"], np.random.default_rng(0)
     further = parameters[len(parameters) - len(distribution.further()) :]
@@ -248,13 +249,6 @@ def noisy(path: Path) -> Predict:
 def _require_parameters(headers: Mapping[str, Header]) -> None:
     if "parameters" not in headers or len(headers["parameters"].shape) != 1:
         raise ValueError("expected a vector of parameters")
-
-
-def _policy(path: Path) -> Network:
-    try:
-        return Network.load(path)
-    except ValueError as error:
-        raise UnusablePolicy(str(error)) from error
 
 
 def _state(path: Path, require: Callable[[Mapping[str, Header]], None]) -> dict[str, NDArray[Any]]:
