@@ -1,4 +1,4 @@
-"""Whether an environment can be used as it is said to be: states are set and read back, steps and resets are repeated,
+"""Checks of an environment before it is used: states are set and read back, steps and resets are repeated,
 and a step from a state that was set is held against the same step of an episode. Every real step is counted.
 
 Shapes: C coordinates, F action entries.

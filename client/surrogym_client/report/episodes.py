@@ -1,5 +1,5 @@
-"""Figures of real episodes, and of what was predicted beside what came. Lines differ by their strokes, so that they can
-be told apart in black and white."""
+"""Figures of real episodes, and of predictions beside measurements. Lines differ by their strokes, so that a reader
+distinguishes them in black and white."""
 
 from __future__ import annotations
 

@@ -39,8 +39,8 @@ def words_of_handover(handover: Handover) -> str:
 
 
 def words_of_interruption(result: TrainResult, asked: str) -> str:
-    """Describe what is left after Ctrl-C and how to continue; ``asked`` is the surrogate with the options of the
-    command."""
+    """Describe what Ctrl-C has left and how to continue. ``asked`` holds the arguments of the command: the surrogate
+    and its options."""
     return (
         f"interrupted after {result.virtual_steps} virtual steps; the policy so far is in {result.path}; to go on: "
         f"surrogym train {asked} --start-from {result.path} --out {result.path}"

@@ -1,6 +1,6 @@
 """A specification for a simulator that nobody has described yet, from a few episodes whose steps are counted.
 
-What can be found out is found out; what can't is asked for in plain words.
+The steps show ranges, limits and coordinates. The file asks in plain words for everything that steps can't show.
 """
 
 from surrogym_client.original.describing.description import Description, describe

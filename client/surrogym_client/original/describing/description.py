@@ -48,12 +48,12 @@ class Description:
     resets: int
 
     def words(self) -> list[str]:
-        """What it took, what was found and what is asked, a line each."""
+        """Lines for the terminal: the real steps, the findings, and the questions to the reader."""
         took = f"{self.spec.environment}: described by {self.steps} real steps and {self.resets} resets"
         return [took, *(f"  found: {line}" for line in self.found), *(f"  please say: {line}" for line in self.asked)]
 
     def text(self) -> str:
-        """As a JSON file: what was found and what is asked in plain words, and the specification."""
+        """A JSON document with the findings, the questions to the reader, and the specification."""
         return json.dumps(
             {
                 "real_steps": self.steps,
@@ -243,7 +243,7 @@ class _Draft:
         return low - margin, high + margin
 
     def _start(self, index: int, coordinate: Coordinate) -> Uniform | Fixed:
-        """Where resets lead, widened as the range of so many uniform draws is on average too narrow."""
+        """The range of starts, widened, because the range of n uniform draws is on average too narrow."""
         if coordinate.kind == "constant" and self._simulator.variables[index].limited:
             return Uniform(low=limits(coordinate.sampling)[0], high=limits(coordinate.sampling)[1])
         starts = self._seen.starts[:, index]

@@ -15,7 +15,7 @@ from surrogym_client.original.terms import evaluate
 from surrogym_shared.spec import EnvironmentSpec, ObservationEntry, Term
 
 TOLERANCE = 1e-7  # of an entry's own size
-FEW_TURNS = 4  # up to so many, sums of three of them are tried too
+FEW_TURNS = 4  # with at most this many turning coordinates, sums of three of them are tried as well
 CLIPPED = 0.02  # share of places at a limit that speaks for one
 
 
