@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from surrogym_client.original.actions import decode_actions
 from surrogym_client.policies import load_policy
 from surrogym_client.training import TrainingInterrupted, TrainProgress, TrainResult, TrainSettings, train
-from surrogym_client.training.search import SEARCHES
+from surrogym_client.training.search import SEARCHES, name_of
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import OpenSession, SessionView
 
@@ -93,7 +93,7 @@ def start_is_taken_or_refused(port: SurrogatePort, settings: TrainSettings, fold
     """Check that the search continues from its own policy file, or refuses to if it declares that it can't."""
     start = train(port, folder / "start.zip", replace(settings, seed=settings.seed + 1)).path
     resumed = replace(settings, start_from=start)
-    if SEARCHES.get(settings.algorithm).resumable:
+    if SEARCHES.get(name_of(settings)).resumable:
         _actions(port, train(port, folder / "policy.zip", resumed))
         return
     try:

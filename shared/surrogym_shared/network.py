@@ -140,7 +140,7 @@ class Network:
         try:
             with zipfile.ZipFile(path) as file:
                 return HEAD in file.namelist()
-        except zipfile.BadZipFile:
+        except (OSError, zipfile.BadZipFile):
             return False
 
 

@@ -75,7 +75,9 @@ class Faults:
 
 
 def trained(server: RestartingServer, out: Path, sig: int | None = None) -> TrainResult:
-    settings = TrainSettings(total_steps=STEPS, num_envs=LANES, hyperparameters=SMALL, session={"time_limit": 50})
+    settings = TrainSettings(
+        "PPO", total_steps=STEPS, num_envs=LANES, hyperparameters=SMALL, session={"time_limit": 50}
+    )
     with HttpSurrogate(server.url, "pendulum", retries=PATIENT) as port:
         if sig is None:
             return train(port, out, settings)

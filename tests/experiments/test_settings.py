@@ -82,5 +82,5 @@ def test_a_task_is_solved_by_whole_episodes():
 
 
 def test_a_demo_imports_torch_early_only_where_its_policy_needs_it():
-    assert later_imports(DemoSettings(pictures=False)) == ("stable_baselines3",)
-    assert later_imports(DemoSettings(algorithm="fastppo", pictures=False)) == ()
+    assert later_imports(DemoSettings(pictures=False)) == ()
+    assert later_imports(DemoSettings(algorithm="ppo", pictures=False)) == ("stable_baselines3",)

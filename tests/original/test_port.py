@@ -78,7 +78,9 @@ def test_a_trainer_takes_it_for_a_surrogate_and_every_step_counts(tmp_path):
 
     port = OriginalPort(spec, lambda: Counted(spec))
     quick = {"n_steps": 16, "batch_size": 32, "n_epochs": 1}
-    result = train(port, tmp_path / "policy.zip", TrainSettings(total_steps=256, num_envs=4, hyperparameters=quick))
+    result = train(
+        port, tmp_path / "policy.zip", TrainSettings("PPO", total_steps=256, num_envs=4, hyperparameters=quick)
+    )
     assert result.virtual_steps == 256
     assert port.steps == len(taken) > 256, "the checks of the policy are real steps too"
     assert (result.settings["n_steps"], result.settings["gae_lambda"]) == (16, 0.97)

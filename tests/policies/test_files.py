@@ -145,9 +145,10 @@ def test_an_algorithm_learns_on_as_the_one_that_was_unpickled(tmp_path: Path, ca
     assert learned[0] == learned[1]
 
 
-def test_what_train_saves_is_read_without_unpickling(tmp_path: Path, no_unpickling):
+@pytest.mark.parametrize("algorithm", ["ppo", "fastppo"])
+def test_what_train_saves_is_read_without_unpickling(tmp_path: Path, no_unpickling, algorithm: str):
     port, policy = ExactPendulum(), tmp_path / "policy"
-    small = {"total_steps": 256, "num_envs": 4, "hyperparameters": {"n_steps": 16}}
+    small = {"algorithm": algorithm, "total_steps": 256, "num_envs": 4, "hyperparameters": {"n_steps": 16}}
     train(port, policy, TrainSettings(**small))
     assert policy.is_file(), "under the name that was given"
     assert load_policy(policy)(np.zeros((2, 3), np.float32)).shape == (2, 1)

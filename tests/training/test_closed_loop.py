@@ -30,7 +30,9 @@ from surrogym_server.local import LocalSurrogate
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import Design, EnvironmentSpec
 
-SETTINGS = TrainSettings(total_steps=400, num_envs=8, hyperparameters={"n_steps": 10, "batch_size": 40, "n_epochs": 1})
+SETTINGS = TrainSettings(
+    "PPO", total_steps=400, num_envs=8, hyperparameters={"n_steps": 10, "batch_size": 40, "n_epochs": 1}
+)
 VISIT = 32 * 200  # 32 lanes for a time limit of 200
 
 
@@ -151,4 +153,4 @@ def test_a_policy_that_explores_by_state_visits_each_lanes_own_way_and_the_same_
 def test_rounds_share_the_steps_that_were_asked_for() -> None:
     assert shares(TrainSettings(total_steps=1_750), rounds=3) == (1_750, 250), "the last has four rounds' steps"
     assert shares(TrainSettings(total_steps=1_900), rounds=9) == (1_900, 100), "many rounds leave it half and more"
-    assert shares(TrainSettings(), rounds=3) == (1_000_000, 150_000)
+    assert shares(TrainSettings("PPO"), rounds=3) == (1_000_000, 150_000)

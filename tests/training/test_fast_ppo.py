@@ -185,30 +185,54 @@ def test_it_goes_on_from_what_it_saved(surrogate, tmp_path: Path):
         )
 
 
-def test_a_network_that_is_given_up_is_followed_by_stable_baselines3(tmp_path: Path, monkeypatch):
-    """Steps of both together stay within what was asked for, and the policy is the reference's."""
+class Patient(Verdicts):
+    """Abandons no network."""
 
-    class Strict(Verdicts):
-        def judge(self) -> None:
-            self.given_up = self.own_steps >= 512
+    def judge(self) -> None:
+        """Keep the present network."""
 
+
+class Strict(Verdicts):
+    """Abandons each network after 512 steps, while enough steps are left for another one."""
+
+    def judge(self) -> None:
+        self.given_up = self.own_steps >= 512 and self.left >= 1_024
+
+
+@pytest.mark.parametrize(
+    ("spec", "by"), [(mountain_car_continuous(), "PPO"), (cartpole(), "FASTPPO")], ids=["continuous", "discrete"]
+)
+def test_an_abandoned_network_is_followed_by_another(spec, by: str, tmp_path: Path, monkeypatch):
+    """Continuous actions are then explored by Stable-Baselines3's state-dependent noise. Steps of all networks together
+    stay within what was asked for."""
     monkeypatch.setattr(searches, "Verdicts", Strict)
     seen: list[int] = []
     settings = TrainSettings(algorithm="fastppo", total_steps=4_096, num_envs=16, hyperparameters=SMALL, prolong=False)
-    surrogate = short(mountain_car_continuous())
-    result = train(surrogate, tmp_path / "policy.zip", settings, lambda now: seen.append(now.steps))
+    result = train(short(spec), tmp_path / "policy.zip", settings, lambda now: seen.append(now.steps))
     assert seen == sorted(seen)
-    assert result.networks == 2
+    assert result.networks == (2 if by == "PPO" else 7)
     assert result.virtual_steps <= settings.total_steps
+    assert result.algorithm == by
     load_policy(result.path, result.algorithm)
 
 
-def test_training_ends_early_where_nothing_can_be_gained(surrogate, tmp_path: Path, monkeypatch):
-    class Saturated(Verdicts):
-        saturated = property(lambda self: len(self._bests) >= 3)
+def test_a_new_network_is_trained_beside_a_policy_of_stable_baselines3(surrogate, tmp_path: Path, monkeypatch):
+    """Without ``anew`` the policy itself is trained further, by its own library. With it that happens only if the new
+    network is abandoned."""
+    monkeypatch.setattr(searches, "Verdicts", Patient)
+    small = {"total_steps": 512, "num_envs": 16, "hyperparameters": SMALL, "prolong": False}
+    start = train(surrogate, tmp_path / "first.zip", TrainSettings("ppo", **small)).path
+    further = TrainSettings("fastppo", start_from=start, **small)
+    assert train(surrogate, tmp_path / "further.zip", further).algorithm == "PPO"
+    assert train(surrogate, tmp_path / "anew.zip", replace(further, anew=True)).algorithm == "FASTPPO"
+    monkeypatch.setattr(searches, "Verdicts", Strict)
+    abandoned = replace(further, anew=True, total_steps=4_096)
+    assert train(surrogate, tmp_path / "abandoned.zip", abandoned).networks == 2
 
-        def judge(self) -> None:
-            """No network is given up."""
+
+def test_training_ends_early_where_nothing_can_be_gained(surrogate, tmp_path: Path, monkeypatch):
+    class Saturated(Patient):
+        saturated = property(lambda self: len(self._bests) >= 3)
 
     monkeypatch.setattr(searches, "Verdicts", Saturated)
     settings = TrainSettings(algorithm="fastppo", total_steps=8_192, num_envs=16, hyperparameters=SMALL, prolong=False)

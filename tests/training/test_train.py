@@ -43,7 +43,7 @@ def surrogate() -> LocalSurrogate:
 
 
 def small(**settings) -> TrainSettings:
-    return TrainSettings(**{"total_steps": 256, "num_envs": 8, "hyperparameters": SMALL} | settings)
+    return TrainSettings(**{"algorithm": "PPO", "total_steps": 256, "num_envs": 8, "hyperparameters": SMALL} | settings)
 
 
 def test_a_policy_and_what_it_was_trained_with_are_written(surrogate, tmp_path: Path):

@@ -25,7 +25,13 @@ RunFolder = Annotated[
 Arm = Annotated[ArmName, typer.Option(help="Method to choose real steps by; docs/results/efficiency.md explains each.")]
 Budget = Annotated[int | None, typer.Option(min=2, help="Maximum number of real steps. [default: from the task]")]
 Steps = Annotated[int | None, typer.Option(min=1, help="Virtual steps of the training. [default: from the task]")]
-Algorithm = Annotated[str | None, typer.Option(help="Policy search, as in surrogym train. [default: that command's]")]
+Algorithm = Annotated[
+    str | None,
+    typer.Option(
+        help="Policy search, as in surrogym train. [default: fastppo; ppo with the paper's arms and oracle]",
+        show_default=False,
+    ),
+]
 
 
 def register(app: typer.Typer) -> None:

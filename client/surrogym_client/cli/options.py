@@ -228,8 +228,8 @@ def read_tolerances(given: list[str]) -> dict[str, float]:
     return tolerances
 
 
-def require_known(algorithm: str) -> None:
-    """Refuse an unknown policy search before any work begins.
+def require_known(algorithm: str) -> str:
+    """Return the registered name of a policy search. An unknown one is refused before any work begins.
 
     Raises:
         CommandError: no policy search has this name.
@@ -238,6 +238,6 @@ def require_known(algorithm: str) -> None:
     from surrogym_client.training.search import SEARCHES
 
     try:
-        SEARCHES.name_of(algorithm)
+        return SEARCHES.name_of(algorithm)
     except ValueError as error:
         raise CommandError(str(error)) from error

@@ -69,6 +69,7 @@ def command(
     """
     from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
     from surrogym_client.surrogates.budget import words_of_rounds
+    from surrogym_client.training.search import with_algorithm
     from surrogym_client.training.words import words_of_result
     from surrogym_shared.terminal import say
 
@@ -76,11 +77,12 @@ def command(
         watch_parent()
     settings = _settings(search, session, start, log)
     token = service.token_for(context)
-    spec, url = _trainable(surrogate, service.server, token, wait, search.algorithm, quiet=output.quiet)
+    spec, url = _trainable(surrogate, service.server, token, wait, settings, quiet=output.quiet)
+    settings = with_algorithm(settings, spec)
     if loop.improve:
         with connect(service.server, token) as api:
             say(words_of_rounds(api, surrogate, loop.improve, loop.rounds), quiet=output.quiet)
-    _import(search.algorithm, quiet=output.quiet)
+    _import(settings, quiet=output.quiet)
     curve: list[CurvePoint] = []
     card = partial(_write_card, surrogate=surrogate, spec=spec, url=url, seed=search.seed, curve=curve)
     with _keeping(card, typed(context, without=("out", "start_from", "trust_policy", "token"))):
@@ -102,13 +104,13 @@ def _settings(search: SearchOptions, session: SessionOptions, start: StartOption
     if start.start_from is not None and not start.start_from.exists():
         raise CommandError(f"{start.start_from}: no such policy file")
     hyperparameters = search.hyperparameters()
-    require_known(search.algorithm)
+    algorithm = None if search.algorithm is None else require_known(search.algorithm)
     return TrainSettings(
-        algorithm=search.algorithm,
+        algorithm=algorithm,
         total_steps=search.steps,
         num_envs=search.num_envs,
         seed=search.seed,
-        tracker=None if log.log == "none" else log.log,
+        tracker=log.tracker(algorithm),
         tensorboard=log.tensorboard,
         hyperparameters=hyperparameters,
         session=given,
@@ -116,14 +118,14 @@ def _settings(search: SearchOptions, session: SessionOptions, start: StartOption
     )
 
 
-def _import(algorithm: str, *, quiet: bool) -> None:
+def _import(settings: TrainSettings, *, quiet: bool) -> None:
     """Import the packages of the policy search, and show on the terminal what takes the time."""
-    from surrogym_client.training.search import SEARCHES
+    from surrogym_client.training.search import SEARCHES, name_of
     from surrogym_shared.terminal import on_interrupt, progress
 
     with on_interrupt(lambda: NOTHING_YET), progress("prepare", quiet=quiet) as update:
-        update(None, f"importing what {algorithm} needs")
-        SEARCHES.get(algorithm)
+        update(None, f"importing what {name_of(settings)} needs")
+        SEARCHES.get(name_of(settings))
 
 
 @contextmanager
@@ -146,7 +148,7 @@ def _keeping(write_card: Callable[[TrainResult], object], asked: str) -> Iterato
 
 
 def _trainable(
-    surrogate: str, server: str | None, token: str | None, wait: float, algorithm: str, *, quiet: bool
+    surrogate: str, server: str | None, token: str | None, wait: float, settings: TrainSettings, *, quiet: bool
 ) -> tuple[EnvironmentSpec, str]:
     """Wait until the surrogate's design has ended, and return its specification and the server's URL.
 
@@ -159,14 +161,13 @@ def _trainable(
         wait_for_design,
         words_of_design,
     )
-    from surrogym_client.training.search import SEARCHES
+    from surrogym_client.training.search import SEARCHES, name_of
     from surrogym_shared.terminal import on_interrupt, progress
 
     with connect(server, token, wait, quiet=quiet) as api:
         view = awaited_surrogate(api, surrogate, wait, quiet=quiet)
         if wait > 0:
-            SEARCHES.get(algorithm)
-
+            SEARCHES.get(name_of(settings))
             stays = "interrupted while the design goes on at the server; the same command waits again"
             with on_interrupt(lambda: stays), progress("design", quiet=quiet) as update:
                 view = wait_for_design(

@@ -12,6 +12,7 @@ import typer
 if TYPE_CHECKING:
     from surrogym_client.training.closed_loop import LoopSettings
     from surrogym_client.training.handover import AuditSettings
+    from surrogym_client.training.settings import Tracker
 
 Variant = Literal["deterministic", "probabilistic", "pathwise"]
 Propagation = Literal["mean", "sample"]
@@ -24,12 +25,14 @@ class SearchOptions:
     """Options that choose the policy search and its length."""
 
     algorithm: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="Policy search: ppo, a2c, sac, td3, ddpg, dqn (Stable-Baselines3), fastppo (the same PPO in NumPy), "
-            "cmaes, gradient, or one from an installed package."
+            help="Policy search: fastppo (PPO in compiled code), ppo, a2c, sac, td3, ddpg, dqn (Stable-Baselines3), "
+            "cmaes, gradient, or one from an installed package. [default: fastppo; ppo if --log, --set or --start-from "
+            "needs it, or if the specification has the paper's preset]",
+            show_default=False,
         ),
-    ] = "PPO"
+    ] = None
     steps: Annotated[
         int | None,
         typer.Option(
@@ -208,7 +211,14 @@ class LoopOptions:
 class LogOptions:
     """Options of where the training's curves and the policy go."""
 
-    log: Annotated[Log, typer.Option(help="Tracker that records the curves of the training.")] = "tensorboard"
+    log: Annotated[
+        Log | None,
+        typer.Option(
+            help="Tracker that records the curves of the training. [default: tensorboard with an algorithm of "
+            "Stable-Baselines3, none with others]",
+            show_default=False,
+        ),
+    ] = None
     tensorboard: Annotated[
         Path | None, typer.Option(help="Folder for TensorBoard's files. [default: tensorboard, beside the policy]")
     ] = None
@@ -219,3 +229,15 @@ class LogOptions:
         ),
     ] = True
     progress_file: Annotated[Path | None, typer.Option(hidden=True, help="Write progress as JSON lines.")] = None
+
+    def tracker(self, algorithm: str | None) -> Tracker | None:
+        """Return the tracker: as chosen, or TensorBoard if its folder is given or the algorithm is one that logs.
+
+        Args:
+            algorithm: registered name of the search; None if it was not chosen.
+        """
+        from surrogym_client.training.search import ALGORITHMS
+
+        if self.log is None:
+            return "tensorboard" if self.tensorboard is not None or algorithm in ALGORITHMS else None
+        return None if self.log == "none" else self.log

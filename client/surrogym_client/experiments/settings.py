@@ -11,6 +11,7 @@ from surrogym_client.experiments.arms import ARMS, Arm
 from surrogym_client.experiments.tasks import EVERY_TASK, DemoTask, design_budget, queries_a_round
 from surrogym_client.original import make
 from surrogym_client.original.loading import with_choices
+from surrogym_client.training.search import FAST, REFERENCE, SEARCHES
 from surrogym_client.training.settings import SUGGESTED_STEPS, TrainSettings, prolongs
 from surrogym_shared.spec import EnvironmentSpec
 
@@ -27,7 +28,7 @@ class DemoSettings:
     episodes: int = 100
     pictures: bool = True
     keep: bool = False
-    algorithm: str | None = None  # name of a policy search
+    algorithm: str | None = None  # name of a policy search; None: see ``search``
 
     @property
     def demo_task(self) -> DemoTask:
@@ -47,6 +48,14 @@ class DemoSettings:
         """Where the default has rounds before its last training, those that have none learn for as long as it may."""
         alone = not self.way.closed_loop and not self.way.original and queries_a_round(self.real_steps) > 0
         return self.steps or self.demo_task.steps or (SUGGESTED_STEPS if alone else None)
+
+    @property
+    def search(self) -> str:
+        """Name of the policy search. By default, the reference where the paper or the original environment is one side
+        of a comparison."""
+        if self.algorithm is not None:
+            return SEARCHES.name_of(self.algorithm)
+        return REFERENCE if self.way.original or self.way.preset == "paper" else FAST
 
     @property
     def prolong(self) -> bool:
@@ -70,8 +79,8 @@ class DemoSettings:
         spec = self.spec().model_dump(mode="json")
         spec["design"].pop("seed")
         names = ["task", "real_steps", "virtual_steps", "prolong", "episodes"]
-        names += ["algorithm"] * (self.algorithm is not None)
-        return {"spec": spec, "arm": self.way.fields(), **{name: getattr(self, name) for name in names}}
+        search = {} if self.search == REFERENCE else {"algorithm": self.search.lower()}
+        return {"spec": spec, "arm": self.way.fields(), **{name: getattr(self, name) for name in names}, **search}
 
 
 def fingerprint(content: Any) -> str:

@@ -13,7 +13,7 @@ from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.training.candidates import Candidates
 from surrogym_client.training.closed_loop import ClosedLoop, LoopSettings, visit
 from surrogym_client.training.handover import AuditSettings, Handover, Subject, hand_over
-from surrogym_client.training.search import search_for
+from surrogym_client.training.search import search_for, with_algorithm
 from surrogym_client.training.settings import (
     TrainingInterrupted,
     TrainProgress,
@@ -99,8 +99,8 @@ class AuditedTraining:
 
     @property
     def _chosen(self) -> TrainSettings:
-        by_mean = search_for(self.settings).by_mean
-        return chosen_for(self.api.surrogate(self.name), self.settings, by_mean=by_mean)
+        settings = with_algorithm(self.settings, self.port.spec())
+        return chosen_for(self.api.surrogate(self.name), settings, by_mean=search_for(settings).by_mean)
 
     def _subject(self, result: TrainResult) -> Subject:
         predict, settings = load_policy(result.path, result.algorithm), self.settings

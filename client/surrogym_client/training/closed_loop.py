@@ -10,7 +10,7 @@ from typing import Any
 from surrogym_client.sb3 import SurrogateVecEnv
 from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.training.candidates import Candidates
-from surrogym_client.training.search import is_prolonged, planned_steps, search_for
+from surrogym_client.training.search import is_prolonged, planned_steps, search_for, with_algorithm
 from surrogym_client.training.settings import (
     SUGGESTED_STEPS,
     TrainingInterrupted,
@@ -83,9 +83,11 @@ class ClosedLoop:
     _region_known: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
-        algorithm = self.settings.algorithm
+        self.settings = with_algorithm(self.settings, self.port.spec())
         if not search_for(self.settings).resumable:
-            raise ValueError(f"{algorithm} can't start from a policy: expected no rounds, or another algorithm")
+            raise ValueError(
+                f"{self.settings.algorithm} can't start from a policy: expected no rounds, or another algorithm"
+            )
         self._whole, self._part = shares(self.settings, self.rounds.rounds)
         self._prolong = is_prolonged(self.settings, self.port.spec())
 

@@ -18,19 +18,22 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, cast
 
 from surrogym_client.policies import load_policy
 from surrogym_client.policies.predict import Predict
 from surrogym_client.training.settings import TrainProgress, TrainSettings, prolongs
+from surrogym_shared.network import Network
 from surrogym_shared.plugins import Registry
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import EnvironmentSpec
 
 MAX_STEPS = 10_000_000  # most virtual steps of a training: hours of PPO
 ALGORITHMS = ("A2C", "DDPG", "DQN", "PPO", "SAC", "TD3")  # of Stable-Baselines3
+FAST = "FASTPPO"  # default
+REFERENCE = "PPO"  # of Stable-Baselines3
 
 Progress = Callable[[TrainProgress], None]
 
@@ -109,25 +112,52 @@ SEARCHES = Registry[PolicySearch](
     PolicySearch,
     {
         **{name: f"surrogym_client.training.stable_baselines.algorithms:{name}" for name in ALGORITHMS},
-        "FASTPPO": "surrogym_client.training.fast_ppo.search:FastPpo",
+        FAST: "surrogym_client.training.fast_ppo.search:FastPpo",
         "CMAES": "surrogym_client.training.cma_es:CmaEs",
         "GRADIENT": "surrogym_client.training.gradients:Gradients",
     },
 )
 
 
+def name_of(settings: TrainSettings) -> str:
+    """Return the registered name of the settings' search.
+
+    Raises:
+        ValueError: no search has this name.
+    """
+    return SEARCHES.name_of(settings.algorithm or FAST)
+
+
+def with_algorithm(settings: TrainSettings, spec: EnvironmentSpec) -> TrainSettings:
+    """Return the settings with a search. If they name none, it is ``FAST``, or ``REFERENCE`` if only that one serves.
+
+    Only ``REFERENCE`` has trackers and some of the hyperparameters, and can continue a policy of Stable-Baselines3. It
+    is also the search of the paper's preset.
+    """
+    if settings.algorithm is not None:
+        return settings
+    start, known = settings.start_from, {field.name for field in fields(cast("Any", SEARCHES.get(FAST)))}
+    by_reference = (
+        settings.tracker is not None
+        or not known.issuperset(settings.hyperparameters)
+        or spec.design.preset == "paper"
+        or (start is not None and not Network.is_at(start))
+    )
+    return replace(settings, algorithm=REFERENCE if by_reference else FAST)
+
+
 def search_for(settings: TrainSettings) -> PolicySearch:
     """Return the search that the settings name, with its hyperparameters.
 
     Raises:
-        ValueError: the name or a hyperparameter is unknown, or the search can't be prolonged, tracked or started from a
-            policy as the settings require.
+        ValueError: the settings name no search, the name or a hyperparameter is unknown, or the search can't be
+            prolonged, tracked or started from a policy as the settings require.
     """
-    name, kind = SEARCHES.name_of(settings.algorithm), SEARCHES.get(settings.algorithm)
+    name, kind = name_of(settings), SEARCHES.get(name_of(settings))
     if settings.prolong and not kind.prolongable:
         raise ValueError(f"{name} takes the steps it is given: expected no prolonging, or another algorithm")
-    if settings.tracker in ("wandb", "mlflow") and not kind.tracked:
-        raise ValueError(f"{name} logs to no tracker: expected none, got {settings.tracker}")
+    if settings.tracker is not None and not kind.tracked:
+        raise ValueError(f"{name} logs to no tracker: expected none, or another algorithm, got {settings.tracker}")
     if settings.start_from is not None and not kind.resumable:
         raise ValueError(f"{name} begins with a new network: expected no policy to start from")
     try:
@@ -143,7 +173,7 @@ def planned_steps(settings: TrainSettings) -> int:
     Raises:
         ValueError: the steps exceed the maximum, or the algorithm is unknown.
     """
-    kind = SEARCHES.get(settings.algorithm)
+    kind = SEARCHES.get(name_of(settings))
     total = kind.suggested_steps if settings.total_steps is None else settings.total_steps
     if total < 1 or (kind.most_steps is not None and total > kind.most_steps):
         raise ValueError(f"virtual steps: expected 1 to {kind.most_steps or 'any number'}, got {total}")

@@ -35,7 +35,7 @@ class TrainSettings:
         ValueError: ``threads`` exceeds any machine's.
     """
 
-    algorithm: str = "PPO"  # name of a ``PolicySearch``, in any case
+    algorithm: str | None = None  # name of a ``PolicySearch``, in any case; None: as ``with_algorithm`` chooses
     total_steps: int | None = None
     num_envs: int | None = None
     seed: int = 0

@@ -8,13 +8,14 @@ from dataclasses import asdict
 from pathlib import Path
 
 from surrogym_client.training.search import (
-    SEARCHES,
     Found,
     Progress,
     SearchTask,
     is_prolonged,
+    name_of,
     planned_steps,
     search_for,
+    with_algorithm,
 )
 from surrogym_client.training.settings import TrainingInterrupted, TrainResult, TrainSettings, with_folder
 from surrogym_shared.port import SurrogatePort
@@ -40,7 +41,7 @@ def train(
         UnusablePolicy: the file to start from is not a policy of the algorithm.
         TrainingInterrupted: Ctrl-C was pressed; the policy with the best imagined return so far is saved.
     """
-    settings = settings or TrainSettings()
+    settings = with_algorithm(settings or TrainSettings(), port.spec())
     search = search_for(settings)
     if search.tracked:
         settings = with_folder(settings, out)
@@ -60,7 +61,7 @@ def train(
 def _result(found: Found, settings: TrainSettings, out: Path, seconds: float) -> TrainResult:
     return TrainResult(
         path=out,
-        algorithm=found.algorithm or SEARCHES.name_of(settings.algorithm),
+        algorithm=found.algorithm or name_of(settings),
         virtual_steps=found.virtual_steps,
         seconds=seconds,
         imagined_return=found.imagined_return,

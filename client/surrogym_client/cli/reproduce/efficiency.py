@@ -41,7 +41,7 @@ def command(
     ] = None,
     episodes: Annotated[int, typer.Option(min=1, help="Number of real episodes of each evaluation.")] = 100,
     algorithm: Annotated[
-        str | None, typer.Option(help="Policy search, as in surrogym train. [default: that command's]")
+        str | None, typer.Option(help="Policy search, as in surrogym demo. [default: that command's]")
     ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,

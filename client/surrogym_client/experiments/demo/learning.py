@@ -20,9 +20,9 @@ from surrogym_client.experiments.processes import Child, Children, await_file
 from surrogym_client.experiments.settings import DemoSettings
 from surrogym_client.experiments.tasks import ROUNDS, queries_a_round
 from surrogym_client.policies import pushing
-from surrogym_client.policies.card import DEFAULT_ALGORITHM, read_card
+from surrogym_client.policies.card import read_card
 from surrogym_client.surrogates.waiting import share_of_design, wait_for_design, words_of_design
-from surrogym_client.training.search import ALGORITHMS, SEARCHES
+from surrogym_client.training.search import ALGORITHMS
 from surrogym_client.training.words import words_of
 from surrogym_client.transport.api import Api
 from surrogym_client.transport.connection import Retries
@@ -204,7 +204,7 @@ def read_curve(path: Path) -> list[dict[str, Any]]:
 
 def later_imports(settings: DemoSettings) -> tuple[str, ...]:
     """Modules that evaluation and pictures will need."""
-    by_sb3 = SEARCHES.name_of(settings.algorithm or DEFAULT_ALGORITHM) in ALGORITHMS
+    by_sb3 = settings.search in ALGORITHMS
     pictures = ["surrogym_client.experiments.demo.pictures"] if settings.pictures else []
     return (*(["stable_baselines3"] if by_sb3 else []), *pictures)
 

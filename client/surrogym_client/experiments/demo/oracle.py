@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 from surrogym_client.experiments.demo.judging import Judgement, episodes_of
@@ -26,9 +26,7 @@ class OriginalRun:
     def learn(self) -> Learned:
         """Train, and count the steps of the original environment."""
         asked = self._settings
-        chosen = TrainSettings(total_steps=asked.virtual_steps, seed=asked.seed, prolong=asked.prolong)
-        if asked.algorithm is not None:
-            chosen = replace(chosen, algorithm=asked.algorithm)
+        chosen = TrainSettings(asked.search, asked.virtual_steps, seed=asked.seed, prolong=asked.prolong)
         port = OriginalPort(self._settings.judged_by(), episodes_of(self._settings))
         with progress("train", quiet=self._quiet) as update:
 

@@ -25,6 +25,7 @@ from surrogym_client.runtime.versions import commit
 from surrogym_client.sampler.worker import Outcome, Sampler, SamplerSettings
 from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.training import TrainProgress, TrainSettings, train
+from surrogym_client.training.search import REFERENCE
 from surrogym_client.transport.api import Api
 from surrogym_client.transport.connection import Retries
 from surrogym_client.transport.http_surrogate import HttpSurrogate
@@ -136,7 +137,7 @@ def _train(cell: Cell, api: Api, place: Path, tell: Say) -> Row:
     def look(now: TrainProgress) -> None:
         tell(0.3 + 0.6 * now.steps / now.total_steps, f"{now.steps} of {now.total_steps} virtual steps")
 
-    settings = TrainSettings(total_steps=cell.scale.steps, seed=cell.seed)
+    settings = TrainSettings(REFERENCE, cell.scale.steps, seed=cell.seed)
     with HttpSurrogate(api.url, cell.name, "") as port:
         result = train(port, place / "policy.zip", settings, look)
     return {

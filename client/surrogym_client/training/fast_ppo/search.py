@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 from surrogym_client.environments.lanes import Lanes, session_request
 from surrogym_client.evaluation.imagined import observation_statistics
 from surrogym_client.policies.defaults import ATTEMPT_SEED, HIDDEN, LANES, WIDER, decaying
+from surrogym_client.policies.files import load_policy
 from surrogym_client.policies.predict import Predict
 from surrogym_client.training.fast_ppo.learner import (
     LearnedNetwork,
@@ -24,9 +25,9 @@ from surrogym_client.training.fast_ppo.learner import (
     restored,
 )
 from surrogym_client.training.fast_ppo.rollouts import Collector, Rollout
-from surrogym_client.training.proportions import even_batch, suggested_gamma
-from surrogym_client.training.search import SEARCHES, Found, PolicySearch, SearchTask
-from surrogym_client.training.settings import TrainProgress
+from surrogym_client.training.proportions import even_batch, explores_by_state, suggested_gamma
+from surrogym_client.training.search import REFERENCE, SEARCHES, Found, PolicySearch, SearchTask
+from surrogym_client.training.settings import TrainProgress, TrainSettings
 from surrogym_client.training.verdicts import Imagined, Verdicts, checked
 from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec
@@ -34,7 +35,6 @@ from surrogym_shared.spec import EnvironmentSpec
 if TYPE_CHECKING:
     from surrogym_client.training.stable_baselines.search import StableBaselinesSearch
 
-REFERENCE = "PPO"  # of Stable-Baselines3
 RANGES = {  # whole numbers have whole bounds
     "n_steps": (1, 100_000),
     "n_epochs": (1, 1_000),
@@ -53,8 +53,8 @@ class FastPpo(PolicySearch):
     """Policy search by PPO in NumPy, with updates that take a sixth of the time of Stable-Baselines3's.
 
     Networks, loss, Adam, scaled rewards and advantages are those of the search ``PPO``. A network that has learned
-    nothing after a quarter of the steps is abandoned. For continuous actions, the ``PPO`` of Stable-Baselines3 then
-    takes the remaining steps, with state-dependent noise.
+    nothing after a quarter of the steps is abandoned, and another one takes the remaining steps. For continuous actions
+    that is one of Stable-Baselines3's ``PPO``, with state-dependent noise.
     """
 
     n_steps: int = 64  # steps of each lane in a rollout
@@ -77,8 +77,7 @@ class FastPpo(PolicySearch):
                 raise ValueError(f"{name}: expected {low} to {high}, got {value!r}")
 
     def search(self, task: SearchTask) -> Found:
-        start = task.settings.start_from
-        if start is not None and not Network.is_at(start):
+        if _starts_from_reference(task.settings) and not task.settings.anew:
             return _reference().search(task)  # only Stable-Baselines3 can train its own policies further
         compiled_update()  # loads a linear algebra library now, so that its threads are limited as well
         with threadpool_limits(limits=task.settings.threads), _lanes(task) as lanes:
@@ -99,16 +98,17 @@ class _Training:
         self._gamma = suggested_gamma(self._spec) if search.gamma is None else search.gamma
         self._rng = np.random.default_rng(settings.seed)
         mean, deviation = observation_statistics(task.port, settings.seed)
-        units = units_of(self._spec)
-        self._new = Learner(self._spec, np.array(mean), np.array(deviation), units, self._rng)
-        self._saved = None if settings.start_from is None else restored(settings.start_from, self._spec, units)
+        self._standardisation = np.array(mean), np.array(deviation)
+        self._new = self._made()
+        self._theirs = _starts_from_reference(settings)
+        own = None if self._theirs else settings.start_from
+        self._saved = None if own is None else restored(own, self._spec, units_of(self._spec))
         self._rollout = lanes.num_envs * search.n_steps
         self._batch = search.batch_size or even_batch(self._rollout)
         self._objective = Objective(search.clip_range, search.vf_coef, search.max_grad_norm)
         self._lanes, self._lost = lanes, 0
         planned = max(task.steps // self._rollout, 1) * self._rollout
-        proof = self._imagined(self._saved) if self._saved is not None and settings.anew else None
-        self._verdicts = Verdicts(planned, self._imagined(self._new), proof)
+        self._verdicts = Verdicts(planned, self._imagined(self._new), self._earlier() if settings.anew else None)
         self._kept: LearnedNetwork | None = None
         self._collector = Collector(lanes, self._gamma, search.gae_lambda, settings.seed)
 
@@ -123,7 +123,7 @@ class _Training:
                 if not verdicts.given_up:
                     break
             else:
-                return self._by_reference()
+                return self._by_reference()  # a network is only abandoned if steps are left
         except KeyboardInterrupt:
             whole = False
         return self._found(self._kept or _saved(learner), whole=whole)
@@ -141,6 +141,22 @@ class _Training:
                 yield self._saved
             elif not anew:
                 yield self._new
+        while not (self._theirs or explores_by_state(self._spec)):
+            yield self._made()
+
+    def _made(self) -> Learner:
+        """Return a new network, with other initial parameters each time."""
+        return Learner(self._spec, *self._standardisation, units_of(self._spec), self._rng)
+
+    def _earlier(self) -> Imagined | None:
+        """Measure the returns of the policy to start from; None if there is none."""
+        if self._saved is not None:
+            return self._imagined(self._saved)
+        settings = self._task.settings
+        if settings.start_from is None:
+            return None
+        predict = load_policy(settings.start_from, REFERENCE, trust=settings.trust_policy)
+        return checked(self._task.port, predict, settings)
 
     def _learn(self, learner: Learner, steps: int) -> None:
         """Train one network for ``steps`` virtual steps, or until it is abandoned."""
@@ -201,12 +217,16 @@ class _Training:
         )
 
     def _by_reference(self) -> Found:
-        """Train ``PPO`` of Stable-Baselines3 for the remaining steps, and return its policy or the best earlier one."""
+        """Train ``PPO`` of Stable-Baselines3 for the remaining steps, and return its policy or the best earlier one.
+
+        It begins with its own saved policy if there is one, and else with a new network.
+        """
         verdicts, task = self._verdicts, self._task
         spent, left = verdicts.steps, max(verdicts.left, 1)
-        chosen = _reference().exploring_by_state(self._spec)
+        start = task.settings.start_from if self._theirs else None
+        chosen = {} if self._theirs else _reference().exploring_by_state(self._spec)
         seed = task.settings.seed + ATTEMPT_SEED
-        settings = replace(task.settings, seed=seed, start_from=None, hyperparameters=chosen, anew=False)
+        settings = replace(task.settings, seed=seed, start_from=start, hyperparameters=chosen, anew=False)
 
         def shifted(now: TrainProgress) -> None:
             task.progress(replace(now, steps=spent + now.steps, total_steps=spent + now.total_steps))
@@ -217,6 +237,11 @@ class _Training:
             best = self._found(self._kept, whole=other.whole)
         networks = verdicts.networks + other.networks
         return replace(best, virtual_steps=spent + other.virtual_steps, networks=networks)
+
+
+def _starts_from_reference(settings: TrainSettings) -> bool:
+    """Whether the policy to start from is one of Stable-Baselines3."""
+    return settings.start_from is not None and not Network.is_at(settings.start_from)
 
 
 def units_of(spec: EnvironmentSpec) -> tuple[int, ...]:

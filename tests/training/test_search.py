@@ -1,0 +1,39 @@
+"""The choice of a policy search where a training names none."""
+
+from pathlib import Path
+
+import pytest
+
+from surrogym_client.original.classic import pendulum
+from surrogym_client.training import TrainSettings
+from surrogym_client.training.search import search_for, with_algorithm
+from surrogym_shared.spec import Design
+
+PAPER = pendulum().model_copy(update={"design": Design(preset="paper", budget=40)})
+
+
+@pytest.mark.parametrize(
+    ("chosen", "spec", "name"),
+    [
+        ({}, pendulum(), "FASTPPO"),
+        ({"hyperparameters": {"n_epochs": 3}}, pendulum(), "FASTPPO"),
+        ({"hyperparameters": {"ent_coef": 0.01}}, pendulum(), "PPO"),
+        ({"tracker": "tensorboard"}, pendulum(), "PPO"),
+        ({}, PAPER, "PPO"),
+        ({"algorithm": "sac", "tracker": "mlflow"}, PAPER, "sac"),
+    ],
+    ids=["nothing", "its hyperparameter", "another's hyperparameter", "tracker", "paper", "named"],
+)
+def test_the_fast_search_is_chosen_unless_only_its_reference_serves(chosen: dict, spec, name: str):
+    assert with_algorithm(TrainSettings(**chosen), spec).algorithm == name
+
+
+def test_a_policy_of_stable_baselines3_is_continued_by_its_own_library(tmp_path: Path):
+    start = tmp_path / "policy.zip"
+    start.write_bytes(b"no network of arrays")
+    assert with_algorithm(TrainSettings(start_from=start), pendulum()).algorithm == "PPO"
+
+
+def test_a_tracker_is_refused_where_nothing_is_logged():
+    with pytest.raises(ValueError, match="FASTPPO logs to no tracker: expected none, or another algorithm, got mlflow"):
+        search_for(TrainSettings("fastppo", tracker="mlflow"))
