@@ -12,11 +12,13 @@ from sqlalchemy.engine import Connection, Row
 from surrogym_server.errors import ForeignLease, UnknownQuery
 from surrogym_server.storage.port import MAX_ATTEMPTS
 from surrogym_server.storage.records import LeasedQuery
+from surrogym_server.storage.sql import expiry
 from surrogym_server.storage.sql.database import clock
 from surrogym_server.storage.sql.rows import append_event, hold, touch, unknown_surrogate
 from surrogym_server.storage.sql.tables import leases, queries, surrogates
 
 EXPIRED = "no answer before the lease ended"
+IS_OPEN = leases.c.outcome == "open"
 
 
 def begin(
@@ -105,7 +107,7 @@ def share(connection: Connection, name: str) -> Row[Any]:
 def sweep_if_needed(connection: Connection, name: str) -> None:
     """Hold and sweep the surrogate if it has leases to end; one that is not there has none."""
     own = sa.select(surrogates.c.id).where(surrogates.c.name == name).scalar_subquery()
-    ended = (leases.c.outcome == "open") & (leases.c.expires <= clock(connection))
+    ended = expiry.has_ended(connection, leases, IS_OPEN)
     wanted = sa.select(leases.c.id).where(leases.c.surrogate_id == own, ended).limit(1)
     if connection.execute(wanted).one_or_none() is not None:
         sweep(connection, hold(connection, name))
@@ -123,17 +125,6 @@ def sweep(connection: Connection, held: Row[Any]) -> int:
     if ids:
         give_back(connection, held, ids, EXPIRED, begun=True)
     return len(ids)
-
-
-def is_too_long(connection: Connection) -> sa.ColumnElement[bool]:
-    """Whether a lease has more time left than it was given, as the clock was set back since."""
-    return (leases.c.outcome == "open") & (leases.c.expires > clock(connection) + leases.c.seconds)
-
-
-def shorten(connection: Connection) -> None:
-    """Give the leases that are too long the time that they were given, from now: a sampler that lives keeps its own."""
-    too_long = sa.update(leases).where(is_too_long(connection))
-    connection.execute(too_long.values(expires=clock(connection) + leases.c.seconds))
 
 
 def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], error: str, *, begun: bool) -> None:

@@ -20,6 +20,7 @@ from surrogym_server.storage.records import (
     QueryStatus,
     fingerprint,
 )
+from surrogym_server.storage.sql import expiry
 from surrogym_server.storage.sql import leases as leasing
 from surrogym_server.storage.sql.database import Database, clock
 from surrogym_server.storage.sql.rows import Span, append_event, find, hold, insert_queries, recall, remember, within
@@ -137,14 +138,15 @@ class SqlQueries(port.Queries):
 
     def sweep_expired(self) -> int:
         with self._database.read() as connection:
-            ended = (leases.c.outcome == "open") & (leases.c.expires <= clock(connection))
+            ended = expiry.has_ended(connection, leases, leasing.IS_OPEN)
             owners = sa.select(leases.c.surrogate_id).where(ended).distinct()
             wanted = sa.select(surrogates.c.name).where(surrogates.c.id.in_(owners))
             names = list(connection.execute(wanted).scalars())
-            set_back = connection.execute(sa.select(sa.exists().where(leasing.is_too_long(connection)))).scalar()
+            too_long = expiry.is_too_long(connection, leases, leasing.IS_OPEN)
+            set_back = connection.execute(sa.select(sa.exists().where(too_long))).scalar()
         if set_back:
             with self._database.write() as connection:
-                leasing.shorten(connection)
+                expiry.shorten(connection, leases, leasing.IS_OPEN)
         return sum(self._sweep(name) for name in names)
 
     def _sweep(self, name: str) -> int:

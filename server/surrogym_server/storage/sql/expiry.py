@@ -1,0 +1,26 @@
+"""How a lease ends: by the database's clock alone. Shared by all tables whose rows have ``expires`` and ``seconds``."""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection
+
+from surrogym_server.storage.sql.database import clock
+
+Held = sa.ColumnElement[bool]  # whether a row of the table is leased
+
+
+def has_ended(connection: Connection, table: sa.Table, held: Held) -> sa.ColumnElement[bool]:
+    """Whether the time of a lease has come."""
+    return held & (table.c.expires <= clock(connection))
+
+
+def is_too_long(connection: Connection, table: sa.Table, held: Held) -> sa.ColumnElement[bool]:
+    """Whether a lease has more time left than it was given, as the clock was set back since."""
+    return held & (table.c.expires > clock(connection) + table.c.seconds)
+
+
+def shorten(connection: Connection, table: sa.Table, held: Held) -> None:
+    """Give the leases that are too long the time that they were given, from now: who lives keeps its own."""
+    too_long = sa.update(table).where(is_too_long(connection, table, held))
+    connection.execute(too_long.values(expires=clock(connection) + table.c.seconds))
