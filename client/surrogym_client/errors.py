@@ -14,6 +14,7 @@ SurrogymClientError
     │   ├── UnknownQuery
     │   ├── UnknownModel
     │   ├── UnknownPolicy
+    │   ├── UnknownJob
     │   └── SessionLost     the environments open a new session and end the running episodes as truncated
     │       ├── UnknownSession
     │       └── SessionExpired
@@ -104,6 +105,10 @@ class UnknownModel(NotThere):
 
 class UnknownPolicy(NotThere):
     """There is no policy of this version or alias, or it lacks the requested file or evaluation."""
+
+
+class UnknownJob(NotThere):
+    """There is no job of this number."""
 
 
 class SessionLost(NotThere):
@@ -199,6 +204,7 @@ BY_CODE: dict[Code, type[ProblemError]] = {
     Code.UNKNOWN_QUERY: UnknownQuery,
     Code.UNKNOWN_MODEL: UnknownModel,
     Code.UNKNOWN_POLICY: UnknownPolicy,
+    Code.UNKNOWN_JOB: UnknownJob,
     Code.METHOD_NOT_ALLOWED: InvalidInput,
     Code.SPEC_CONFLICT: SpecConflict,
     Code.IDEMPOTENCY_CONFLICT: IdempotencyConflict,

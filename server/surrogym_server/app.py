@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 from surrogym_server import dashboard
 from surrogym_server.api import (
     events,
+    jobs,
     metrics,
     models,
     openapi,
@@ -56,6 +57,7 @@ from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.designer import Designer
 from surrogym_server.services.events import EventService
+from surrogym_server.services.jobs import JobService
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.models import ModelService, load_model, stored_tolerances
 from surrogym_server.services.notices import Notices
@@ -145,7 +147,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
         app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", *settings.host_names}))
     app.add_middleware(Observed, metrics=app.state.metrics)
     app.router.routes.extend(stepping.routes)  # tried first, and directly: an included router is another search
-    for room in (sessions, service, metrics, surrogates, queries, samples, models, policies, events):
+    for room in (sessions, service, metrics, surrogates, queries, samples, models, policies, jobs, events):
         app.include_router(room.router)
     _add_dashboard(app)
     return app
@@ -239,6 +241,7 @@ def _build_services(settings: Settings, design: DesignPort, process: _Process) -
         queries=QueryService(storage, definitions, notices, samplers),
         samples=SampleService(storage, definitions, notices, samplers),
         models=ModelService(storage, definitions, process.models, notices),
+        jobs=JobService(storage, notices),
         policies=PolicyService(storage, _complete, notices, settings.policies_mib * MEBIBYTE),
         sessions=SessionService(storage, definitions, process.engine),
         engine=process.engine,

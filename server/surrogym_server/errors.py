@@ -9,6 +9,7 @@ SurrogymError
 │   ├── UnknownQuery
 │   ├── UnknownModel
 │   ├── UnknownPolicy
+│   ├── UnknownJob
 │   ├── UnknownSession
 │   └── SessionExpired      it was there; open a new one
 ├── Conflict                the request is well formed but does not fit the present state
@@ -70,6 +71,10 @@ class UnknownModel(NotThere):
 
 class UnknownPolicy(NotThere):
     """No policy of this version or alias, or it lacks the file or evaluation that was asked for."""
+
+
+class UnknownJob(NotThere):
+    """No job of this number."""
 
 
 class UnknownSession(NotThere):

@@ -24,6 +24,7 @@ class Code(StrEnum):
     UNKNOWN_QUERY = "unknown_query"
     UNKNOWN_MODEL = "unknown_model"
     UNKNOWN_POLICY = "unknown_policy"  # no such version or alias, or a file or an evaluation that it lacks
+    UNKNOWN_JOB = "unknown_job"
     METHOD_NOT_ALLOWED = "method_not_allowed"
     SPEC_CONFLICT = "spec_conflict"  # the name exists with another specification
     IDEMPOTENCY_CONFLICT = "idempotency_conflict"  # the same key with another body
@@ -56,6 +57,7 @@ STATUS: dict[Code, int] = {
     Code.UNKNOWN_QUERY: 404,
     Code.UNKNOWN_MODEL: 404,
     Code.UNKNOWN_POLICY: 404,
+    Code.UNKNOWN_JOB: 404,
     Code.METHOD_NOT_ALLOWED: 405,
     Code.SPEC_CONFLICT: 409,
     Code.IDEMPOTENCY_CONFLICT: 409,

@@ -60,6 +60,8 @@ class Shell:
     def _remember(self, reply: Any) -> None:
         if "seq" in reply and "id" in reply:
             self.names["SESSION"] = reply["id"]
+        if reply.get("job"):
+            self.names |= {"JOB": str(reply["job"]["id"]), "JOB_LEASE": reply["job"]["lease_token"]}
         match reply.get("queries"):
             case [{"id": query, "lease_token": lease}, *_]:
                 self.names |= {"QUERY": str(query), "LEASE": lease}
@@ -77,7 +79,7 @@ def test_every_curl_line_works_in_its_order(server: ServerProcess, tmp_path: Pat
 
 def test_every_route_is_on_the_page(server: ServerProcess) -> None:
     routes = httpx.get(f"{server.url}/openapi.json").json()["paths"]
-    told = re.sub(r"\$(QUERY|SESSION)|(?<=surrogates/)(rail|pendulum)|(?<=models/)1|" + POLICY, "{}", PAGE)
+    told = re.sub(r"\$(QUERY|SESSION|JOB)|(?<=surrogates/)(rail|pendulum)|(?<=models/)1|" + POLICY, "{}", PAGE)
     missing = [route for route in routes if not re.search(re.escape(_shape(route)) + r"(?![/\w:])", _shape(told))]
     assert missing == []
 

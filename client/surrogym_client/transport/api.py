@@ -1,4 +1,4 @@
-"""One typed method for each route of the server, except the routes of sessions and policies."""
+"""One typed method for each route of the server, except the routes of sessions, policies and jobs."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from surrogym_client.errors import NoModel, ProtocolMismatch, ServerUnreachable
 from surrogym_client.transport import routes
 from surrogym_client.transport.connection import Connection, Retries, Timeouts
+from surrogym_client.transport.jobs import JobCalls
 from surrogym_client.transport.policies import PolicyCalls
 from surrogym_client.transport.replies import parse
 from surrogym_shared import wire
@@ -390,6 +391,13 @@ class Api:
     def policies(self) -> PolicyCalls:
         """Methods for the routes of policies."""
         return PolicyCalls(self.connection)
+
+    # Jobs
+
+    @property
+    def jobs(self) -> JobCalls:
+        """Methods for the routes of jobs."""
+        return JobCalls(self.connection)
 
     # Events
 

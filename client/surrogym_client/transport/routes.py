@@ -28,6 +28,11 @@ def policy(name: str, which: str | int) -> str:
     return f"{surrogate(name)}/policies/{_segment(str(which), POLICY_PATTERN, expected)}"
 
 
+def job(name: str, id: int) -> str:
+    """Return the route of a job. Raises ``InvalidInput`` for an invalid name of a surrogate."""
+    return f"{surrogate(name)}/jobs/{id:d}"
+
+
 def alias(name: str) -> str:
     """Return an alias as the last part of a route. Raises ``InvalidInput`` for an invalid one."""
     return _segment(name, POLICY_PATTERN, "alias of a policy: expected lower-case letters, digits, - and _")

@@ -25,6 +25,7 @@ CODES: dict[type[errors.SurrogymError], Code] = {
     errors.UnknownQuery: Code.UNKNOWN_QUERY,
     errors.UnknownModel: Code.UNKNOWN_MODEL,
     errors.UnknownPolicy: Code.UNKNOWN_POLICY,
+    errors.UnknownJob: Code.UNKNOWN_JOB,
     errors.UnknownSession: Code.UNKNOWN_SESSION,
     errors.SessionExpired: Code.SESSION_EXPIRED,
     errors.SpecConflict: Code.SPEC_CONFLICT,

@@ -1,6 +1,7 @@
 """Wire <-> core, in pairs."""
 
 from surrogym_server.convert.definitions import default_budget, definition_from_spec, stored_definition
+from surrogym_server.convert.jobs import claimed_job, job_detail, job_list, job_progress, job_result, job_view
 from surrogym_server.convert.numbers import numbers
 from surrogym_server.convert.policies import (
     episodes,
@@ -53,6 +54,7 @@ from surrogym_server.convert.sessions import (
 __all__ = [
     "added_samples",
     "claimed",
+    "claimed_job",
     "created",
     "default_budget",
     "definition_from_spec",
@@ -63,6 +65,11 @@ __all__ = [
     "framed_policy_run",
     "imagined",
     "improved",
+    "job_detail",
+    "job_list",
+    "job_progress",
+    "job_result",
+    "job_view",
     "lane_mask",
     "ledger",
     "model_view",

@@ -1,32 +1,59 @@
-"""Which samplers are at work, for people to look at. Kept in memory."""
+"""Which samplers and trainer workers are at work, for people to look at. Kept in memory."""
 
 from __future__ import annotations
 
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from typing import Generic, TypeVar
 
 Clock = Callable[[], float]
+T = TypeVar("T")
 
-ALIVE_SECONDS = 60.0  # a sampler that was not heard of for so long is taken for gone
+ALIVE_SECONDS = 60.0  # one that was not heard of for so long is taken for gone
 
 
-class Samplers:
-    """When each sampler was last heard of. May be called from any thread."""
+class _Alive(Generic[T]):
+    """When each was last heard of, and what it said of itself. May be called from any thread."""
 
     def __init__(self, clock: Clock = time.monotonic) -> None:
         self._clock = clock
-        self._heard: dict[tuple[str, str], float] = {}
+        self._heard: dict[tuple[str, str], tuple[float, T]] = {}
+
+    def _note(self, surrogate: str, name: str, said: T) -> None:
+        now = self._clock()
+        fresh = {key: one for key, one in self._heard.copy().items() if now - one[0] < ALIVE_SECONDS}
+        self._heard = fresh | {(surrogate, name): (now, said)}
+
+    def _alive(self) -> list[tuple[str, str, T]]:
+        now = self._clock()
+        heard = sorted(self._heard.items(), key=lambda one: one[0])
+        return [(*key, said) for key, (at, said) in heard if now - at < ALIVE_SECONDS]
+
+
+class Samplers(_Alive[None]):
+    """When each sampler was last heard of."""
 
     def heard(self, surrogate: str, sampler: str) -> None:
-        now = self._clock()
-        fresh = {key: at for key, at in self._heard.copy().items() if now - at < ALIVE_SECONDS}
-        self._heard = fresh | {(surrogate, sampler): now}
+        self._note(surrogate, sampler, None)
 
     def by_surrogate(self) -> dict[str, list[str]]:
         """Names of those that asked or answered within the last minute."""
-        now, alive = self._clock(), defaultdict[str, list[str]](list)
-        for (surrogate, sampler), at in sorted(self._heard.items()):
-            if now - at < ALIVE_SECONDS:
-                alive[surrogate].append(sampler)
+        alive = defaultdict[str, list[str]](list)
+        for surrogate, sampler, _ in self._alive():
+            alive[surrogate].append(sampler)
         return alive
+
+
+class Workers(_Alive[int]):
+    """When each trainer worker was last heard of, and how many real episodes it takes at most."""
+
+    def heard(self, surrogate: str, worker: str, most_episodes: int | None = None) -> None:
+        """Note that a worker asked or reported; None keeps what it said before."""
+        if most_episodes is None:
+            _, most_episodes = self._heard.get((surrogate, worker), (0.0, 0))
+        self._note(surrogate, worker, most_episodes)
+
+    def of(self, surrogate: str) -> dict[str, int]:
+        """The most real episodes of each worker that was heard of within the last minute, by its name."""
+        return {worker: most for owner, worker, most in self._alive() if owner == surrogate}

@@ -41,6 +41,7 @@ class Sweeper:
 
     async def _sweep_leases(self) -> None:
         self._metrics.expired_leases += await asyncio.to_thread(self._storage.queries.sweep_expired)
+        self._metrics.expired_leases += await asyncio.to_thread(self._storage.jobs.sweep_expired)
 
     async def _try(self, sweep: Callable[[], Awaitable[None]]) -> None:
         try:

@@ -19,6 +19,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
+from surrogym_server.storage.jobs import Jobs
 from surrogym_server.storage.policies import Blobs, Policies
 from surrogym_server.storage.records import (
     AddedSamples,
@@ -416,6 +417,7 @@ class Storage(ABC):
     events: Events
     policies: Policies
     blobs: Blobs
+    jobs: Jobs
 
     @abstractmethod
     def ping(self) -> None:

@@ -24,7 +24,7 @@ FREE = ("audit", "logged")  # purposes of samples that cost none of the budget
 QueryStatus = Literal["pending", "leased", "answered", "set_aside"]
 QueryKind = Literal["step", "rollout"]
 Synchronous = Literal["full", "normal"]  # of a SQLite file: wait for the disk at every commit, or not always
-EventKind = Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged", "policy"]
+EventKind = Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged", "policy", "job"]
 
 OPEN_STATUSES: tuple[QueryStatus, ...] = ("pending", "leased")
 

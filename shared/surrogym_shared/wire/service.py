@@ -31,6 +31,6 @@ class Event(Reply):
     """Server-sent event of a surrogate. Its ``id`` increases, so that a reader can continue with Last-Event-ID."""
 
     id: int
-    kind: Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged", "policy"]
+    kind: Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged", "policy", "job"]
     created_at: float
     body: dict[str, Any]

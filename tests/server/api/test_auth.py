@@ -24,14 +24,17 @@ ALLOWED = {
         GET /v1/surrogates/{name}/sessions, POST /v1/surrogates/{name}/query_uncertainty,
         POST /v1/surrogates/{name}/predict, POST /v1/surrogates/{name}/imagine, GET /v1/surrogates/{name}/policies,
         GET /v1/surrogates/{name}/policies/{which}, GET /v1/surrogates/{name}/policies/{which}/files/{form},
-        GET /v1/surrogates/{name}/policies/{which}/evaluations/{id}""",
+        GET /v1/surrogates/{name}/policies/{which}/evaluations/{id}, GET /v1/surrogates/{name}/jobs,
+        GET /v1/surrogates/{name}/jobs/{job_id}""",
     "train": """
         POST /v1/surrogates/{name}/sessions, POST /v1/surrogates/{name}/improve, GET /v1/sessions/{id},
         DELETE /v1/sessions/{id}, POST /v1/sessions/{id}/occupancy, POST /v1/sessions/{id}/reset,
         POST /v1/sessions/{id}/step, POST /v1/sessions/{id}/rollout, GET /v1/sessions/{id}/coordinates,
         POST /v1/surrogates/{name}/policies, PUT /v1/surrogates/{name}/policies/{version}/files/{form},
         POST /v1/surrogates/{name}/policies/{version}/evaluations, POST /v1/surrogates/{name}/audit,
-        POST /v1/surrogates/{name}/audit:withdraw""",
+        POST /v1/surrogates/{name}/audit:withdraw, POST /v1/surrogates/{name}/jobs,
+        POST /v1/surrogates/{name}/jobs:claim, POST /v1/surrogates/{name}/jobs/{job_id}:cancel,
+        POST /v1/surrogates/{name}/jobs/{job_id}:report, POST /v1/surrogates/{name}/jobs/{job_id}:finish""",
     "sample": """
         POST /v1/surrogates/{name}/queries, POST /v1/surrogates/{name}/queries:claim,
         POST /v1/surrogates/{name}/queries/{query_id}:renew, POST /v1/surrogates/{name}/queries/{query_id}:fail,
@@ -61,7 +64,7 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
 def called(client: httpx.Client, call: str, header: str | None) -> httpx.Response:
     """The head of a reply, with its body where it is a refusal; streams of events would not end."""
     method, path = call.split()
-    url = path.format(name="none", id="none", query_id=1, version=1, which=1, form="zip", alias="a")
+    url = path.format(name="none", id="none", query_id=1, job_id=1, version=1, which=1, form="zip", alias="a")
     headers = {"authorization": header} if header else {}
     with client.stream(method, url, json=None if method == "GET" else {}, headers=headers) as reply:
         if reply.is_error:

@@ -20,7 +20,7 @@ from surrogym_server.storage.sql.tables import metadata
 SPEC = {"environment": "Pendulum-v1", "coordinates": [{"name": "angle"}, {"name": "speed"}]}
 SECONDS = 60.0  # a lease no test outlives
 NAME = "pendulum"
-TIMES = ("created_at", "begun", "expires", "fit_expires")
+TIMES = ("created_at", "begun", "expires", "fit_expires", "finished_at")
 
 
 @pytest.fixture(scope="session")

@@ -14,6 +14,7 @@ from surrogym_server.storage.sql.blobs import FolderBlobs, RowBlobs
 from surrogym_server.storage.sql.checks import check_pages, check_tables
 from surrogym_server.storage.sql.database import Database, connect
 from surrogym_server.storage.sql.designs import SqlDesigns
+from surrogym_server.storage.sql.jobs import SqlJobs
 from surrogym_server.storage.sql.ledger import SqlLedger
 from surrogym_server.storage.sql.memory import SqlEvents, SqlOccupancy, SqlSessions
 from surrogym_server.storage.sql.migrate import migrate
@@ -42,6 +43,7 @@ class SqlStorage(Storage):
         self.events = SqlEvents(database)
         self.policies = SqlPolicies(database)
         self.blobs = blobs
+        self.jobs = SqlJobs(database)
 
     def ping(self) -> None:
         self._readiness.require()

@@ -13,6 +13,7 @@ import numpy as np
 import sqlalchemy as sa
 from sqlalchemy.engine import Dialect
 
+from surrogym_server.storage.jobs import JobKind, JobStatus
 from surrogym_server.storage.records import (
     Array,
     EventKind,
@@ -361,6 +362,35 @@ policy_evaluations = sa.Table(
     sa.Column("blob", sa.Text),  # NULL: not there
     sa.UniqueConstraint("surrogate_id", "version", "key"),
     _policy(),
+    sqlite_autoincrement=True,
+)
+
+jobs = sa.Table(
+    "jobs",
+    metadata,
+    _id(),
+    _owner(),
+    sa.Column("kind", Word("jobs.kind", JobKind), nullable=False),
+    sa.Column("status", Word("jobs.status", JobStatus), nullable=False),
+    sa.Column("task", Json("jobs.task"), nullable=False),
+    sa.Column("episodes", sa.Integer, nullable=False),  # real ones that it asks for
+    sa.Column("created_at", sa.Double, nullable=False),
+    sa.Column("attempts", sa.Integer, nullable=False),
+    sa.Column("worker", sa.Text),
+    sa.Column("token", sa.Text),  # of the last lease
+    sa.Column("begun", sa.Double),
+    sa.Column("expires", sa.Double),
+    sa.Column("seconds", sa.Double),  # for how long the lease was given out last
+    sa.Column("cancelling", sa.Boolean, nullable=False),
+    sa.Column("lost", sa.Boolean, nullable=False),  # it ended because its lease did
+    sa.Column("finished_at", sa.Double),
+    sa.Column("state", Json("jobs.state"), nullable=False),
+    sa.Column("curve", Json("jobs.curve"), nullable=False),
+    sa.Column("error", sa.Text),
+    sa.Column("version", sa.Integer),  # of the policy
+    sa.Column("evaluation", Id),
+    sa.Index(None, "surrogate_id", "status", "id"),
+    sa.Index(None, "status", "expires"),
     sqlite_autoincrement=True,
 )
 

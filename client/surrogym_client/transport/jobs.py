@@ -1,0 +1,119 @@
+"""One typed method for each route of jobs."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+from pydantic import BaseModel
+
+from surrogym_client.transport import routes
+from surrogym_client.transport.connection import Connection, Retries
+from surrogym_client.transport.replies import parse
+from surrogym_shared import wire
+
+R = TypeVar("R", bound=wire.Reply)
+
+
+class JobCalls:
+    """Routes of the jobs of trainer workers.
+
+    Every method raises as those of ``Api``, and ``UnknownJob`` for a job that does not exist.
+    """
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+
+    def list(self, surrogate: str) -> wire.JobList:
+        """List the jobs of a surrogate, newest first, and the workers that are connected."""
+        route = f"{routes.surrogate(surrogate)}/jobs"
+        return parse(wire.JobList, self._connection.send("GET", route), route)
+
+    def get(self, surrogate: str, id: int) -> wire.JobDetail:
+        """Return one job, with the curve of its training so far."""
+        route = routes.job(surrogate, id)
+        return parse(wire.JobDetail, self._connection.send("GET", route), route)
+
+    def add(self, surrogate: str, task: wire.Task, *, idempotency_key: str | None = None) -> wire.JobView:
+        """Queue a training or an evaluation.
+
+        Raises:
+            NoModel: a training needs a model.
+            UnknownPolicy: the policy to evaluate does not exist.
+            Overloaded: too many jobs wait.
+        """
+        body = wire.AddJob(task=task, idempotency_key=idempotency_key)
+        return self._post(wire.JobView, f"{routes.surrogate(surrogate)}/jobs", body, repeatable=bool(idempotency_key))
+
+    def cancel(self, surrogate: str, id: int) -> wire.JobView:
+        """Cancel a job that waits, or ask the worker of a running one to stop."""
+        route = f"{routes.job(surrogate, id)}:cancel"
+        return parse(wire.JobView, self._connection.send("POST", route), route)
+
+    def claim(
+        self,
+        surrogate: str,
+        worker: str,
+        *,
+        most_episodes: int = 0,
+        wait_seconds: float = 0.0,
+        lease_seconds: float = 60.0,
+    ) -> wire.LeasedJob | None:
+        """Lease a job for a worker, and wait up to ``wait_seconds`` until there is one.
+
+        A claim whose reply is lost is not sent again. Its lease expires, and the job returns to the queue.
+        """
+        body = wire.ClaimJob(
+            worker=worker, most_episodes=most_episodes, wait_seconds=wait_seconds, lease_seconds=lease_seconds
+        )
+        timeout = self._connection.timeouts.request + wait_seconds
+        route = f"{routes.surrogate(surrogate)}/jobs:claim"
+        return self._post(wire.ClaimedJob, route, body, timeout=timeout, repeatable=False).job
+
+    def report(
+        self,
+        surrogate: str,
+        id: int,
+        lease_token: str,
+        *,
+        state: wire.JobState | None = None,
+        lease_seconds: float = 60.0,
+        retries: Retries | None = None,
+    ) -> bool:
+        """Keep a job, and store how far it is. Returns whether the worker is to stop.
+
+        Raises:
+            LeaseExpired: the job has ended, or another worker has it.
+        """
+        body = wire.ReportJob(lease_token=lease_token, lease_seconds=lease_seconds, state=state)
+        return self._post(wire.ReportedJob, f"{routes.job(surrogate, id)}:report", body, retries=retries).cancel
+
+    def finish(
+        self,
+        surrogate: str,
+        id: int,
+        lease_token: str,
+        status: wire.JobEnd,
+        *,
+        error: str | None = None,
+        version: int | None = None,
+        evaluation: int | None = None,
+    ) -> wire.JobView:
+        """End a job. Repeating it is harmless. Raises as ``report``."""
+        body = wire.FinishJob(
+            lease_token=lease_token, status=status, error=error, version=version, evaluation=evaluation
+        )
+        return self._post(wire.JobView, f"{routes.job(surrogate, id)}:finish", body)
+
+    def _post(
+        self,
+        reply: type[R],
+        route: str,
+        body: BaseModel,
+        *,
+        timeout: float | None = None,
+        repeatable: bool = True,
+        retries: Retries | None = None,
+    ) -> R:
+        content = body.model_dump_json().encode()
+        options = {"timeout": timeout, "repeatable": repeatable, "retries": retries}
+        return parse(reply, self._connection.send("POST", route, content, **options), route)  # type: ignore[arg-type]

@@ -1,0 +1,132 @@
+"""Jobs over HTTP: bounded, without code, seen by people, and run by one worker at a time."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import pytest
+
+from support.policies import network_file
+from support.server import ServerProcess
+from surrogym_client.errors import InvalidInput, LeaseExpired, NoModel, Overloaded, UnknownJob, UnknownPolicy
+from surrogym_client.original.classic import pendulum
+from surrogym_client.transport import Api
+from surrogym_shared import wire
+
+TRAIN = wire.TrainTask(kind="train", algorithm="fastppo", steps=1_000)
+EVALUATE = wire.EvaluateTask(kind="evaluate", episodes=5, compare="zero")
+STATE = wire.JobState(stage="training", share=0.5, steps=512, total_steps=1024, curve=[wire.JobPoint(steps=512)])
+
+
+@pytest.fixture
+def api(server_process: ServerProcess) -> Iterator[Api]:
+    with Api(server_process.url) as opened:
+        yield opened
+
+
+@pytest.fixture
+def known(api: Api, taught: str) -> Iterator[str]:
+    """A surrogate with a model; jobs that nobody claimed are cancelled at the end."""
+    yield taught
+    for job in api.jobs.list(taught).jobs:
+        if job.status == "queued":
+            api.jobs.cancel(taught, job.id)
+
+
+def test_a_job_is_seen_from_its_queue_to_its_end(api: Api, known: str):
+    added = api.jobs.add(known, TRAIN)
+    assert (added.status, added.task) == ("queued", TRAIN)
+    job = api.jobs.claim(known, "trainer-1", most_episodes=7)
+    assert job is not None
+    assert (job.id, job.task, job.attempt) == (added.id, TRAIN, 1)
+    assert not api.jobs.report(known, job.id, job.lease_token, state=STATE)
+    seen = api.jobs.get(known, job.id)
+    assert (seen.status, seen.stage, seen.steps, seen.curve) == ("running", "training", 512, STATE.curve)
+    shown = api.jobs.list(known)
+    assert [(worker.name, worker.most_episodes) for worker in shown.workers if worker.name == "trainer-1"] == [
+        ("trainer-1", 7)
+    ]
+    assert api.jobs.cancel(known, job.id).cancelling
+    assert api.jobs.report(known, job.id, job.lease_token)
+    ended = api.jobs.finish(known, job.id, job.lease_token, "cancelled", error="stopped by a person", version=2)
+    assert (ended.status, ended.error, ended.version) == ("cancelled", "stopped by a person", 2)
+    with pytest.raises(LeaseExpired):
+        api.jobs.report(known, job.id, job.lease_token)
+    with pytest.raises(UnknownJob):
+        api.jobs.get(known, 2**40)
+
+
+def test_a_waiting_worker_gets_a_job_as_it_comes(api: Api, known: str):
+    found: list[Any] = []
+    waiting = threading.Thread(target=lambda: found.append(api.jobs.claim(known, "waiting", wait_seconds=30)))
+    waiting.start()
+    with Api(api.url) as another:
+        id = another.jobs.add(known, TRAIN, idempotency_key=f"{known}-waits").id
+    waiting.join(20)
+    assert [job.id for job in found] == [id]
+    api.jobs.finish(known, id, found[0].lease_token, "done")
+
+
+def test_an_evaluation_names_a_version_and_goes_to_a_worker_that_takes_it(api: Api, known: str):
+    with pytest.raises(UnknownPolicy):
+        api.jobs.add(known, EVALUATE.model_copy(update={"policy": "production"}))
+    version = api.policies.push(known, wire.PushedCard(), [], "zip", network_file(seed=1)).version
+    added = api.jobs.add(known, EVALUATE)
+    assert added.task == EVALUATE.model_copy(update={"policy": str(version)})
+    assert api.jobs.claim(known, "careful", most_episodes=9) is None  # the comparison takes as many
+    job = api.jobs.claim(known, "bold", most_episodes=10)
+    assert job is not None
+    api.jobs.finish(known, job.id, job.lease_token, "failed", error="the motor did not answer")
+
+
+def test_a_training_needs_a_model(api: Api, name: str):
+    api.create_surrogate(name, pendulum())
+    with pytest.raises(NoModel):
+        api.jobs.add(name, TRAIN)
+    api.delete_surrogate(name)
+
+
+def test_jobs_that_nobody_runs_are_bounded(api: Api, known: str):
+    while sum(job.status in ("queued", "running") for job in api.jobs.list(known).jobs) < 20:
+        api.jobs.add(known, TRAIN)
+    with pytest.raises(Overloaded, match="wait or run"):
+        api.jobs.add(known, TRAIN)
+
+
+@pytest.mark.parametrize(
+    ("task", "said"),
+    [
+        ({"kind": "train", "algorithm": "os:system"}, "algorithm"),
+        ({"kind": "train", "steps": 10**9}, "steps"),
+        ({"kind": "train", "steps": 5, "preset": "quick"}, "expected steps or preset quick"),
+        ({"kind": "train", "hyperparameters": {}}, "hyperparameters"),
+        ({"kind": "evaluate", "env": "os:system"}, "env"),
+        ({"kind": "evaluate", "episodes": 10**6}, "episodes"),
+        ({"kind": "evaluate", "policy": "../../etc"}, "policy"),
+        ({"kind": "shell"}, "kind"),
+    ],
+)
+def test_a_task_outside_its_bounds_is_refused_and_changes_nothing(
+    client: httpx.Client, known: str, task: dict[str, Any], said: str
+):
+    before = client.get(f"/v1/surrogates/{known}/jobs").json()["jobs"]
+    reply = client.post(f"/v1/surrogates/{known}/jobs", json={"task": task})
+    assert reply.status_code == 422
+    assert said in reply.json()["detail"]
+    assert client.get(f"/v1/surrogates/{known}/jobs").json()["jobs"] == before
+
+
+def test_a_report_outside_its_bounds_is_refused(api: Api, client: httpx.Client, known: str):
+    id = api.jobs.add(known, TRAIN).id
+    job = api.jobs.claim(known, "trainer-1")
+    assert job is not None
+    points = [{"steps": 1}] * 201
+    for state in ({"stage": "training", "curve": points}, {"stage": "hacking"}, {"stage": "training", "share": 2}):
+        body = {"lease_token": job.lease_token, "state": state}
+        assert client.post(f"/v1/surrogates/{known}/jobs/{id}:report", json=body).status_code == 422
+    with pytest.raises(InvalidInput):
+        api.jobs.get("no/such", id)
+    api.jobs.finish(known, id, job.lease_token, "done")
