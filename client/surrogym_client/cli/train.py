@@ -261,27 +261,10 @@ def _write_card(
     curve: list[CurvePoint],
 ) -> dict[str, Any]:
     """Write the policy's card beside it, and return the result as JSON."""
-    from surrogym_client.policies.card import NotedAddress, PolicyCard, write_card
-    from surrogym_client.policies.pushing import thinned
-    from surrogym_client.runtime.versions import versions
+    from surrogym_client.policies.card import write_card
+    from surrogym_client.training.cards import card_of
 
-    card = PolicyCard(
-        algorithm=result.algorithm,
-        surrogate=surrogate,
-        server=NotedAddress(url),
-        spec=spec,
-        seed=seed,
-        virtual_steps=result.virtual_steps,
-        seconds=result.seconds,
-        imagined_return=result.imagined_return,
-        visited_confidence=result.visited_confidence,
-        networks=result.networks,
-        curve=thinned(curve),
-        untrained=result.untrained,
-        **({} if handover is None else vars(handover)),
-        settings=result.settings,
-        versions=versions(),
-    )
+    card = card_of(result, handover, surrogate=surrogate, spec=spec, url=url, seed=seed, curve=curve)
     write_card(Path(result.path), card)
     return {
         "policy": str(result.path),
