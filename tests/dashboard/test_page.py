@@ -14,7 +14,7 @@ from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
 
 Open = Callable[..., Page]
-PARTS = ("Policies", "Learning", "Maps", "Probe", "Sessions", "Queue", "Ledger", "Steer", "Model versions")
+PARTS = ("Policies", "Learning", "Maps", "Probe", "Sessions", "Queue", "Ledger", "Steer", "Downloads", "Model versions")
 
 
 @pytest.fixture

@@ -17,6 +17,7 @@ from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
+    CheckedSurrogate,
     CreatedSurrogate,
     CreateSurrogate,
     Improve,
@@ -46,6 +47,23 @@ def create(body: Annotated[CreateSurrogate, example(examples.CREATE)], use: Use)
     budget = convert.default_budget(spec)
     status, created = use.surrogates.create(body.name, spec.model_dump(mode="json"), budget, spec.design.target)
     return convert.created(status, created=created)
+
+
+@router.post(
+    ":check",
+    summary="Check a registration",
+    dependencies=[ADMIN],
+    openapi_extra=json_up_to(128),
+    responses=documented(Code.INVALID_REQUEST, Code.INVALID_SPEC, Code.SPEC_CONFLICT),
+)
+def check(body: Annotated[CreateSurrogate, example(examples.CREATE)], use: Use) -> CheckedSurrogate:
+    """What the registration of this body would store, with every default. Nothing is stored. What a registration
+    refuses is refused here too."""
+    spec = body.spec
+    budget = convert.default_budget(spec)
+    return convert.checked(
+        body.name, spec, budget, use.surrogates.check(body.name, spec.model_dump(mode="json"), budget)
+    )
 
 
 @router.get("", summary="All surrogates", dependencies=[READ], responses=documented(Code.INVALID_REQUEST))

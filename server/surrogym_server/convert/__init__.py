@@ -16,6 +16,7 @@ from surrogym_server.convert.policies import (
 )
 from surrogym_server.convert.resources import (
     added_samples,
+    checked,
     claimed,
     created,
     event,
@@ -53,6 +54,7 @@ from surrogym_server.convert.sessions import (
 
 __all__ = [
     "added_samples",
+    "checked",
     "claimed",
     "claimed_job",
     "created",

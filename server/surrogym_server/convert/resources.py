@@ -14,7 +14,7 @@ from surrogym_server.sampling.uncertainty import UncertaintyResult
 from surrogym_server.services.models import Said
 from surrogym_server.services.queries import Claim
 from surrogym_server.services.samples import Added
-from surrogym_server.services.surrogates import Listed, SurrogateStatus
+from surrogym_server.services.surrogates import Checked, Listed, SurrogateStatus
 from surrogym_server.storage.records import (
     EventRecord,
     LeasedQuery,
@@ -47,6 +47,18 @@ def surrogate_view(status: SurrogateStatus) -> replies.SurrogateView:
 
 def created(status: SurrogateStatus, *, created: bool) -> replies.CreatedSurrogate:
     return replies.CreatedSurrogate(**_view_fields(status), created=created)
+
+
+def checked(name: str, spec: wire.EnvironmentSpec, budget: int, found: Checked) -> replies.CheckedSurrogate:
+    return replies.CheckedSurrogate(
+        name=name,
+        spec=spec,
+        budget=budget,
+        target=spec.design.target,
+        initial=found.initial,
+        outputs=list(found.outputs),
+        exists=found.exists,
+    )
 
 
 def improved(status: SurrogateStatus, raised: int) -> replies.ImprovedSurrogate:

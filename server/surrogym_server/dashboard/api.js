@@ -14,6 +14,7 @@ export class Problem extends Error {
     super(body.detail ?? body.title ?? `status ${status}`);
     this.status = status;
     this.code = body.code;
+    this.errors = body.errors ?? null; // of fields: {field, expected, got} each
   }
 }
 
@@ -53,7 +54,12 @@ export async function call(method, path, body, signal) {
 /** Saves what a route gives as a file: a link would carry no token. */
 export async function download(path, name) {
   const reply = await send(path, { headers: headers() });
-  const address = URL.createObjectURL(await reply.blob());
+  save(await reply.blob(), name);
+}
+
+/** Saves bytes that the page has as a file. */
+export function save(blob, name) {
+  const address = URL.createObjectURL(blob);
   const link = document.createElement("a");
   link.href = address;
   link.download = name;

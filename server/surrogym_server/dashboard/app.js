@@ -4,6 +4,7 @@ import { call, events, Gone, Problem, token } from "/page/api.js";
 import { compareView } from "/page/compare.js";
 import { h } from "/page/dom.js";
 import { listView } from "/page/list.js";
+import { registerView } from "/page/registering.js";
 import { surrogateView } from "/page/surrogate.js";
 
 const LOOK_MS = 3_000; // what no event tells of: steps of sessions, samplers that fall silent
@@ -29,9 +30,10 @@ function route() {
   const [kind, ...names] = location.hash.slice(2).split("/").map(decodeURIComponent);
   page.view?.close();
   if (kind === "compare") page.view = compareView(main, names);
+  else if (kind === "register") page.view = registerView(main, { role: () => page.role });
   else if (kind === "s") page.view = surrogateView(main, names.join("/"), { role: () => page.role, refresh });
   else page.view = listView(main, { refresh });
-  document.title = { compare: "Compare policies · Surrogym", s: `${names.join("/")} · Surrogym` }[kind] ?? "Surrogym";
+  document.title = { compare: "Compare policies · Surrogym", register: "Register an environment · Surrogym", s: `${names.join("/")} · Surrogym` }[kind] ?? "Surrogym";
   refresh();
 }
 

@@ -11,6 +11,7 @@ const ADDRESS = HOME.includes(location.origin) ? "" : `export SURROGYM_URL=${loc
 const EMPTY = () => h("div", { class: "card welcome" },
   h("h2", {}, "No surrogate yet"),
   h("p", {}, "Register an environment, and let a sampler answer the questions about it. This page follows by itself."),
+  h("p", {}, h("a", { href: "#/register" }, "Register from a specification"), ", or by commands:"),
   h("pre", {}, `${ADDRESS}surrogym register Pendulum-v1 --name pendulum\nsurrogym sample pendulum`));
 
 function row(surrogate) {
@@ -45,7 +46,8 @@ export function listView(main, { refresh }) {
   const place = h("div", {}, h("div", { class: "card loading", "aria-busy": "true" }, "Asking the server…"));
   const rows = keyed(list, row);
   const compare = h("p", { hidden: true }, h("a", { href: "#/compare" }, "Compare policies of two surrogates"));
-  main.replaceChildren(h("h1", {}, "Surrogates"), place, more, compare);
+  const register = h("p", { hidden: true }, h("a", { href: "#/register" }, "Register another environment"));
+  main.replaceChildren(h("h1", {}, "Surrogates"), place, more, register, compare);
   return {
     async refresh() {
       const { found, rest } = await firstOf(wished);
@@ -53,6 +55,7 @@ export function listView(main, { refresh }) {
       const wanted = found.length ? list : place.querySelector(".welcome") ?? EMPTY();
       if (place.firstChild !== wanted) place.replaceChildren(wanted);
       more.hidden = !rest;
+      register.hidden = !found.length;
       compare.hidden = found.length < 2;
     },
     fail: (error) => place.replaceChildren(h("div", { class: "card bad", role: "alert" }, error.message)),

@@ -55,12 +55,14 @@ export function policyList(name, spec, { role, refresh }) {
     const trusted = policy.trusted === null ? "Nobody judged the promise." : `The promise was ${policy.trusted ? "" : "not "}trusted: ${policy.reason}.`;
     const parts = [h("p", {}, trusted)];
     if (policy.differs) parts.push(h("p", { class: "bad" }, `It was made for another specification: that differs in ${policy.differs}.`));
-    parts.push(table(`Real episodes of version ${policy.version}`, [["actions of", ""], ["starts", ""], ["episodes", "num"], ["mean return (95 %)", "num"], ["success", "num"], ["real steps", "num"]],
-      policy.evaluations.map((each) => [ACTING[each.controller], each.note || "–", each.episodes, meanWords(each), percent(each.success_rate), each.steps]), "No real episode yet: surrogym evaluate runs some."));
+    parts.push(table(`Real episodes of version ${policy.version}`, [["actions of", ""], ["starts", ""], ["episodes", "num"], ["mean return (95 %)", "num"], ["success", "num"], ["real steps", "num"], ["", ""]],
+      policy.evaluations.map((each) => [ACTING[each.controller], each.note || "–", each.episodes, meanWords(each), percent(each.success_rate), each.steps, episodesOf(policy, each)]), "No real episode yet: surrogym evaluate runs some."));
     inside.replaceChildren(...parts, files(policy), naming(policy));
     if (detail.curve.length > 1) inside.append(...curve(detail.curve));
     await episodes(policy, inside);
   }
+
+  const episodesOf = (policy, { id }) => h("button", { type: "button", class: "link", "aria-label": `Download the episodes of evaluation ${id}`, onclick: () => attempt(() => download(`${url}/${policy.version}/evaluations/${id}`, `${name}-${policy.version}-evaluation-${id}.json`)) }, "Download");
 
   function files(policy) {
     const links = policy.files.map((file) => (file.stored

@@ -3,6 +3,7 @@
 import { actions } from "/page/actions.js";
 import { call, Problem, surrogate as path } from "/page/api.js";
 import { learningCurves } from "/page/charts.js";
+import { downloads } from "/page/downloads.js";
 import { h, shown } from "/page/dom.js";
 import { cost, leastSure, sure, where } from "/page/hero.js";
 import { maps } from "/page/maps.js";
@@ -13,7 +14,7 @@ import { probe } from "/page/probe.js";
 import { ledgerTable, modelTable, queueTable, sessionTable } from "/page/tables.js";
 
 const PAGE = 10_000;
-const LINKS = [["policies", "Policies"], ["learning", "Learning"], ["maps", "Maps"], ["probe", "Probe"], ["queue", "Queue"], ["sessions", "Sessions"], ["ledger", "Ledger"], ["models", "Models"], ["actions", "Steer"]];
+const LINKS = [["policies", "Policies"], ["learning", "Learning"], ["maps", "Maps"], ["probe", "Probe"], ["queue", "Queue"], ["sessions", "Sessions"], ["ledger", "Ledger"], ["models", "Models"], ["actions", "Steer"], ["downloads", "Downloads"]];
 
 export function surrogateView(main, name, context) {
   const url = path(name);
@@ -79,6 +80,7 @@ function build(main, name, spec, context) {
   const controls = pointControls(spec, () => { map.moved(); probing.moved(); });
   const map = maps(name, spec, controls);
   const steer = actions(name, context);
+  const files = downloads(name);
   const settable = spec.max_rollout === undefined || spec.max_rollout === null;
   const probing = probe(name, spec, controls, { onepisodes: map.paths, ask: settable && ((point) => steer.ask(point)) });
   const [queue, ledger, versions, sessions] = [queueTable(), ledgerTable(), modelTable(), sessionTable(name)];
@@ -104,7 +106,7 @@ function build(main, name, spec, context) {
     section("maps", "Maps", "Two coordinates at a time; the sliders set the others. Click a map, or move with the arrow keys.",
       h("div", { class: "cut" }, controls.form, h("div", {}, map.parts))),
     section("probe", "Probe", "What the model says of one step from the point above, with its standard deviations.", probing.parts),
-    queue.element, sessions.element, h("div", { class: "two" }, ledger.element, steer.element), versions.element);
+    queue.element, sessions.element, h("div", { class: "two" }, ledger.element, steer.element), versions.element, files.element);
 
   let found = null;
   let looked = null;
@@ -135,6 +137,7 @@ function build(main, name, spec, context) {
       ledger.show(now.ledger);
       if (open) sessions.show(open);
       steer.show(now);
+      files.show(now);
       look(rest);
     },
     repaint: () => [curves, map, probing, stored].forEach((part) => part.repaint()),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.errors import InvalidInput, NoModel, SpecConflict
+from surrogym_server.errors import InvalidInput, NoModel, SpecConflict, UnknownSurrogate
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Define, Definitions
 from surrogym_server.services.notices import Notices
@@ -51,6 +51,15 @@ class SurrogateStatus(Listed):
     outputs: tuple[str, ...]
     model: ModelRecord | None
     budget_left: int  # real steps that may still be asked for within it
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What a registration would store."""
+
+    initial: int  # real steps of the initial queries
+    outputs: tuple[str, ...]
+    exists: bool  # with the same spec
 
 
 class SurrogateService:
@@ -110,6 +119,19 @@ class SurrogateService:
             check_same(name, self._complete(present.spec), self._complete(spec))
         self._notices.post(name)
         return self.status(name), created
+
+    def check(self, name: str, spec: dict[str, Any], budget: int) -> Checked:
+        """Check what ``create`` would do, without doing it. Raises as ``create``."""
+        definition = self._define(spec)
+        _, coordinates, _, rollouts = self._plan(definition, budget)
+        try:
+            present = self._storage.surrogates.get(name)
+        except UnknownSurrogate:
+            exists = False
+        else:
+            check_same(name, self._complete(present.spec), self._complete(spec))
+            exists = True
+        return Checked(len(coordinates) + sum(map(len, rollouts)), definition.outputs, exists)
 
     def status(self, name: str) -> SurrogateStatus:
         """Raises ``UnknownSurrogate``."""

@@ -146,6 +146,7 @@ from surrogym_shared.wire.sessions import (
     SubmittedOccupancy,
 )
 from surrogym_shared.wire.surrogates import (
+    CheckedSurrogate,
     CreatedSurrogate,
     CreateSurrogate,
     Fidelity,
@@ -192,6 +193,7 @@ __all__ = [
     "AuditModel",
     "AutoresetMode",
     "BoxSpace",
+    "CheckedSurrogate",
     "ClaimJob",
     "ClaimQueries",
     "ClaimedJob",

@@ -124,6 +124,18 @@ class CreatedSurrogate(SurrogateView):
     created: bool = Field(description="whether this request made it; false: it was there, with the same specification")
 
 
+class CheckedSurrogate(Reply):
+    """Reply to the check of a registration: what it would store. Nothing was stored."""
+
+    name: str
+    spec: EnvironmentSpec = Field(description="with the default of every field that the request left out")
+    budget: int = Field(description="real steps that the design would be allowed to take")
+    target: float = Field(description="confidence index to reach")
+    initial: int = Field(description="real steps of the initial queries")
+    outputs: list[str] = Field(description="quantities that the model would predict")
+    exists: bool = Field(description="whether there is a surrogate of this name and specification")
+
+
 class ImprovedSurrogate(SurrogateView):
     """Reply to a request for more queries: the surrogate, and by how much its budget was raised."""
 

@@ -41,7 +41,7 @@ ALLOWED = {
         POST /v1/surrogates/{name}/add_sample""",
     "train sample": "POST /v1/surrogates/{name}/ledger",
     "": """
-        POST /v1/surrogates, PATCH /v1/surrogates/{name}, DELETE /v1/surrogates/{name},
+        POST /v1/surrogates, POST /v1/surrogates:check, PATCH /v1/surrogates/{name}, DELETE /v1/surrogates/{name},
         POST /v1/surrogates/{name}/models, DELETE /v1/surrogates/{name}/policies/{version},
         PUT /v1/surrogates/{name}/policies/aliases/{alias}, DELETE /v1/surrogates/{name}/policies/aliases/{alias}""",
 }

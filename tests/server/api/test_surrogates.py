@@ -26,6 +26,21 @@ def test_creating_twice_is_harmless(client: httpx.Client, fresh: str):
     assert (first["phase"], first["queries"]["pending"]) == ("collecting", pendulum.INITIAL)
 
 
+def test_a_checked_registration_stores_nothing(client: httpx.Client, name: str):
+    checked = client.post("/v1/surrogates:check", json={"name": name, "spec": pendulum.spec()})
+    assert checked.status_code == 200
+    assert (checked.json()["initial"], checked.json()["exists"]) == (pendulum.INITIAL, False)
+    assert client.get(f"/v1/surrogates/{name}").status_code == 404
+    created = client.post("/v1/surrogates", json={"name": name, "spec": pendulum.spec()}).json()
+    same = ("spec", "budget", "target", "outputs")
+    assert {key: created[key] for key in same} == {key: checked.json()[key] for key in same}
+    again = client.post("/v1/surrogates:check", json={"name": name, "spec": pendulum.spec()}).json()
+    assert again["exists"]
+    other = client.post("/v1/surrogates:check", json={"name": name, "spec": pendulum.spec(initial=7)})
+    assert (other.status_code, other.json()["code"]) == (409, "spec_conflict")
+    client.delete(f"/v1/surrogates/{name}")
+
+
 def test_a_new_surrogate_asks_a_latin_hypercube(client: httpx.Client, fresh: str):
     queries = client.get(f"/v1/surrogates/{fresh}/queries").json()["queries"]
     speeds = sorted((query["coordinates"][1] + 8) / 16 * pendulum.INITIAL for query in queries)
