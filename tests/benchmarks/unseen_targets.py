@@ -15,8 +15,8 @@ from surrogym_client.experiments.tasks import UNSEEN
 from surrogym_client.experiments.unseen.machine import Machine
 from surrogym_client.experiments.unseen.tasks import ResetOnly
 from surrogym_client.original.loading import load_factory
-from surrogym_client.original.terms import observe
 from surrogym_shared.network import Network
+from surrogym_shared.terms import observe
 
 UNITS, POPULATION, STARTS, GENERATIONS = 16, 32, 16, 300
 SHARE = 0.8  # of the way from no action to the best

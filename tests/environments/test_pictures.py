@@ -19,9 +19,9 @@ from surrogym_client.original.classic import TASKS
 from surrogym_client.original.episodes import draw
 from surrogym_client.original.errors import NotRenderable
 from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
-from surrogym_client.original.terms import observe
 from surrogym_client.registration import SWING_UP
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
+from surrogym_shared.terms import observe
 
 SPECS = {name: task.spec() for name, task in TASKS.items()} | {name: make() for name, make in SPECIFICATIONS.items()}
 SHOWN = (

@@ -14,9 +14,9 @@ import pytest
 
 from support import reactor
 from surrogym_client.logs import ReadLog, UnusableLog, read_log
-from surrogym_client.logs.columns import roles_by_name
 from surrogym_client.logs.importing import Options, keep_rejected
 from surrogym_client.logs.reading import format_of
+from surrogym_shared.logs.columns import roles_by_name
 
 
 def read(path: Path, **changes) -> ReadLog:

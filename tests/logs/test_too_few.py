@@ -11,7 +11,7 @@ import pytest
 from support import reactor
 from surrogym_client.logs import UnusableLog, import_log, read_log
 from surrogym_client.logs.importing import Options
-from surrogym_client.logs.too_few import TooFewSteps
+from surrogym_shared.logs.too_few import TooFewSteps
 
 
 def said(path: Path, text: str) -> str:

@@ -7,9 +7,9 @@ import pytest
 
 from support import reactor
 from surrogym_client.logs import importing
-from surrogym_client.logs.errors import UnusableLog
-from surrogym_client.logs.units import require_units
 from surrogym_client.original.classic import pendulum
+from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.units import require_units
 
 
 def states(speed: np.ndarray) -> np.ndarray:

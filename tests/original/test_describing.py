@@ -11,9 +11,9 @@ import pytest
 import surrogym
 from support.simulators import CASES, Register, Spiral, installed
 from surrogym_client import original
-from surrogym_client.original import terms
 from surrogym_client.original.describing import Description, describe
 from surrogym_client.original.simulator import Simulated
+from surrogym_shared import terms
 from surrogym_shared.spec import EnvironmentSpec, limits
 
 STEPS = 80

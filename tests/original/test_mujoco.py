@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from surrogym_client import original
-from surrogym_client.original import terms
 from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
+from surrogym_shared import terms
 from surrogym_shared.spec import limits
 
 pytest.importorskip("mujoco")

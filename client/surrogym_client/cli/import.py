@@ -242,8 +242,8 @@ def _covered(log: ReadLog) -> dict[str, float]:
 
 
 def _words(file: Path, imported: Imported, view: SurrogateView | None, again: str) -> list[str]:
-    from surrogym_client.logs.too_few import counted, has
     from surrogym_client.report.coverage import coverage_of
+    from surrogym_shared.logs.too_few import counted, has
 
     log = imported.log
     lines = [f"{file}: {counted(len(log.table), 'row')}, {counted(len(log.steps), 'step')}"]
@@ -271,7 +271,7 @@ def _columns(log: ReadLog) -> list[str]:
 
 
 def _rejected(imported: Imported) -> list[str]:
-    from surrogym_client.logs.too_few import counted
+    from surrogym_shared.logs.too_few import counted
 
     rejected = imported.log.rejected
     if not rejected:
@@ -282,7 +282,7 @@ def _rejected(imported: Imported) -> list[str]:
 
 
 def _specified(spec: EnvironmentSpec, notes: tuple[str, ...]) -> list[str]:
-    from surrogym_client.logs.drafting import limited
+    from surrogym_shared.logs.drafting import limited
 
     lines = [f"  {name}: {words}" for name, words in limited(spec).items()]
     return ["specification:", *lines, *(f"  {note}" for note in notes)]

@@ -14,10 +14,10 @@ from surrogym_client.original.actions import decode_actions
 from surrogym_client.original.episodes import Episode, Moment, draw
 from surrogym_client.original.errors import EvaluationFailed, PolicyMisfit
 from surrogym_client.original.protocol import LONGEST_EPISODE
-from surrogym_client.original.terms import holds
 from surrogym_client.policies.predict import Predict
 from surrogym_client.runtime.lifetime import signals_between_steps
 from surrogym_shared.spec import EnvironmentSpec, Success
+from surrogym_shared.terms import holds
 from surrogym_shared.wire import TraceRank
 
 Array = NDArray[np.float64]

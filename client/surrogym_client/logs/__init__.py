@@ -7,7 +7,8 @@ Examples:
 
 from __future__ import annotations
 
-from surrogym_client.logs.errors import UnusableLog
-from surrogym_client.logs.importing import Imported, ReadLog, import_log, read_log, send
+from surrogym_client.logs.importing import Imported, import_log, read_log, send
+from surrogym_shared.logs.checking import ReadLog
+from surrogym_shared.logs.errors import UnusableLog
 
 __all__ = ["Imported", "ReadLog", "UnusableLog", "import_log", "read_log", "send"]

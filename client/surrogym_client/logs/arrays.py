@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from surrogym_client.logs.columns import ACTION, SINGLE, STATE
-from surrogym_client.logs.errors import UnusableLog
-from surrogym_client.logs.table import Cells, Table
+from surrogym_shared.logs.columns import ACTION, SINGLE, STATE
+from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.table import Cells, Table
 
 STATES = ("coordinates", "observations", "observation", "states", "state", "obs", "q")
 ACTIONS = ("actions", "action", "u")

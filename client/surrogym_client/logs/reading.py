@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from surrogym_client.logs.arrays import table_of_arrays
-from surrogym_client.logs.errors import UnusableLog
-from surrogym_client.logs.table import Cells, Table
 from surrogym_shared.archives import read_arrays
+from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.table import Cells, Table
+from surrogym_shared.logs.text import table_of_text
 
 Format = Literal["csv", "npz", "parquet", "minari", "surrogate"]
 
 MOST_BYTES = 4 * 1024**3  # of the arrays in an NPZ file
 SURROGATE = ".surrogate"
-DELIMITERS = ",;\t"
 
 
 def format_of(path: Path) -> Format:
@@ -63,27 +60,9 @@ def read(path: Path) -> Table:
 def read_csv(path: Path) -> Table:
     """A table of text with a heading; separated by commas, semicolons or tabs."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        return table_of_text(path.read_text(encoding="utf-8-sig"), str(path))
     except UnicodeDecodeError as error:
         raise UnusableLog(f"expected text, NPZ, Parquet or a surrogate's file, got other bytes in {path}") from error
-    heading = text.partition("\n")[0]
-    delimiter = max(DELIMITERS, key=heading.count)
-    reader = csv.reader(io.StringIO(text), delimiter=delimiter)
-    names = [name.strip() for name in next(reader, [])]
-    _require_names(path, names)
-    rows: list[list[str]] = []
-    lines: list[int] = []
-    faults: dict[int, str] = {}
-    for row in reader:
-        if not row:
-            continue
-        if len(row) != len(names):
-            faults[len(rows)] = f"expected {len(names)} columns, got {len(row)}"
-        rows.append(row)
-        lines.append(reader.line_num)
-    padded = [row if len(row) == len(names) else [*row, *([""] * len(names))][: len(names)] for row in rows]
-    columns = {name: np.array([row[i] for row in padded], dtype=np.str_) for i, name in enumerate(names)}
-    return Table(columns, np.array(lines, dtype=np.int64), faults, rows, delimiter)
 
 
 def read_npz(path: Path) -> Table:
@@ -140,14 +119,6 @@ def read_minari(path: Path) -> Table:
 
 def _rows(array: Cells) -> Cells:
     return array[:, None] if array.ndim == 1 else array
-
-
-def _require_names(path: Path, names: Sequence[str]) -> None:
-    if not any(names):
-        raise UnusableLog(f"expected a log with a heading that names its columns, got none in {path}")
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise UnusableLog(f"expected each column once in {path}, got {twice[0]!r} {names.count(twice[0])} times")
 
 
 def _minari() -> Any:

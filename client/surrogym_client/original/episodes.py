@@ -25,8 +25,8 @@ from surrogym_client.original.protocol import (
 )
 from surrogym_client.original.rollouts import answering
 from surrogym_client.original.simulator import Simulated, random_factor
-from surrogym_client.original.terms import observe
 from surrogym_shared.spec import EnvironmentSpec, Fixed, Normal, Uniform, limits
+from surrogym_shared.terms import observe
 
 
 @dataclass(frozen=True)

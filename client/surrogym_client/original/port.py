@@ -11,9 +11,9 @@ from surrogym_client.original.actions import decode_actions
 from surrogym_client.original.episodes import Episode, Moment, draw
 from surrogym_client.original.errors import NotParallel
 from surrogym_client.original.protocol import LONGEST_EPISODE, Array
-from surrogym_client.original.terms import observe
 from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
+from surrogym_shared.terms import observe
 from surrogym_shared.wire import (
     ActionSpace,
     BoxSpace,

@@ -15,10 +15,10 @@ from surrogym_client.original import OriginalEnvironment, make
 from surrogym_client.original.episodes import GymnasiumEpisode, Moment, draw
 from surrogym_client.original.protocol import RealStep
 from surrogym_client.original.simulator import SMALLEST_FACTOR
-from surrogym_client.original.terms import observe
 from surrogym_client.policies.predict import Predict
 from surrogym_client.transport.api import Api
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
+from surrogym_shared.terms import observe
 from surrogym_shared.wire import ModelView
 
 Array = NDArray[np.float64]

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from surrogym_client.original.protocol import Array
-from surrogym_client.original.terms import evaluate
 from surrogym_shared.spec import EnvironmentSpec, ObservationEntry, Term
+from surrogym_shared.terms import evaluate
 
 TOLERANCE = 1e-7  # of an entry's own size
 FEW_TURNS = 4  # with at most this many turning coordinates, sums of three of them are tried as well

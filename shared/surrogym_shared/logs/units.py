@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from surrogym_client.logs.errors import UnusableLog
-from surrogym_client.logs.table import Floats
+from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.table import Floats
 from surrogym_shared.spec import EnvironmentSpec, limits
 
 BEYOND = 20.0  # widths of its range from the middle, for the middle value of a column: no plant strays so far

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_client.original.protocol import Array
 from surrogym_shared.spec import EnvironmentSpec, Inequality, Part, Term
 
+Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 

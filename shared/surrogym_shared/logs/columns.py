@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from surrogym_client.logs.errors import UnusableLog
+from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.spec.base import MAX_DIMENSIONS
 
 SINGLE = {

@@ -9,8 +9,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from surrogym_client.logs.rows import Rows
-from surrogym_client.logs.table import Bools, Floats, Ints
+from surrogym_shared.logs.rows import Rows
+from surrogym_shared.logs.table import Bools, Floats, Ints
 
 ONE_INTERVAL = 0.5  # a step's time may differ from the sampling interval by this share of it
 

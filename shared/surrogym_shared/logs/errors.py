@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from surrogym_client.errors import SurrogymClientError
 
-
-class UnusableLog(SurrogymClientError):
+class UnusableLog(ValueError):
     """The log, its mapping or its columns can't be used; says what was expected and what came."""

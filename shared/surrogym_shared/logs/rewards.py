@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from surrogym_client.logs.table import Bools, Floats
-from surrogym_client.original.terms import evaluate, holds
+from surrogym_shared.logs.table import Bools, Floats
 from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, RewardTerm
+from surrogym_shared.terms import evaluate, holds
 
 
 def declared_reward(spec: EnvironmentSpec, q: Floats, u: Floats, q_next: Floats, terminated: Bools) -> Floats:

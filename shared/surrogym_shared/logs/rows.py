@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surrogym_client.logs.columns import Roles
-from surrogym_client.logs.table import Bools, Floats, Ints, Table, flags, groups, numbers, times
+from surrogym_shared.logs.columns import Roles
+from surrogym_shared.logs.table import Bools, Floats, Ints, Table, flags, groups, numbers, times
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
 
 SLACK = 1e-6  # of a range: what a number in single precision may be off

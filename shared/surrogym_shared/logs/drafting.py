@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surrogym_client.logs.columns import Roles
-from surrogym_client.logs.errors import UnusableLog
-from surrogym_client.logs.table import Bools, Floats
-from surrogym_client.logs.transitions import Transitions
+from surrogym_shared.logs.columns import Roles
+from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.table import Bools, Floats
+from surrogym_shared.logs.transitions import Transitions
 from surrogym_shared.spec import (
     Bounds,
     BoxAction,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from collections import Counter
 
-from surrogym_client.logs.errors import UnusableLog
-from surrogym_client.logs.table import Table
-from surrogym_client.logs.transitions import Transitions
+from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.table import Table
+from surrogym_shared.logs.transitions import Transitions
 
 DECIMAL_COMMA = re.compile(r"^\s*[-+]?\d+,\d+\s*$")
 

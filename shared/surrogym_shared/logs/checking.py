@@ -1,0 +1,167 @@
+"""A log, checked: its rows against a specification, or a specification drafted from them."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surrogym_shared.logs.columns import Roles
+from surrogym_shared.logs.drafting import Draft, draft, wrapped
+from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.rewards import declared_reward
+from surrogym_shared.logs.rows import rows_of
+from surrogym_shared.logs.table import Bools, Floats, Table
+from surrogym_shared.logs.too_few import require_steps
+from surrogym_shared.logs.transitions import Transitions, transitions_of
+from surrogym_shared.logs.units import require_units
+from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_shared.terms import terminates
+
+
+@dataclass(frozen=True)
+class ReadLog:
+    """A log whose rows were checked.
+
+    Attributes:
+        table: as it was read.
+        roles: what its columns are.
+        steps: what can be used of it.
+        spec: the specification that it was checked against, or that was drafted from it.
+        notes: what the draft was concluded from; none where a specification was given.
+    """
+
+    table: Table
+    roles: Roles
+    steps: Transitions
+    spec: EnvironmentSpec
+    notes: tuple[str, ...] = ()
+
+    @cached_property
+    def rejected(self) -> list[tuple[int, str]]:
+        """The line and the reason of each row that was set aside."""
+        return [(int(self.table.lines[row]), reason) for row, reason in self.steps.rejected.items()]
+
+    @property
+    def ignored(self) -> dict[str, str]:
+        """The columns and arrays of the file that are not used, with the reason."""
+        return {**self.table.ignored, **dict.fromkeys(self.roles.ignored, "it has no role")}
+
+    def write_rejected(self, path: Path) -> None:
+        """Write the rows that were set aside as CSV: line, reason, and the row as it stands in the log."""
+        write_rejected(path, self.table, self.steps)
+
+    @cached_property
+    def reward(self) -> Floats:
+        """Rewards of the usable steps (m,): those of the log, or what the specification declares."""
+        steps = self.steps
+        if steps.reward is not None:
+            return steps.reward
+        return declared_reward(self.spec, steps.q, steps.u, steps.q_next, steps.terminated)
+
+
+def check_log(table: Table, roles: Roles, spec: EnvironmentSpec) -> ReadLog:
+    """Check the rows of a log against a specification.
+
+    Raises:
+        UnusableLog: columns that don't fit the specification.
+        TooFewSteps: no usable step.
+    """
+    roles = _of_spec(roles, spec)
+    rows = rows_of(table, roles, spec)
+    require_units(rows.q, spec)
+    steps = _consistent(spec, _shaped(spec, roles, transitions_of(rows)))
+    require_steps(table, steps, 1)
+    return ReadLog(table, roles, steps, spec)
+
+
+def draft_log(table: Table, roles: Roles, name: str, budget: int = 0) -> ReadLog:
+    """Check the rows of a log, and draft the specification of the environment that it is of.
+
+    Args:
+        table: as it was read.
+        roles: what its columns are.
+        name: what the environment is called.
+        budget: real steps that a design may ask for.
+
+    Raises:
+        UnusableLog: no state ever moves, or an action never varies.
+        TooFewSteps: no usable step, or a single one.
+    """
+    steps = transitions_of(rows_of(table, roles))
+    require_steps(table, steps, 2)
+    drafted: Draft = draft(roles, steps, name, budget)
+    return ReadLog(table, roles, _shaped(drafted.spec, roles, steps), drafted.spec, drafted.notes)
+
+
+def write_rejected(path: Path, table: Table, steps: Transitions) -> None:
+    """Write the rows that were set aside as CSV: line, reason, and the row as it stands in the log."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["line", "reason", *table.names])
+        for row, reason in steps.rejected.items():
+            writer.writerow([table.lines[row], reason, *table.row(row)])
+
+
+def _of_spec(roles: Roles, spec: EnvironmentSpec) -> Roles:
+    """The roles with the coordinates of a specification, in its order; other states are ignored."""
+    if missing := [name for name in spec.coordinate_names if name not in roles.state]:
+        raise UnusableLog(
+            f"expected the coordinates {list(spec.coordinate_names)} of the specification, got {list(roles.state)}: "
+            f"{missing[0]!r} is missing; name the columns in a mapping file (--map)"
+        )
+    if len(roles.action) != spec.action.size:
+        raise UnusableLog(f"expected {spec.action.size} columns of the action, got {list(roles.action.values())}")
+    if roles.reward is None and spec.reward.kind == "learned":
+        raise UnusableLog("expected a column of the reward, which the specification has learned, got none")
+    return replace(
+        roles,
+        state={name: roles.state[name] for name in spec.coordinate_names},
+        following={name: roles.following[name] for name in spec.coordinate_names} if roles.following else {},
+        ignored=(*roles.ignored, *(one for name, one in roles.state.items() if name not in spec.coordinate_names)),
+    )
+
+
+def _shaped(spec: EnvironmentSpec, roles: Roles, steps: Transitions) -> Transitions:
+    """The steps with the coordinates of a specification alone, and their angles wrapped."""
+    names = list(roles.state)
+    kept = [names.index(name) for name in spec.coordinate_names]
+    q, q_next = steps.q[:, kept].copy(), steps.q_next[:, kept].copy()
+    for index, coordinate in enumerate(spec.coordinates):
+        if coordinate.kind == "angle":
+            q[:, index], q_next[:, index] = wrapped(q[:, index]), wrapped(q_next[:, index])
+    return replace(steps, q=q, q_next=q_next)
+
+
+def _consistent(spec: EnvironmentSpec, steps: Transitions) -> Transitions:
+    """The steps but those that the specification contradicts: a discrete action that is no whole number, an end where
+    none is declared, and none where one is."""
+    reasons: dict[int, str] = {}
+    if not isinstance(spec.action, BoxAction):
+        for place in np.flatnonzero((steps.u != np.floor(steps.u)).any(1)).tolist():
+            reasons[place] = f"action: expected whole numbers, got {steps.u[place].tolist()}"
+    if spec.termination != "learned":
+        declared = terminates(spec, steps.q_next)
+        for place in np.flatnonzero(declared != steps.terminated).tolist():
+            reasons.setdefault(place, _contradiction(bool(declared[place])))
+    rejected = {int(steps.row[place]): reason for place, reason in reasons.items()}
+    kept = np.array([place not in reasons for place in range(len(steps))], dtype=np.bool_)
+    return _without(steps, kept, rejected) if reasons else steps
+
+
+def _contradiction(declared: bool) -> str:
+    if declared:
+        return "terminated: expected 1, as a declared termination holds at the next state, got 0"
+    return "terminated: expected 0, as no declared termination holds at the next state, got 1"
+
+
+def _without(steps: Transitions, kept: Bools, rejected: dict[int, str]) -> Transitions:
+    fields: dict[str, Any] = {
+        name: getattr(steps, name)[kept] for name in ("row", "q", "u", "q_next", "terminated", "truncated", "first")
+    }
+    reward: Floats | None = None if steps.reward is None else steps.reward[kept]
+    return replace(steps, **fields, reward=reward, rejected=dict(sorted({**steps.rejected, **rejected}.items())))

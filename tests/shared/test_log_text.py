@@ -1,0 +1,29 @@
+"""A log as text: whoever sends it decides neither how much memory its columns take nor how long a message is."""
+
+from __future__ import annotations
+
+import pytest
+
+from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.table import numbers
+from surrogym_shared.logs.text import LONGEST_NAME, MOST_COLUMNS, table_of_text
+
+
+def test_one_long_cell_does_not_widen_its_column() -> None:
+    table = table_of_text("x,note\n" + "1,short\n" * 1_000 + f"2,{'long' * 10_000}\n", "the log")
+    assert sum(column.nbytes for column in table.columns.values()) == 2 * 8 * len(table)
+    assert numbers("x", table.columns["x"])[0].sum() == 1_002
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("x\n1\n2\n3\n", "at most 2 rows in the log, got more"),
+        (",".join(f"x{i}" for i in range(MOST_COLUMNS + 1)), f"at most {MOST_COLUMNS} columns in the log, got 1001"),
+        ("x" * (LONGEST_NAME + 1), "names of at most 200 letters"),
+        (f"x\n{'1' * 200_000}\n", "expected CSV in the log, got other text in line 2"),
+    ],
+)
+def test_a_log_beyond_its_bounds_is_refused(text: str, expected: str) -> None:
+    with pytest.raises(UnusableLog, match=expected):
+        table_of_text(text, "the log", most_rows=2)
