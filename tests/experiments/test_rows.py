@@ -16,7 +16,7 @@ def test_a_row_says_what_the_run_gave():
     assert row.key == ("pendulum", "default", 14, 3)
     assert (row.real_steps, row.failures, row.also_success, row.seconds) == (9, 7, 0.9, 50.0)
     assert (row.promise, row.promise_low, row.promise_high) == (-144.0, -160.0, -130.0)
-    assert (row.trusted, row.audit_steps) == (True, 8)
+    assert (row.trusted, row.audit_steps, row.without) == (True, 8, METRICS["without"]["mean"])
     assert row_of({**METRICS, "promise": None, "trusted": None}).trusted is None, "learned without a surrogate"
     assert row_of({**METRICS, "also": None, "success_rate": None}).failures is None
 

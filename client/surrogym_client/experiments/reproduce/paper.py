@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from surrogym_client.experiments.processes import Children, await_file
+from surrogym_client.experiments.reproduce.markdown import markdown
 from surrogym_client.experiments.reproduce.paper_cases import Cell
 from surrogym_client.experiments.reproduce.paper_measures import Unseen, confidences, run_variation, some
 from surrogym_client.experiments.reproduce.paper_table import per_seed, table
-from surrogym_client.experiments.reproduce.table import markdown
 from surrogym_client.original import make
 from surrogym_client.policies.files import load_policy
 from surrogym_client.runtime.versions import commit

@@ -54,6 +54,7 @@ class Row:
     virtual_steps: int | None = None
     phase: str = ""
     confidence_index: float | None = None
+    without: float | None = None  # mean return without the policy
     seconds: float | None = None
     commit: str = ""
     specification: str = ""
@@ -68,13 +69,13 @@ class Row:
 
 
 COLUMNS = tuple(field.name for field in fields(Row))
-LATER = ("promise", "promise_low", "promise_high", "trusted", "audit_steps")  # columns that older files lack
+LATER = ("promise", "promise_low", "promise_high", "trusted", "audit_steps", "without")  # columns that older files lack
 
 
 def row_of(metrics: dict[str, Any]) -> Row:
     """The row of a run, from the metrics of its demo."""
     real, returns, also = metrics["real_queries"], metrics["real_return"], metrics["also"]
-    success, promise = metrics["success_rate"], metrics.get("promise")
+    success, promise, without = metrics["success_rate"], metrics.get("promise"), metrics.get("without")
     return Row(
         **{name: metrics[name] for name in ("task", "arm", "seed", "budget", "reached", "virtual_steps")},
         **{name: metrics[name] for name in ("confidence_index", "commit", "specification", "configuration", "machine")},
@@ -93,6 +94,7 @@ def row_of(metrics: dict[str, Any]) -> Row:
         promise_high=promise and promise["high"],
         trusted=metrics.get("trusted"),
         audit_steps=real.get("audit"),
+        without=without and without["mean"],
         phase=metrics["phase"] or "",
         seconds=metrics["seconds"]["total"],
     )
@@ -109,7 +111,7 @@ def read_rows(path: Path) -> list[Row]:
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
         given = tuple(reader.fieldnames or ())
-        if given != COLUMNS and given != tuple(name for name in COLUMNS if name not in LATER):
+        if given != tuple(name for name in COLUMNS if name in given or name not in LATER):
             raise UnusableRows(f"{path}: expected the columns {', '.join(COLUMNS)}, got {reader.fieldnames}")
         rows = []
         for number, line in enumerate(reader, start=2):

@@ -5,7 +5,7 @@ R. Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical P
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import comb
 
 import numpy as np
@@ -29,6 +29,22 @@ def difference_interval(first: Array, second: Array) -> tuple[float, float]:
     """The same for the interquartile mean of first (n,) minus that of second (m,), resampled independently."""
     rng = np.random.default_rng(0)
     return _interval(_resampled(first, rng) - _resampled(second, rng))
+
+
+def clustered_interval(clusters: Sequence[Array]) -> tuple[float, float]:
+    """95 % percentile interval of the mean of all values, by resampling whole clusters, each an array of values."""
+    rng, sums = np.random.default_rng(0), np.array([[values.sum(), len(values)] for values in clusters])
+    drawn = sums[rng.integers(len(sums), size=(RESAMPLES, len(sums)))].sum(axis=1)
+    return _interval(drawn[:, 0] / drawn[:, 1])
+
+
+def interval_score(low: Array, high: Array, value: Array, chance: float) -> Array:
+    """Interval scores (n,) of central intervals that hold with ``chance``, in the values' unit. Lower is better.
+
+    The width, and 2 / (1 - chance) times the distance of a value outside (Gneiting and Raftery 2007, equation 43).
+    """
+    outside = np.maximum(low - value, 0.0) + np.maximum(value - high, 0.0)
+    return np.asarray(high - low + 2 / (1 - chance) * outside)
 
 
 def exact_interval(count: int, of: int) -> tuple[float, float]:

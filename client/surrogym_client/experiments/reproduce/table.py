@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from surrogym_client.evaluation.evaluator import interquartile_mean
 from surrogym_client.experiments.arms import ARMS
+from surrogym_client.experiments.reproduce.markdown import markdown
+from surrogym_client.experiments.reproduce.promises import promise_tables
 from surrogym_client.experiments.reproduce.rows import Row
-from surrogym_client.experiments.reproduce.statistics import bootstrap_interval, difference_interval, exact_interval
+from surrogym_client.experiments.reproduce.statistics import bootstrap_interval, difference_interval
 from surrogym_client.experiments.tasks import EVERY_TASK, queries_a_round
 
 Group = tuple[str, str, int]
@@ -19,11 +21,6 @@ HEADING = (
     *("task", "arm", "seeds", "real steps", "real return", "worst seed", "worst episode"),
     *("success", "other starts", "imagined", "target reached", "virtual steps", "seconds"),
 )
-TRUST_HEADING = (
-    *("task", "runs", "steps of audits", "reached their target", "trusted", "of those that reached it"),
-    "real return above the promise's 5 % quantile, of the trusted",
-)
-TRUST_NOTES = "Promises and audits of the default arm, with exact 95 % intervals of shares:\n"
 FEW = 3  # seeds; fewer have no interval worth the name
 CONTRASTS = (  # what a pair of arms tells, at the same budget
     ("adaptive queries", "no_loop", "latin_hypercube"),
@@ -58,8 +55,8 @@ def report(rows: Sequence[Row]) -> str:
             "Difference of interquartile means, first arm minus second, with a 95 % bootstrap interval:\n",
             pairs,
         ]
-    if trusted := trust(grouped(rows)):
-        parts += [TRUST_NOTES, trusted]
+    if promised := promise_tables(grouped(rows)):
+        parts.append(promised)
     return "\n".join([*parts, _origin(rows)])
 
 
@@ -105,41 +102,6 @@ def contrasts(rows: Sequence[Row]) -> str:
     return markdown(lines) if len(lines) > 1 else ""
 
 
-def trust(groups: dict[Group, list[Row]]) -> str:
-    """A line for each task and budget of the default arm with promises, and one for all; empty where there is none."""
-    promised = {
-        task if budget == EVERY_TASK[task].budget else f"{task}, budget {budget}": found
-        for (task, arm, budget), rows in groups.items()
-        if arm == "default" and (found := [row for row in rows if row.promise is not None])
-    }
-    lines = [TRUST_HEADING, *(_trust_line(name, rows) for name, rows in promised.items())]
-    if len(promised) > 1:
-        lines.append(_trust_line("all", [row for rows in promised.values() for row in rows]))
-    return markdown(lines) if promised else ""
-
-
-def _trust_line(name: str, rows: Sequence[Row]) -> Sequence[str]:
-    trusted, reached = [row for row in rows if row.trusted], [row for row in rows if row.reached]
-    kept = sum(row.mean is not None and row.promise_low is not None and row.mean >= row.promise_low for row in trusted)
-    return (
-        *(name, str(len(rows)), _range([row.audit_steps for row in rows])),
-        *(str(len(reached)), str(len(trusted)), _of(sum(bool(row.trusted) for row in reached), len(reached))),
-        _of(kept, len(trusted)),
-    )
-
-
-def _of(count: int, of: int) -> str:
-    if not of:
-        return "-"
-    low, high = exact_interval(count, of)
-    return f"{count} of {of} ({100 * low:.0f} to {100 * high:.0f} %)"
-
-
-def _range(values: Sequence[int | None]) -> str:
-    known = sorted(value for value in values if value is not None)
-    return "-" if not known else f"{known[0]} to {known[-1]}" if known[0] < known[-1] else str(known[0])
-
-
 def grouped(rows: Sequence[Row]) -> dict[Group, list[Row]]:
     """Rows by task, arm and budget; tasks and arms in their order here, seeds ascending."""
     tasks, arms = list(EVERY_TASK), list(ARMS)
@@ -159,12 +121,6 @@ def tasks_with_results(rows: Sequence[Row]) -> list[str]:
 def column(rows: Sequence[Row], name: str) -> NDArray[np.float64]:
     """The known values of a column."""
     return np.array([value for row in rows if (value := getattr(row, name)) is not None], dtype=np.float64)
-
-
-def markdown(lines: Sequence[Sequence[str]]) -> str:
-    """A table, of which the first line is the heading."""
-    rows = [lines[0], ["---"] * len(lines[0]), *lines[1:]]
-    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
 
 def _line(group: Group, rows: Sequence[Row]) -> Sequence[str]:
