@@ -20,6 +20,7 @@ from surrogym_server import dashboard
 from surrogym_server.api import (
     events,
     jobs,
+    logs,
     metrics,
     models,
     openapi,
@@ -132,7 +133,8 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
     app.state.gate = Gate(settings.tokens)
     app.state.max_body_bytes = settings.max_body_bytes
     app.state.parsing = asyncio.Lock()
-    app.state.turns = Turns()
+    app.state.turns = Turns("predictions", at_work=2, waiting=32)
+    app.state.log_turns = Turns("logs", at_work=1, waiting=8)
     if settings.tokens:
         known = ", ".join(f"{role} {fingerprint(token)}" for token, role in settings.tokens.items())
         logger.info("fingerprints of the tokens: %s", known)
@@ -147,7 +149,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
         app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", *settings.host_names}))
     app.add_middleware(Observed, metrics=app.state.metrics)
     app.router.routes.extend(stepping.routes)  # tried first, and directly: an included router is another search
-    for room in (sessions, service, metrics, surrogates, queries, samples, models, policies, jobs, events):
+    for room in (sessions, service, metrics, surrogates, queries, samples, logs, models, policies, jobs, events):
         app.include_router(room.router)
     _add_dashboard(app)
     return app

@@ -14,7 +14,19 @@ from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
 
 Open = Callable[..., Page]
-PARTS = ("Policies", "Learning", "Maps", "Probe", "Sessions", "Queue", "Ledger", "Steer", "Downloads", "Model versions")
+PARTS = (
+    "Policies",
+    "Learning",
+    "Maps",
+    "Probe",
+    "Sessions",
+    "Queue",
+    "Ledger",
+    "Steer",
+    "Downloads",
+    "Log",
+    "Model versions",
+)
 
 
 @pytest.fixture

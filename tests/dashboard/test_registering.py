@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
+from support import reactor
 from support.browser import serious
 from support.server import ServerProcess
 from surrogym_client.original.classic import pendulum
@@ -83,3 +84,45 @@ def test_everything_shown_can_be_downloaded(
     assert (tmp_path / "1").read_text().count("\n") == 13  # a heading and twelve steps
     expect(part.get_by_role("alert")).to_be_hidden()
     assert complaints == []
+
+
+def test_a_log_becomes_a_surrogate_with_a_model(url: str, open_page: Open, complaints: list[str], tmp_path: Path):
+    file = reactor.log(runs=3, length=20).write(tmp_path / "reactor.csv")
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join([*lines, lines[1], ""]))  # a row that repeats another
+    page = open_page(f"{url}/#/register")
+    page.get_by_text("Start from a log instead").click()
+    page.get_by_label("Log as CSV").set_input_files(file)
+    page.get_by_role("button", name="Check the log").click()
+    expect(page.get_by_text("usable steps of 61 rows")).to_be_visible()
+    expect(page.get_by_role("region", name="Rows that can't be used")).to_contain_text("repeats line 2")
+    assert serious(page) == []
+    page.get_by_role("button", name="Register reactor and store its log").click()
+    expect(page.locator(".facts")).to_contain_text("60 more came in a log")
+    expect(page.locator(".title")).to_contain_text("from a log", timeout=60_000)
+    with Api(url) as api:
+        assert api.surrogate("reactor").ledger.logged == 60
+        api.delete_surrogate("reactor")
+    assert complaints == []
+
+
+def test_a_log_with_other_columns_is_stored_by_a_mapping(url: str, open_page: Open, tmp_path: Path):
+    file = tmp_path / "plant.csv"
+    file.write_text("angle,rate,motor,profit\n0.1,0.0,1.5,-1\n0.115,0.3,0.5,-1\n0.13,9.9,0.5,-1\n0.14,0.1,0.5,-1\n")
+    with Api(url) as api:
+        api.create_surrogate("plant", pendulum())
+        page = open_page(f"{url}/#/s/plant")
+        part = page.locator("#log")
+        part.get_by_label("Log as CSV").set_input_files(file)
+        part.get_by_role("button", name="Check the log").click()
+        expect(part.get_by_role("alert")).to_contain_text("expected a column of the action")
+        mapping = {"state": {"theta": "angle", "speed": "rate"}, "action": ["motor"], "reward": "profit"}
+        part.get_by_label("Mapping as JSON").fill(json.dumps(mapping))
+        part.get_by_role("button", name="Check the log").click()
+        expect(part.get_by_role("region", name="Rows that can't be used")).to_contain_text("rate: expected a value in")
+        assert serious(page) == []
+        assert api.surrogate("plant").ledger.logged == 0
+        part.get_by_role("button", name="Store 1 step").click()
+        expect(part.get_by_role("status")).to_contain_text("1 new logged step")
+        assert api.surrogate("plant").ledger.logged == 1
+        api.delete_surrogate("plant")

@@ -63,6 +63,14 @@ ADD_SAMPLE: Example = {
         }
     ],
 }
+DRAFT_LOG: Example = {
+    "text": "level,action_valve,reward\n1.0,0.5,-1\n1.1,0.4,-1.2\n1.2,0.3,-1.4\n",
+    "environment": "tank",
+}
+ADD_LOG: Example = {
+    "text": "theta,theta_dot,action_torque,reward\n0.1,0.0,1.5,-0.01\n0.115,0.3,-0.5,-0.02\n0.13,0.2,0.1,-0.02\n",
+    "check_only": True,
+}
 LEDGER: Example = {"steps": 20_000, "episodes": 100, "note": "ppo.zip", "idempotency_key": "evaluation-1"}
 IMPROVE: Example = {"queries": 5, "checkpoint": "after-100k-steps", "idempotency_key": "improve-1"}
 POINTS: Example = {"coordinates": [[0.1, 0.0]], "action": [[1.5]]}

@@ -13,15 +13,16 @@ from surrogym_server.errors import Overloaded
 
 T = TypeVar("T")
 
-AT_WORK, WAITING = 2, 32
-
 
 class Turns:
-    """Lets ``AT_WORK`` requests work, each in a thread, and ``WAITING`` wait for their turn."""
+    """Lets ``at_work`` requests work, each in a thread, and ``waiting`` wait for their turn."""
 
-    def __init__(self) -> None:
+    def __init__(self, what: str, at_work: int, waiting: int) -> None:
+        """``what`` they are, for the message to who is refused."""
+        self._what = what
+        self._most = at_work + waiting
         self._inside = 0
-        self._turn = asyncio.Semaphore(AT_WORK)
+        self._turn = asyncio.Semaphore(at_work)
 
     async def take(self, request: Request, work: Callable[[], T]) -> T:
         """The result of ``work`` when its turn has come.
@@ -30,8 +31,8 @@ class Turns:
             Overloaded: too many wait.
             ClientDisconnect: the caller has gone meanwhile; nothing was computed.
         """
-        if self._inside >= AT_WORK + WAITING:
-            raise Overloaded(f"expected at most {AT_WORK + WAITING} predictions at work or waiting, got one more")
+        if self._inside >= self._most:
+            raise Overloaded(f"expected at most {self._most} {self._what} at work or waiting, got one more")
         self._inside += 1
         try:
             async with self._turn:

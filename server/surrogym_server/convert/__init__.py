@@ -2,6 +2,7 @@
 
 from surrogym_server.convert.definitions import default_budget, definition_from_spec, stored_definition
 from surrogym_server.convert.jobs import claimed_job, job_detail, job_list, job_progress, job_result, job_view
+from surrogym_server.convert.logs import added_report, checked_log, drafted_log, drafted_report, logged_samples
 from surrogym_server.convert.numbers import numbers
 from surrogym_server.convert.policies import (
     episodes,
@@ -53,13 +54,17 @@ from surrogym_server.convert.sessions import (
 )
 
 __all__ = [
+    "added_report",
     "added_samples",
     "checked",
+    "checked_log",
     "claimed",
     "claimed_job",
     "created",
     "default_budget",
     "definition_from_spec",
+    "drafted_log",
+    "drafted_report",
     "episodes",
     "evaluation_detail",
     "evaluation_view",
@@ -74,6 +79,7 @@ __all__ = [
     "job_view",
     "lane_mask",
     "ledger",
+    "logged_samples",
     "model_view",
     "new_policy",
     "new_sample",

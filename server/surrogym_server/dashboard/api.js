@@ -39,8 +39,8 @@ async function send(path, options) {
 }
 
 /** One request; its reply as an object, null where it has no body. Raises `Problem` or `Gone`. */
-export async function call(method, path, body, signal) {
-  const limit = AbortSignal.timeout(PATIENCE_MS);
+export async function call(method, path, body, signal, patience = PATIENCE_MS) {
+  const limit = AbortSignal.timeout(patience);
   const signals = signal ? AbortSignal.any([signal, limit]) : limit;
   try {
     const reply = await send(path, { method, headers: headers(body), body: body && JSON.stringify(body), signal: signals });

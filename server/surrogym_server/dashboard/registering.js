@@ -3,6 +3,7 @@
 import { call, Problem } from "/page/api.js";
 import { h } from "/page/dom.js";
 import { plural } from "/page/format.js";
+import { logDraft, storeLog } from "/page/logs.js";
 import { table } from "/page/parts.js";
 import { specificationParts } from "/page/specification.js";
 
@@ -54,10 +55,14 @@ export function registerView(main, { role }) {
     h("label", { for: "spec" }, "or paste its text"), text,
     h("label", { for: "spec-name" }, "Name of the surrogate (empty: from the environment)"), name,
     forbidden, h("p", { class: "buttons" }, h("button", { class: "main" }, "Check")));
+  const fromLog = h("details", { class: "card" }, h("summary", {}, "Start from a log instead"),
+    h("p", { class: "note" }, "A log of an expensive environment is enough for a surrogate: no machine and no sampler are needed."), logDraft(drafted));
+  let log = null; // whose steps are stored with the registration
   let checked = 0; // number of the newest check: an older answer is not shown
 
   file.addEventListener("change", async () => {
     if (!file.files.length) return;
+    log = null;
     text.value = file.files[0].size > MOST_BYTES ? "" : await file.files[0].text();
     forget();
     if (!text.value) fail(new Error(`Expected a file of 1 byte to ${MOST_BYTES / 1024} KiB, got ${file.files[0].size} bytes.`));
@@ -68,7 +73,13 @@ export function registerView(main, { role }) {
     event.preventDefault();
     check();
   });
-  main.replaceChildren(h("a", { class: "back", href: "#/" }, "All surrogates"), h("h1", {}, "Register an environment"), form, answer);
+  main.replaceChildren(h("a", { class: "back", href: "#/" }, "All surrogates"), h("h1", {}, "Register an environment"), fromLog, form, answer);
+
+  function drafted({ spec, notes }, given) {
+    text.value = JSON.stringify({ found: notes, specification: spec }, null, 1);
+    log = given;
+    check();
+  }
 
   function forget() {
     checked += 1;
@@ -90,12 +101,13 @@ export function registerView(main, { role }) {
   }
 
   function show(body, reply, found, asked) {
-    const go = h("button", { type: "button", class: "main" }, `Register ${reply.name}`);
+    const go = h("button", { type: "button", class: "main" }, `Register ${reply.name}${log ? " and store its log" : ""}`);
     const trouble = h("div", {});
     go.addEventListener("click", async () => {
       go.disabled = true;
       try {
         await call("POST", "/v1/surrogates", body);
+        if (log) await storeLog(reply.name, log);
         location.hash = `#/s/${encodeURIComponent(reply.name)}`;
       } catch (error) {
         go.disabled = false;

@@ -6,6 +6,7 @@ import { learningCurves } from "/page/charts.js";
 import { downloads } from "/page/downloads.js";
 import { h, shown } from "/page/dom.js";
 import { cost, leastSure, sure, where } from "/page/hero.js";
+import { logUpload } from "/page/logs.js";
 import { maps } from "/page/maps.js";
 import { alive, phaseBadge, section } from "/page/parts.js";
 import { pointControls } from "/page/point.js";
@@ -14,7 +15,7 @@ import { probe } from "/page/probe.js";
 import { ledgerTable, modelTable, queueTable, sessionTable } from "/page/tables.js";
 
 const PAGE = 10_000;
-const LINKS = [["policies", "Policies"], ["learning", "Learning"], ["maps", "Maps"], ["probe", "Probe"], ["queue", "Queue"], ["sessions", "Sessions"], ["ledger", "Ledger"], ["models", "Models"], ["actions", "Steer"], ["downloads", "Downloads"]];
+const LINKS = [["policies", "Policies"], ["learning", "Learning"], ["maps", "Maps"], ["probe", "Probe"], ["queue", "Queue"], ["sessions", "Sessions"], ["ledger", "Ledger"], ["models", "Models"], ["actions", "Steer"], ["log", "Log"], ["downloads", "Downloads"]];
 
 export function surrogateView(main, name, context) {
   const url = path(name);
@@ -80,6 +81,7 @@ function build(main, name, spec, context) {
   const controls = pointControls(spec, () => { map.moved(); probing.moved(); });
   const map = maps(name, spec, controls);
   const steer = actions(name, context);
+  const log = logUpload(name, context);
   const files = downloads(name);
   const settable = spec.max_rollout === undefined || spec.max_rollout === null;
   const probing = probe(name, spec, controls, { onepisodes: map.paths, ask: settable && ((point) => steer.ask(point)) });
@@ -106,7 +108,7 @@ function build(main, name, spec, context) {
     section("maps", "Maps", "Two coordinates at a time; the sliders set the others. Click a map, or move with the arrow keys.",
       h("div", { class: "cut" }, controls.form, h("div", {}, map.parts))),
     section("probe", "Probe", "What the model says of one step from the point above, with its standard deviations.", probing.parts),
-    queue.element, sessions.element, h("div", { class: "two" }, ledger.element, steer.element), versions.element, files.element);
+    queue.element, sessions.element, h("div", { class: "two" }, ledger.element, steer.element), versions.element, log.element, files.element);
 
   let found = null;
   let looked = null;
@@ -137,6 +139,7 @@ function build(main, name, spec, context) {
       ledger.show(now.ledger);
       if (open) sessions.show(open);
       steer.show(now);
+      log.show();
       files.show(now);
       look(rest);
     },

@@ -18,6 +18,8 @@ from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LedgerRecord, NewSample, SampleRecord
 
 PAGE = 10_000
+BATCH = 500  # steps of a log in one transaction
+LOG = "log"  # the sampler of logged steps
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,15 @@ class Added:
     ids: tuple[int, ...]
     duplicates: int
     ledger: LedgerRecord
+
+
+@dataclass(frozen=True)
+class AddedLog:
+    stored: int  # new ones
+    duplicates: int
+
+
+NOTHING = AddedLog(0, 0)
 
 
 class SampleService:
@@ -67,6 +78,15 @@ class SampleService:
         self._samplers.heard(name, sampler)
         self._notices.post(name)
         return Added(added.ids, added.duplicates, self._storage.ledger.read(name))
+
+    def add_log(self, name: str, samples: Sequence[NewSample]) -> AddedLog:
+        """Store a whole log, batch by batch; a repeat stores what an earlier call did not. Raises as ``add``."""
+        duplicates = 0
+        for first in range(0, len(samples), BATCH):
+            batch = samples[first : first + BATCH]
+            complete = first + BATCH >= len(samples)
+            duplicates += self.add(name, LOG, batch, None, logged=True, complete=complete).duplicates
+        return AddedLog(len(samples) - duplicates, duplicates)
 
     def _withdraw_covered(self, name: str, definition: EnvironmentDefinition) -> None:
         pending = [query for query in self._storage.queries.list(name, ("pending",)) if query.purpose == "initial"]

@@ -137,6 +137,10 @@ class SurrogateService:
         """Raises ``UnknownSurrogate``."""
         return self._status(self._storage.surrogates.get(name))
 
+    def spec(self, name: str) -> dict[str, Any]:
+        """The stored spec. Raises ``UnknownSurrogate``."""
+        return self._storage.surrogates.get(name).spec
+
     def list(self, after: int, limit: int) -> list[Listed]:
         """Up to ``limit`` surrogates with an id above ``after``, oldest first."""
         alive, sessions = self._samplers.by_surrogate(), self._engine.counts().sessions

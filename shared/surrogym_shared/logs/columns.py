@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
+from surrogym_shared.bounded import FailFast
 from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.spec.base import MAX_DIMENSIONS
 
@@ -40,6 +41,7 @@ EXPECTED = {
 }
 SHOWN = 60  # letters of what came
 LONGEST = 64  # letters of a coordinate's name
+MOST = 1_000  # columns that a mapping names for one role
 
 Limits = Annotated[list[float | None], Field(min_length=2, max_length=2)]
 
@@ -81,23 +83,42 @@ class Roles:
         found |= {column: f"next state {name}" for name, column in self.following.items()}
         return found | {column: role for role in SINGLE if (column := getattr(self, role)) is not None}
 
+    @property
+    def mapping(self) -> LogMapping:
+        """The mapping that gives these columns the same roles."""
+        single = {role: getattr(self, role) for role in SINGLE}
+        return LogMapping(
+            state=dict(self.state),
+            action=dict(self.action),
+            next=dict(self.following),
+            limits={name: list(ends) for name, ends in self.limits.items()},
+            angles=sorted(self.angles),
+            constants=sorted(self.constants),
+            discrete=self.discrete,
+            **single,
+        )
 
-class Mapped(BaseModel):
-    """A mapping file. A list of columns names coordinates by their columns, a table gives names of one's own."""
+
+Columns = Annotated[dict[str, str], Field(max_length=MOST)] | Annotated[list[str], Field(max_length=MOST)]
+
+
+class LogMapping(FailFast):
+    """What the columns of a log are. A list of columns names coordinates by their columns, a table gives names of one's
+    own."""
 
     model_config = ConfigDict(extra="forbid")
 
-    state: dict[str, str] | list[str]
-    action: dict[str, str] | list[str]
-    next: dict[str, str] = {}
+    state: Columns
+    action: Columns
+    next: dict[str, str] = Field(default_factory=dict, max_length=MOST)
     reward: str | None = None
     terminated: str | None = None
     truncated: str | None = None
     episode: str | None = None
     time: str | None = None
-    limits: dict[str, Limits] = {}
-    angles: list[str] = []
-    constants: list[str] = []
+    limits: dict[str, Limits] = Field(default_factory=dict, max_length=MOST)
+    angles: list[str] = Field(default_factory=list, max_length=MOST)
+    constants: list[str] = Field(default_factory=list, max_length=MOST)
     discrete: bool | None = None
 
 
@@ -140,7 +161,11 @@ def roles_by_file(path: Path, names: Sequence[str]) -> Roles:
 
 def roles_by_map(content: Mapping[str, Any], names: Sequence[str], where: str = "the mapping") -> Roles:
     """What the columns are by a mapping. Raises ``UnusableLog`` as ``roles_by_file``."""
-    mapped = _mapped(content, where)
+    return roles_by_mapping(_mapped(content, where), names, where)
+
+
+def roles_by_mapping(mapped: LogMapping, names: Sequence[str], where: str = "the mapping") -> Roles:
+    """What the columns are by a mapping that was read. Raises ``UnusableLog``: it names a column that the log lacks."""
     fields: dict[str, Any] = {role: getattr(mapped, role) or None for role in SINGLE}
     state, action = _by_name(mapped.state), _by_name(mapped.action)
     wanted = [*state.values(), *action.values(), *mapped.next.values(), *filter(None, fields.values())]
@@ -165,12 +190,12 @@ def roles_by_map(content: Mapping[str, Any], names: Sequence[str], where: str = 
     )
 
 
-def _mapped(content: Mapping[str, Any], where: str) -> Mapped:
+def _mapped(content: Mapping[str, Any], where: str) -> LogMapping:
     """The mapping; everything that is wrong with it is named at once."""
     if not isinstance(content, Mapping):
         raise UnusableLog(f"expected a table with the keys state and action in {where}, got {_short(content)}")
     try:
-        return Mapped.model_validate(content)
+        return LogMapping.model_validate(content)
     except ValidationError as error:
         keys = dict.fromkeys(str(found["loc"][0]) for found in error.errors())
         faults = "; ".join(_fault(key, content) for key in keys)

@@ -38,10 +38,11 @@ ALLOWED = {
     "sample": """
         POST /v1/surrogates/{name}/queries, POST /v1/surrogates/{name}/queries:claim,
         POST /v1/surrogates/{name}/queries/{query_id}:renew, POST /v1/surrogates/{name}/queries/{query_id}:fail,
-        POST /v1/surrogates/{name}/add_sample""",
+        POST /v1/surrogates/{name}/add_sample, POST /v1/surrogates/{name}/logs""",
     "train sample": "POST /v1/surrogates/{name}/ledger",
     "": """
-        POST /v1/surrogates, POST /v1/surrogates:check, PATCH /v1/surrogates/{name}, DELETE /v1/surrogates/{name},
+        POST /v1/surrogates, POST /v1/surrogates:check, POST /v1/logs:draft,
+        PATCH /v1/surrogates/{name}, DELETE /v1/surrogates/{name},
         POST /v1/surrogates/{name}/models, DELETE /v1/surrogates/{name}/policies/{version},
         PUT /v1/surrogates/{name}/policies/aliases/{alias}, DELETE /v1/surrogates/{name}/policies/aliases/{alias}""",
 }

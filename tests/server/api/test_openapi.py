@@ -20,6 +20,8 @@ EXAMPLES = {
     "ADD_QUERIES": wire.AddQueries,
     "WITHDRAW": wire.WithdrawQueries,
     "ADD_SAMPLE": wire.AddSamples,
+    "DRAFT_LOG": wire.DraftLog,
+    "ADD_LOG": wire.AddLog,
     "LEDGER": wire.ReportSteps,
     "IMPROVE": wire.Improve,
     "POINTS": wire.Points,

@@ -1,0 +1,56 @@
+"""Routes of logs: recorded real steps as CSV, for who has no program that reads them."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Request
+
+from surrogym_server import convert
+from surrogym_server.api import examples
+from surrogym_server.api.auth import ADMIN, SAMPLE
+from surrogym_server.api.body import example
+from surrogym_server.api.door import DoorRoute, json_up_to
+from surrogym_server.api.problems import documented
+from surrogym_server.api.state import Services, Use
+from surrogym_server.api.turns import Turns
+from surrogym_server.services.samples import NOTHING
+from surrogym_shared.codes import Code
+from surrogym_shared.wire import AddedLog, AddLog, DraftedLog, DraftLog
+
+router = APIRouter(prefix="/v1", tags=["logs"], route_class=DoorRoute)
+
+KIBIBYTES = 5 * 1024  # letters of a log, and what JSON adds to them
+
+
+@router.post(
+    "/logs:draft",
+    summary="Draft a specification from a log",
+    dependencies=[ADMIN],
+    openapi_extra=json_up_to(KIBIBYTES),
+    responses=documented(Code.INVALID_REQUEST, Code.TOO_LARGE, Code.TOO_MANY_REQUESTS),
+)
+async def draft(body: Annotated[DraftLog, example(examples.DRAFT_LOG)], request: Request) -> DraftedLog:
+    """Each row is checked, and a specification is drafted from those that can be used. Nothing is stored."""
+    turns: Turns = request.app.state.log_turns
+    return await turns.take(request, lambda: convert.drafted_report(convert.drafted_log(body)))
+
+
+@router.post(
+    "/surrogates/{name}/logs",
+    summary="Hand in a log",
+    dependencies=[SAMPLE],
+    openapi_extra=json_up_to(KIBIBYTES),
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST, Code.TOO_LARGE, Code.TOO_MANY_REQUESTS),
+)
+async def add(name: str, body: Annotated[AddLog, example(examples.ADD_LOG)], request: Request, use: Use) -> AddedLog:
+    """Each row is checked against the surrogate's specification. The usable ones are stored as ``logged`` samples,
+    unless ``check_only``. A step that equals a stored one in every number is a duplicate, so a repeat is harmless."""
+    turns: Turns = request.app.state.log_turns
+    return await turns.take(request, lambda: _added(name, body, use))
+
+
+def _added(name: str, body: AddLog, use: Services) -> AddedLog:
+    log = convert.checked_log(body, use.surrogates.spec(name))
+    added = NOTHING if body.check_only else use.samples.add_log(name, convert.logged_samples(log))
+    return convert.added_report(log, added)
