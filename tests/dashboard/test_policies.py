@@ -5,7 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from statistics import NormalDist
 
+import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
@@ -66,15 +68,43 @@ def test_a_file_is_downloaded_as_it_came(url: str, open_page: Open, tmp_path: Pa
 def test_the_better_of_two_surrogates_is_named_with_its_interval(url: str, open_page: Open, complaints: list[str]):
     page = open_page(f"{url}/#/compare/worse/better")
     said = page.locator(".big")
-    expect(said).to_contain_text(
-        re.compile(r"^better@2.* is better than worse@2 by (9\d|10\d)[.\d]* \(95 %: \S+ to \S+\)\.$")
-    )
+    by, low, high = (f"{value:.{0 if value >= 100 else 1}f}" for value in paired(pairs=6))
+    expect(said).to_have_text(re.compile(rf"^better@2.* is better than worse@2 by {by} \(95 %: {low} to {high}\)\.$"))
+    expect(page.locator("main")).to_contain_text("Both ran the same 30 starts")
+    picture = page.locator(".ranges")
+    expect(picture).to_have_attribute("aria-label", re.compile("better@2.*: real .*worse@2: real .*worse@1"))
+    rows = page.get_by_role("region", name="Each policy beside the best").locator("tbody tr")
+    expect(rows).to_have_count(4)
+    expect(rows.first).to_contain_text("the best")
     assert serious(page) == []
     page.get_by_role("combobox").nth(1).select_option("bare")
     expect(said).to_contain_text("are needed to say which is better")
     page.get_by_role("combobox").nth(0).select_option("pendulum")
     expect(page.locator("main")).to_contain_text("Neither has a policy yet.")
     assert complaints == []
+
+
+def paired(pairs: int) -> tuple[float, float, float]:
+    """By how much better@2 is better than worse@2 start by start, and the interval of one of so many pairs."""
+    returns = [mean + np.random.default_rng(seed).normal(0, 10, 30) for seed, mean in ((601, -150), (501, -250))]
+    gaps = returns[0] - returns[1]
+    reach = NormalDist().inv_cdf(1 - 0.025 / pairs) * gaps.std(ddof=1) / np.sqrt(len(gaps))
+    return gaps.mean(), gaps.mean() - reach, gaps.mean() + reach
+
+
+def test_differences_on_other_starts_are_wider_and_one_surrogate_has_its_own_best(url: str, open_page: Open):
+    page = open_page(f"{url}/#/compare/better/better")
+    expect(page.locator(".big")).to_contain_text(re.compile("^better@2.* is better than better@1 by"))
+    found = page.evaluate("""async () => {
+      const { difference, tail } = await import("/page/differences.js");
+      const entry = (mean, seed) => ({ returns: [mean - 1, mean + 1], policy: { evaluations: [{ controller: "policy",
+        declared: true, first_seed: seed, note: "", mean, mean_interval: { low: mean - 3, high: mean + 3 } }] } });
+      return { same: difference(entry(5, 1), entry(2, 1)), other: difference(entry(5, 1), entry(2, 7)),
+        z: [0.025, 0.025 / 9].map(tail) };
+    }""")
+    assert found["same"] == {"by": 3, "low": 3, "high": 3, "paired": True}  # the same gap at each start
+    assert found["other"]["high"] - 3 == pytest.approx(3 * 2**0.5, rel=1e-6)
+    assert found["z"] == pytest.approx([NormalDist().inv_cdf(1 - share) for share in (0.025, 0.025 / 9)], rel=1e-8)
 
 
 def test_a_surrogate_without_a_policy_or_a_model_says_how_to_get_one(url: str, open_page: Open):

@@ -134,9 +134,15 @@ def evaluate(
 
 
 @router.get("/{which}/evaluations/{id}", summary="One evaluation", dependencies=[READ], responses=documented(*THERE))
-def evaluation(name: str, which: Which, id: Annotated[int, Path(ge=1, le=2**63 - 1)], use: Use) -> EvaluationDetail:
+def evaluation(
+    name: str,
+    which: Which,
+    id: Annotated[int, Path(ge=1, le=2**63 - 1)],
+    use: Use,
+    traces: Annotated[bool, Query(description="whether the reply has traces too; they are most of its bytes")] = True,
+) -> EvaluationDetail:
     """With the return of each episode, and traces of some. Where those can't be read, ``missing`` says why."""
-    return convert.evaluation_detail(*use.policies.episodes(name, which, id))
+    return convert.evaluation_detail(*use.policies.episodes(name, which, id), traces=traces)
 
 
 @router.put("/aliases/{alias}", summary="Name a policy", dependencies=[ADMIN], responses=documented(*THERE))

@@ -61,11 +61,13 @@ def evaluation_view(policy: PolicyRecord, record: EvaluationRecord) -> wire.Eval
 
 
 def evaluation_detail(
-    policy: PolicyRecord, record: EvaluationRecord, episodewise: JSON | None, missing: str | None
+    policy: PolicyRecord, record: EvaluationRecord, episodewise: JSON | None, missing: str | None, *, traces: bool
 ) -> wire.EvaluationDetail:
     """``episodewise`` is None where it is ``missing``."""
     there = episodewise or {"returns": [], "lengths": [], "success": None, "traces": []}
     fields = {**_evaluation(record, _card(policy)), **there, "missing": missing}
+    if not traces:
+        fields["traces"] = []
     return read_stored(wire.EvaluationDetail, "an evaluation", fields)
 
 

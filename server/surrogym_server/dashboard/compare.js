@@ -1,24 +1,43 @@
 // The policies of two surrogates beside each other: which is better in reality, and by how much.
 
 import { call, surrogate } from "/page/api.js";
+import { difference } from "/page/differences.js";
 import { h, shown } from "/page/dom.js";
-import { number } from "/page/format.js";
-import { compared, marksOf, realOf } from "/page/judged.js";
-import { ranges, rangesKey } from "/page/ranges.js";
+import { number, percent, plural } from "/page/format.js";
+import { meanWords, realMark, realOf, withoutOf } from "/page/judged.js";
+import { table } from "/page/parts.js";
+import { ranges } from "/page/ranges.js";
 
-const MOST = 5; // policies of each
+const MOST = 5; // policies of each: those with an alias, and the newest
+const ROW = 26; // of the picture
 
-/** How `compared` reads. */
-function words(found) {
-  if (!found) return "Two policies with real episodes from the declared starts are needed to say which is better.";
-  const { better, worse, by, low, high } = found;
-  const interval = `${number(by)} (95 %: ${number(low)} to ${number(high)})`;
-  return low > 0
-    ? `${better.label} is better than ${worse.label} by ${interval}.`
-    : `${better.label} and ${worse.label} can't be told apart: the difference is ${interval}, which includes none.`;
+const interval = ({ low, high }) => `${number(low)} to ${number(high)}`;
+const byMean = (one, other) => realOf(other.policy).mean - realOf(one.policy).mean;
+const chosenOf = (policies) => [...policies.filter(({ aliases }) => aliases.length), ...policies.filter(({ aliases }) => !aliases.length)].slice(0, MOST);
+
+/** One sentence about the best of each surrogate, or the best two of one. */
+function words(better, worse, found) {
+  const by = `${number(Math.abs(found.by))} (95 %: ${interval(found)})`;
+  return found.low > 0
+    ? `${better.label} is better than ${worse.label} by ${by}.`
+    : `${better.label} and ${worse.label} can't be told apart: the difference is ${by}, which includes none.`;
 }
 
-const best = (entries) => entries.filter(({ policy }) => realOf(policy)).toSorted((a, b) => realOf(b.policy).mean - realOf(a.policy).mean)[0] ?? null;
+function grounds(better, found, pairs, same) {
+  const real = realOf(better.policy);
+  const starts = found.paired ? `Both ran the same ${plural(real.episodes, "start")}, and each start is compared with itself.` : "They ran different starts.";
+  return `The best ${same ? "two" : "of each"}, by mean return in real episodes from the declared starts. ${starts} `
+    + (pairs > 1 ? `The intervals of all ${pairs} pairs of policies hold together with 95 % chance, so choosing the best does not flatter it.` : "");
+}
+
+/** Each policy beside the best one. */
+function everyPolicy(entries, pairs) {
+  const [best] = entries;
+  const gap = (entry) => (entry === best ? "the best" : (({ by, ...ends }) => `${number(by)} (${interval(ends)})`)(difference(entry, best, pairs)));
+  const without = ({ policy }) => (withoutOf(policy) ? meanWords(withoutOf(policy)) : "–");
+  return table("Each policy beside the best", [["policy", ""], ["mean real return (95 %)", "num"], ["difference from the best (95 %, all together)", "num"], ["success", "num"], ["without the policy", "num"]],
+    entries.map((entry) => [entry.label, meanWords(realOf(entry.policy)), gap(entry), percent(realOf(entry.policy).success_rate), without(entry)]), "");
+}
 
 export function compareView(main, given) {
   const chosen = [...given];
@@ -36,19 +55,41 @@ export function compareView(main, given) {
     return h("label", { class: "pick" }, at ? "with" : "policies of", select);
   }));
 
-  const draw = shown(place, ({ pair, environments }) => {
-    const entries = pair.map(({ name, policies }) => policies.slice(0, MOST).map((policy) => ({ label: [`${name}@${policy.version}`, ...policy.aliases].join(", "), policy })));
-    const all = entries.flat();
+  const draw = shown(place, ({ sides, environments, same }) => {
+    const all = sides.flat();
     if (!all.length) return h("p", { class: "card empty" }, "Neither has a policy yet.");
-    const other = new Set(environments).size > 1;
-    const ends = entries.map(best);
-    const found = pair[0].name === pair[1].name ? null : ends.every(Boolean) ? compared(...ends) : null;
+    const judged = all.filter(({ policy }) => realOf(policy)?.mean_interval).toSorted(byMean);
+    const unjudged = all.filter((entry) => !judged.includes(entry)).map(({ label }) => label);
+    const missing = unjudged.length > 0 && h("p", { class: "note" }, `Without two real episodes from the declared starts: ${unjudged.join(", ")}.`);
+    if (new Set(environments).size > 1) return h("div", { class: "card" }, h("p", { class: "bad" }, `These are different environments (${environments.join(" and ")}), so their returns don't compare.`));
+    const pairs = (judged.length * (judged.length - 1)) / 2;
+    const bests = same ? [judged[0], judged[1]] : sides.map((side) => judged.find((entry) => side.includes(entry)));
+    const [better, worse] = bests.every(Boolean) ? bests.toSorted(byMean) : [];
+    const found = worse ? difference(better, worse, pairs) : null;
     return h("div", { class: "card" },
-      other && h("p", { class: "bad" }, `These are different environments (${environments.join(" and ")}), so their returns don't compare.`),
-      !other && h("p", { class: "big" }, words(found)),
-      !other && found && h("p", { class: "note" }, "The best of each, by its mean return in real episodes from the declared starts. The interval is that of the difference of two means over new starts. Of several policies, the best one looks a little better than it is."),
-      rangesKey(), ranges(all.map(({ label, policy }) => ({ label, marks: marksOf(policy) })), "Returns of the newest policies of both"));
+      h("p", { class: "big" }, found ? words(better, worse, found) : "Two policies with real episodes from the declared starts are needed to say which is better."),
+      found && h("p", { class: "note" }, grounds(better, found, pairs, same)),
+      judged.length > 0 && [h("h2", {}, "Mean real return, the best first; a bar is its 95 % interval"),
+        ranges(judged.map(({ label, policy }) => ({ label, marks: [realMark(policy)] })), "Mean real returns of the policies of both", ROW),
+        everyPolicy(judged, pairs)],
+      missing);
   });
+
+  const known = new Map(); // returns of the episodes of an evaluation, which never change
+  async function returnsOf(name, policy) {
+    const real = realOf(policy);
+    if (!real) return [];
+    const path = `${surrogate(name)}/policies/${policy.version}/evaluations/${real.id}?traces=false`;
+    if (!known.has(path)) known.set(path, (await call("GET", path)).returns);
+    return known.get(path);
+  }
+
+  async function side(name) {
+    const { policies } = await call("GET", `${surrogate(name)}/policies`);
+    return Promise.all(chosenOf(policies).map(async (policy) => ({
+      label: [`${name}@${policy.version}`, ...policy.aliases].join(", "), policy, returns: await returnsOf(name, policy),
+    })));
+  }
 
   return {
     async refresh() {
@@ -56,10 +97,10 @@ export function compareView(main, given) {
       const names = surrogates.map(({ name }) => name);
       chosen[0] = names.includes(chosen[0]) ? chosen[0] : names[0];
       chosen[1] = names.includes(chosen[1]) ? chosen[1] : names.find((name) => name !== chosen[0]) ?? names[0];
-      if (!names.length) return draw({ pair: [{ name: "", policies: [] }, { name: "", policies: [] }], environments: [] });
-      const lists = await Promise.all(chosen.map((name) => call("GET", `${surrogate(name)}/policies`)));
+      if (!names.length) return draw({ sides: [[], []], environments: [] });
+      const sides = chosen[0] === chosen[1] ? [await side(chosen[0]), []] : await Promise.all(chosen.map(side));
       pick({ names, now: [...chosen] });
-      draw({ pair: chosen.map((name, at) => ({ name, policies: lists[at].policies })), environments: chosen.map((name) => surrogates.find((one) => one.name === name).environment) });
+      draw({ sides, same: chosen[0] === chosen[1], environments: chosen.map((name) => surrogates.find((one) => one.name === name).environment) });
     },
     fail: (error) => place.replaceChildren(h("div", { class: "card bad", role: "alert" }, error.message)),
     repaint() {},

@@ -2,8 +2,6 @@
 
 import { number, percent, plural } from "/page/format.js";
 
-const Z = 1.959964; // a 95 % interval reaches so many standard errors to both sides
-
 const newest = (evaluations, wanted) => evaluations.filter(wanted).at(-1) ?? null;
 
 /** The newest real episodes of a policy from the declared starts. */
@@ -16,10 +14,14 @@ export function withoutOf(policy) {
     ["zero", "random"].includes(controller) && seed === real.first_seed && note === real.note);
 }
 
+const mark = (kind, { mean, mean_interval: interval }) => ({ kind, value: mean, low: interval?.low ?? null, high: interval?.high ?? null });
+
+/** The mark of its real episodes for `ranges`. */
+export const realMark = (policy) => mark("real", realOf(policy));
+
 /** The marks of a policy for `ranges`. */
 export function marksOf(policy) {
   const [real, without] = [realOf(policy), withoutOf(policy)];
-  const mark = (kind, { mean, mean_interval: interval }) => ({ kind, value: mean, low: interval?.low ?? null, high: interval?.high ?? null });
   return [
     policy.promise && { kind: "promise", value: policy.promise.median, low: policy.promise.low, high: policy.promise.high },
     real && mark("real", real),
@@ -39,15 +41,4 @@ export function sentence(policy) {
   const kept = real.promise_kept === null ? "" : real.promise_kept ? ": the promise was kept" : ": the promise was broken";
   const success = real.success_rate === null ? "" : `; ${percent(real.success_rate)} succeeded`;
   return `${said}; really ${meanWords(real)} in ${plural(real.episodes, "episode")}${success}${kept}.`;
-}
-
-/** Which of two policies is better in reality: {better, worse, by, low, high}; null where that is not known. */
-export function compared(one, other) {
-  const [a, b] = [realOf(one.policy), realOf(other.policy)];
-  if (!a?.mean_interval || !b?.mean_interval) return null;
-  const error = ({ low, high }) => (high - low) / (2 * Z);
-  const reach = Z * Math.hypot(error(a.mean_interval), error(b.mean_interval));
-  const [better, worse] = a.mean >= b.mean ? [one, other] : [other, one];
-  const by = Math.abs(a.mean - b.mean);
-  return { better, worse, by, low: by - reach, high: by + reach };
 }

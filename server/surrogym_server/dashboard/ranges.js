@@ -4,7 +4,7 @@ import { h } from "/page/dom.js";
 import { number } from "/page/format.js";
 
 const WIDTH = 600;
-const ROW = 40;
+const ROW = 40; // three marks high
 const LABEL = 24; // characters
 const PAD = { left: 170, right: 8, top: 4, bottom: 22 };
 
@@ -22,23 +22,26 @@ function shape({ kind, value, low, high }, x, y) {
   return parts;
 }
 
+/** Where the first of some marks goes in a row, so that they are in its middle. */
+const middle = (top, row, many) => (row < ROW ? top + row / 2 - (11 * (many - 1)) / 2 : top + 8);
+
 /** `rows` are {label, marks: [{kind: "promise" | "real" | "without", value, low, high}]}; null where nothing is known. */
-export function ranges(rows, label) {
+export function ranges(rows, label, row = ROW) {
   const all = rows.flatMap(({ marks }) => marks.flatMap(({ value, low, high }) => [value, low ?? value, high ?? value]));
   if (!all.length) return null;
   const [least, most] = [Math.min(...all), Math.max(...all)];
   const span = most - least || Math.abs(most) || 1;
   const [from, to] = [least - 0.04 * span, most + 0.04 * span];
   const x = (value) => PAD.left + ((WIDTH - PAD.left - PAD.right) * (value - from)) / (to - from);
-  const height = PAD.top + ROW * rows.length + PAD.bottom;
+  const height = PAD.top + row * rows.length + PAD.bottom;
   const said = rows.map(({ label: who, marks }) => `${who}: ${marks.map(({ kind, value, low, high }) => `${kind} ${number(value)}${low === null || low === undefined ? "" : ` between ${number(low)} and ${number(high)}`}`).join(", ") || "nothing known"}`);
   const ticks = [from + 0.04 * span, (from + to) / 2, to - 0.04 * span];
   return h("svg", { class: "ranges", viewBox: `0 0 ${WIDTH} ${height}`, role: "img", "aria-label": `${label}. ${said.join("; ")}` },
     rows.map(({ label: who, marks }, at) => {
-      const top = PAD.top + ROW * at;
-      const label = text(0, top + 22, who.length > LABEL ? `${who.slice(0, LABEL - 1)}…` : who, "start");
+      const top = PAD.top + row * at;
+      const label = text(0, top + row / 2 + (row < ROW ? 4 : 2), who.length > LABEL ? `${who.slice(0, LABEL - 1)}…` : who, "start");
       label.append(h("title", {}, who));
-      return [label, ...marks.map((mark, which) => shape(mark, x, top + 8 + 11 * which))];
+      return [label, ...marks.map((mark, which) => shape(mark, x, middle(top, row, marks.length) + 11 * which))];
     }),
     h("line", { class: "axis", x1: PAD.left, x2: WIDTH - PAD.right, y1: height - PAD.bottom, y2: height - PAD.bottom }),
     ticks.map((value, at) => text(x(value), height - 6, number(value), ["start", "middle", "end"][at])));

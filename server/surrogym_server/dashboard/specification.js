@@ -12,7 +12,7 @@ function spread({ kind, low, high, mean, std, value }) {
 }
 
 const end = (value) => (value === null || value === undefined ? "no limit" : number(value));
-const limits = (bounds) => (bounds ? `${end(bounds.low)} to ${end(bounds.high)}` : "none");
+const limits = (bounds) => (bounds && [bounds.low, bounds.high].some((one) => end(one) !== "no limit") ? `${end(bounds.low)} to ${end(bounds.high)}` : "none");
 
 /** A sum of functions of coordinates, such as "cos(theta) + 2 speed". */
 export function termWords({ parts, low, high }) {

@@ -102,6 +102,8 @@ def test_an_evaluation_has_intervals_and_says_whether_the_promise_was_kept(api: 
     assert again == said  # the same key: once
     detail = api.policies.evaluation(surrogate, "latest", said.id)
     assert (detail.returns, detail.traces, detail.missing) == ([-140, -160, -150], [trace], None)
+    short = api.connection.send("GET", f"/v1/surrogates/{surrogate}/policies/1/evaluations/{said.id}?traces=false")
+    assert wire.EvaluationDetail.model_validate_json(short) == detail.model_copy(update={"traces": []})
     worse = api.policies.evaluate(surrogate, 1, episodes("b", returns=[-180.0] * 3))
     wide = api.policies.evaluate(surrogate, 1, episodes("c", returns=[-180.0] * 3, declared=False))
     assert (worse.promise_kept, wide.promise_kept) == (False, None)
