@@ -88,8 +88,7 @@ def _near(definition: EnvironmentDefinition, what: str, rows: Floats) -> Floats:
         far = np.abs(rows[:, index]) > most
         if far.any():
             raise InvalidInput(
-                f"{what}: expected {coordinate.name!r} within {most:g}, which is far beyond its range, "
-                f"got {rows[far, index][0]:g}"
+                f"{what}: expected {coordinate.name!r} from {-most:g} to {most:g}, got {rows[far, index][0]:g}"
             )
     return rows
 

@@ -40,7 +40,7 @@ class QueriesOpen(RuntimeError):
 
     def __init__(self, ids: Sequence[int]) -> None:
         self.ids = tuple(ids)
-        super().__init__(f"expected the answers to the queries {list(ids)} first: tell them, or give them up")
+        super().__init__(f"expected the answers to the queries {list(ids)} first: tell() them, or give_up() them")
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ class Design:
             InvalidInput: the budget has fewer steps left, or the states have the wrong shape or are not finite.
         """
         left = self.budget - self._spoken_for()
-        wanted = checks.whole("steps", steps, 1, left, why=", which is what the budget has left")
+        wanted = checks.whole("steps", steps, 1, left, why=", because the budget has no more left")
         self._visited = None if visited is None else checks.states(self._definition, "visited", visited)
         self._extra = wanted
 
@@ -323,7 +323,7 @@ class Design:
             raise InvalidInput(f"expected a Query that was asked, got {type(query).__name__}")
         if self._open.get(query.id) == query:
             return
-        why = "was answered already" if query in self._answered else "is not one of this design's"
+        why = "was answered already" if query in self._answered else "belongs to another design"
         why = "was given up" if query in self._given_up else why
         raise InvalidInput(f"expected an open query, got query {query.id}, which {why}")
 
@@ -333,7 +333,7 @@ class Design:
 
     def _last(self) -> DesignResult:
         if self._result is None:
-            raise InvalidInput("expected a design with a model: answer its first queries, and ask for the next one")
+            raise InvalidInput("expected a design with a model: answer its first queries, then call ask() again")
         return self._result
 
 

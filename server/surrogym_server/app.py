@@ -184,7 +184,7 @@ async def _lifespan(
     process.fits.start()
     restored = await services.sessions.restore()
     if restored:
-        logger.info("sessions that came back: %d", restored)
+        logger.info("sessions restored: %d", restored)
     looking = asyncio.to_thread(_name_lacking, process.definitions)
     work = (services.designer.run(), sweeper.run(), looking, process.engine.start())
     tasks = [asyncio.create_task(one) for one in work]
@@ -255,7 +255,7 @@ def _build_services(settings: Settings, design: DesignPort, process: _Process) -
 
 def _name_lacking(definitions: Definitions) -> None:
     for sentence in definitions.lacking():
-        logger.warning("%s; what reads it works, fits and sessions are refused", sentence)
+        logger.warning("%s; it can still be read, but fits and sessions are refused", sentence)
 
 
 def _define(spec: dict[str, Any]) -> EnvironmentDefinition:

@@ -112,7 +112,7 @@ class _Search:
             raise InvalidInput(f"expected a model that can be differentiated, got one of the family {family!r}")
         action = self._spec.action
         if not isinstance(action, BoxAction) or action.bins is not None:
-            raise InvalidInput("expected continuous actions to differentiate by, got discrete ones")
+            raise InvalidInput("expected continuous actions, got discrete ones, which have no gradient")
         self._limit = self._spec.time_limit or LONGEST_EPISODE
         third = min(max(self._limit // 3, SHORTEST_HORIZON), LONGEST_HORIZON)
         self._horizon = min(settings.horizon or third, self._limit)
@@ -138,7 +138,7 @@ class _Search:
         self._lanes, _ = reset(self._model.definition, self._training, self._lanes)
         returns = self._returns(self._lanes.q, self._horizon)
         if not returns.requires_grad:
-            raise InvalidInput("expected a return that depends on the actions, got one that is the same for all")
+            raise InvalidInput("expected a return that depends on the actions, got the same return for all actions")
         self._adam.zero_grad()
         (-returns.mean() / self._horizon).backward()  # type: ignore[no-untyped-call]
         gradient = self._vector.grad

@@ -39,8 +39,8 @@ class Registry(plugins.Registry[T]):
         except plugins.UnknownMember:
             why = self.why_broken(choice.name)
             if why is None:
-                return f"{what}, which no installed package brings: install it on the server and restart"
-            return f"{what}, which can't be loaded: mend it on the server and restart ({why})"
+                return f"{what}, which no installed package provides: install its package on the server and restart"
+            return f"{what}, which can't be loaded: repair its package on the server and restart ({why})"
         try:
             self.make(choice)
         except InvalidSpec as error:
@@ -105,7 +105,7 @@ def _check_settings(kind: type, settings: dict[str, float | bool | str]) -> None
     fields = [field for field in dataclasses.fields(kind) if field.init] if dataclasses.is_dataclass(kind) else []
     names = ", ".join(field.name for field in fields)
     if unknown := sorted(set(settings) - {field.name for field in fields}):
-        raise ValueError(f"expected as settings {f'one of {names}' if names else 'none'}, got {unknown[0]!r}")
+        raise ValueError(f"expected {f'a setting out of {names}' if names else 'no settings'}, got {unknown[0]!r}")
     for field in fields:
         needed = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if needed and field.name not in settings:

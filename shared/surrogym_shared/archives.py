@@ -45,7 +45,7 @@ def read_entries(zipped: Path | bytes, limit: int) -> dict[str, bytes]:
                 raise ValueError(f"expected at most {limit} bytes inside, got {size}")
             return {entry.filename: _content(archive, entry) for entry in archive.infolist()}
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, zlib.error) as error:
-        raise ValueError(f"expected a zip, got something else: {error}") from error
+        raise ValueError(f"expected a zip file, got content that can't be read as one: {error}") from error
 
 
 def stored(entries: Mapping[str, bytes]) -> bytes:

@@ -514,4 +514,4 @@ def _read(decoder: msgspec.msgpack.Decoder[T], content: bytes) -> T:
     try:
         return decoder.decode(content)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise FrameError(f"expected a frame, got {len(content)} bytes that are none: {error}") from error
+        raise FrameError(f"expected a frame, got {len(content)} bytes that can't be read as one: {error}") from error

@@ -130,10 +130,10 @@ class Registry(Generic[T]):
         If several packages add the same name, none is loaded, because the order of the search path must not decide.
         """
         if len(entries) > 1:
-            raise _Unfit("they have the same name, and none of them is used: uninstall all but one")
+            raise _Unfit("they have the same name, so none of them is used: uninstall all but one")
         (entry,) = entries
         if _same(entry.name, self._built_in):
-            raise _Unfit(f"expected another name than the built-in {', '.join(self._built_in)}")
+            raise _Unfit(f"expected a name that differs from the built-in {', '.join(self._built_in)}")
         member = entry.load()
         if not (isinstance(member, type) and issubclass(member, self._base)):
             raise _Unfit(f"expected a subclass of {self._base.__module__}.{self._base.__name__}, got {member!r}")

@@ -20,7 +20,7 @@ def open_to_others(path: Path) -> str | None:
         return None
     if os.name != "posix" or not mode & OTHERS:
         return None
-    return f"{path} may be read by other users of this machine (mode {mode:o}): chmod 600 {path} closes it"
+    return f"{path} may be read by other users of this machine (mode {mode:o}): chmod 600 {path} prevents this"
 
 
 def tokens_in(path: Path) -> dict[str, Role]:
@@ -48,4 +48,4 @@ def parse_token(entry: str) -> tuple[str, Role]:
     for known in get_args(Role):
         if role == known:
             return token, known
-    raise ValueError(f"a token's role: expected one of {', '.join(get_args(Role))} before its colon, got another word")
+    raise ValueError(f"a token's role: expected one of {', '.join(get_args(Role))} before the colon, got another word")

@@ -158,13 +158,15 @@ def _split(data: bytes) -> tuple[Header, bytes]:
     length = int.from_bytes(data[:LENGTH_BYTES], "little")
     end = LENGTH_BYTES + length
     if len(data) < LENGTH_BYTES or end > len(data) or length > MAX_HEADER_BYTES:
-        raise NotASurrogateFile(f"expected a surrogate's file, got {len(data)} bytes that are no safetensors")
+        raise NotASurrogateFile(
+            f"expected a surrogate's file, got {len(data)} bytes that are not in safetensors format"
+        )
     try:
         header = json.loads(data[LENGTH_BYTES:end])
     except UNREADABLE as error:
-        raise NotASurrogateFile("expected a header of JSON, got something else") from error
+        raise NotASurrogateFile("expected a header in JSON, got other content") from error
     if not isinstance(header, dict) or not isinstance(header.get(METADATA, {}), dict):
-        raise NotASurrogateFile("expected a header of names and arrays, got something else")
+        raise NotASurrogateFile("expected a header with names and arrays, got other content")
     return header, data[end:]
 
 

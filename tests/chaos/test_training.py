@@ -103,5 +103,5 @@ def test_kills_in_the_middle_are_counted_and_reported(server: RestartingServer, 
     killed = trained(server, tmp_path / "killed.zip", signal.SIGKILL)
     lost = LANES * FAULTS
     assert killed.lost_episodes == lost
-    assert f"{lost} episodes cut short, lost with the server's sessions" in words_of_result(killed)
+    assert f"{lost} episodes cut short, because the server lost its sessions" in words_of_result(killed)
     assert f'"lost_episodes": {lost}' in (tmp_path / "killed.json").read_text()

@@ -114,7 +114,7 @@ def test_a_surrogate_leaves_and_enters_as_one_file(surrogym, pendulum_server, na
     taken = surrogym("import", "pendulum.surrogate", "--quiet", *server)
     assert (taken.code, taken.err) == (
         1,
-        "error: expected a name that is free, got 'pendulum': give another by --name\n",
+        "error: expected an unused name, got 'pendulum': give another by --name\n",
     )
 
 
@@ -213,7 +213,7 @@ def _look_at(on_server, pendulum, tmp_path):
     pushed = on_server("policy", "push", "taken.zip")
     assert pushed.out.startswith(f"{pendulum}@1: known already")
     unknown = on_server("policy", f"{pendulum}@7")
-    assert (unknown.code, "got 7, which is not there" in unknown.err) == (1, True)
+    assert (unknown.code, "got 7, which does not exist" in unknown.err) == (1, True)
 
 
 def _no(*_, **__):

@@ -25,7 +25,7 @@ def test_the_file_is_on_standard_output_and_the_words_beside_it(surrogym) -> Non
     assert said.json["specification"]["environment"] == "Swimmer-v5"
     assert f"Swimmer-v5: described by {said.json['real_steps']} real steps and" in said.err
     assert "a shift of slider1, slider2 changes nothing" in said.err
-    assert "please say: success" in said.err
+    assert "to decide: success" in said.err
 
 
 def test_a_described_environment_is_registered_by_its_file_and_by_its_name(on_server, described: Path, name) -> None:
@@ -55,7 +55,7 @@ def test_a_name_of_no_environment_is_one_sentence(surrogym) -> None:
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [("{", "env.json is no specification: "), (json.dumps({"specification": {}}), "is no specification: ")],
+    [("{", "env.json is not a specification: "), (json.dumps({"specification": {}}), "is not a specification: ")],
 )
 def test_a_file_that_holds_no_specification_is_refused(surrogym, tmp_path, content: str, message: str) -> None:
     (tmp_path / "env.json").write_text(content)

@@ -53,13 +53,16 @@ def test_an_address_that_is_none(surrogym):
         (("register", "Pendulum-v1", "--budget", "5", "--initial", "9"), "initial 9 exceeds the budget 5"),
         (("register",), "expected an environment or --spec FILE, got neither"),
         (("register", "--spec", "missing.json"), "missing.json: No such file or directory"),
-        (("register", "--spec", "broken.json"), "broken.json is no specification: "),
+        (("register", "--spec", "broken.json"), "broken.json is not a specification: "),
         (("register", "--spec", "crossed.json"), "uniform range crosses: expected low < high, got [1.0, -1.0]"),
         (("train", "pendulum", "--start-from", "missing.zip"), "missing.zip: no such policy file"),
-        (("train", "pendulum", "--spread", "0"), "--spread is variant probabilistic's: give --variant probabilistic"),
+        (
+            ("train", "pendulum", "--spread", "0"),
+            "--spread works with variant probabilistic alone: give --variant probabilistic",
+        ),
         (("change", "pendulum", "--tolerance", "theta=small"), "expected output=number, such as theta=0.01"),
         (("evaluate", "missing.zip", "--env", "Pendulum-v1"), "missing.zip: no such policy file"),
-        (("evaluate", "junk.zip", "--env", "Pendulum-v1", "--quiet"), "junk.zip is no policy of PPO"),
+        (("evaluate", "junk.zip", "--env", "Pendulum-v1", "--quiet"), "junk.zip is not a policy of PPO"),
         (("evaluate", "junk.zip"), "expected --env with the original environment, got none"),
         (("evaluate", "junk.zip", "--env", "Nowhere-v1"), "Nowhere-v1 can't be made: "),
         (
@@ -71,7 +74,7 @@ def test_an_address_that_is_none(surrogym):
             ("import", "junk.zip"),
             "expected a surrogate's file, or a log with a heading and rows, got neither in junk.zip",
         ),
-        (("demo", "pendulum", "--out", "."), "expected an empty run folder, got ., where there is something already"),
+        (("demo", "pendulum", "--out", "."), "expected an empty run folder, got ., which holds files already"),
         (("demo", "pendulum", "--json", "no/such/m.json"), "expected an existing folder for --json, got no/such"),
         (
             ("export", "pendulum", "--out", "samples.txt"),
@@ -103,15 +106,15 @@ def test_wrong_usage(surrogym, arguments):
 def test_an_unknown_surrogate(on_server, command):
     said = refused(on_server(command, "nobody"))
     assert "nobody" in said
-    assert said.endswith("; surrogym status lists those there are\n")
+    assert said.endswith("; surrogym status lists the existing ones\n")
 
 
 @pytest.mark.parametrize(
     ("answer", "way_out"),
     [
         (problem(Code.UNAUTHENTICATED), "; give a token of this server by SURROGYM_TOKEN or --token-file"),
-        (problem(Code.FORBIDDEN), "; surrogym doctor says what this token may do"),
-        (reply("<html>"), "; surrogym doctor says more"),
+        (problem(Code.FORBIDDEN), "; surrogym doctor shows what this token may do"),
+        (reply("<html>"), "; surrogym doctor shows more"),
     ],
     ids=["no token", "a token of another role", "another program"],
 )

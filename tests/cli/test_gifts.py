@@ -86,7 +86,7 @@ def test_a_card_with_a_name_that_none_can_have_is_refused(surrogym, tmp_path, na
     network(tmp_path, surrogate=name)
     ended = surrogym(*EVALUATE)
     assert ended.code == 1
-    assert ended.err.startswith("error: policy.json is no card of a policy: surrogate: ")
+    assert ended.err.startswith("error: policy.json is not the card of a policy: surrogate: ")
 
 
 @pytest.mark.parametrize(

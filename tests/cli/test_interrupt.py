@@ -49,7 +49,7 @@ def test_training_saves_its_policy(pendulum_server: ServerProcess, surrogym_on_t
         assert terminal.interrupt() == INTERRUPTED
     given = " ".join([*options, "--server", pendulum_server.url])
     again = f"surrogym train pendulum {given} --start-from policy.zip --out policy.zip"
-    assert f"to go on: {again}" in said(terminal)
+    assert f"to continue: {again}" in said(terminal)
     load_policy(tmp_path / "policy.zip")
     card = json.loads((tmp_path / "policy.json").read_text())
     assert 0 < card["virtual_steps"] < 899_072

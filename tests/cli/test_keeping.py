@@ -27,7 +27,7 @@ def test_episodes_that_no_server_takes_are_named_and_lose_no_result(
 ):
     policy = tmp_path / "policy.zip"
     _keep(policy, [("policy", episodes(returns))], EvaluationSettings(episodes=len(returns)), quiet=False)
-    assert f"the episodes can't be stored on the server: {named}" in capsys.readouterr().err
+    assert f"the server can't store the episodes: {named}" in capsys.readouterr().err
     assert not waiting_path(policy).exists()
 
 

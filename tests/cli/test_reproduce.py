@@ -14,7 +14,7 @@ ROW = Row("pendulum", "default", 0, 14, 4, 5, 9, mean=-150.0, min=-400.0, reache
     [
         ("--tasks=nothing", "unknown task 'nothing': expected all, or some of pendulum, "),
         ("--arms=default,x", "unknown arm 'x': expected all, study, or some of default, "),
-        ("--shares=half", "expected numbers with commas between, got 'half'"),
+        ("--shares=half", "expected numbers separated by commas, got 'half'"),
         ("--shares=0", "expected numbers above 0"),
     ],
 )
@@ -54,7 +54,10 @@ def test_rows_of_several_sittings_become_one_table(surrogym, tmp_path):
     assert read_rows(tmp_path / "both" / "efficiency.csv") == [ROW, oracle]
     assert (tmp_path / "both" / "efficiency.md").read_text() in said.out
     assert "| pendulum | oracle | 1 | 300,000 | -170.0 |" in said.out
-    assert surrogym("reproduce", "table", "--rows=nowhere.csv").err == "error: nowhere.csv: no such file\n"
+    assert (
+        surrogym("reproduce", "table", "--rows=nowhere.csv").err
+        == "error: expected a file of rows, got nowhere.csv, which does not exist\n"
+    )
 
 
 def test_a_page_takes_the_table(surrogym, tmp_path):

@@ -51,7 +51,7 @@ def test_a_design_that_failed_by_its_machine_names_the_way_on(on_server, server_
         while api.surrogate(name).phase != "failed":
             for query in api.claim(name, "w", max_queries=4, wait_seconds=1.0, lease_seconds=60.0).queries:
                 api.fail(name, query.id, query.lease_token, "no power", begun=True)
-    assert f"4 set aside as they failed; surrogym change {name} --resume asks those again" in on_server(
+    assert f"4 set aside because they failed; surrogym change {name} --resume queues them again" in on_server(
         "status", name
     ).out.replace("\n", " ")
     sampled = on_server("sample", name, "--until-done")

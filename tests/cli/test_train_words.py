@@ -23,7 +23,7 @@ def test_a_server_that_was_given_is_given_to_the_evaluation_too():
 
 
 def test_the_closed_loop_says_how_well_the_policys_region_is_known():
-    assert "; the design was ready, no round was needed; next" in words_of_result(RESULT, closed_loop=True)
+    assert "; the design was ready, so no round was needed; next" in words_of_result(RESULT, closed_loop=True)
     after = replace(RESULT, visited_confidence=(0.9, 0.99914))
     assert "; 2 rounds, confidence index 0.9991 where the policy went; next" in words_of_result(after, closed_loop=True)
     now = TrainProgress(100, 512, None, 0.0, visited_confidence=0.9)
@@ -32,14 +32,14 @@ def test_the_closed_loop_says_how_well_the_policys_region_is_known():
 
 def test_a_training_that_still_got_better_says_how_it_goes_on():
     words = words_of_result(replace(RESULT, gaining=True))
-    assert "; it still got better at the end, --start-from p.zip goes on; next: surrogym evaluate" in words
+    assert "; it still improved at the end, and --start-from p.zip continues it; next: surrogym evaluate" in words
 
 
 def test_networks_that_were_given_up_are_told():
-    assert "; 1 network that learned too little given up; next" in words_of_result(replace(RESULT, networks=2))
-    assert "; 2 networks that learned too little given up; next" in words_of_result(replace(RESULT, networks=3))
+    assert "; 1 network replaced because of slow learning; next" in words_of_result(replace(RESULT, networks=2))
+    assert "; 2 networks replaced because of slow learning; next" in words_of_result(replace(RESULT, networks=3))
 
 
 def test_after_an_interruption_the_closed_loop_is_asked_for_again():
     words = words_of_interruption(RESULT, "cart --improve 5 --rounds 3")
-    assert words.endswith("to go on: surrogym train cart --improve 5 --rounds 3 --start-from p.zip --out p.zip")
+    assert words.endswith("to continue: surrogym train cart --improve 5 --rounds 3 --start-from p.zip --out p.zip")

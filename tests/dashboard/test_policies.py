@@ -130,7 +130,7 @@ def test_damaged_episodes_are_named_and_the_rest_is_shown(
     expect(part).to_contain_text("The single episodes can't be shown")
     expect(part).to_contain_text("Promised −220 to −180")
     page.get_by_role("button", name=re.compile("^Download zip")).click()
-    expect(part.get_by_role("alert")).to_contain_text("is not what was stored")
+    expect(part.get_by_role("alert")).to_contain_text("has changed since it was stored")
     with Api(url) as api:
         api.policies.delete("bare", 1)
     assert [said for said in complaints if "500" not in said] == []

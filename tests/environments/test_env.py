@@ -82,7 +82,7 @@ def test_one_lane_takes_no_autoreset_mode():
 
 
 def test_rendering_is_refused():
-    with pytest.raises(ValueError, match=r"can't be rendered.*'human'"):
+    with pytest.raises(ValueError, match=r"expected render_mode.*'human'"):
         RemoteEnv(ExactPendulum(), render_mode="human")
 
 

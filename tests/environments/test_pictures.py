@@ -138,7 +138,7 @@ def test_an_environment_of_ones_own_draws_itself(own: None) -> None:
     [
         (LINE, None, r"expected original='package\.module:factory'"),
         (LINE, "line:Blind", r"have a method picture\(coordinates\), got a Blind"),
-        (BLIND, "line:Line", "got none that tells 'x'"),
+        (BLIND, "line:Line", "got none for 'x'"),
     ],
 )
 def test_what_can_not_be_shown_is_refused_in_words(own: None, spec, original, message) -> None:
@@ -189,6 +189,6 @@ def test_rendering_before_a_reset_is_refused() -> None:
 
 def test_what_can_not_be_rendered_opens_no_session() -> None:
     for kind in (RemoteEnv, RemoteVectorEnv):
-        with pytest.raises(ValueError, match="expected render_mode None or rgb_array, got 'human'"):
+        with pytest.raises(ValueError, match="expected render_mode None or rgb_array for a surrogate, got 'human'"):
             kind(port := ExactPendulum(), render_mode="human")
         assert port.opened == []

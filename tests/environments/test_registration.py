@@ -52,7 +52,7 @@ def test_the_id_may_name_the_package_to_import():
 def test_without_a_surrogate_the_error_says_what_is_missing():
     for make in (gymnasium.make, partial(gymnasium.make_vec, num_envs=2)):
         with pytest.raises(
-            ValueError, match=r'which surrogate\? expected gymnasium.make\("surrogym/Remote-v0", surrogate='
+            ValueError, match=r'expected the name of a surrogate: gymnasium.make\("surrogym/Remote-v0", surrogate='
         ):
             make(ENVIRONMENT_ID, url="http://127.0.0.1:8000")
 

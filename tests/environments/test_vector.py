@@ -116,7 +116,9 @@ def test_the_time_limit_may_be_given_by_gymnasiums_name():
 
 
 def test_two_time_limits_are_refused():
-    with pytest.raises(ValueError, match="expected time_limit or max_episode_steps, which mean the same, got both"):
+    with pytest.raises(
+        ValueError, match="expected either time_limit or max_episode_steps, which mean the same, got both"
+    ):
         RemoteVectorEnv(ExactPendulum(), 2, max_episode_steps=3, time_limit=4)
 
 

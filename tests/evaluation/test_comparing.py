@@ -52,12 +52,14 @@ def test_a_wrong_step_is_found_with_its_episode_state_and_output() -> None:
     assert found.by_episode() == {1: 2}
     assert found.missing == {0: 0.0, 1: -1.5}
     lines = Differing(found, 10_000).in_words(SPEC)
-    assert lines[0] == "2 of 20 real steps differ from the model by more than it claims"
-    assert lines[1].startswith("  episode of seed 10001: 2 such steps; its compared steps paid -1.5 ")
-    assert f"seed 10001, step 3, at x {traces[1].coordinates[3, 0]:.4g}: reward is -1.5 beside" in lines[2]
+    assert lines[0] == "2 of 20 real steps differ from the model by more than the model's uncertainty"
+    assert lines[1].startswith("  episode of seed 10001: 2 such steps; its compared steps earned -1.5 ")
+    assert f"seed 10001, step 3, at x {traces[1].coordinates[3, 0]:.4g}: reward is -1.5 off the prediction" in lines[2]
     assert Differing(found, 10_000).as_json()["steps"][0]["seed"] == 10_001
 
 
 def test_a_model_that_is_right_is_said_to_be() -> None:
     found = held(episodes(2, 10), np.zeros((20, 2)))
-    assert Differing(found, 0).in_words(SPEC) == ["none of 20 real steps differs from the model by more than it claims"]
+    assert Differing(found, 0).in_words(SPEC) == [
+        "none of 20 real steps differs from the model by more than the model's uncertainty"
+    ]

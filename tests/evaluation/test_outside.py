@@ -27,7 +27,7 @@ def test_a_way_of_other_speeds_is_outside_and_says_which() -> None:
     assert found.share == 1.0
     assert found.much
     assert found.name == "speed"
-    assert "100 % of the policy's steps lie where the log has never been, with speed between 6" in found.words()
+    assert "100 % of the policy's steps lie outside the log, with speed between 6" in found.words()
 
 
 def test_a_hole_in_the_middle_of_a_log_is_outside_too() -> None:

@@ -126,7 +126,7 @@ def test_an_interrupted_demo_ends_all_its_processes(demo, number):
     interrupted.process.wait(60)
     assert interrupted.process.returncode == 130
     said = interrupted.process.stderr.read()
-    assert f"interrupted; all processes have ended; kept in {interrupted.folder}: the real samples" in said
+    assert f"interrupted; all processes have ended; {interrupted.folder} keeps the real samples" in said
     assert interrupted.family() == []
 
 

@@ -41,7 +41,7 @@ def test_a_policy_that_starts_where_the_log_never_was_has_no_promise(server_proc
     found = handed_over(server_process.url, log, "outside-of-log", EnvironmentSpec.model_validate(fields))
     assert found.promise is None
     assert not found.trusted
-    assert "lie where the log has never been, with temperature between" in found.reason
+    assert "lie outside the log, with temperature between" in found.reason
     assert words_of_handover(found).startswith("no promise, not trusted: ")
 
 

@@ -195,7 +195,7 @@ def test_a_mapping_that_names_no_column_is_refused(tmp_path: Path):
 def test_a_mapping_of_another_form_is_refused_in_plain_words(tmp_path: Path, text: str, says: str):
     (tmp_path / "log.csv").write_text("a,b\n1,1\n2,0\n3,1\n")
     (tmp_path / "map.toml").write_text(text)
-    with pytest.raises(UnusableLog, match="map.toml is no mapping of columns: .*" + says):
+    with pytest.raises(UnusableLog, match="map.toml is not a mapping of columns: .*" + says):
         read_log(tmp_path / "log.csv", Options(mapping=tmp_path / "map.toml"))
 
 

@@ -25,7 +25,7 @@ def test_the_most_frequent_reason_is_said_with_its_line(tmp_path: Path):
     rows = ["0.1,", "0.2,x", "0.3,y", "0.4,z"]
     words = said(tmp_path / "log.csv", "\n".join(["level,action", *rows]) + "\n")
     assert words.startswith("expected two usable steps at least, got 0 of 4 rows; ")
-    assert "4 rows can't be used, 3 of them for one reason, first in line 3: " in words
+    assert "4 rows can't be used, 3 of them for the same reason, first in line 3: " in words
     assert "action: expected a number, got 'x'" in words
     assert words.endswith(f"all of these rows are in {tmp_path / 'log.rejected.csv'}")
     kept = list(csv.reader((tmp_path / "log.rejected.csv").read_text().splitlines()))

@@ -115,7 +115,7 @@ def test_parameters_of_a_process_come_from_a_file(tmp_path) -> None:
     assert read["a_space"]["high"].tolist() == [302.0]
     assert read["x0"].tolist() == [0.8, 330.0, 0.8]
     file.write_text(json.dumps(given | {"noise": True}))
-    with pytest.raises(UnknownEnvironment, match="asks for noise"):
+    with pytest.raises(UnknownEnvironment, match="sets noise"):
         parameters_of(str(file))
 
 
@@ -152,7 +152,7 @@ def test_a_state_that_can_not_be_read_leaves_only_resets(registered: Register) -
     [
         ({"action_space": gymnasium.spaces.Box(-np.inf, np.inf, (1,))}, "expected a Box with one row of finite bounds"),
         ({"action_space": gymnasium.spaces.MultiBinary(2)}, "expected a Box with one row of finite bounds"),
-        ({"observation_space": gymnasium.spaces.Discrete(4)}, "one of several symbols"),
+        ({"observation_space": gymnasium.spaces.Discrete(4)}, "a symbol out of several"),
     ],
 )
 def test_spaces_that_no_specification_can_express_are_refused(registered: Register, space, message: str) -> None:

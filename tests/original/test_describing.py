@@ -116,7 +116,7 @@ def test_every_step_is_counted(registered: Register) -> None:
 def test_an_environment_that_remembers_what_can_not_be_set_can_only_be_reset(registered: Register) -> None:
     found = describe(registered("Worn-v0", wear=0.01), 60)
     assert found.spec.query == "rollout"
-    assert any("something is remembered that can't be set" in line for line in found.found)
+    assert any("has memory that can't be set" in line for line in found.found)
 
 
 def test_a_state_that_can_not_be_read_is_what_is_shown(registered: Register) -> None:
@@ -130,7 +130,7 @@ def test_a_reward_that_is_mostly_the_same_is_asked_for(registered: Register) -> 
         return shown, float(reward > -0.01), *rest
 
     found = describe(registered("Sparse-v0", space={"step": step}), 60)
-    assert any("random steps paid exactly 0. A design of few real steps may meet" in line for line in found.asked)
+    assert any("random steps paid exactly 0. A design with few real steps may see" in line for line in found.asked)
     assert not any("paid exactly" in line for line in describe(registered("Spiral-v0"), 60).asked)
 
 

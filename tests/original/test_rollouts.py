@@ -81,7 +81,7 @@ def test_what_a_specification_declares_its_class_must_be_able_to_do():
         def spec(self):
             return super().spec().model_copy(update={"query": "step"})
 
-    with pytest.raises(UnknownEnvironment, match="query='step', for which it needs step_from"):
+    with pytest.raises(UnknownEnvironment, match="query='step', which needs step_from"):
         answering(Says())
     with pytest.raises(UnknownEnvironment, match="reset, step, coordinates and close, got a int"):
         answering(3)

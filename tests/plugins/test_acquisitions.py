@@ -40,7 +40,7 @@ def test_the_design_asks_by_an_installed_acquisition(plugin_server: ServerProces
     [
         ("nobody", {}, "expected one of integrated_variance, variance, uncertainty_index, latin_hypercube, focused_"),
         ("broken", {}, f"package '{BROKEN}', entry point broken = 'nowhere_to_be_found:Missing'"),
-        ("focused_variance", {"sigma": 1.0}, "expected as settings one of coordinate, near, width, got 'sigma'"),
+        ("focused_variance", {"sigma": 1.0}, "expected a setting out of coordinate, near, width, got 'sigma'"),
         (
             "focused_variance",
             {},
@@ -58,7 +58,7 @@ def test_the_design_asks_by_an_installed_acquisition(plugin_server: ServerProces
             "acquisition focused_variance: expected coordinate to be one of theta, speed, got 'x'",
         ),
         ("focused_variance", {"coordinate": "speed", "width": -1.0}, "expected a positive width, got -1.0"),
-        ("variance", {"width": 1.0}, "expected as settings none, got 'width'"),
+        ("variance", {"width": 1.0}, "expected no settings, got 'width'"),
     ],
 )
 def test_what_is_not_installed_or_set_wrong_is_refused(

@@ -78,7 +78,9 @@ def test_a_file_of_one_family_is_not_taken_by_a_surrogate_of_another(plugin_serv
     assert httpx.post(to.format("mine"), content=exported, headers=octets, timeout=60).status_code == 201
     refused = httpx.post(to.format("default"), content=exported, headers=octets, timeout=60)
     assert refused.status_code == 422
-    assert "family 'gaussian_process', as specified, got one of 'bayesian_linear'" in refused.json()["detail"]
+    assert (
+        "family 'gaussian_process', as the specification says, got one of 'bayesian_linear'" in refused.json()["detail"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -86,7 +88,7 @@ def test_a_file_of_one_family_is_not_taken_by_a_surrogate_of_another(plugin_serv
     [
         ("nobody", {}, "model: expected one of gaussian_process, ensemble, bayesian_linear, got 'nobody'"),
         ("broken", {}, "package 'broken_model', entry point broken = 'nowhere_to_be_found:Missing' of surrogym.models"),
-        ("bayesian_linear", {"depth": 1}, "expected as settings one of ridge, got 'depth'"),
+        ("bayesian_linear", {"depth": 1}, "expected a setting out of ridge, got 'depth'"),
         ("bayesian_linear", {"ridge": -1.0}, "expected a positive ridge, got -1.0"),
     ],
 )

@@ -42,7 +42,7 @@ DESIGNS = {
     "foc": {"acquisition": {"name": "focused_variance", "settings": {"coordinate": "theta"}}},
 }
 TARGET = 0.99999
-INSTALL = "which no installed package brings: install it on the server and restart"
+INSTALL = "which no installed package provides: install its package on the server and restart"
 LIN = f"surrogate lin needs the model family 'bayesian_linear', {INSTALL}"
 FOC = f"surrogate foc needs the acquisition 'focused_variance', {INSTALL}"
 

@@ -122,7 +122,7 @@ def test_what_can_not_be_exported_is_refused_in_words(tmp_path: Path):
     policy = saved(tmp_path, "DQN")
     with pytest.raises(NotExportable, match=r"ending in \.onnx or \.pt2, got '\.txt'"):
         export_policy(policy, tmp_path / "policy.txt", "DQN")
-    with pytest.raises(UnusablePolicy, match="no policy of SAC"):
+    with pytest.raises(UnusablePolicy, match="not a policy of SAC"):
         export_policy(policy, tmp_path / "policy.pt2", "SAC", trust=True)
     (tmp_path / "junk.onnx").write_bytes(b"junk")
     with pytest.raises(UnusableOnnx, match="expected a policy in ONNX, got 4 bytes"):

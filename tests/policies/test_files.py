@@ -180,7 +180,7 @@ def test_a_policy_of_stable_baselines3_is_read_when_it_is_trusted(tmp_path: Path
 
 
 def test_a_trusted_gift_runs(tmp_path: Path, mark: Path):
-    with pytest.raises(UnusablePolicy, match="no policy of PPO"):
+    with pytest.raises(UnusablePolicy, match="not a policy of PPO"):
         load_policy(gift(tmp_path / "policy.zip", mark), trust=True)
     assert mark.exists(), "else the other tests would show nothing"
 
@@ -203,7 +203,7 @@ def test_a_gift_among_the_weights_stays_pickled(tmp_path: Path, mark: Path, trus
     file = io.BytesIO()
     torch.save([Touches(mark), torch.zeros(10_000)], file)
     policy = changed(saved(tmp_path, "PPO, continuous"), policy__pth=file.getvalue())
-    with pytest.raises(UnusablePolicy, match="expected numbers alone as weights"):
+    with pytest.raises(UnusablePolicy, match="expected weights that are numbers"):
         load_policy(policy, trust=trust)
     assert not mark.exists()
 
@@ -260,7 +260,7 @@ def test_a_description_that_lies_is_refused(tmp_path: Path, change: dict[str, An
     policy = saved(tmp_path, "PPO, continuous")
     described = json.loads(read_entries(policy, LIMIT)[ENTRY])
     policy.write_bytes(stored(read_entries(policy, LIMIT) | {ENTRY: json.dumps(described | change).encode()}))
-    with pytest.raises(UnusablePolicy, match=re.compile(f"is no policy of PPO: .*({message})", re.DOTALL)):
+    with pytest.raises(UnusablePolicy, match=re.compile(f"is not a policy of PPO: .*({message})", re.DOTALL)):
         load_policy(policy)
 
 
@@ -358,7 +358,7 @@ def test_a_card_is_read_to_its_bound_alone(tmp_path: Path):
     with (tmp_path / "policy.json").open("wb") as card:
         card.truncate(2**28)
     tracemalloc.start()
-    with pytest.raises(UnusablePolicy, match=f"no card of a policy: expected at most {MAX_CARD_BYTES} bytes"):
+    with pytest.raises(UnusablePolicy, match=f"not the card of a policy: expected at most {MAX_CARD_BYTES} bytes"):
         read_card(tmp_path / "policy.zip")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -367,6 +367,6 @@ def test_a_card_is_read_to_its_bound_alone(tmp_path: Path):
 
 def test_a_plain_pickle_is_no_policy(tmp_path: Path, mark: Path):
     (tmp_path / "policy.zip").write_bytes(pickle.dumps(Touches(mark)))
-    with pytest.raises(UnusablePolicy, match="no policy of PPO: expected a zip"):
+    with pytest.raises(UnusablePolicy, match="not a policy of PPO: expected a zip"):
         load_policy(tmp_path / "policy.zip")
     assert not mark.exists()

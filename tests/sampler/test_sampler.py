@@ -137,7 +137,7 @@ def test_an_environment_that_hangs_is_killed_and_the_worker_goes_on(api, line):
 def test_a_step_of_the_wrong_shape_fails_the_query(api, line):
     Sampler(api, line, GivesNonsense(), SamplerSettings(once=True, batch=1, wait_seconds=5.0)).run()
     (failed,) = [query.error for query in api.queries(line) if query.error]
-    assert failed == "a step of the wrong shape: expected (1,) for next_coordinates, got (2,)"
+    assert failed == "expected the shape (1,) for next_coordinates of a step, got (2,)"
 
 
 def test_a_lease_shorter_than_the_step_is_kept_alive(api, line):

@@ -128,7 +128,7 @@ def test_arrays_of_another_size_are_refused(client: httpx.Client, session: str):
         reply = client.post(f"/v1/sessions/{session}/step", json={"action": action})
         refused(reply, Code.INVALID_REQUEST, "action", "got")
     reply = client.post(f"/v1/sessions/{session}/step", json={"action": [[0.5]] * 1_000_000})
-    refused(reply, Code.TOO_LARGE, "at most 65536 bytes", "larger ones come as application/vnd.msgpack")
+    refused(reply, Code.TOO_LARGE, "at most 65536 bytes", "send a larger body as application/vnd.msgpack")
 
 
 def test_an_announced_gigabyte_is_refused_unread(server: ServerProcess):

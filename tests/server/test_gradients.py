@@ -112,5 +112,5 @@ def test_no_lane_outweighs_the_others():
 
 def test_discrete_actions_are_refused():
     spec = cartpole()
-    with pytest.raises(InvalidInput, match="expected continuous actions to differentiate by"):
+    with pytest.raises(InvalidInput, match="expected continuous actions, got discrete ones"):
         optimise(local(spec), SMALL)

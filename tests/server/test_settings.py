@@ -62,7 +62,7 @@ def test_tokens_come_with_roles(tmp_path: Path):
         ({"SURROGYM_PORT": "many"}, "setting port: .*integer"),
         ({"SURROGYM_PORT": "70000"}, "setting port: .*65535"),
         ({"SURROGYM_TOKEN": "short"}, "at least 8 characters, got 5"),
-        ({"SURROGYM_TOKENS": "king:some-long-token"}, "one of read, train, sample, admin before its colon"),
+        ({"SURROGYM_TOKENS": "king:some-long-token"}, "one of read, train, sample, admin before the colon"),
         ({"SURROGYM_TOKEN_FILE": "/no/such/file"}, "'/no/such/file' can't be read"),
         ({"SURROGYM_LOG_LEVEL": "loud"}, "setting log_level: .*'info'"),
     ],

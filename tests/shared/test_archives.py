@@ -103,7 +103,7 @@ def test_compression_that_can_not_be_bounded_is_refused(kind: int):
 
 @pytest.mark.parametrize("content", [b"", b"no zip", deflated("a", bytes(100))[:-30]], ids=["empty", "text", "cut"])
 def test_what_is_no_zip_is_refused(content: bytes):
-    with pytest.raises(ValueError, match="expected a zip, got something else"):
+    with pytest.raises(ValueError, match="expected a zip file, got content"):
         read_entries(content, MEBIBYTE)
 
 
@@ -146,12 +146,12 @@ def test_a_network_whose_arrays_do_not_fit_together_is_refused(tmp_path: Path, u
     if units == 3:
         assert Network.load(path)(np.zeros((5, 2))).shape == (5, 1)
         return
-    with pytest.raises(ValueError, match="no network of arrays"):
+    with pytest.raises(ValueError, match="not a network of arrays"):
         Network.load(path)
 
 
 def test_a_pickle_in_the_place_of_a_network_is_refused(tmp_path: Path):
-    with pytest.raises(ValueError, match="no network of arrays"):
+    with pytest.raises(ValueError, match="not a network of arrays"):
         Network.load(network_file(tmp_path / "policy.zip", pickle.dumps([1])))
 
 
@@ -209,5 +209,5 @@ def test_a_network_that_finds_no_memory_is_refused_in_a_sentence(tmp_path: Path,
         raise MemoryError("Unable to allocate 1 GiB")
 
     monkeypatch.setattr("surrogym_shared.network.read_arrays", full)
-    with pytest.raises(ValueError, match=r"policy\.zip is no network of arrays: Unable to allocate 1 GiB"):
+    with pytest.raises(ValueError, match=r"policy\.zip is not a network of arrays: Unable to allocate 1 GiB"):
         Network.load(network_file(tmp_path / "policy.zip", b""))

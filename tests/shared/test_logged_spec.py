@@ -18,7 +18,7 @@ def spec(**changes) -> EnvironmentSpec:
         ({"starts": [[0.0]]}, "starts: expected 2 entries, got 1"),
         ({"starts": [[0.0, float("inf")]]}, "finite"),
         ({"starts": [[0.0, 0.0]] * 257}, "at most 256"),
-        ({"outside_reward": -1.0, "time_limit": None}, "outside_reward pays for the steps up to the time limit"),
+        ({"outside_reward": -1.0, "time_limit": None}, "outside_reward is paid for each step up to the time limit"),
         ({"design": {"budget": 1}}, "expected a budget of 2 or more real steps, or 0 for none, got 1"),
     ],
 )

@@ -89,7 +89,7 @@ def test_of_two_packages_with_one_name_none_is_used_and_both_are_named(sites: Si
     assert things.names == ("plain",)
     assert things.broken == {
         "same": f"package 'first', entry point same = 'first:Member'; package 'second', entry point "
-        f"Same = 'second:Member' of {GROUP}: they have the same name, and none of them is used: uninstall all but one"
+        f"Same = 'second:Member' of {GROUP}: they have the same name, so none of them is used: uninstall all but one"
     }
 
 
@@ -97,4 +97,4 @@ def test_no_package_takes_a_built_in_name(sites: Sites):
     sites.add("thief", "PLAIN", GOOD)
     things = registry()
     assert things.get("plain") is Plain
-    assert "expected another name than the built-in plain" in things.broken["PLAIN"]
+    assert "expected a name that differs from the built-in plain" in things.broken["PLAIN"]

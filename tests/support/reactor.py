@@ -76,7 +76,7 @@ WAYS = {
     "text": "concentration: expected a number, got 'error'",
     "out of bounds": "temperature: expected a value in [250, 400], got 999",
     "duplicated": "repeats line",
-    "going on after its end": "goes on with the episode, got 1",
+    "going on after its end": "continues the episode, got 1",
     "backwards": "time: expected a time after",
     "action": "action_coolant: expected a value in [280, 320], got 350",
 }

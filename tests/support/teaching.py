@@ -29,7 +29,7 @@ def teach(
         if claimed.queries:
             steps = [query for query in claimed.queries if isinstance(query, wire.StepQuery)]
             api.add_samples(name, "teacher", [answer(original, query) for query in steps])
-    raise AssertionError(f"the design of {name} was not done after {seconds} s: {api.surrogate(name)}")
+    raise AssertionError(f"the design of {name} had not ended after {seconds} s: {api.surrogate(name)}")
 
 
 def answer(original: GymnasiumEnvironment, query: wire.StepQuery) -> wire.NewSample:

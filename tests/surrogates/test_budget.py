@@ -45,7 +45,7 @@ def test_rounds_beyond_the_budget_are_for_those_who_may_raise_it(guarded: Server
     with Api(guarded.url, TOKENS["train"]) as api, pytest.raises(BudgetTooSmall, match=rf"{owned} --budget 13\b"):
         words_of_rounds(api, owned, queries=3, rounds=3)
     with Api(guarded.url, TOKENS["admin"]) as api:
-        assert words_of_rounds(api, owned, queries=3, rounds=3).endswith("left, and is raised up to 13")
+        assert words_of_rounds(api, owned, queries=3, rounds=3).endswith("left, and will be raised to at most 13")
 
 
 def test_the_server_refuses_too_and_changes_nothing(guarded: ServerProcess, owned: str) -> None:

@@ -177,7 +177,7 @@ def test_it_goes_on_from_what_it_saved(surrogate, tmp_path: Path):
     resumed = replace(settings, start_from=first)
     train(surrogate, tmp_path / "second.zip", resumed)
     load_policy(first).save(tmp_path / "alone.zip")
-    with pytest.raises(UnusablePolicy, match="got a policy alone"):
+    with pytest.raises(UnusablePolicy, match="got a policy without"):
         train(
             surrogate,
             tmp_path / "third.zip",

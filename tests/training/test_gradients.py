@@ -60,13 +60,16 @@ def test_it_finds_the_policy_of_optimise_with_the_servers_model(pendulum_server:
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"start_from": Path("policy.zip")}, "GRADIENT begins with a new network: expected no policy to start from"),
+        (
+            {"start_from": Path("policy.zip")},
+            "GRADIENT always begins with a new network: expected no policy to start from",
+        ),
         ({"session": {"penalty": 1.0}}, r"expected no session options, got \['penalty'\]"),
         (
             {"hyperparameters": {"speed": 1}},
             "GRADIENT takes lanes, horizon, units, learning_rate, largest_norm",
         ),
-        ({"prolong": True}, "GRADIENT takes the steps it is given"),
+        ({"prolong": True}, "GRADIENT trains for a fixed number of steps"),
     ],
 )
 def test_what_has_no_meaning_for_gradients_is_refused(

@@ -105,9 +105,9 @@ def test_what_a_policy_does_not_go_with_is_told(surrogate, tmp_path: Path):
     first = tmp_path / "first.zip"
     train(surrogate, first, small(total_steps=128))
     for changes in ({"n_steps": "many"}, {"device": "moon"}):
-        with pytest.raises(UnusablePolicy, match=f"first.zip does not go with {next(iter(changes))}="):
+        with pytest.raises(UnusablePolicy, match=f"first.zip does not fit {next(iter(changes))}="):
             train(surrogate, tmp_path / "policy.zip", small(start_from=first, hyperparameters=changes))
-    with pytest.raises(UnusablePolicy, match=r"first.zip does not go with .*this surrogate: .*spaces do not match"):
+    with pytest.raises(UnusablePolicy, match=r"first.zip does not fit .*this surrogate: .*spaces do not match"):
         train(local(cartpole()), tmp_path / "policy.zip", small(start_from=first))
 
 
@@ -117,7 +117,7 @@ def test_a_file_of_another_algorithm_is_not_gone_on_from(surrogate, tmp_path: Pa
     train(surrogate, a_search, TrainSettings(algorithm="cmaes", total_steps=1, hyperparameters=few))
     (tmp_path / "a.txt").write_text("text")
     for path in (a_search, tmp_path / "a.txt"):
-        with pytest.raises(UnusablePolicy, match=f"{path.name} is no policy of PPO"):
+        with pytest.raises(UnusablePolicy, match=f"{path.name} is not a policy of PPO"):
             train(surrogate, tmp_path / "policy.zip", small(start_from=path))
     assert not (tmp_path / "policy.zip").exists()
 

@@ -97,7 +97,9 @@ def test_an_id_that_no_session_can_have_reaches_no_server(identity: str):
     with api_of(reply("{}")) as (api, server):
         remote = HttpSurrogate(api.url, "pendulum")
         for call in (remote.reset, remote.close):
-            with pytest.raises(errors.InvalidInput, match="expected no slash, and something else than dots"):
+            with pytest.raises(
+                errors.InvalidInput, match="expected no slash, and at least one character other than a dot"
+            ):
                 call(identity)
         assert server.received == []
 

@@ -148,7 +148,7 @@ def test_a_token_comes_from_a_file_too(monkeypatch: pytest.MonkeyPatch, tmp_path
         (None, "can't be read: No such file or directory"),
         ("", "expected lines like 'sample:token', got none"),
         ("read:one-secret\ntrain:two-secret", "expected one token, got 2"),
-        ("king:a-secret", "a token's role: expected one of read, train, sample, admin before its colon, got another"),
+        ("king:a-secret", "a token's role: expected one of read, train, sample, admin before the colon, got another"),
     ],
 )
 def test_a_token_file_that_holds_no_token_is_refused(monkeypatch, tmp_path: Path, content: str | None, message: str):

@@ -53,7 +53,7 @@ def command(
     card = read_card(policy)
     name = surrogate or card.surrogate
     if name is None:
-        raise CommandError(f"expected --surrogate, as no card beside {policy} names one")
+        raise CommandError(f"expected --surrogate NAME, because no card beside {policy} names a surrogate")
     predict, asked = reading.load(policy, card), AuditSettings(steps=steps, seed=seed)
     with (
         service.connect(context) as api,
@@ -63,7 +63,7 @@ def command(
         subject = Subject(api, name, port, predict, _session(card), card.untrained, seed)
         found = hand_over(subject, asked, lambda view: update(None, f"{view.ledger.audit} real steps of audits"))
     if found.audit is None:
-        raise CommandError(f"no audit was taken, and the card is as it was: {found.reason}")
+        raise CommandError(f"no audit was made, and the card is unchanged: {found.reason}")
     noted = card.model_copy(update=vars(found))
     write_card(policy, noted)
     version = push_or_say(service.server, service.token_for(context), policy, name, quiet=output.quiet)

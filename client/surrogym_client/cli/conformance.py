@@ -34,7 +34,7 @@ def command(
     from surrogym_shared.terminal import on_interrupt, visible
 
     outcomes = []
-    with on_interrupt(lambda: f"interrupted; nothing stays of {surrogate!r}"):
+    with on_interrupt(lambda: f"interrupted; {surrogate!r} was deleted"):
         for outcome in conformance(service.server, service.token_for(context), surrogate):
             outcomes.append(outcome)
             if not output.as_json and (outcome.failure or not output.quiet):

@@ -37,7 +37,7 @@ def differ_from(
             steps = steps_of(result.traces)
             return Differing(disagreements(steps, compared(api, view.spec, view, steps)), first_seed)
     except SurrogymClientError as error:
-        say(f"not held against the model of {surrogate!r}: {error}", quiet=quiet)
+        say(f"not compared with the model of {surrogate!r}: {error}", quiet=quiet)
         return None
 
 
@@ -54,13 +54,16 @@ class Differing:
 
         found = self.found
         if not found.found:
-            return [f"none of {found.compared} real steps differs from the model by more than it claims"]
-        lines = [f"{len(found.found)} of {found.compared} real steps differ from the model by more than it claims"]
+            return [f"none of {found.compared} real steps differs from the model by more than the model's uncertainty"]
+        lines = [
+            f"{len(found.found)} of {found.compared} real steps differ from the model by more than the model's "
+            "uncertainty"
+        ]
         for episode, count in list(found.by_episode().items())[:SHOWN]:
             paid = found.missing.get(episode, 0.0)
             lines.append(
-                f"  episode of seed {self.first_seed + episode}: {count} such steps; its compared steps paid "
-                f"{paid:+.4g} beside the prediction"
+                f"  episode of seed {self.first_seed + episode}: {count} such steps; its compared steps earned "
+                f"{paid:+.4g} compared with the prediction"
             )
         names = () if spec is None else spec.coordinate_names
         return [*lines, *(f"  {self._at(one, names)}" for one in found.found[:SHOWN])]
@@ -94,5 +97,5 @@ class Differing:
         state = ", ".join(f"{name} {value:.4g}" for name, value in zip(known, one.step.coordinates, strict=True))
         return (
             f"seed {self.first_seed + one.step.episode}, step {one.step.number}, at {state}: {one.output} is "
-            f"{one.error:+.3g} beside the prediction, where {one.claimed:.3g} was claimed"
+            f"{one.error:+.3g} off the prediction, whose deviation is {one.claimed:.3g}"
         )

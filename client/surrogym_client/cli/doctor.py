@@ -92,7 +92,8 @@ def _described(env: str) -> tuple[EnvironmentSpec | None, list[Finding]]:
     except OriginalError:
         return None, []  # making it says the same
     words = (
-        f"no built-in one; described by {found.steps} real steps and {found.resets} resets (surrogym describe {env})"
+        f"no built-in specification; described by {found.steps} real steps and {found.resets} resets (surrogym "
+        f"describe {env})"
     )
     return found.spec, [Finding("spec", words)]
 

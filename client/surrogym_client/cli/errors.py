@@ -44,17 +44,17 @@ def _way_out(error: SurrogymClientError) -> str:
 
     match error:
         case errors.RequestTimeout():
-            return "; surrogym doctor says how far away it is"
+            return "; surrogym doctor measures how long it takes to answer"
         case errors.ServerUnreachable():
             return f"; {START_SERVER}"
         case errors.ProtocolMismatch():
-            return "; surrogym doctor says more"
+            return "; surrogym doctor shows more"
         case errors.Unauthenticated():
             return f"; {GIVE_TOKEN}"
         case errors.Forbidden():
-            return "; surrogym doctor says what this token may do"
+            return "; surrogym doctor shows what this token may do"
         case errors.UnknownSurrogate():
-            return "; surrogym status lists those there are"
+            return "; surrogym status lists the existing ones"
         case _:
             return ""
 

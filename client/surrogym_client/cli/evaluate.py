@@ -227,7 +227,7 @@ def _keep(
             for controller, result in reports
         ]
     except ValidationError as error:
-        say(f"the episodes can't be stored on the server: {invalid(error)}", quiet=quiet)
+        say(f"the server can't store the episodes: {invalid(error)}", quiet=quiet)
         return
     for one in noted:
         keep(policy, one)
@@ -256,7 +256,10 @@ def _run(
         enter(failure.steps, 0, "failed")
         raise
     except EvaluationInterrupted as interruption:
-        say(f"interrupted after {interruption.steps} real steps; no result was kept, the same command begins anew")
+        say(
+            f"interrupted after {interruption.steps} real steps; no result was kept; the same command starts from the "
+            "beginning"
+        )
         enter(interruption.steps, 0, "interrupted")
         raise
 

@@ -46,7 +46,7 @@ def command(
     from surrogym_shared.terminal import on_interrupt, progress
 
     token = service.token_for(context)
-    stays = "interrupted; nothing was written, and the same command begins anew"
+    stays = "interrupted; nothing was written; the same command starts from the beginning"
     with (
         on_interrupt(lambda: stays),
         progress("export", quiet=output.quiet) as update,

@@ -38,7 +38,7 @@ def command(
     from surrogym_shared.terminal import on_interrupt, progress
 
     card = read_card(policy)
-    stays = "interrupted; no checked file was written, and the same command begins anew"
+    stays = "interrupted; no checked file was written; the same command starts from the beginning"
     with on_interrupt(lambda: stays), progress("export", quiet=output.quiet) as update:
         update(0.0, "converting and checking")
         from surrogym_client.policies.export import CHECKS, export_policy

@@ -127,7 +127,7 @@ def _import_surrogate(context: typer.Context, file: Path, name: str | None, serv
     from surrogym_shared.terminal import on_interrupt, progress
 
     token = service.token_for(context)
-    stays = "interrupted; nothing stays of it at the server, and the same command begins anew"
+    stays = "interrupted; the server kept nothing of it; the same command starts from the beginning"
     with (
         on_interrupt(lambda: stays),
         progress("import", quiet=output.quiet) as update,
@@ -148,7 +148,7 @@ def _import_log(context: typer.Context, file: Path, log: OfLogs, wait: float, se
     from surrogym_shared.terminal import on_interrupt, progress
 
     token = service.token_for(context) if log.register or log.to else None
-    stays = "interrupted; the steps that were stored stay, and the same command stores the others"
+    stays = "interrupted; the steps stored so far are kept; the same command stores the others"
     with on_interrupt(lambda: stays), progress("import", quiet=output.quiet) as update:
         imported = import_log(
             file,

@@ -205,9 +205,9 @@ def read_spec(path: Path | None) -> EnvironmentSpec | None:
             return EnvironmentSpec.model_validate_json(json.dumps(read["specification"]))
         return EnvironmentSpec.model_validate_json(content)
     except ValidationError as error:
-        raise CommandError(f"{path} is no specification: {invalid(error)}") from error
+        raise CommandError(f"{path} is not a specification: {invalid(error)}") from error
     except ValueError as error:
-        raise CommandError(f"{path} is no specification: {error}") from error
+        raise CommandError(f"{path} is not a specification: {error}") from error
 
 
 def read_tolerances(given: list[str]) -> dict[str, float]:

@@ -22,7 +22,10 @@ def push_or_say(
         with connect(server, token) as api:
             sent = push(api, policy, surrogate)
     except SurrogymClientError as error:
-        say(f"not stored on the server: {error}; to store it later: surrogym policy push {policy}", quiet=quiet)
+        say(
+            f"the policy was not stored on the server: {error}; to store it later: surrogym policy push {policy}",
+            quiet=quiet,
+        )
         return None
     say(f"stored on the server as {sent.surrogate}@{sent.policy.version}", quiet=quiet)
     return sent.policy.version

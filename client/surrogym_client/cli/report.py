@@ -40,7 +40,7 @@ def command(
     """
     from surrogym_shared.terminal import on_interrupt, progress
 
-    stays = "interrupted; nothing was written, and the same command begins anew"
+    stays = "interrupted; nothing was written; the same command starts from the beginning"
     with (
         on_interrupt(lambda: stays),
         progress("report", quiet=output.quiet) as update,

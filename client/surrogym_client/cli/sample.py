@@ -155,7 +155,7 @@ def _telling(api: Api, surrogate: str, *, quiet: bool) -> Iterator[Tell | None]:
 def _words_of_interruption(report: SamplerReport) -> str:
     return (
         f"interrupted after {report.answered} queries answered with {report.steps} real steps; all of them are stored, "
-        "queries under way went back into the queue, and the same command goes on"
+        "unfinished queries went back into the queue, and the same command continues"
     )
 
 
@@ -176,6 +176,7 @@ def _words(surrogate: str, report: SamplerReport) -> str:
         said += f"; {IN_WORDS[report.phase]}"
     if report.phase == "failed":
         said += (
-            f": surrogym status {surrogate} says why, surrogym change {surrogate} --resume asks anew what was set aside"
+            f": surrogym status {surrogate} shows why; surrogym change {surrogate} --resume queues again the queries "
+            "that were set aside"
         )
     return f"{said}; next: surrogym train {surrogate}" if report.phase in COMPLETED else said

@@ -85,7 +85,7 @@ def _patiently(look: Callable[[], str], as_json: bool) -> str:
     try:
         return look()
     except ServerUnreachable as error:
-        return json.dumps({"error": str(error)}) if as_json else f"{error}; trying again, Ctrl-C ends it"
+        return json.dumps({"error": str(error)}) if as_json else f"{error}; trying again until Ctrl-C"
 
 
 def _short(seen: SurrogateSummary) -> str:
@@ -130,7 +130,7 @@ def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
         f"queries: {view.queries.pending} pending, {view.queries.leased} leased, {view.queries.set_aside} set aside",
     ]
     if view.queries.set_aside:
-        lines[-1] += f" as they failed; surrogym change {view.name} --resume asks those again"
+        lines[-1] += f" because they failed; surrogym change {view.name} --resume queues them again"
     if hint := _hint(view):
         lines.append(hint)
     if view.error:
@@ -158,11 +158,13 @@ def _steps(seen: SurrogateSummary) -> str:
 def _hint(view: SurrogateView) -> str | None:
     """Return what a person has to do next, if nothing proceeds without them."""
     if view.phase == "from_log":
-        return f"the model holds what the log shows, and no real step is asked for; next: surrogym train {view.name}"
+        return (
+            f"the model is fitted to the log, and the design requests no real steps; next: surrogym train {view.name}"
+        )
     if view.budget == 0 and view.model_version is None and not view.samples:
-        return f"it asks for no real step, and has no log yet; next: surrogym import LOG --to {view.name}"
+        return f"the design requests no real steps, and there is no log yet; next: surrogym import LOG --to {view.name}"
     if view.queries.pending and not view.samplers and not view.paused:
-        logged = "; the model of the log is served meanwhile" if view.ledger.logged and view.model_version else ""
+        logged = "; until then, the model of the log is served" if view.ledger.logged and view.model_version else ""
         return f"{view.queries.pending} queries wait for a sampler{logged}; next: surrogym sample {view.name}"
     return None
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     Record = Callable[[TrainProgress], None]
 
-NOTHING_YET = "interrupted before there was a policy; nothing was saved, and the same command begins anew"
+NOTHING_YET = "interrupted before there was a policy; nothing was saved; the same command starts from the beginning"
 
 
 def register(app: typer.Typer) -> None:
@@ -168,7 +168,7 @@ def _trainable(
         view = awaited_surrogate(api, surrogate, wait, quiet=quiet)
         if wait > 0:
             SEARCHES.get(name_of(settings))
-            stays = "interrupted while the design goes on at the server; the same command waits again"
+            stays = "interrupted; the design continues on the server; the same command waits again"
             with on_interrupt(lambda: stays), progress("design", quiet=quiet) as update:
                 view = wait_for_design(
                     api, surrogate, wait, lambda view: update(share_of_design(view), words_of_design(view))
@@ -180,7 +180,9 @@ def _trainable(
                 f"run {learn} {surrogate}, or give --wait SECONDS"
             )
         if view.phase not in COMPLETED and not view.paused:
-            typer.echo(f"the design of {surrogate!r} goes on; training starts on model {view.model_version}", err=True)
+            typer.echo(
+                f"the design of {surrogate!r} continues; training starts with model {view.model_version}", err=True
+            )
         return view.spec, api.url
 
 

@@ -135,7 +135,9 @@ class SessionOptions:
         given = {name: value for name, value in vars(self).items() if value is not None and value is not False}
         for name in OF_PARTICLES:
             if name in given and self.variant != "probabilistic":
-                raise CommandError(f"--{name} is variant probabilistic's: give --variant probabilistic with it")
+                raise CommandError(
+                    f"--{name} works with variant probabilistic alone: give --variant probabilistic as well"
+                )
         return given
 
 

@@ -56,7 +56,7 @@ def installation() -> Iterator[Finding]:
     for registry in _registries():
         for name, why in registry.broken.items():
             said = f"the {registry.kind} {name!r} is left out: {why}"
-            yield Finding("plug-in", said, "bring the package up to date, or remove it")
+            yield Finding("plug-in", said, "update the package, or uninstall it")
 
 
 def _registries() -> Iterator[Registry[Any]]:
@@ -88,7 +88,7 @@ def service(api: Api) -> Iterator[Finding]:
     try:
         yield Finding("ready", f"storage {api.ready().storage}")
     except (ProblemError, ServerUnreachable) as error:
-        yield Finding("ready", str(error), "its database does not answer: see the server's log")
+        yield Finding("ready", str(error), "the server's database does not answer: see the server's log")
     yield _access(api)
     yield _round_trip(api)
 

@@ -49,7 +49,7 @@ def make_vector_env(
 def _named(surrogate: str | None) -> str:
     if surrogate is None:
         raise ValueError(
-            f'which surrogate? expected gymnasium.make("{ENVIRONMENT_ID}", surrogate="its name"); '
-            "surrogym status lists those of a server"
+            f'expected the name of a surrogate: gymnasium.make("{ENVIRONMENT_ID}", surrogate="its name"); '
+            "surrogym status lists a server's surrogates"
         )
     return surrogate

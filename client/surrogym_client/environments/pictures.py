@@ -46,7 +46,7 @@ class Pictures:
             ResetNeeded: there is no observation yet.
         """
         if observation is None:
-            raise gymnasium.error.ResetNeeded("nothing to render yet: expected reset() before render()")
+            raise gymnasium.error.ResetNeeded("expected reset() before render(), got render() first")
         return self._renderer.draw(self._read(np.asarray(observation, dtype=np.float64)))
 
     def close(self) -> None:
@@ -64,9 +64,7 @@ def pictures_for(render_mode: str | None, spec: EnvironmentSpec, original: str |
     if render_mode is None:
         return None
     if render_mode not in RENDER_MODES:
-        raise ValueError(
-            f"a surrogate can't be rendered so: expected render_mode None or rgb_array, got {render_mode!r}"
-        )
+        raise ValueError(f"expected render_mode None or rgb_array for a surrogate, got {render_mode!r}")
     return Pictures(spec, original)
 
 
@@ -92,7 +90,9 @@ def coordinates_from_observation(spec: EnvironmentSpec) -> Callable[[Array], Arr
     """
     reads = [_read(spec, name) for name in spec.coordinate_names]
     if missing := [name for name, read in zip(spec.coordinate_names, reads, strict=True) if read is None]:
-        raise NotRenderable(f"expected observations that tell every coordinate, got none that tells {missing[0]!r}")
+        raise NotRenderable(
+            f"expected observations from which every coordinate can be computed, got none for {missing[0]!r}"
+        )
     known = [read for read in reads if read is not None]
     return lambda observation: np.array([read(observation) for read in known])
 

@@ -158,7 +158,7 @@ def _with_time_limit(options: dict[str, Any], max_episode_steps: int | None) -> 
     if max_episode_steps is None:
         return options
     if options.get("time_limit") is not None:
-        raise ValueError("expected time_limit or max_episode_steps, which mean the same, got both")
+        raise ValueError("expected either time_limit or max_episode_steps, which mean the same, got both")
     return options | {"time_limit": max_episode_steps}
 
 

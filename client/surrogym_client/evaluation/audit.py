@@ -91,20 +91,21 @@ def judge(compared: Compared, before: Promise, after: Promise, floor: float | No
         if sums[i] > limit
     ]
     faults += [
-        f"{compared.names[i]}: errors of {compared.errors[:, i].mean():.3g} on average, which is no noise"
+        f"{compared.names[i]}: errors of {compared.errors[:, i].mean():.3g} on average, more than noise explains"
         for i in np.flatnonzero(compared.biased() & (sums <= limit)).tolist()
     ]
     if compared.misplaced >= MISPLACED_ENDS:
-        faults.append(f"{compared.misplaced} of {n} steps ended, or did not end, against the prediction")
+        faults.append(f"{compared.misplaced} of {n} steps ended where the model predicted no end, or the reverse")
     slack = SLACK * max(earned(before, floor), earned(after, floor))
     if not before.low - slack <= after.median <= before.high + slack:
         faults.append(
-            f"the promise moved from {before.median:.4g} to {after.median:.4g} with the audit's steps learned"
+            f"the promise moved from {before.median:.4g} to {after.median:.4g} after the model learned the audit's "
+            "steps"
         )
     if "reward" in compared.names and compared.length:
         missing = float(compared.errors[:, list(compared.names).index("reward")].mean()) * compared.length
         if abs(missing) > BIAS * earned(before, floor):
-            faults.append(f"rewards differ from the prediction by {missing:.4g} in an episode, if all its steps do so")
+            faults.append(f"rewards would differ from the prediction by {missing:.4g} over a whole episode")
     return Audit(
         steps=n,
         passed=not faults,

@@ -45,9 +45,9 @@ class EvaluationSettings:
 
     def __post_init__(self) -> None:
         if self.episodes < 1 or (self.parallel is not None and self.parallel < 1):
-            raise ValueError(f"expected 1 episode and 1 instance at least, got {self.episodes} and {self.parallel}")
+            raise ValueError(f"expected at least 1 episode and 1 instance, got {self.episodes} and {self.parallel}")
         if self.wide and self.start_scale != 1:
-            raise ValueError("expected starts over the whole range or scaled ones, got both")
+            raise ValueError("expected either starts over the whole range or scaled starts, got both")
 
     @property
     def declared(self) -> bool:

@@ -50,7 +50,7 @@ class Outside:
                 f", with {self.name} between {self.way[0]:.4g} and {self.way[1]:.4g} "
                 f"(the log: {self.log[0]:.4g} to {self.log[1]:.4g})"
             )
-        return f"{100 * self.share:.0f} % of the policy's steps lie where the log has never been{where}"
+        return f"{100 * self.share:.0f} % of the policy's steps lie outside the log{where}"
 
 
 def outside_of(spec: EnvironmentSpec, q: Array, u: Array, way_q: Array, way_u: Array) -> Outside:

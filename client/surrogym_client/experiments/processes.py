@@ -42,7 +42,7 @@ class Child:
     def last_words(self) -> str:
         """The last line it has written."""
         lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return lines[-1] if lines else "it said nothing"
+        return lines[-1] if lines else "no output"
 
 
 class Children:

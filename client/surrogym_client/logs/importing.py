@@ -132,7 +132,7 @@ def import_log(
         >>> import_log("reactor.csv", register="reactor").taken
     """
     if (register is not None and to is not None) or (to is not None and spec is not None):
-        raise ValueError("expected one of register and to, and spec only without to")
+        raise ValueError("expected either register or to, and spec only together with register")
     if register is not None and not re.match(NAME_PATTERN, register):
         raise UnusableLog(
             "expected a name of at most 64 letters, digits, '.', '_' and '-' for the surrogate, with a letter or digit "

@@ -187,7 +187,7 @@ class OwnEpisode(Episode):
         reached, reward = np.asarray(step.next_coordinates, dtype=np.float64), float(step.reward)
         if reached.shape != (size := len(self.spec.coordinates),) or not np.isfinite([*reached, reward]).all():
             raise StepFailed(
-                f"expected {size} finite coordinates and a finite reward of a step, got {reached.tolist()} and {reward}"
+                f"expected {size} finite coordinates and a finite reward, got {reached.tolist()} and {reward}"
             )
         return Moment(self._shown(reached), reward, bool(step.terminated), reached, bool(step.truncated))
 

@@ -86,7 +86,7 @@ class IsolatedEnvironment:
             answer = _await_answer(pipe, self._number, limit)
         except (EOFError, OSError) as error:
             code = self._kill()
-            raise EnvironmentDied(f"the environment's process ended with exit code {code} in {method}") from error
+            raise EnvironmentDied(f"the environment's process ended with exit code {code} during {method}") from error
         if answer is None:
             self._kill()
             raise StepTimedOut(f"{method} took longer than {limit:g} s and was killed")

@@ -99,7 +99,7 @@ def specification(name: str) -> EnvironmentSpec:
         )
     open_simulator(name).close()
     raise UnknownEnvironment(
-        f"{name} has no built-in specification (these have one: {known}): surrogym describe {name} > env.json writes "
+        f"{name} has no built-in specification (built in: {known}): surrogym describe {name} > env.json writes "
         "one, and --spec env.json uses it"
     )
 

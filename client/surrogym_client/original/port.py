@@ -157,7 +157,7 @@ class OriginalPort:
     def _check_alone(self, others: int) -> None:
         if others and not self._parallel:
             raise NotParallel(
-                f"expected one lane in one session, for the environment runs one instance at a time, got {others} more "
+                f"expected one lane in one session, as the environment runs one instance at a time, got {others} more "
                 "(a simulator that runs several declares it by an attribute parallel = True)"
             )
 

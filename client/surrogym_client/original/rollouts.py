@@ -106,6 +106,6 @@ def answering(environment: object) -> Environment:
     )
     if not isinstance(environment, needed):
         raise UnknownEnvironment(
-            f"its specification declares query={query!r}, for which it needs {methods}: it lacks some of them"
+            f"its specification declares query={query!r}, which needs {methods}: some of them are missing"
         )
     return environment

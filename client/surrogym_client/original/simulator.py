@@ -120,7 +120,7 @@ class Simulator(ABC):
         """
         known = [variable.name for variable in self.variables]
         if unknown := [name for name in names if name not in known]:
-            raise UnknownEnvironment(f"coordinates {unknown} are no variables of the state: expected some of {known}")
+            raise UnknownEnvironment(f"coordinates {unknown} are not variables of the state: expected some of {known}")
         return [known.index(name) for name in names]
 
     def action_taken(self, action: Array) -> Array:
@@ -147,7 +147,7 @@ class Simulated:
         self._columns = simulator.columns(spec.coordinate_names)
         if spec.query == "step" and not simulator.settable:
             raise UnknownEnvironment(
-                f"{spec.environment} can't be set to a state, as its state can't be read: register it with "
+                f"{spec.environment} can't be set to a state, because its state can't be read: register it with "
                 "--no-teleport, or give a specification with query 'rollout'"
             )
 

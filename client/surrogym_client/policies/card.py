@@ -83,11 +83,13 @@ def read_card(policy: Path) -> PolicyCard:
     with card_path(policy).open("rb") as file:
         content = file.read(MAX_CARD_BYTES + 1)
     if len(content) > MAX_CARD_BYTES:
-        raise UnusablePolicy(f"{card_path(policy)} is no card of a policy: expected at most {MAX_CARD_BYTES} bytes")
+        raise UnusablePolicy(
+            f"{card_path(policy)} is not the card of a policy: expected at most {MAX_CARD_BYTES} bytes"
+        )
     try:
         return PolicyCard.model_validate_json(content)
     except ValidationError as error:
-        raise UnusablePolicy(f"{card_path(policy)} is no card of a policy: {first_fault(error)}") from error
+        raise UnusablePolicy(f"{card_path(policy)} is not the card of a policy: {first_fault(error)}") from error
 
 
 def first_fault(error: ValidationError) -> str:

@@ -176,11 +176,13 @@ def _difference(ours: Predict, theirs: Predict, size: int) -> float:
     observations = (3 * np.random.default_rng(0).standard_normal((CHECKS, size))).astype(np.float32)
     expected, got = ours(observations), theirs(observations)
     if expected.shape != got.shape:
-        raise NotExportable(f"expected actions of shape {expected.shape} of the file, got {got.shape}")
+        raise NotExportable(f"expected the file to give actions of shape {expected.shape}, got {got.shape}")
     largest = float(np.abs(expected.astype(np.float64) - got).max())
     bound = TOLERANCE * max(float(np.ptp(expected)), 1.0) if expected.dtype.kind == "f" else 0.0
     if not largest <= bound:
-        raise NotExportable(f"expected the policy's actions of the file, got some that differ by {largest:g}")
+        raise NotExportable(
+            f"expected the file to give the policy's actions, got actions that differ by up to {largest:g}"
+        )
     return largest
 
 

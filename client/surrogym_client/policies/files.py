@@ -81,13 +81,13 @@ def load_learner(
     except UnusablePolicy:
         raise
     except pickle.UnpicklingError as error:
-        raise UnusablePolicy(f"{path}: expected numbers alone as weights, got other pickled objects") from error
+        raise UnusablePolicy(f"{path}: expected weights that are numbers, got other pickled objects") from error
     except Exception as error:  # a malformed file can raise anything
         if changes:
             load_learner(path, algorithm, trust=trust)
             given = [f"{name}={value!r}" for name, value in changes.items() if name not in ("env", "seed")]
-            raise UnusablePolicy(f"{path} does not go with {', '.join([*given, 'this surrogate'])}: {error}") from error
-        raise UnusablePolicy(f"{path} is no policy of {algorithm}: {error}") from error
+            raise UnusablePolicy(f"{path} does not fit {', '.join([*given, 'this surrogate'])}: {error}") from error
+        raise UnusablePolicy(f"{path} is not a policy of {algorithm}: {error}") from error
 
 
 def _loaded(kind: type[BaseAlgorithm], path: Path, trust: bool, changes: dict[str, Any]) -> BaseAlgorithm:

@@ -78,11 +78,11 @@ def _check_self_contained(model: Any) -> None:
     import onnx
 
     if model.functions:
-        raise ValueError("expected operators of ONNX alone, got a function of the file's own")
+        raise ValueError("expected only operators of ONNX, got a function that the file defines")
     for message in _messages(model):
         match message:
             case onnx.TensorProto(data_location=onnx.TensorProto.EXTERNAL):
-                raise ValueError(f"expected all arrays in this file, got {message.name!r} in another one")
+                raise ValueError(f"expected all arrays inside the file, got {message.name!r} in another one")
             case onnx.SparseTensorProto():
                 raise ValueError("expected dense arrays, got a sparse one")
             case onnx.GraphProto() if message is not model.graph:

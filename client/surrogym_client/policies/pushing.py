@@ -61,7 +61,7 @@ def push(api: Api, policy: Path, surrogate: str | None = None) -> Pushed:
     card, form = read_card(policy), _form(policy)
     name = surrogate or card.surrogate
     if name is None:
-        raise UnusablePolicy(f"expected the name of a surrogate, as no card beside {policy} names one")
+        raise UnusablePolicy(f"expected the name of a surrogate, because no card beside {policy} names one")
     try:
         card_sent, curve = as_pushed(card), thinned(card.curve)
     except ValidationError as error:
@@ -98,7 +98,7 @@ def _read(policy: Path) -> list[wire.AddEvaluation]:
         return _WAITING.validate_json(content)
     except (ValidationError, ValueError) as error:
         said = first_fault(error) if isinstance(error, ValidationError) else str(error)
-        raise UnusablePolicy(f"{path} is no list of evaluations: {said}") from error
+        raise UnusablePolicy(f"{path} is not a list of evaluations: {said}") from error
 
 
 def _write(policy: Path, evaluations: Sequence[wire.AddEvaluation]) -> None:

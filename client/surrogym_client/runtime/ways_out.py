@@ -16,7 +16,7 @@ EXTRAS = {  # their packages
     "robotics": ("gymnasium_robotics",),
     "pcgym": ("pcgym",),
 }
-START_SERVER = "start one with surrogym serve, or name another by --server or SURROGYM_URL"
+START_SERVER = "start one with surrogym serve, or give another address by --server or SURROGYM_URL"
 GIVE_TOKEN = "give a token of this server by SURROGYM_TOKEN or --token-file"
 
 

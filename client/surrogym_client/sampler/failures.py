@@ -48,6 +48,7 @@ class Failures:
         only_these = failed > 1 and self._queries.issuperset(waiting)
         if failed >= MANY or (not self._answered and (failed >= FIRST_FEW or only_these)):
             raise MachineFails(
-                f"the original environment failed at {failed} different queries in a row, so that the fault may be its "
-                f"own, and no other query was begun; it said: {self._last}; mend it, and start the sampler again"
+                f"the original environment failed at {failed} different queries in a row, so the fault may be its "
+                f"own, and no other query was begun; the last error was: {self._last}; repair it, and start the "
+                "sampler again"
             )

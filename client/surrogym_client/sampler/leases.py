@@ -89,7 +89,7 @@ class Leases:
         if self._left(query) <= NEARLY_OVER * self._lease_seconds:
             self._renew(query)
         if self._left(query) <= 0:
-            raise LeaseEnded("its lease has ended, so that another sampler may have answered it")
+            raise LeaseEnded("its lease has ended, so another sampler may have answered it")
 
     def _left(self, query: Query) -> float:
         with self._lock:

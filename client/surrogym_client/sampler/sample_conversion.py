@@ -39,7 +39,9 @@ def sample_of(query: Query, step: RealStep, size: int, number: int = 0) -> NewSa
             next_observation=_entries(step.next_observation),
         )
     except (ValidationError, TypeError) as error:
-        raise StepFailed(f"a step that can't be used: {_first(error)}") from error
+        raise StepFailed(
+            f"expected a step that can be used as a sample, got one with an error: {_first(error)}"
+        ) from error
 
 
 def _requested_actions(query: Query) -> list[list[float]]:
@@ -50,7 +52,7 @@ def _requested_actions(query: Query) -> list[list[float]]:
 def _numbers(values: Any, size: int, what: str) -> list[float]:
     array = np.asarray(values, dtype=np.float64)
     if array.shape != (size,):
-        raise StepFailed(f"a step of the wrong shape: expected ({size},) for {what}, got {array.shape}")
+        raise StepFailed(f"expected the shape ({size},) for {what} of a step, got {array.shape}")
     numbers: list[float] = array.tolist()
     return numbers
 

@@ -25,10 +25,10 @@ def verdict(view: SurrogateView) -> str:
     if view.phase == "ready":
         return "ready"
     if not doubtful:
-        return "sure of its model, which has yet to be tested by adaptive queries"
+        return "certain of its model, which adaptive queries have not tested yet"
     named = ", ".join(_named(output, view.target) for output in doubtful)
     if len(doubtful) == 1 and len(outputs) > 1:
-        return f"ready but for {named}"
+        return f"ready except for {named}"
     nearly = all(output.confidence_index >= NEARLY * view.target for output in doubtful)
     return f"{'nearly ready' if nearly else 'not ready'}: {named}"
 
@@ -56,7 +56,7 @@ def advice(view: SurrogateView, models: Sequence[ModelView]) -> str:
         )
     if len(models) < 2 * FEWEST_MODELS:
         return (
-            "too few rounds to see a rate; as many real steps again: "
+            "too few rounds to estimate the progress; to take as many real steps again: "
             f"surrogym improve {view.name} --queries {max(view.samples, 1)}"
         )
     steps = _steps_to_go(view, worst, models)

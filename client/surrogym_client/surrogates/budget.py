@@ -18,15 +18,18 @@ def words_of_rounds(api: Api, name: str, queries: int, rounds: int) -> str:
     """
     view = api.surrogate(name)
     if view.phase == "ready":
-        return f"the design of {name!r} is ready: no more real steps are asked for"
+        return f"the design of {name!r} is ready: no more real steps are needed"
     needed = queries * rounds
     left = f"the budget of {name!r} has {view.budget_left} of {view.budget} real steps left"
     if needed <= view.budget_left:
         return f"up to {needed} more real steps ({rounds} rounds of {queries}); {left}"
     budget = view.budget + needed - view.budget_left
     if api.access().role == "admin":
-        return f"up to {needed} more real steps ({rounds} rounds of {queries}); {left}, and is raised up to {budget}"
+        return (
+            f"up to {needed} more real steps ({rounds} rounds of {queries}); {left}, and will be raised to at most "
+            f"{budget}"
+        )
     raise BudgetTooSmall(
-        f"{rounds} rounds of {queries} queries need up to {needed} more real steps, and {left}: ask for fewer by "
+        f"{rounds} rounds of {queries} queries need up to {needed} more real steps, and {left}: use fewer by "
         f"--improve and --rounds, or have a token of role admin raise it (surrogym change {name} --budget {budget})"
     )

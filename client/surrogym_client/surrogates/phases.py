@@ -8,7 +8,7 @@ COMPLETED: tuple[Phase, ...] = ("ready", "over_budget", "from_log")  # the model
 ENDED: tuple[Phase, ...] = (*COMPLETED, "failed")  # a sampler has nothing left to do
 IN_WORDS: dict[Phase, str] = {
     "ready": "the design is ready",
-    "over_budget": "the design has ended, and is not sure of its model",
-    "from_log": "the model holds what the log shows, and no real step is asked for",
+    "over_budget": "the design has ended without being certain of its model",
+    "from_log": "the model is fitted to the log, and the design requests no real steps",
     "failed": "the design has failed",
 }

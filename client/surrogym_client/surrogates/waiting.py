@@ -83,7 +83,7 @@ def wait_for_design(
             return view
         if view.phase == "failed":
             raise DesignUnfinished(f"the design of {name!r} failed: {view.error}")
-    raise DesignUnfinished(f"the design of {name!r} was not done after {seconds:g} s: its phase is {_phase(view)}")
+    raise DesignUnfinished(f"the design of {name!r} had not ended after {seconds:g} s: its phase is {_phase(view)}")
 
 
 def wait_for_answers(

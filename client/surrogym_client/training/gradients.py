@@ -74,7 +74,7 @@ class Gradients(PolicySearch):
 def _require_plain(task: SearchTask) -> None:
     """Refuse settings that have no meaning for the mean of the latest model."""
     if others := sorted({*task.settings.session} - {*DRAWS, *FUNCTIONS}):
-        raise ValueError(f"gradients follow the mean of the latest model: expected no session options, got {others}")
+        raise ValueError(f"gradients use the mean of the latest model: expected no session options, got {others}")
 
 
 def _library() -> Any:

@@ -93,7 +93,7 @@ def hand_over(
     """
     before = subject.promise()
     if audit is None or (why := _not_possible(subject)) is not None:
-        return _unaudited(subject, before, "asked for none" if audit is None else str(why))
+        return _unaudited(subject, before, "none was requested" if audit is None else str(why))
     try:
         found = take(subject, audit, before, progress)
     except NobodyAnswers:
@@ -187,7 +187,7 @@ def _not_possible(subject: Subject) -> str | None:
     """Return why no audit is possible; None if one is."""
     view = subject.api.surrogate(subject.name)
     if view.spec.design.preset == "paper":
-        return "preset paper has none"
+        return "preset paper has no audits"
     if not view.samplers:
         return NO_SAMPLER
     return "the design is paused" if view.paused else None
@@ -204,7 +204,7 @@ def _verdict(audit: Audit, floor: float | None) -> tuple[bool, str]:
 def _unaudited(subject: Subject, promise: Promise, why: str) -> Handover:
     """Return a handover whose promise no real step supports."""
     if (left := _left_the_log(subject)) is not None and left.much:
-        return Handover(None, None, False, f"{left.words()}: nothing can be promised of it")
+        return Handover(None, None, False, f"{left.words()}: no promise can be made for them")
     return _without(subject.api.surrogate(subject.name), promise, subject.floor, why)
 
 
@@ -214,7 +214,7 @@ def _without(view: SurrogateView, promise: Promise, floor: float | None, why: st
         return Handover(promise, None, False, wide)
     if view.phase == "ready":
         return Handover(promise, None, True, f"the design is ready; not audited: {why}")
-    state = "is not sure of its model" if view.phase in COMPLETED else "has not ended"
+    state = "is not certain of its model" if view.phase in COMPLETED else "has not ended"
     return Handover(promise, None, False, f"the design {state}, and there was no audit: {why}")
 
 
@@ -223,6 +223,7 @@ def _too_wide(promise: Promise, floor: float | None) -> str | None:
     if floor is None or promise.median - promise.low <= WIDE * abs(promise.median - floor):
         return None
     return (
-        f"the promise, from {promise.low:.4g} to {promise.high:.4g}, does not stand out from the {floor:.4g} of an "
+        f"the promise, from {promise.low:.4g} to {promise.high:.4g}, is too wide to be told apart from the "
+        f"{floor:.4g} of an "
         "untrained policy"
     )

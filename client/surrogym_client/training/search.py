@@ -155,11 +155,11 @@ def search_for(settings: TrainSettings) -> PolicySearch:
     """
     name, kind = name_of(settings), SEARCHES.get(name_of(settings))
     if settings.prolong and not kind.prolongable:
-        raise ValueError(f"{name} takes the steps it is given: expected no prolonging, or another algorithm")
+        raise ValueError(f"{name} trains for a fixed number of steps: expected no prolonging, or another algorithm")
     if settings.tracker is not None and not kind.tracked:
-        raise ValueError(f"{name} logs to no tracker: expected none, or another algorithm, got {settings.tracker}")
+        raise ValueError(f"{name} supports no tracker: expected none, or another algorithm, got {settings.tracker}")
     if settings.start_from is not None and not kind.resumable:
-        raise ValueError(f"{name} begins with a new network: expected no policy to start from")
+        raise ValueError(f"{name} always begins with a new network: expected no policy to start from")
     try:
         return kind(**settings.hyperparameters)
     except TypeError as error:

@@ -17,7 +17,7 @@ def words_of_result(
     """Describe the result of a training and the next command, which needs ``server`` if that is given."""
     on_server = "" if server is None else f" --server {shlex.quote(server)}"
     lost = result.lost_episodes
-    cut = f"; {lost} episode{'s' * (lost > 1)} cut short, lost with the server's sessions" if lost else ""
+    cut = f"; {lost} episode{'s' * (lost > 1)} cut short, because the server lost its sessions" if lost else ""
     return (
         f"{result.path}: {result.virtual_steps} virtual steps in {result.seconds:.1f} s"
         f"{_imagined(result.imagined_return)}{cut}{_loop(result.visited_confidence) if closed_loop else ''}"
@@ -32,7 +32,7 @@ def words_of_handover(handover: Handover) -> str:
     if promise is None:
         return f"no promise, {trusted}: {handover.reason}"
     return (
-        f"promise{', with the audit learned' if handover.audit else ''}: mean return {promise.median:.4g}, "
+        f"promise{', after learning the audit' if handover.audit else ''}: mean return {promise.median:.4g}, "
         f"between {promise.low:.4g} and {promise.high:.4g} with 90 % chance; "
         f"{trusted}: {handover.reason}"
     )
@@ -42,7 +42,7 @@ def words_of_interruption(result: TrainResult, asked: str) -> str:
     """Describe what Ctrl-C has left and how to continue. ``asked`` holds the arguments of the command: the surrogate
     and its options."""
     return (
-        f"interrupted after {result.virtual_steps} virtual steps; the policy so far is in {result.path}; to go on: "
+        f"interrupted after {result.virtual_steps} virtual steps; the policy so far is in {result.path}; to continue: "
         f"surrogym train {asked} --start-from {result.path} --out {result.path}"
     )
 
@@ -55,17 +55,17 @@ def words_of(now: dict[str, Any]) -> str:
 
 
 def _given_up(networks: int) -> str:
-    return f"; {networks} network{'s' * (networks > 1)} that learned too little given up" if networks else ""
+    return f"; {networks} network{'s' * (networks > 1)} replaced because of slow learning" if networks else ""
 
 
 def _gaining(result: TrainResult) -> str:
-    return f"; it still got better at the end, --start-from {result.path} goes on" if result.gaining else ""
+    return f"; it still improved at the end, and --start-from {result.path} continues it" if result.gaining else ""
 
 
 def _loop(rounds: Sequence[float | None]) -> str:
     """Describe the closed loop by the confidence index of each round."""
     if not rounds:
-        return "; the design was ready, no round was needed"
+        return "; the design was ready, so no round was needed"
     return f"; {len(rounds)} round{'s' * (len(rounds) > 1)}{_known(rounds[-1])}"
 
 

@@ -197,7 +197,9 @@ class Api:
             repeatable=False,
         )
         if len(claimed.queries) > max_queries:
-            raise ProtocolMismatch(f"expected {max_queries} queries of a claim at most, got {len(claimed.queries)}")
+            raise ProtocolMismatch(
+                f"expected at most {max_queries} queries in the reply to a claim, got {len(claimed.queries)}"
+            )
         return claimed
 
     def renew(

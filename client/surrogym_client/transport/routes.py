@@ -40,7 +40,7 @@ def alias(name: str) -> str:
 
 def session(identity: str) -> str:
     """Return the route of a session. Raises ``InvalidInput`` for an invalid id."""
-    expected = "id of a session: expected no slash, and something else than dots"
+    expected = "id of a session: expected no slash, and at least one character other than a dot"
     return f"/v1/sessions/{_segment(identity, SESSION_PATTERN, expected)}"
 
 

@@ -169,7 +169,7 @@ class Stream:
     def _closed(self) -> Exception:
         close = self._protocol.close_rcvd
         if close is None:
-            return StreamLost("the stream ended without a word")
+            return StreamLost("the stream ended without a closing message")
         if close.code == CloseCode.MESSAGE_TOO_BIG:
             return refused_here(Code.TOO_LARGE, f"expected a smaller message: {close.reason}")
         return StreamLost(f"the stream was closed with code {close.code}")
@@ -182,7 +182,7 @@ def _refused(response: Response) -> Exception:
     except ValidationError:
         return StreamUnavailable(f"the upgrade was refused with status {response.status_code}")
     if problem.code in NO_SUCH_ROUTE:
-        return StreamUnavailable("the server knows no stream, or something on the way takes the upgrade out")
+        return StreamUnavailable("the server has no stream, or a proxy on the way removes the header that asks for one")
     return error_from_problem(problem)
 
 

@@ -67,7 +67,7 @@ class Door:
         if announced.isdigit() and int(announced) > limit:
             expected = f"expected a body of at most {limit} bytes as {media_type}"
             larger = [name for name, size in self.bodies.items() if size is None and name != media_type]
-            instead = f"; larger ones come as {larger[0]}" if larger else ""
+            instead = f"; send a larger body as {larger[0]}" if larger else ""
             raise HTTPException(413, f"{expected}, got {announced.decode()} bytes{instead}")
 
     def _media_type(self, scope: Scope) -> str:
@@ -76,7 +76,7 @@ class Door:
             raise HTTPException(415, f"expected content type {' or '.join(self.bodies)}, got {given or 'none'}")
         encoding = raw_header(scope, b"content-encoding").decode("latin-1").strip().lower()
         if encoding not in ("", "identity"):
-            raise HTTPException(415, f"expected a body without content encoding, got one of {encoding!r}")
+            raise HTTPException(415, f"expected a body without content encoding, got the encoding {encoding!r}")
         return given
 
 

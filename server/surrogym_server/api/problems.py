@@ -100,7 +100,7 @@ def problem_of(error: Exception) -> Problem:
             return _problem(code_of(error), str(error))
         case FrameError():
             return _problem(Code.INVALID_REQUEST, str(error))
-    return _problem(Code.INTERNAL, "the server failed on this request; its log says more")
+    return _problem(Code.INTERNAL, "the server failed on this request; its log has the details")
 
 
 def response_of(problem: Problem, headers: Mapping[str, str] | None = None) -> Response:
@@ -231,7 +231,9 @@ async def _http_error(request: Request, error: Exception) -> Response:
 async def _gone(_: Request, error: Exception) -> Response:
     """For the log alone: who would read it has left in the middle of a request."""
     assert isinstance(error, ClientDisconnect)
-    return problem_response(Code.REQUEST_TIMEOUT, "the connection ended before the request did")
+    return problem_response(
+        Code.REQUEST_TIMEOUT, "expected a whole request, but the connection ended before it had arrived"
+    )
 
 
 async def _unexpected(_: Request, error: Exception) -> Response:

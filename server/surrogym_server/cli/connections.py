@@ -91,7 +91,7 @@ class Patient(HttpToolsProtocol):
     def on_headers_complete(self) -> None:
         self._head_complete, self._unparsed = True, 0
         if len(self.pipeline) >= MAX_PIPELINED:
-            self._stop(f"expected at most {MAX_PIPELINED} requests that wait for an answer, got one more", 429)
+            self._stop(f"expected at most {MAX_PIPELINED} unanswered requests on one connection, got one more", 429)
         super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:

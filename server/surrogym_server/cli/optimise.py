@@ -45,7 +45,7 @@ def optimise(
 
     Example: surrogym optimise --spec spec.json --model model.safetensors --out policy.zip
     """
-    nothing = "interrupted; nothing was saved, and the same command begins anew"
+    nothing = "interrupted; nothing was saved; the same command starts from the beginning"
     with on_interrupt(lambda: nothing), progress("optimise", quiet=quiet) as update:
         update(0.0, "importing torch")
         import torch

@@ -77,7 +77,7 @@ class Runner(uvicorn.Server):
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         if self._ended_by is not None:
-            logger.info("%s: the server ends", self._ended_by.name)
+            logger.info("%s: the server stops", self._ended_by.name)
         say_goodbye(self._app)
         await super().shutdown(sockets)
 

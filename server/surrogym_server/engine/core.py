@@ -181,7 +181,7 @@ def visited_states(session: Session) -> Array:
     if session.visited is None:
         raise InvalidInput("expected a session opened with occupancy=true, got one without")
     if not len(session.visited.states):
-        raise NotReset("this session has visited no state yet: reset and step it first")
+        raise NotReset("expected a session that has visited states, got a new one: reset and step it first")
     return session.visited.states
 
 

@@ -70,7 +70,9 @@ class Fits(Compute):
             if isinstance(outcome, _Failure):
                 raise _failure(outcome)
             return outcome
-        raise Unavailable("the process that fits died twice on the same job: is there enough memory?")
+        raise Unavailable(
+            "the process that fits models died twice on the same job; perhaps the machine has too little memory"
+        )
 
     def close(self) -> None:
         """End all processes, in the middle of a fit or of its start too; harmless when they have ended."""

@@ -79,7 +79,7 @@ class ModelCache:
             except Damaged:
                 if self._newest().get(surrogate) == version:
                     raise
-        raise NoModel("expected a surrogate with a model, but nothing has been fitted yet")
+        raise NoModel("expected a surrogate with a model, but no model has been fitted yet")
 
     def look(self) -> list[int]:
         """Publish what other servers have stored of the surrogates that are in use here, and forget those that are

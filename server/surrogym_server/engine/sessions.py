@@ -213,7 +213,7 @@ class LiveSessions:
             Unavailable: this process stops.
         """
         if self._stopping:
-            raise Unavailable("the server stops, and the steps of this request were not taken: send it again")
+            raise Unavailable("the server is stopping and took no step of this request: send it again")
         if id not in self._live:
             raise UnknownSession(f"session {id!r} was closed during this request")
 

@@ -50,7 +50,7 @@ def _read(definition: EnvironmentDefinition, data: bytes) -> DynamicsModel:
     expected, got = definition.learning.model, header.pop(FAMILY, GAUSSIAN_PROCESS)
     if got != expected.name:
         raise InvalidInput(
-            f"expected a model of the family {expected.name!r}, as specified, got one of {str(got)[:80]!r}"
+            f"expected a model of the family {expected.name!r}, as the specification says, got one of {str(got)[:80]!r}"
         )
     return learner_of(expected).codec.decode(definition, StoredModel(header, tensors))
 
@@ -68,4 +68,4 @@ def _require_whole(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
     """Raise ``InvalidInput`` where something is not as it was written; files from before have no checksum."""
     written = header.pop(CHECKSUM, None)
     if written is not None and written != _checksum(header, tensors):
-        raise InvalidInput("expected a model as it was written, got one with another checksum: the file is damaged")
+        raise InvalidInput("expected the checksum that the model was written with, got another: the file is damaged")

@@ -43,10 +43,12 @@ def learn(definition: EnvironmentDefinition, samples: Samples, warm: Warm | None
         learned = learner_of(definition.learning.model).learn(definition, samples, warm)
         model: object = getattr(learned, "model", learned)
         if not isinstance(model, DynamicsModel):
-            raise _wrong(definition, "expected a DynamicsModel, in Learned, from learn", type(model).__name__)
+            raise _wrong(definition, "expected learn to return a Learned with a DynamicsModel", type(model).__name__)
         for name, array in learned.warm.items():
             if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
-                raise _wrong(definition, f"expected an array of numbers as warm start {name!r}", type(array).__name__)
+                raise _wrong(
+                    definition, f"expected the warm start {name!r} to be an array of numbers", type(array).__name__
+                )
         every = max(1, len(samples) // POINTS)
         require_sound(learned.model, samples.q[::every][:POINTS], samples.u[::every][:POINTS])
     return learned
@@ -69,11 +71,11 @@ def require_sound(model: DynamicsModel, q: Tensor, u: Tensor) -> None:
         ends = model.learned_termination(q)
         require_numbers(definition, "learned termination", ends, q.shape[:1])
         if bool(((ends < 0) | (ends > 1)).any()):
-            raise _wrong(definition, "learned termination: expected chances within 0 and 1", f"{_worst(ends):g}")
+            raise _wrong(definition, "learned termination: expected probabilities from 0 to 1", f"{_worst(ends):g}")
     try:
         json.dumps([model.description, list(model.structures)], allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise _wrong(definition, "expected a description that JSON can carry", in_one_line(error)) from error
+        raise _wrong(definition, "expected a description that can be written as JSON", in_one_line(error)) from error
 
 
 def require_shapes(model: DynamicsModel, predicted: Transition, q: Tensor, *, deviations: bool = False) -> None:
@@ -81,7 +83,7 @@ def require_shapes(model: DynamicsModel, predicted: Transition, q: Tensor, *, de
     they have to be there."""
     definition, rows = model.definition, len(q)
     if not isinstance(predicted, Transition):
-        raise _wrong(definition, "expected a Transition from transition", type(predicted).__name__)
+        raise _wrong(definition, "expected transition to return a Transition", type(predicted).__name__)
     _require_shape(definition, "next coordinates", predicted.q_next, q.shape)
     _require_shape(definition, "reward", predicted.reward, (rows,))
     if deviations or predicted.deviation is not None:

@@ -93,7 +93,7 @@ def check_points(definition: EnvironmentDefinition, q: Array, u: Array) -> tuple
     """
     q = check_coordinates(definition, "coordinates", q)
     if len(q) != len(u):
-        raise InvalidInput(f"expected as many actions as coordinates, got {len(u)} and {len(q)}")
+        raise InvalidInput(f"expected as many actions as coordinates, got {len(u)} actions and {len(q)} coordinates")
     return q, model_actions(definition.action, u)
 
 

@@ -119,9 +119,9 @@ class Designer:
                     try:
                         await self._begin_all_due()
                     except Unavailable as error:
-                        logger.warning("storage is away or damaged, the design waits: %s", error)
+                        logger.warning("the storage is unavailable or damaged, so the design waits: %s", error)
                     except Exception:  # one surrogate's trouble must not end the design of all others
-                        logger.exception("a look for what is due failed; the next one follows")
+                        logger.exception("the search for due fits failed; it is repeated shortly")
                     await listener.wait(self._look_seconds)
         finally:
             tasks = list(self._tasks.values())
@@ -150,7 +150,7 @@ class Designer:
         except SurrogymError as error:  # deleted or taken by another server meanwhile, or the storage is away
             logger.debug("%s is not fitted: %s", name, error)
         except Exception:
-            logger.exception("the fit of %s could not be begun or ended; the next look follows", name)
+            logger.exception("the fit of %s could not be started or finished; it is tried again shortly", name)
         finally:
             del self._tasks[name]
 
@@ -165,7 +165,9 @@ class Designer:
             BeyondBudget: the budget has not as many left, and may not be raised.
         """
         if checkpoint is not None and self._storage.occupancy.get(name, checkpoint) is None:
-            raise InvalidInput(f"no occupancy was submitted as {checkpoint!r}: submit it from a session first")
+            raise InvalidInput(
+                f"expected the name of a submitted occupancy, got {checkpoint!r}: submit it from a session first"
+            )
         if checkpoint is None and (latest := self._storage.occupancy.latest(name)) is not None:
             checkpoint = latest.checkpoint
         granted = self._storage.designs.improve(
@@ -224,8 +226,8 @@ class Designer:
                 keeper.result()
             family = job.definition.learning.model.name
             raise PluginFailed(
-                f"the model family {family!r} took longer than {self._fit_seconds:g} s, and was ended: "
-                "surrogym serve --fit-seconds allows more"
+                f"the model family {family!r} took longer than {self._fit_seconds:g} s, and was stopped: "
+                "surrogym serve --fit-seconds sets a longer limit"
             )
         finally:
             for task in (work, keeper):
@@ -248,7 +250,9 @@ class Designer:
                 if (took := time.monotonic() - began) > tell_after:
                     tell_after *= 2
                     name, most = lease.surrogate, self._fit_seconds
-                    logger.warning("the fit of %s has been running for %.0f s, and is ended at %g s", name, took, most)
+                    logger.warning(
+                        "the fit of %s has been running for %.0f s, and is stopped after %g s", name, took, most
+                    )
                     await turn.let_others_pass()
                 await asyncio.sleep(PAUSE_SECONDS)
 
@@ -312,7 +316,9 @@ class Designer:
         for name in self._storage.designs.hopeless():
             with suppress(UnknownSurrogate):  # deleted meanwhile
                 set_aside = self._storage.queries.list(name, ("set_aside",))
-                error = f"all {len(set_aside)} initial queries were set aside; the last said: {set_aside[-1].error}"
+                error = (
+                    f"all {len(set_aside)} initial queries were set aside; the last error was: {set_aside[-1].error}"
+                )
                 self._storage.surrogates.set_phase(name, "failed", error)
                 self._notices.post(name)
 

@@ -75,7 +75,10 @@ def stored_model(storage: Storage, name: str, version: int) -> bytes:
     except Damaged as error:
         if storage.models.set_aside(name, version, str(error)):
             logger.error(
-                "model %d of %s is set aside, the one before it serves, a fit is due: %s", version, name, error
+                "model %d of %s is set aside, the version before it is served, and a new fit is due: %s",
+                version,
+                name,
+                error,
             )
         raise
 

@@ -79,7 +79,7 @@ class PolicyService:
         record = self._storage.policies.get(name, str(version))
         own = next((known for known in record.files if known.form == file.form and known.main), None)
         if own is not None and own.digest != file.digest:
-            raise InvalidInput(f"expected the file that version {version} was announced with, got another")
+            raise InvalidInput(f"expected the file that version {version} was announced with, got a different file")
         check_file(file.form, content, file.bytes, file.digest)
         blob = self._storage.blobs.put(content)
         with self._removed_if_refused(blob):
@@ -100,7 +100,7 @@ class PolicyService:
         file = next((one for one in record.files if one.form == form and one.blob is not None), None)
         if file is None:
             there = ", ".join(one.form for one in record.files if one.blob is not None) or "none"
-            raise UnknownPolicy(f"expected a file of {place}, got {form!r}; those that are there: {there}")
+            raise UnknownPolicy(f"expected one of the files of {place} ({there}), got {form!r}")
         return record.version, self._content(file.blob, file.digest, f"the {form} file of {place}")
 
     def evaluate(self, name: str, version: int, episodes: Episodes, key: str) -> tuple[PolicyRecord, EvaluationRecord]:
@@ -172,7 +172,7 @@ class PolicyService:
         assert blob is not None
         content = self._storage.blobs.get(blob)
         if hashlib.sha256(content).hexdigest() != digest:
-            raise Damaged(f"{what} is not what was stored: its digest is another")
+            raise Damaged(f"{what} has changed since it was stored: its digest differs")
         return content
 
     def _difference(self, name: str, spec: JSON | None) -> str | None:

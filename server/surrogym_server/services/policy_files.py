@@ -28,7 +28,7 @@ def check_file(form: str, content: bytes, size: int, digest: str) -> None:
         raise InvalidInput(f"expected a file with SHA-256 {digest}, as announced, got {found}")
     expected, looks_right = FORMS[form]
     if not looks_right(content):
-        raise InvalidInput(f"expected {expected}, got something else that begins with {content[:8]!r}")
+        raise InvalidInput(f"expected {expected}, got content that begins with {content[:8]!r}")
 
 
 def _names(content: bytes) -> set[str]:

@@ -106,13 +106,15 @@ class QueryService:
         if definition.max_rollout is None:
             if len(rollouts) or not len(coordinates):
                 raise InvalidInput(
-                    "expected coordinates and action alone: the original environment can be set to any state"
+                    "expected coordinates and actions, no rollouts: the original environment can be set to any state"
                 )
             q, u = check_points(definition, check_settable(definition, coordinates), action)
             ids = self._storage.queries.enqueue(name, q, u, purpose=purpose, key=key)
         else:
             if len(coordinates) or len(action) or not len(rollouts):
-                raise InvalidInput("expected rollouts alone: the original environment can only be reset and act")
+                raise InvalidInput(
+                    "expected rollouts, no coordinates: the original environment can't be set to a state"
+                )
             ids = self._storage.queries.enqueue(
                 name, *NO_STEPS, check_rollouts(definition, rollouts), purpose=purpose, key=key
             )

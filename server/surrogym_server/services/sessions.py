@@ -77,7 +77,7 @@ class SessionService:
         try:
             taken = self._storage.sessions.take()
         except Damaged as error:
-            logger.error("the saved sessions can't be read, their trainers have to open new ones: %s", error)
+            logger.error("the saved sessions can't be read, so trainers must open new ones: %s", error)
             return 0
         return sum([await self._restored(saved) for saved in taken])
 

@@ -199,7 +199,9 @@ def check_same(name: str, had: Any, got: Any) -> None:
     """Raises ``SpecConflict`` where two specs differ, which says where."""
     if had != got:
         where, old, new = difference(had, got)
-        raise SpecConflict(f"{name!r} exists with another spec: {where} was created as {short(old)}, got {short(new)}")
+        raise SpecConflict(
+            f"{name!r} exists with another specification: {where} was created as {short(old)}, got {short(new)}"
+        )
 
 
 def difference(had: Any, got: Any, where: str = "") -> tuple[str, Any, Any]:

@@ -47,9 +47,9 @@ class Sweeper:
         try:
             await sweep()
         except SurrogymError as error:
-            logger.warning("a sweep was cut short, the next one follows: %s", error)
+            logger.warning("a sweep stopped early; it is repeated shortly: %s", error)
         except Exception:  # leases must go on to end, whatever one sweep meets
-            logger.exception("a sweep failed; the next one follows")
+            logger.exception("a sweep failed; it is repeated shortly")
 
     def _sweep_files(self) -> None:
         """Once in ``ORPHAN_SECONDS``, remove the files whose policy or surrogate was deleted, or never stored."""
@@ -61,4 +61,4 @@ class Sweeper:
         orphans = tuple(sorted(old - self._storage.policies.blobs())) if old else ()
         self._storage.blobs.remove(orphans)
         if orphans:
-            logger.info("files of policies that are gone were removed: %d", len(orphans))
+            logger.info("files removed that belonged to deleted policies: %d", len(orphans))

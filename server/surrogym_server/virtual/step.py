@@ -24,7 +24,7 @@ def in_fastest_form(settings: VirtualSettings, model: DynamicsModel) -> VirtualS
     try:
         return replace(settings, compiled=_array_steps(model, replace(settings, compiled=True)) is not None)
     except Exception:  # of numba or of its compiler, on a platform where they don't work
-        logger.warning("steps can't be compiled here, so they are computed by torch", exc_info=True)
+        logger.warning("steps can't be compiled on this machine, so torch computes them", exc_info=True)
         return settings
 
 

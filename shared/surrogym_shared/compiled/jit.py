@@ -51,7 +51,9 @@ def entry(*arguments: Any) -> Callable[[F], F]:
             except NumbaError:
                 raise  # it would fail again
             except Exception as error:  # numba unpickles its cache files, and its cache folder may be unwritable
-                logger.warning("compiled code can't be kept in %s, so they are compiled again: %s", folder, error)
+                logger.warning(
+                    "compiled code can't be stored in %s, so the functions are compiled again: %s", folder, error
+                )
         return cast(F, njit([arguments], **chosen)(function))
 
     return compile_or_load

@@ -199,7 +199,7 @@ def _mapped(content: Mapping[str, Any], where: str) -> LogMapping:
     except ValidationError as error:
         keys = dict.fromkeys(str(found["loc"][0]) for found in error.errors())
         faults = "; ".join(_fault(key, content) for key in keys)
-        raise UnusableLog(f"{where} is no mapping of columns: {faults}") from error
+        raise UnusableLog(f"{where} is not a mapping of columns: {faults}") from error
 
 
 def _fault(key: str, content: Mapping[str, Any]) -> str:

@@ -67,7 +67,9 @@ def draft(roles: Roles, steps: Transitions, name: str, budget: int = 0) -> Draft
         if (found := _coordinate(roles, steps, one, index, notes)) is not None
     ]
     if not any(c.kind != "constant" for c in coordinates):
-        raise UnusableLog(f"expected a state that moves from row to row, got {list(roles.state)}, which never do")
+        raise UnusableLog(
+            f"expected at least one state that changes from row to row, got {list(roles.state)}, which never change"
+        )
     kept = [index for index, one in enumerate(roles.state) if one in {c.name for c in coordinates}]
     starts = {c.name: _start(c, steps, index) for c, index in zip(coordinates, kept, strict=True)}
     spec = EnvironmentSpec(
@@ -173,7 +175,8 @@ def _outside_reward(steps: Transitions, budget: int, notes: list[str]) -> float 
         return None
     worst = float(steps.reward.min())
     notes.append(
-        f"outside the ranges: a virtual episode ends, and each step that it lacks pays {worst:g}, the worst seen"
+        f"outside the ranges: a virtual episode ends, and each missing step up to the time limit pays {worst:g}, the "
+        "log's worst reward"
     )
     return worst
 
@@ -200,7 +203,7 @@ def _action(roles: Roles, steps: Transitions, notes: list[str]) -> BoxAction | D
     if values.shape[1] == 1 and (roles.discrete or (roles.discrete is None and whole and named)):
         if not whole:
             raise UnusableLog(
-                f"expected whole numbers from 0 of a discrete action, got {np.unique(values)[:5].tolist()}"
+                f"expected whole numbers from 0 for a discrete action, got {np.unique(values)[:5].tolist()}"
             )
         notes.append(f"action: one of {highest + 1}, as all values are whole numbers from 0 to {highest}")
         return DiscreteAction(n=highest + 1)
@@ -212,7 +215,7 @@ def _action(roles: Roles, steps: Transitions, notes: list[str]) -> BoxAction | D
         if least == most:
             raise UnusableLog(
                 f"expected an action {name!r} that varies, got {least:g} in every row: nothing can be learned of it; "
-                "leave it out by a mapping file (--map)"
+                "leave it out with a mapping file (--map)"
             )
         low.append(least)
         high.append(most)
@@ -222,13 +225,17 @@ def _action(roles: Roles, steps: Transitions, notes: list[str]) -> BoxAction | D
 def _time_limit(steps: Transitions, notes: list[str]) -> int:
     if len(steps.episodes) >= FEW_EPISODES:
         return max(steps.episodes)
-    notes.append(f"time limit: {USUAL_LIMIT} steps of a virtual episode, as the log is a single one")
+    notes.append(
+        f"time limit: {USUAL_LIMIT} steps of a virtual episode, because the log has too few episodes to show one"
+    )
     return USUAL_LIMIT
 
 
 def _reward(steps: Transitions, notes: list[str]) -> Reward | DeclaredReward:
     if steps.reward is None:
-        notes.append("reward: no column, so it is declared as 0; declare it in the drafted file before a training")
+        notes.append(
+            "reward: no column, so it is declared as 0; declare the real one in the drafted file before training"
+        )
         return DeclaredReward(kind="declared", terms=(RewardTerm(weight=0, shape="one"),))
     return Reward(timing="auto")
 
@@ -237,7 +244,7 @@ def _about(roles: Roles, steps: Transitions) -> list[str]:
     notes = []
     if steps.interval is not None:
         notes.append(
-            f"sampling interval: {steps.interval:g}, in the unit of {roles.time}; a virtual step takes as long"
+            f"sampling interval: {steps.interval:g}, in the unit of {roles.time}; a virtual step covers the same time"
         )
     return notes
 
@@ -249,7 +256,7 @@ def _remarks(values: Floats) -> list[str]:
     if not far.any():
         return []
     worst = values[np.abs(values - middle).argmax()]
-    return [f"{ending(int(far.sum()))} far from the others, up to {worst:g}; declare limits if these are faults"]
+    return [f"{ending(int(far.sum()))} far from the others, up to {worst:g}; if these are faults, declare limits"]
 
 
 def ending(count: int) -> str:

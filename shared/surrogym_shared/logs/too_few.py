@@ -31,13 +31,15 @@ def require_steps(table: Table, steps: Transitions, least: int) -> None:
     wanted = "two usable steps" if least == 2 else "one usable step"
     parts = [f"expected {wanted} at least, got {len(steps)} of {counted(len(table), 'row')}"]
     if steps.ends:
-        parts.append(f"{has(steps.ends, 'row')} no next state, as an episode or the log ends there, or a gap follows")
+        parts.append(
+            f"{has(steps.ends, 'row')} no next state, because an episode or the log ends there, or a gap follows"
+        )
     if steps.rejected:
         kinds = {row: _kind(reason) for row, reason in steps.rejected.items()}
         kind, count = Counter(kinds.values()).most_common(1)[0]
         row = next(row for row in kinds if kinds[row] == kind)
         parts.append(
-            f"{counted(len(steps.rejected), 'row')} can't be used, {count} of them for one reason, first in line "
+            f"{counted(len(steps.rejected), 'row')} can't be used, {count} of them for the same reason, first in line "
             f"{table.lines[row]}: {steps.rejected[row]}"
         )
     if table.faults:

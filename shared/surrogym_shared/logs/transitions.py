@@ -145,7 +145,7 @@ def _backwards(rows: Rows, episode: Ints, order: Iterable[int], rejected: dict[i
 def _going_on(rows: Rows, follower: dict[int, int], rejected: dict[int, str]) -> dict[int, str]:
     """Rows that say their episode ended while another row of it follows."""
     return {
-        row: f"{rows.roles.terminated}: expected 0, as line {rows.lines[after]} goes on with the episode, got 1"
+        row: f"{rows.roles.terminated}: expected 0, as line {rows.lines[after]} continues the episode, got 1"
         for row, after in follower.items()
         if rows.terminated[row] and row not in rejected
     }

@@ -26,7 +26,7 @@ class BoxAction(Frozen):
     def _ordered(self) -> Self:
         require(
             len(self.low) == len(self.high),
-            f"action low and high differ in length: {len(self.low)} and {len(self.high)}",
+            f"action: expected as many entries in low as in high, got {len(self.low)} and {len(self.high)}",
         )
         for i, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
             require_range(f"action {i}", low, high)

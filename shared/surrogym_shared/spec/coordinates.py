@@ -82,7 +82,7 @@ class Bounds(Frozen):
 
     @model_validator(mode="after")
     def _some(self) -> Self:
-        require(self.low is not None or self.high is not None, "bounds need a low or a high")
+        require(self.low is not None or self.high is not None, "bounds: expected a low or a high, got neither")
         if self.low is not None and self.high is not None:
             require_range("range of bounds", self.low, self.high)
         return self

@@ -126,7 +126,7 @@ class EnvironmentSpec(Frozen):
         require_unique("coordinate", names)
         require_unique("observation", self.observation_names)
         outputs = names if self.design.preset == "default" else (*names, *self.observation_names)
-        require(REWARD not in outputs, f"nothing that is learned beside the reward may be called {REWARD!r}")
+        require(REWARD not in outputs, f"a coordinate or observation entry must not be called {REWARD!r}")
         require_known("start", self.start, names)
         missing = [n for n in names if n not in self.start]
         require(not missing, f"start distribution lacks {missing}: expected every coordinate of {list(names)}")
@@ -150,7 +150,7 @@ class EnvironmentSpec(Frozen):
             require(len(start) == len(names), f"starts: expected {len(names)} entries, got {len(start)}")
         require(
             self.outside_reward is None or self.time_limit is not None,
-            "outside_reward pays for the steps up to the time limit: expected a time_limit, got none",
+            "outside_reward is paid for each step up to the time limit: expected a time_limit, got none",
         )
         self._require_reward()
         for where, term in self._terms():
@@ -184,10 +184,12 @@ class EnvironmentSpec(Frozen):
             lengths <= {self.action.size},
             f"reward: expected {self.action.size} weights of the action, got {sorted(lengths)}",
         )
-        require(self.design.preset == "default", "preset 'paper' learns its reward: expected one of kind 'learned'")
+        require(
+            self.design.preset == "default", "preset 'paper' learns its reward: expected a reward of kind 'learned'"
+        )
 
     def _require_stoppable(self, name: str, stopped: str) -> None:
-        require(stopped != name, f"coordinate {name!r} stops itself: expected another one")
+        require(stopped != name, f"coordinate {name!r} stops itself: expected the name of another coordinate")
         bounds = self.coordinates[self.coordinate_names.index(stopped)].bounds
         if bounds is not None:
             holds = (bounds.low is None or bounds.low <= 0) and (bounds.high is None or bounds.high >= 0)

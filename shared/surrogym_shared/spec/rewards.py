@@ -33,7 +33,10 @@ class Quantity(Frozen):
 
     @model_validator(mode="after")
     def _something(self) -> Self:
-        require(self.term is not None or bool(self.action), "a quantity needs a term or weights of the action")
+        require(
+            self.term is not None or bool(self.action),
+            "a quantity: expected a term or weights of the action, got neither",
+        )
         return self
 
 

@@ -354,7 +354,7 @@ def test_a_policy_that_cannot_act(client: httpx.Client, session: str, body: Any,
 
 def test_a_policy_too_large_for_json_is_told_the_way_of_frames(client: httpx.Client, session: str):
     reply = post(client, f"/v1/sessions/{session}/rollout", with_layers(8, 100))
-    refused(reply, Code.TOO_LARGE, "131072 bytes", "larger ones come as application/vnd.msgpack")
+    refused(reply, Code.TOO_LARGE, "131072 bytes", "send a larger body as application/vnd.msgpack")
 
 
 @pytest.mark.parametrize(

@@ -140,18 +140,18 @@ def test_a_file_that_is_not_of_its_form_is_refused(api: Api, surrogate: str, tmp
     with zipfile.ZipFile(zipped, "w") as archive:
         archive.writestr("holiday.jpg", b"not a policy")
     for content in (b"PK\x03\x04 broken", zipped.getvalue(), b"#!/bin/sh"):
-        with pytest.raises(InvalidInput, match=r"expected a zip of Stable-Baselines3.*got something else"):
+        with pytest.raises(InvalidInput, match=r"expected a zip of Stable-Baselines3.*got content"):
             api.policies.push(surrogate, card(), [], "zip", content)
     broken, *_ = api.policies.list(surrogate)
     assert [one.stored for one in broken.files] == [False]  # it says so, and the card is there
     version = api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path)).version
     for form, content in (("mp4", b"<html>no video"), ("gif", b"GIF88a"), ("onnx", b"PK"), ("pt2", b"\x08\x01")):
-        with pytest.raises(InvalidInput, match="got something else that begins with"):
+        with pytest.raises(InvalidInput, match="got content that begins with"):
             api.policies.put_file(surrogate, version, form, content)
     api.policies.put_file(surrogate, version, "gif", b"GIF89a and so on")
-    with pytest.raises(InvalidInput, match="was announced with, got another"):
+    with pytest.raises(InvalidInput, match="was announced with, got a different file"):
         api.policies.put_file(surrogate, version, "zip", network_file(tmp_path, seed=1))
-    with pytest.raises(UnknownPolicy, match="got 'onnx'; those that are there: zip, gif"):
+    with pytest.raises(UnknownPolicy, match=r"\(zip, gif\), got 'onnx'"):
         api.policies.file(surrogate, version, "onnx")
 
 
@@ -197,9 +197,9 @@ def test_damage_is_named_and_the_rest_is_shown(api: Api, surrogate: str, tmp_pat
         for table in ("policy_files", "policy_evaluations"):
             for (blob,) in database.execute(own.format(table), (surrogate,)):
                 (folder / blob).write_bytes(b"something else")
-    with pytest.raises(ServerFailure, match=r"the zip file of version 1 .* is not what was stored"):
+    with pytest.raises(ServerFailure, match=r"the zip file of version 1 .* has changed since it was stored"):
         api.policies.file(surrogate, version, "zip")
     detail = api.policies.evaluation(surrogate, version, said.id)
     assert (detail.returns, detail.mean) == ([], said.mean)
-    assert "is not what was stored" in (detail.missing or "")
+    assert "has changed since it was stored" in (detail.missing or "")
     assert api.policies.get(surrogate, version).promise == PROMISE

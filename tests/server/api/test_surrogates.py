@@ -182,7 +182,7 @@ def test_a_design_without_any_answer_fails_openly_and_goes_on_by_hand(client: ht
     failed = view(client, fresh)
     assert (failed.phase, failed.error) == (
         "failed",
-        f"all {pendulum.INITIAL} initial queries were set aside; the last said: no power",
+        f"all {pendulum.INITIAL} initial queries were set aside; the last error was: no power",
     )
     samples = [pendulum.real_step([x, 2 * x], [x / 2]) for x in np.linspace(-3, 3, pendulum.BUDGET)]
     pendulum.add(client, fresh, samples, idempotency_key="by hand").raise_for_status()

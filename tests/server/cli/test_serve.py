@@ -85,7 +85,7 @@ def test_a_clean_end_brings_the_sessions_back(tmp_path: Path):
         first = client.post(f"/v1/sessions/{sessions[0]}/step", json=step).content
     assert server.stop() == 0
     assert "Traceback" not in server.log
-    assert "SIGTERM: the server ends" in server.log
+    assert "SIGTERM: the server stops" in server.log
     assert "sessions saved: 2" in server.log
     with running_server(tmp_path) as again, httpx.Client(base_url=again.url, timeout=60) as client:
         replies = [client.post(f"/v1/sessions/{session}/step", json=step).content for session in sessions]

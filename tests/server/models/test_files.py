@@ -45,7 +45,9 @@ def test_a_file_without_a_family_is_read(model):
 def test_a_file_of_another_family_than_the_specifications_is_refused(model, family):
     header = header_of(to_bytes(model)) | {"family": family}
     del header["checksum"]
-    with pytest.raises(InvalidInput, match="family 'gaussian_process', as specified, got one of") as refused:
+    with pytest.raises(
+        InvalidInput, match="family 'gaussian_process', as the specification says, got one of"
+    ) as refused:
         from_bytes(model.definition, rewritten(to_bytes(model), header))
     assert len(str(refused.value)) < 300
 

@@ -32,7 +32,7 @@ def test_settings_of_the_specification_override_those_of_the_preset():
     ("choice", "said"),
     [
         (Choice("nobody"), "model: expected one of gaussian_process.*, got 'nobody'"),
-        (Choice("gaussian_process", (("depth", 3.0),)), "expected as settings one of kernel, reward_jumps, symmetry"),
+        (Choice("gaussian_process", (("depth", 3.0),)), "expected a setting out of kernel, reward_jumps, symmetry"),
         (Choice("gaussian_process", (("kernel", "cubic"),)), "kernel to be one of composite, squared_exponential"),
         (Choice("gaussian_process", (("reward_jumps", 1.0),)), "reward_jumps to be true or false, got 1.0"),
         (Choice("gaussian_process", (("kernel", 1.0),)), "expected kernel to be a text, got 1.0"),

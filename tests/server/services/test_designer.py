@@ -261,8 +261,8 @@ def test_a_fit_that_takes_too_long_is_ended_and_named(answered: Storage, designe
     record = answered.surrogates.get(NAME)
     assert (record.phase, runner.ended) == ("failed", 1)
     assert record.error == (
-        "the fit failed: the model family 'gaussian_process' took longer than 0.2 s, and was ended: "
-        "surrogym serve --fit-seconds allows more"
+        "the fit failed: the model family 'gaussian_process' took longer than 0.2 s, and was stopped: "
+        "surrogym serve --fit-seconds sets a longer limit"
     )
 
 
@@ -298,7 +298,7 @@ def test_a_fit_that_takes_long_is_told_and_passed(answered: Storage, designer, r
     asyncio.run(run())
     assert runner.ended == 1
     assert answered.designs.due() == [NAME]
-    assert f"the fit of {NAME} has been running for 0 s, and is ended at 3600 s" in caplog.text
+    assert f"the fit of {NAME} has been running for 0 s, and is stopped after 3600 s" in caplog.text
 
 
 @pytest.mark.parametrize("workers", [1, 2])

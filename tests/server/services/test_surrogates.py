@@ -22,6 +22,6 @@ from surrogym_server.services.surrogates import check_same
 def test_another_spec_under_the_same_name_is_refused(other: dict[str, Any], words: str) -> None:
     spec = {"x": [{"low": 1}], "y": None}
     check_same("a", spec, spec)
-    with pytest.raises(SpecConflict, match=f"^'a' exists with another spec: {words}") as refused:
+    with pytest.raises(SpecConflict, match=f"^'a' exists with another specification: {words}") as refused:
         check_same("a", spec, other)
     assert len(str(refused.value)) < 250

@@ -291,7 +291,11 @@ def test_a_writer_that_stays_keeps_the_others_waiting_for_a_while_only(
         with opened.write():
             pytest.fail("two writers at once")
 
-    with ThreadPoolExecutor(1) as thread, opened.write(), pytest.raises(Unavailable, match="others have been writing"):
+    with (
+        ThreadPoolExecutor(1) as thread,
+        opened.write(),
+        pytest.raises(Unavailable, match="other writers have held it"),
+    ):
         thread.submit(second).result()
     with opened.write():
         pass

@@ -82,7 +82,7 @@ def test_an_alias_leads_to_one_version_and_goes_with_it(storage: Storage, make: 
     assert [policy.aliases for policy in storage.policies.list(name)] == [("production",), ()]
     storage.policies.delete(name, 2)
     for which in ("production", "2", "99999999999", "²"):
-        with pytest.raises(UnknownPolicy, match="which is not there"):
+        with pytest.raises(UnknownPolicy, match="which does not exist"):
             storage.policies.get(name, which)
     with pytest.raises(UnknownPolicy):
         storage.policies.put_alias(name, "production", 2)
@@ -119,7 +119,7 @@ def test_a_file_that_aliased_ones_leave_no_room_for_changes_nothing(storage: Sto
     name = make()
     version, _ = pushed(storage, name, b"x" * 100)
     storage.policies.put_alias(name, "production", version)
-    with pytest.raises(TooLarge, match="150 more; delete a policy"):
+    with pytest.raises(TooLarge, match="150 more: delete a policy"):
         pushed(storage, name, b"y" * 150, most=100)
     assert storage.policies.get(name, "production").files[0].blob is not None
 

@@ -97,7 +97,7 @@ def test_renewing_keeps_a_lease_alive(
     until(lambda: storage.queries.sweep_expired() == 1)
     assert storage.queries.get(name, kept.id).status == "leased"
     assert storage.queries.get(name, lost.id).status == "pending"
-    with pytest.raises(LeaseExpired, match="claim again"):
+    with pytest.raises(LeaseExpired, match="claim a query again"):
         storage.queries.renew(name, lost.id, lost.token, LONG)
 
 

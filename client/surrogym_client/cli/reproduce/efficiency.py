@@ -81,7 +81,7 @@ def run_study(wanted: Sequence[Cell], out: Path, jobs: int, *, again: bool, as_j
     rows = read_rows(out / "rows.csv")
     todo = wanted if again else [cell for cell in wanted if not done_already(cell, rows)]
     say(f"{len(wanted)} runs, {len(wanted) - len(todo)} of them done already", quiet=quiet)
-    stays = f"interrupted; what is done stays in {out / 'rows.csv'}, and the same command goes on from there"
+    stays = f"interrupted; finished runs are kept in {out / 'rows.csv'}; the same command continues from there"
     with terminations_as_interrupts(), on_interrupt(lambda: stays), progress("reproduce", quiet=quiet) as update:
 
         def tell(now: Progress) -> None:
@@ -92,7 +92,7 @@ def run_study(wanted: Sequence[Cell], out: Path, jobs: int, *, again: bool, as_j
         rows = run_cells(todo, rows, out, jobs, tell) if todo else rows
     present(rows, out, as_json=as_json, quiet=quiet)
     if bad := [row for row in rows if row.error and row.key in {cell.key for cell in wanted}]:
-        raise CommandError(f"{len(bad)} runs ended badly, the first with {bad[0].error}; logs: {out / 'logs'}")
+        raise CommandError(f"{len(bad)} runs failed, the first with {bad[0].error}; logs: {out / 'logs'}")
 
 
 def _wanted(tasks: str, arms: str, seeds: Sequence[int], chosen: dict[str, Any]) -> list[Cell]:
@@ -133,7 +133,7 @@ def _shares(given: str) -> list[float]:
     try:
         shares = [float(share) for share in given.split(",")]
     except ValueError as error:
-        raise CommandError(f"--shares: expected numbers with commas between, got {given!r}") from error
+        raise CommandError(f"--shares: expected numbers separated by commas, got {given!r}") from error
     if not all(0 < share <= 10 for share in shares):
         raise CommandError(f"--shares: expected numbers above 0 and up to 10, got {given!r}")
     return shares
@@ -147,6 +147,6 @@ def _words(now: Progress) -> str:
 def _outcome(row: Row) -> str:
     name = f"{row.task} {row.arm} seed {row.seed}"
     if row.error or row.mean is None or row.seconds is None:
-        return f"{name}: ended badly, {row.error}"
+        return f"{name}: failed, {row.error}"
     reached = "reached" if row.reached else "not reached"
     return f"{name}: {row.real_steps} real steps, mean return {row.mean:.1f}, target {reached}, {row.seconds:.0f} s"

@@ -54,7 +54,7 @@ def command(
         raise CommandError(f"unknown task {unknown[0]!r}: expected some of {', '.join(TASKS)}")
     scale = QUICK if quick else WHOLE
     scale = scale if steps is None else replace(scale, steps=steps)
-    stays = f"interrupted; what is done stays in {out}, and the same command goes on from there"
+    stays = f"interrupted; intermediate results are kept in {out}; the same command continues from there"
     with on_interrupt(lambda: stays), progress("reproduce", quiet=quiet) as update:
         rows = run_cells(list(cells(chosen, seeds, scale)), out, update)
         update(1.0, f"{len(rows)} cells")

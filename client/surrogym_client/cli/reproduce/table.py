@@ -48,7 +48,7 @@ def command(
     from surrogym_shared.terminal import give
 
     if missing := [path for path in rows if not path.exists()]:
-        raise CommandError(f"{missing[0]}: no such file")
+        raise CommandError(f"expected a file of rows, got {missing[0]}, which does not exist")
     merged = merge(*map(read_rows, rows))
     write_rows(out / "efficiency.csv", merged)
     if page is None:

@@ -46,5 +46,5 @@ def _outcome(check: Check, target: Target) -> Outcome:
     except (Mismatch, SurrogymClientError) as failure:
         return Outcome(name, str(failure))
     except (LookupError, TypeError, ValueError) as failure:  # a reply without the fields of the protocol
-        return Outcome(name, f"expected a reply of the protocol, got one that gives {failure!r}")
+        return Outcome(name, f"expected a reply that follows the protocol, got one that causes {failure!r}")
     return Outcome(name, None)

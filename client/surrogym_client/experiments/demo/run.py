@@ -86,7 +86,7 @@ def _new_folder(settings: DemoSettings) -> Path:
 def _empty_folder(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
-        raise RunFailed(f"expected an empty run folder, got {folder}, where there is something already")
+        raise RunFailed(f"expected an empty run folder, got {folder}, which holds files already")
     return folder.resolve()
 
 
@@ -95,7 +95,7 @@ def _what_stays(folder: Path) -> str:
     database, policy = _database(folder), folder / "policy.zip"
     kept = [f"the real samples (surrogym serve --database {database})"] if database.exists() else []
     kept += [f"the policy so far ({policy})"] if policy.exists() else []
-    return f"interrupted; all processes have ended; kept in {folder}: {' and '.join(kept) or 'logs alone'}"
+    return f"interrupted; all processes have ended; {folder} keeps {' and '.join(kept) or 'only logs'}"
 
 
 def _database(folder: Path) -> Path:

@@ -194,7 +194,7 @@ class Job:
         """What the run gave."""
         if self._process.returncode == 0:
             return row_of(json.loads(self._metrics.read_text(encoding="utf-8")))
-        said = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines() or ["it said nothing"]
+        said = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines() or ["no output"]
         task, arm, budget, seed = self.cell.key
         return Row(
             *(task, arm, seed, budget),

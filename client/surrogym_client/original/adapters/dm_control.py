@@ -32,8 +32,8 @@ def open_simulator(name: str) -> Simulator:
         raise
     except Exception as error:  # dm_control 1.0.50 raises an AttributeError of its own beside MuJoCo 4
         raise UnknownEnvironment(
-            f"dm_control does not start beside the installed MuJoCo ({type(error).__name__}: {error}): "
-            "pip install 'surrogym[dm-control]' in an environment of its own"
+            f"dm_control does not work with the installed version of MuJoCo ({type(error).__name__}: {error}): "
+            "pip install 'surrogym[dm-control]' in a separate Python environment"
         ) from error
     match = NAME.fullmatch(name)
     if match is None or match.groups() not in suite.ALL_TASKS:

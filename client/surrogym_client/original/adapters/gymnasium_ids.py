@@ -34,7 +34,7 @@ def open_simulator(name: str) -> Simulator:
     env = make(name)
     if type(env.observation_space).__name__ in SYMBOLS:
         raise UnknownEnvironment(
-            f"{name} shows {env.observation_space}, one of several symbols: expected numbers that change gradually"
+            f"{name} shows {env.observation_space}, a symbol out of several: expected numbers that change gradually"
         )
     limit = env.spec.max_episode_steps
     wrapped = getattr(env.spec, "additional_wrappers", ())  # these may change what is shown and paid

@@ -59,7 +59,7 @@ def action_of(name: str, space: Any) -> Action:
         return MultiDiscreteAction(nvec=tuple(map(int, space.nvec)))
     raise UnknownEnvironment(
         f"{name} has the action space {space}: expected a Box with one row of finite bounds, Discrete or "
-        "MultiDiscrete from 0; wrap it in a class of your own (docs/how-to/own-environment.md)"
+        "MultiDiscrete from 0; write a wrapper class (docs/how-to/own-environment.md)"
     )
 
 
@@ -73,6 +73,7 @@ def flat(name: str, observation: Any) -> Array:
     arrays = [np.asarray(entry) for entry in entries]
     if any(a.ndim > 1 or a.dtype.kind not in "fiub" for a in arrays):
         raise UnknownEnvironment(
-            f"{name} shows images, or entries that are no numbers: expected a row of numbers, or a dictionary of rows"
+            f"{name} observes images, or values that are not numbers: expected a row of numbers, or a dictionary of "
+            "rows"
         )
     return np.concatenate([a.astype(np.float64).ravel() for a in arrays])

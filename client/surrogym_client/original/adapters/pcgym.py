@@ -29,9 +29,9 @@ STIRRED_TANK: dict[str, Any] = {  # the quick start of pc-gym 0.1.8
 }
 ARRAYS = ("a_space", "o_space", "disturbance_bounds", "a_space_act")
 REFUSED = {
-    "a_delta": "actions as changes, whose sum is no part of its state",
-    "uncertainty_percentages": "parameters drawn by a generator that can't be seeded",
-    "noise": "noise of a generator that can't be seeded",
+    "a_delta": "actions are changes, and their sum is not part of the state",
+    "uncertainty_percentages": "its parameters are drawn by a generator that can't be seeded",
+    "noise": "its noise comes from a generator that can't be seeded",
 }
 
 
@@ -49,7 +49,8 @@ def open_simulator(name: str) -> Simulator:
         return Process(name, make_env(parameters))
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise UnknownEnvironment(
-            f"pc-gym refuses the parameters of {name}: {type(error).__name__}: {error}; its documentation names what "
+            f"pc-gym refuses the parameters of {name}: {type(error).__name__}: {error}; pc-gym's documentation lists "
+            "what "
             "make_env needs"
         ) from error
 
@@ -63,7 +64,9 @@ def parameters_of(which: str) -> dict[str, Any]:
     given = STIRRED_TANK if which == "cstr" else _read(which)
     for key, why in REFUSED.items():
         if given.get(key):
-            raise UnknownEnvironment(f"pcgym:{which} asks for {key}, {why}: leave it out of the parameters")
+            raise UnknownEnvironment(
+                f"pcgym:{which} sets {key}, which is not supported: {why}; remove it from the parameters"
+            )
     try:
         spaces = {
             key: {end: np.array(given[key][end], float) for end in ("low", "high")} for key in ARRAYS if key in given
@@ -85,7 +88,7 @@ def _read(which: str) -> dict[str, Any]:
     try:
         given = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise UnknownEnvironment(f"{path} is no JSON: {error}") from error
+        raise UnknownEnvironment(f"{path} is not JSON: {error}") from error
     if not isinstance(given, dict) or "x0" not in given:
         raise UnknownEnvironment(f"{path}: expected an object with model, N, tsim, SP, a_space, o_space and x0")
     return given

@@ -50,7 +50,7 @@ class Description:
     def words(self) -> list[str]:
         """Lines for the terminal: the real steps, the findings, and the questions to the reader."""
         took = f"{self.spec.environment}: described by {self.steps} real steps and {self.resets} resets"
-        return [took, *(f"  found: {line}" for line in self.found), *(f"  please say: {line}" for line in self.asked)]
+        return [took, *(f"  found: {line}" for line in self.found), *(f"  to decide: {line}" for line in self.asked)]
 
     def text(self) -> str:
         """A JSON document with the findings, the questions to the reader, and the specification."""
@@ -97,7 +97,7 @@ class _Draft:
         lived = ~seen.ended_at_once
         self._all = np.concatenate([seen.starts, seen.states[lived], seen.next_states[lived]])
         if not np.isfinite(self._all).all():
-            raise UnknownEnvironment(f"{name} reached states that are no finite numbers under random actions")
+            raise UnknownEnvironment(f"{name} reached states with infinite values or NaN under random actions")
         self._kept = self._chosen()
         if len(self._kept) > MAX_DIMENSIONS:
             raise UnknownEnvironment(
@@ -132,17 +132,19 @@ class _Draft:
             _words_of_access(probed),
         ]
         if probed.shifts:
-            lines.append(f"a shift of {_listed(sorted(probed.shifts))} changes nothing: left out")
+            lines.append(f"a shift of {_listed(sorted(probed.shifts))} changes nothing, so it is left out")
         if kinds["angle"]:
-            lines.append(f"a whole turn of {_listed(kinds['angle'])} changes nothing: shown by cosine and sine")
+            lines.append(
+                f"a whole turn of {_listed(kinds['angle'])} changes nothing, so it is observed as cosine and sine"
+            )
         if kinds["constant"]:
-            lines.append(f"{_listed(kinds['constant'])}: constant in an episode, and chosen anew for the next")
+            lines.append(f"{_listed(kinds['constant'])}: constant within an episode, and drawn again at each reset")
         if still:
-            lines.append(f"never moved, or repeats another variable, and left out: {_listed(still)}")
+            lines.append(f"left out, because it never moved or repeats another variable: {_listed(still)}")
         if self._left_out:
             lines.append(
-                f"entries {_listed([str(i) for i in self._left_out])} of the environment's own observation are no sums "
-                "of 1, q, sin and cos: the policy sees the coordinates in their place"
+                f"entries {_listed([str(i) for i in self._left_out])} of the environment's observation are not sums "
+                "of 1, q, sin(q) and cos(q): the policy observes the coordinates instead"
             )
         return tuple(lines)
 
@@ -156,8 +158,9 @@ class _Draft:
         ended, lines = int(self._seen.terminated.sum()), list[str]()
         if guessed:
             lines.append(
-                f"sampling range of {_listed(guessed)}: is it as wide as a good policy goes? It is what random actions "
-                f"reached, speeds {FASTER:g} times as far; nothing outside is ever asked"
+                f"sampling range of {_listed(guessed)}: does it cover the states that a good policy visits? It covers "
+                "what random actions "
+                f"reached, and {FASTER:g} times that for speeds; the design never queries outside it"
             )
         if self._unmoved:
             lines.append(
@@ -166,14 +169,17 @@ class _Draft:
             )
         if ended:
             lines.append(
-                f"termination: {ended} of {len(self._seen.rewards)} steps ended an episode. It is learned; an "
-                "inequality that you know takes fewer real steps"
+                f"termination: {ended} of {len(self._seen.rewards)} steps ended an episode. It is learned from these; "
+                "an "
+                "inequality that you declare saves real steps"
             )
         else:
-            lines.append("termination: no step ended an episode. If states end one, declare them")
+            lines.append("termination: no step ended an episode. If some states should end it, declare them")
         if self._simulator.time_limit is None:
-            lines.append(f"time_limit: none is known; {UNKNOWN_LIMIT} steps are assumed")
-        lines.append("success: when does an episode count as solved? Without it, evaluations report returns alone")
+            lines.append(f"time_limit: the environment declares none; {UNKNOWN_LIMIT} steps are assumed")
+        lines.append(
+            "success: when does an episode count as solved? Without a criterion, evaluations report returns only"
+        )
         lines.append(self._asked_of_reward())
         return tuple(lines)
 
@@ -181,10 +187,10 @@ class _Draft:
         values, counts = np.unique(self._seen.rewards, return_counts=True)
         usual, often = float(values[counts.argmax()]), int(counts.max())
         if often < MOSTLY * counts.sum():
-            return "reward: it is learned; one that you know takes no real step (kind 'declared')"
+            return "reward: it is learned; a reward that you declare needs no real steps (kind 'declared')"
         return (
-            f"reward: {often} of {counts.sum()} random steps paid exactly {usual:g}. A design of few real steps may "
-            "meet nothing else, and then takes it for constant: declare it (kind 'declared'), or raise --initial"
+            f"reward: {often} of {counts.sum()} random steps paid exactly {usual:g}. A design with few real steps may "
+            "see no other reward and take it for constant: declare it (kind 'declared'), or raise --initial"
         )
 
     def _chosen(self) -> list[int]:
@@ -298,11 +304,11 @@ def _raw(term: Term) -> set[str]:
 
 def _words_of_access(probed: Probed) -> str:
     if not np.isfinite(probed.set_error):
-        return "its state can't be read: it is taken for what it shows, and can only be reset"
+        return "its state can't be read: the observation is used as its state, and it can only be reset"
     if not probed.settable:
         return (
-            f"a step from a state that was set differs from the same step of an episode by {probed.set_error:.2g} of "
-            "its range: something is remembered that can't be set, so it can only be reset"
+            f"a step from a set state differs from the same step within an episode by {probed.set_error:.2g} of "
+            "its range: the environment has memory that can't be set, so it can only be reset"
         )
     noise = f"; two steps from one state differ by {probed.repeat_error:.2g}" if probed.noisy else ""
     same = "that of an episode" if probed.set_error <= EXACT else f"that of an episode within {probed.set_error:.2g}"

@@ -255,10 +255,12 @@ def _state(path: Path, require: Callable[[Mapping[str, Header]], None]) -> dict[
     try:
         entries = read_entries(path, MAX_BYTES)
         if LEARNER not in entries:
-            raise ValueError("expected what this algorithm saves, got a policy alone")
+            raise ValueError(
+                "expected a file that this algorithm saved, got a policy without the state of its training"
+            )
         return read_arrays(entries[LEARNER], MAX_BYTES, require)
     except (OSError, ValueError) as error:
-        raise UnusablePolicy(f"{path} is nothing to go on from: {error}") from error
+        raise UnusablePolicy(f"training can't continue from {path}: {error}") from error
 
 
 def _initialise(network: Mlp, last_gain: float, rng: np.random.Generator) -> None:

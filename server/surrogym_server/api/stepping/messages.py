@@ -67,7 +67,7 @@ class PromptMessages(WebSocketsSansIOProtocol):
             return
         whole = self._frames.split(data)
         if len(whole) > MAX_FRAMES or len(self.frames) > MAX_FRAMES:
-            self._end(f"expected at most {MAX_FRAMES} frames at once and in one message, got more")
+            self._end(f"expected at most {MAX_FRAMES} frames in one message and in one read, got more")
             return
         for frame, extent in whole:
             self._oversized = extent is None
@@ -123,7 +123,9 @@ class PromptMessages(WebSocketsSansIOProtocol):
             late = f"expected a whole message within {self._seconds:g} s"
             self._timer = self.loop.call_later(self._seconds, self._end, late)
         if self._together.bytes > self._together.most:
-            self._end(f"expected unfinished messages of at most {self._together.most} bytes in all streams, got more")
+            self._end(
+                f"expected unfinished messages of at most {self._together.most} bytes in all streams together, got more"
+            )
 
     def _end(self, reason: str) -> None:
         """Close the connection because of what came."""

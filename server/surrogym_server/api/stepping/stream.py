@@ -96,7 +96,7 @@ async def _reply(
 
 def _refused(error: Exception, seq: int | None) -> bytes:
     if not isinstance(error, SurrogymError | frames.FrameError):
-        logger.exception("a request of the stream failed", exc_info=error)
+        logger.exception("a request on the stream failed", exc_info=error)
     return _refusal(error, seq)
 
 

@@ -77,11 +77,11 @@ def _check_steps(lease: Answered, steps: set[int]) -> None:
         if more := steps - lease.reported.keys():
             raise IdempotencyConflict(
                 f"expected the {len(lease.reported)} samples first reported for query {lease.query_id}, "
-                f"got step {min(more)} as well"
+                f"got step {min(more)} in addition"
             )
     elif steps != set(range(len(steps))) or len(steps) > lease.steps:
         raise InvalidInput(
-            f"expected steps 0, 1, ... of query {lease.query_id}, {lease.steps} at most, got {sorted(steps)}"
+            f"expected steps 0, 1, ... of query {lease.query_id}, at most {lease.steps}, got {sorted(steps)}"
         )
 
 

@@ -96,7 +96,7 @@ class RowBlobs(port.Blobs):
         with self._database.read() as connection:
             content = connection.execute(sa.select(blobs.c.content).where(blobs.c.name == name)).scalar()
         if content is None:
-            raise damaged("a file of a policy is not in the table blobs")
+            raise damaged("expected a policy's file in the table blobs, but there is none")
         return bytes(content)
 
     def remove(self, names: Freed) -> None:

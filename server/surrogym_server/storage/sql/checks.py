@@ -45,7 +45,7 @@ def check_pages(connection: Connection, seconds: float = CHECK_SECONDS) -> None:
         timer.cancel()
         timer.join()  # or it might interrupt a later statement
     if expired.is_set():  # what an interrupted check finds is not reliable
-        logger.warning("the database is large: only what could be checked within %g s was checked", seconds)
+        logger.warning("the database is large: its check stopped after %g s, and the rest was not checked", seconds)
     elif found != "ok":
         raise damaged(" ".join(found.split()))
 

@@ -116,7 +116,9 @@ class Database:
             yield
             return
         if not self._turn.acquire(timeout=BUSY_SECONDS):
-            raise Unavailable(f"the database can't be used now: others have been writing for {BUSY_SECONDS} s")
+            raise Unavailable(
+                f"the database can't be used now: other writers have held it for {BUSY_SECONDS} s; try again later"
+            )
         try:
             yield
         finally:

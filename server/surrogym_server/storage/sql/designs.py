@@ -145,8 +145,8 @@ def _to_raise(connection: Connection, record: SurrogateRecord, queries: int, *, 
     missing = max(0, queries - unspoken)
     if missing and not allowed:
         raise BeyondBudget(
-            f"expected at most {max(0, unspoken)} more queries, which is what the budget of {record.budget} real steps "
-            f"of {record.name!r} has left, got {queries}: a token of role admin may raise it "
+            f"expected at most {max(0, unspoken)} more queries, because the budget of {record.budget} real steps "
+            f"of {record.name!r} has no more left, got {queries}: a token of role admin may raise it "
             f"(surrogym change {record.name} --budget {record.budget + missing})"
         )
     return missing
@@ -155,7 +155,7 @@ def _to_raise(connection: Connection, record: SurrogateRecord, queries: int, *, 
 def _hold_right(connection: Connection, lease: FitLease) -> Row[Any]:
     held = hold(connection, lease.surrogate, surrogates.c.fit_token)
     if held.fit_token != lease.token:
-        raise LeaseExpired(f"the right to fit {lease.surrogate!r} has ended; begin again")
+        raise LeaseExpired(f"the right to fit {lease.surrogate!r} has ended: start the fit again")
     return held
 
 

@@ -84,10 +84,12 @@ class FileLock:
         if self._overwritten:
             raise self._foreign()
         if _identity(self._path) != self._identity:
-            raise _displaced(self._path, "put it back to its place")
+            raise _displaced(self._path, "put it back in its place")
         for path, identity in self._beside.items():
             if _identity(path) != identity:
-                raise _displaced(path, "stop the server without killing it: then it saves what it still holds")
+                raise _displaced(
+                    path, "stop the server without killing it, so that it can save the data that it still holds"
+                )
 
     def is_as_noted(self) -> bool:
         """Whether the file begins as it was noted: nobody wrote to it, and no log was merged into it."""
@@ -121,8 +123,8 @@ class FileLock:
         if not write_ahead_log.belongs(self._log, header):
             raise Unavailable(
                 f"expected a write-ahead log of {self._path}, got {self._log}, which was written for another database "
-                f"or another state of it; nothing was changed: to go on with {self._path} as it is, for example after "
-                f"you restored it, move {self._log.name} and {self._index.name} away; to go on with what the log "
+                f"or another state of it; nothing was changed: to keep {self._path} as it is, for example after "
+                f"you restored it, move {self._log.name} and {self._index.name} away; to keep what the log "
                 f"holds, put the database that it was written for back in place of {self._path.name}"
             )
 

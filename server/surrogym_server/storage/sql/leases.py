@@ -83,11 +83,11 @@ def of_query(connection: Connection, surrogate_id: int, query_id: int, token: st
 
 
 def unknown_query(query_id: int) -> UnknownQuery:
-    return UnknownQuery(f"expected a query of this surrogate, got {query_id}, which is not there")
+    return UnknownQuery(f"expected a query of this surrogate, got {query_id}, which does not exist")
 
 
 def foreign_lease(query_id: int) -> ForeignLease:
-    return ForeignLease(f"expected a lease token that was given out for query {query_id}, got another")
+    return ForeignLease(f"expected a lease token of query {query_id}, got another token")
 
 
 def set_outcome(connection: Connection, lease_ids: Sequence[int], outcome: str) -> None:

@@ -30,7 +30,7 @@ class SqlOccupancy(port.Occupancy):
             others = sa.select(sa.func.count()).where(occupancies.c.surrogate_id == held.id)
             if connection.execute(others).scalar_one() >= MAX_CHECKPOINTS:
                 beyond = f"expected at most {MAX_CHECKPOINTS} checkpoints of {name!r}, got one more"
-                raise TooLarge(f"{beyond}: submit under the name of one of them")
+                raise TooLarge(f"{beyond}: reuse the name of one of them")
             connection.execute(
                 sa.insert(occupancies).values(
                     surrogate_id=held.id,

@@ -63,6 +63,6 @@ def _refuse_newer(present: list[str], known: list[str]) -> None:
     unknown = sorted(map(str, set(present) - set(known)))
     if unknown:
         raise Unavailable(
-            f"the database is of a newer Surrogym: its schema is {', '.join(unknown)}, this program knows "
+            f"the database was written by a newer Surrogym: its schema is {', '.join(unknown)}, this program knows "
             f"schemas up to {known[-1]}; start the newer program"
         )

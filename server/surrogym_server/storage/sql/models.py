@@ -56,7 +56,7 @@ class SqlModels(port.Models):
         with self._database.read() as connection:
             row = _one(connection, name, version, models.c.version, models.c.blob, models.c.checksum)
         if _checksum(row.blob) != row.checksum:
-            raise damaged(f"model {row.version} of {name!r} is not what was stored: its checksum is another")
+            raise damaged(f"model {row.version} of {name!r} has changed since it was stored: its checksum differs")
         return bytes(row.blob)
 
     def set_aside(self, name: str, version: int, damage: str) -> bool:
@@ -129,5 +129,5 @@ def _one(connection: Connection, name: str, version: int | None, *columns: sa.Co
     if row is not None:
         return row
     if version is None:
-        raise NoModel(f"expected a model of {name!r}, but nothing has been fitted yet")
-    raise UnknownModel(f"expected a version of {name!r}'s models, got {version}, which is not there")
+        raise NoModel(f"expected a model of {name!r}, but no model has been fitted yet")
+    raise UnknownModel(f"expected a version of {name!r}'s models, got {version}, which does not exist")

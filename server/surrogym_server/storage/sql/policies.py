@@ -177,7 +177,7 @@ def _require(connection: Connection, surrogate: int, name: str, version: int) ->
 
 
 def _unknown(name: str, which: object) -> UnknownPolicy:
-    return UnknownPolicy(f"expected a version or an alias of {name!r}'s policies, got {which}, which is not there")
+    return UnknownPolicy(f"expected a version or an alias of {name!r}'s policies, got {which}, which does not exist")
 
 
 def _make_place(connection: Connection, surrogate: int, name: str) -> Freed:
@@ -186,7 +186,9 @@ def _make_place(connection: Connection, surrogate: int, name: str) -> Freed:
     own = sa.select(sa.func.count()).select_from(policies).where(policies.c.surrogate_id == surrogate)
     beyond = connection.execute(own).scalar_one() + 1 - MAX_POLICIES
     if beyond > len(versions):
-        raise TooLarge(f"expected at most {MAX_POLICIES} policies of {name!r}, got one more, and all have aliases")
+        raise TooLarge(
+            f"expected at most {MAX_POLICIES} policies of {name!r}, got one more, and all have aliases: remove an alias"
+        )
     return _delete(connection, surrogate, versions[: max(0, beyond)])
 
 
@@ -204,7 +206,7 @@ def _within(connection: Connection, surrogate: int, version: int, most: int, nam
             connection.execute(sa.update(table).where(_own(table, surrogate, oldest)).values(blob=None))
     if beyond > 0:
         kept = f"files of {name!r}'s policies of at most {most} bytes"
-        raise TooLarge(f"expected {kept}, got {beyond} more; delete a policy, or take an alias away")
+        raise TooLarge(f"expected {kept}, got {beyond} more: delete a policy, or remove an alias")
     return tuple(freed)
 
 

@@ -166,8 +166,8 @@ def _require_room(connection: Connection, held: Row[Any], steps: int) -> None:
     limit = max(int(budget), LEAST_AUDITED)
     if before + steps > limit:
         raise BeyondBudget(
-            f"expected at most {max(0, limit - int(before))} more real steps of audits, got {steps}: together they "
-            f"take at most as many as the budget, or {LEAST_AUDITED}"
+            f"expected at most {max(0, limit - int(before))} more real steps of audits, got {steps}: all audits "
+            f"together take at most as many real steps as the budget has, or {LEAST_AUDITED} if that is more"
         )
 
 
@@ -182,7 +182,7 @@ def query_counts(connection: Connection, span: Span) -> dict[int, QueryCounts]:
 
 
 def _ended(query_id: int) -> LeaseExpired:
-    return LeaseExpired(f"the lease of query {query_id} has ended; claim again")
+    return LeaseExpired(f"the lease of query {query_id} has ended: claim a query again")
 
 
 def _records(connection: Connection) -> sa.Select[Any]:

@@ -33,7 +33,7 @@ class Readiness:
         probe = self._latest()
         wait([probe], PATIENCE_SECONDS)
         if not probe.done():
-            raise Unavailable(f"the database can't be used now: no write was done within {PATIENCE_SECONDS:g} s")
+            raise Unavailable(f"the database can't be used now: no write succeeded within {PATIENCE_SECONDS:g} s")
         if (error := probe.exception()) is not None:
             raise Unavailable(str(error)) from error
 

@@ -45,7 +45,7 @@ def within(table: sa.Table, span: Span) -> sa.ColumnElement[bool]:
 
 
 def unknown_surrogate(name: str) -> UnknownSurrogate:
-    return UnknownSurrogate(f"expected the name of a surrogate, got {name!r}, which is not there")
+    return UnknownSurrogate(f"expected the name of a surrogate, got {name!r}, which does not exist")
 
 
 def append_event(connection: Connection, held: Row[Any], kind: EventKind, **body: Any) -> None:
@@ -74,7 +74,7 @@ def recall(connection: Connection, held: Row[Any], operation: str, key: str | No
     if found is None:
         return None
     if found.fingerprint != body:
-        raise IdempotencyConflict(f"expected the body that key {key!r} first came with, got another")
+        raise IdempotencyConflict(f"expected the same body as in the first request with key {key!r}, got another")
     return found.result
 
 
@@ -105,7 +105,9 @@ def insert_queries(
         InvalidInput: not as many rows in the one as in the other.
     """
     if len(coordinates) != len(action):
-        raise InvalidInput(f"expected one action for each query, got {len(coordinates)} and {len(action)}")
+        raise InvalidInput(
+            f"expected one action for each query, got {len(coordinates)} queries and {len(action)} actions"
+        )
     asked = [
         {"kind": "step", "coordinates": q, "action": u, "steps": 1}
         for q, u in zip(np.asarray(coordinates), np.asarray(action), strict=True)

@@ -128,7 +128,9 @@ def _store(
     for identity, sample, lease in zip(identities, batch, answered, strict=True):
         row = row_of(held, sampler, sample, lease)
         if prints.setdefault(identity, row["fingerprint"]) != row["fingerprint"]:
-            raise IdempotencyConflict(f"expected the sample first reported for query {sample.query_id}, got another")
+            raise IdempotencyConflict(
+                f"expected the same sample as first reported for query {sample.query_id}, got another"
+            )
         if identity not in ids:
             new.setdefault(identity, row)
     ids |= dict(zip(new, insert_samples(connection, held, sampler, list(new.values())), strict=True))

@@ -47,7 +47,7 @@ class SqlSurrogates(port.Surrogates):
         with self._database.read() as connection:
             name = connection.execute(sa.select(surrogates.c.name).where(surrogates.c.id == id)).scalar()
         if name is None:
-            raise UnknownSurrogate("expected a surrogate that is there, got one that was deleted")
+            raise UnknownSurrogate("expected an existing surrogate, got one that was deleted")
         return str(name)
 
     def summary(self, name: str) -> SurrogateSummary:

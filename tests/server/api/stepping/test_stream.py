@@ -128,7 +128,7 @@ def test_a_refused_request_is_a_problem_frame_and_the_stream_goes_on(stream: Cli
 
 
 BAD: list[tuple[bytes, str]] = [
-    (b"no frame", "expected a frame, got 8 bytes that are none"),
+    (b"no frame", "expected a frame, got 8 bytes that can't be read as one"),
     (b"", "expected a frame, got 0 bytes"),
     (frames.encode(frames.step_request(2, np.ones((3, 1)), None, False)), "action: expected 16 bytes"),
     (frames.encode(frames.step_request(2, ACTION, np.ones(3, bool), False)), "mask: expected 2 bytes"),

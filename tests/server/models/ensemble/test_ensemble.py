@@ -112,7 +112,7 @@ def test_very_many_samples_are_learned_from_in_batches():
         ({"units": 1.5}, "expected units to be a whole number, got 1.5"),
         ({"steps": True}, "expected steps to be a whole number, got True"),
         ({"seed": -1}, "seed to be a whole number"),
-        ({"depth": 3}, "expected as settings one of members, units, steps, seed, got 'depth'"),
+        ({"depth": 3}, "expected a setting out of members, units, steps, seed, got 'depth'"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(settings, said):
@@ -134,7 +134,7 @@ def changed(model: NetworkEnsembleModel, **header: object) -> bytes:
         ({"outputs": ["theta", "reward"]}, "with outputs"),
         ({"samples": 0}, "finite terminal reward and samples"),
         ({"terminal_reward": float("inf")}, "finite terminal reward"),
-        ({"family": "gaussian_process"}, "family 'ensemble', as specified, got one of 'gaussian_process'"),
+        ({"family": "gaussian_process"}, "family 'ensemble', as the specification says, got one of 'gaussian_process'"),
     ],
 )
 def test_a_header_that_contradicts_the_environment_is_refused(model, definition, header, said):

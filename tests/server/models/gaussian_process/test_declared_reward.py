@@ -119,7 +119,7 @@ def test_pilcos_narrow_reward_can_be_declared():
 def test_a_declared_reward_survives_storage_and_refuses_a_learned_one(model, pendulum_model):
     loaded = from_bytes(model.definition, to_bytes(model))
     assert loaded.description == model.description
-    with pytest.raises(InvalidInput, match="without a reward of its own"):
+    with pytest.raises(InvalidInput, match="without a learned reward"):
         from_bytes(model.definition, to_bytes(pendulum_model))
 
 
@@ -143,7 +143,7 @@ SQUARE = {"shape": "square", "of": [{"action": [1.0]}]}
         ({"kind": "declared", "terms": [{**SQUARE, "shape": "one"}]}, "takes no quantities"),
         ({"kind": "declared", "terms": [{**SQUARE, "shape": "lambda q: q"}]}, "'one', 'linear'"),
         ({"kind": "declared", "terms": [{**SQUARE, "weight": math.nan}]}, "finite number"),
-        ({"kind": "declared", "terms": [{**SQUARE, "of": [{}]}]}, "needs a term or weights"),
+        ({"kind": "declared", "terms": [{**SQUARE, "of": [{}]}]}, "expected a term or weights"),
         ({"kind": "declared", "terms": [{**SQUARE, "of": [{"action": [1.0, 2.0]}]}]}, "expected 1 weights"),
         ({"kind": "declared", "terms": [SQUARE], "timing": "auto"}, "'before' or 'after'"),
         ({"kind": "declared", "terms": [SQUARE], "penalty": 1.0}, "Extra inputs"),

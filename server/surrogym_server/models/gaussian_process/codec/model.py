@@ -99,14 +99,14 @@ def _require_consistent(model: GaussianProcessModel) -> None:
         raise InvalidInput(f"expected a finite terminal reward and samples, got {got}")
     if any(output.feature_map.after for output in model.transitions):
         raise InvalidInput(
-            "expected transition outputs that read the state before the step, got one that reads its own"
+            "expected transition outputs that read the state before the step, got one that reads the state after it"
         )
     if (model.ending is not None) != definition.learns_termination:
         learned, got = ("learned" if x else "declared" for x in (definition.learns_termination, model.ending))
         raise InvalidInput(f"expected a model of an environment whose termination is {learned}, got {got}")
     known = definition.declared_reward
     if known is not None and (reward.posterior, reward.centre, reward.feature_map.after) != (None, 0.0, known.after):
-        raise InvalidInput("expected a model without a reward of its own, as the environment's is declared")
+        raise InvalidInput("expected a model without a learned reward, because the environment's reward is declared")
 
 
 def _read_after(reward: OutputModel) -> OutputModel:

@@ -62,7 +62,7 @@ def read_jumps(
     for index, (size, entry) in enumerate(entries):
         region = read_region(definition, entry, tensors, f"{prefix}.{index}")
         if region is None:
-            raise ValueError("a jump without a region")
+            raise ValueError("expected a region for each jump, got none")
         jumps.append(Jump(region, float(size)))
     return tuple(jumps)
 
@@ -96,7 +96,7 @@ def _read_form(definition: EnvironmentDefinition, entry: Any, tensors: Mapping[s
 
 def _require_classifier(classifier: Classifier) -> None:
     if classifier.process.feature_map.lead:
-        raise InvalidInput("expected a classifier of states, got one that reads the lead")
+        raise InvalidInput("expected a classifier of states, got one that also reads the lead")
     require_output(classifier.definition, classifier.process)
 
 
