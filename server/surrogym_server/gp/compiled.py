@@ -1,6 +1,6 @@
-"""One process in compiled code: mean and latent deviation of a block of inputs, (d, B), one column each.
+"""One process in compiled code: mean and latent deviation of a block of inputs, (d, B), one input in each column.
 
-All exponents are taken by differences, which here cost no more than products (see ``gp.serving``, the reference).
+Exponents are computed by differences, which cost no more than products here (see ``gp.serving``, the reference).
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ OF_MEAN, OF_PRIOR, OF_MIRROR, OF_POINTS = 0, 2, 4, 5  # rows of POLYNOMIALS
 def add_process(
     tables: TablesBuilder, posterior: Posterior, inputs: tuple[int, ...], centre: float, scale: float
 ) -> int:
-    """Put a process that reads the columns ``inputs`` of x; gives its place. Its output is centre + scale * process."""
+    """Add a process that reads the columns ``inputs`` of x, and return its place. Its output is centre + scale *
+    process."""
     hyper, x, polynomial = posterior.hyper, posterior.x, posterior.hyper.polynomial
     points, weights, mirror = x, posterior.weights, torch.zeros_like(hyper.lengthscale)
     if (reflection := hyper.reflection) is not None:
@@ -128,7 +129,7 @@ def _covariances(head: Floats, rows: Floats, own: Floats, smooth: Floats) -> Flo
 
 @inlined
 def _explain(factor: Floats, k: Floats) -> None:
-    """L^-1 k in the place of k (n, B)."""
+    """Replace k (n, B) by L^-1 k."""
     lanes = k.shape[1]
     for i in range(len(factor)):
         j = 0
@@ -148,7 +149,7 @@ def _explain(factor: Floats, k: Floats) -> None:
 
 @inlined
 def _deviation(head: Floats, rows: Floats, own: Floats, explained: Floats, deviation: Floats) -> None:
-    """sqrt(k(x, x) - |L^-1 k|^2) into (B,)."""
+    """Write sqrt(k(x, x) - |L^-1 k|^2) to an array (B,)."""
     size, lanes = own.shape
     deviation[:] = 0.0
     if head[0, PARITY] != 0:
@@ -175,7 +176,7 @@ def _deviation(head: Floats, rows: Floats, own: Floats, explained: Floats, devia
 def _add_residuals(
     head: Floats, rows: Floats, kept: Floats, turned: Floats, own: Floats, k: Floats, paths: Floats, mean: Floats
 ) -> None:
-    """Add to the mean (B,) how far drawn functions, the first columns of paths (B, W), are from it."""
+    """Add to the mean (B,) the residuals of drawn functions, the first columns of paths (B, W)."""
     (size, count), parity, scale = kept.shape, head[0, PARITY], head[0, SCALE]
     straight, mirrored = np.empty(count), np.empty(count)
     sine, cosine = np.empty(count), np.empty(count)
@@ -219,9 +220,10 @@ def _add_residuals(
 def predict(
     numbers: Floats, places: Ints, at: int, x: Floats, wanted: bool, paths: Floats, mean: Floats, deviation: Floats
 ) -> None:
-    """Mean and, if wanted, latent deviation at inputs x (d, B), in the output's unit: into (B,) each.
+    """Write the mean and, if wanted, the latent deviation at inputs x (d, B), in the output's unit, to arrays (B,)
+    each.
 
-    With ``paths`` (B, W) the value of a drawn function, one a column of x, takes the place of the mean.
+    With ``paths`` (B, W) the value of a drawn function, one for each column of x, replaces the mean.
     """
     head, inputs = matrix(numbers, places, at + HEAD), matrix(numbers, places, at + INPUTS)
     points, weights = matrix(numbers, places, at + POINTS), matrix(numbers, places, at + WEIGHTS)

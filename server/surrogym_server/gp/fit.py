@@ -51,7 +51,8 @@ class FitOptions:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A fit: the posterior, its score (log evidence at the optimum, priors included), and theta for a warm start."""
+    """Result of a fit: the posterior, its score (log evidence at the optimum, priors included), and theta for a warm
+    start."""
 
     posterior: Posterior
     score: float
@@ -61,9 +62,9 @@ class Fitted:
 def fit(
     x: Tensor, y: Tensor, options: FitOptions, warm: Array | None = None, reflection: Reflection | None = None
 ) -> Fitted:
-    """Fit a process to x (n, d) and y (n,), both standardised, of functions that have the ``reflection`` if given.
+    """Fit a process to x (n, d) and y (n,), both standardised. With a ``reflection``, fit functions with this symmetry.
 
-    On the CPU. ``warm`` is the theta of an earlier fit. Raises NumericalFailure.
+    Runs on the CPU. ``warm`` is the theta of an earlier fit. Raises ``NumericalFailure``.
     """
     objective = _Objective(x, y, options, reflection)
     with _blas().limit(limits=1):
@@ -75,11 +76,11 @@ def fit(
 def refine(
     x: Tensor, y: Tensor, options: FitOptions, theta: Array, reflection: Reflection | None = None
 ) -> tuple[Hyperparameters, ...]:
-    """Hyperparameters for x (n, d) and y (n,), from ``theta``, those of fewer such points: of each stage, the last best
-    where it has seen all points.
+    """Refine hyperparameters of x (n, d) and y (n,) from ``theta``, which was fitted to fewer points. Return the result
+    of each stage; the last one has seen all points.
 
-    More points have other optima: they resolve what fewer took for noise. So some of them are searched from two starts,
-    and all from the better of what is found, in a few iterations. Both are bounded, see ``gp.subsets``.
+    More points have other optima, because they resolve what fewer points explain as noise. So a subset is searched from
+    two starts, and the full set in a few iterations from the better result. Both are bounded, see ``gp.subsets``.
     """
     rows = spread(len(y), SOME)
     objective = _Objective(x[rows], y[rows], options, reflection)
@@ -111,11 +112,11 @@ def _minimum(objective: _Objective, start: Array) -> tuple[float, Array]:
 
 @cache
 def _blas() -> ThreadpoolController:
-    """L-BFGS-B multiplies matrices of a dozen rows: with more than one thread it waits ten times as long as it works,
-    on a machine that does something else as well.
+    """Limit BLAS to one thread. L-BFGS-B multiplies matrices of a dozen rows; with more threads it waits ten times as
+    long as it computes if the machine has other work.
 
-    SciPy has a library of its own, beside NumPy's. A controller knows only what is loaded when it is made, so SciPy's
-    parts come first.
+    SciPy has a BLAS library of its own, beside NumPy's. A controller only knows libraries that are loaded when it is
+    made, so SciPy's parts are imported first.
     """
     for part in ("linalg", "optimize"):
         getattr(scipy, part)
@@ -123,8 +124,8 @@ def _blas() -> ThreadpoolController:
 
 
 def _starts(default: Array, warm: Array | None, points: int) -> Sequence[Array]:
-    """The default start, and a warm one. Few points have many optima, and a fit of them is cheap: both are tried; more
-    than ``MANY_POINTS`` leave a warm start by itself but for one fit in four."""
+    """The default start and the warm start. With few points there are many optima and a fit is cheap, so both are
+    tried. With more than ``MANY_POINTS`` points the default start is tried in one of four fits only."""
     if warm is None:
         return (default,)
     return (warm,) if points > MANY_POINTS and points % 4 else (warm, default)
@@ -133,8 +134,9 @@ def _starts(default: Array, warm: Array | None, points: int) -> Sequence[Array]:
 class _Objective:
     """Negative log evidence with priors, and its gradient.
 
-    Thousands of evaluations of a few dozen points make a fit, so what is symmetric is kept once: as pairs i >= j of
-    points, (P,) with P = n (n + 1) / 2, and NumPy and LAPACK are called: torch's calls take longer than the work.
+    A fit makes thousands of evaluations on a few dozen points. So symmetric matrices are kept once, as pairs i >= j of
+    points, (P,) with P = n (n + 1) / 2, and NumPy and LAPACK are called: calls of torch take longer than the
+    computation.
     """
 
     def __init__(self, x: Tensor, y: Tensor, options: FitOptions, reflection: Reflection | None) -> None:
@@ -143,7 +145,7 @@ class _Objective:
         self.n, self.d, self.y = n, d, y.numpy()
         self.rows, self.columns = np.tril_indices(n)
         self.places = self.rows * n + self.columns  # of the pairs in a matrix by rows
-        self.twice = np.where(self.rows == self.columns, 1.0, 2.0)  # how often a pair stands in a symmetric matrix
+        self.twice = np.where(self.rows == self.columns, 1.0, 2.0)  # how often a pair occurs in a symmetric matrix
         mirrored = [] if reflection is None else [x * reflection.signs]
         differences = [other.numpy()[self.columns] - x.numpy()[self.rows] for other in (x, *mirrored)]
         self.squared = np.ascontiguousarray(np.concatenate(differences).T ** 2)  # (d, P) or (d, 2 P)
@@ -163,7 +165,7 @@ class _Objective:
         self.constant = 0.5 * n * math.log(2 * math.pi) + float(np.log(self.prior[:, 1]).sum())
 
     def theta(self, hyper: Hyperparameters) -> Array:
-        """The free parameters of hyperparameters, within the bounds: what ``hyper`` turns back."""
+        """The free parameters theta of hyperparameters, within the bounds; the inverse of ``hyper``."""
         variances = [hyper.signal_variance]
         variances += [hyper.linear_variance] * self.options.linear
         variances += [hyper.quadratic_variance] * self.options.quadratic
@@ -189,7 +191,7 @@ class _Objective:
         matrix = np.zeros((self.n, self.n))
         matrix.ravel()[self.places] = k
         matrix.flat[:: self.n + 1] += noise
-        if (solved := self._solve(matrix)) is None:  # outside what float64 can factor: a wall for the line search
+        if (solved := self._solve(matrix)) is None:  # float64 can't factor it: infinite cost for the line search
             return 1e10, np.zeros_like(theta)
         inverse, weights, log_root = solved
         product = weights.take(self.rows) * weights.take(self.columns)
@@ -204,15 +206,15 @@ class _Objective:
         return float(value), z / self.prior[:, 1] - np.concatenate([*slopes, [noise * trace]])
 
     def _values(self, theta: Array) -> tuple[Array, float, float, float, float]:
-        """Length scales, the variances of the three parts and of the noise."""
+        """Length scales, and the variances of the three parts and of the noise."""
         values = np.exp(theta)
         linear = float(values[self.d + 1]) if self.options.linear else 0.0
         quadratic = float(values[-2]) if self.options.quadratic else 0.0
         return values[: self.d], float(values[self.d]), linear, quadratic, float(values[-1])
 
     def _solve(self, matrix: Array) -> tuple[Array, Array, float] | None:
-        """Of a matrix K, given by its lower half: the inverse (its lower half counts), K^-1 y, and half of K's log
-        determinant; None if it has no Cholesky factor."""
+        """From a matrix K, given by its lower half: the inverse (its lower half is valid), K^-1 y, and half of K's log
+        determinant. None if K has no Cholesky factor."""
         lapack = scipy.linalg.lapack
         upper, info = lapack.dpotrf(matrix.T, lower=0, overwrite_a=1)  # transposed: the order that LAPACK wants
         if info:
@@ -223,6 +225,6 @@ class _Objective:
         return inverse.T, weights, root
 
     def _pairs(self, symmetric: Tensor) -> Array:
-        """A symmetric matrix (n, n) by its pairs, (P,)."""
+        """The pairs (P,) of a symmetric matrix (n, n)."""
         pairs: Array = symmetric.numpy()[self.rows, self.columns]
         return pairs

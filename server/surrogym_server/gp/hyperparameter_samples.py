@@ -1,7 +1,7 @@
-"""Samples from the posterior of hyperparameters, where few points leave them uncertain.
+"""Samples from the posterior of hyperparameters, for processes with few points, which leave hyperparameters uncertain.
 
-The prior of theta, the logarithms, is normal, so that elliptical slice sampling needs no step size: it turns theta
-around the prior's mean, in the plane through theta and a fresh draw of the prior, until the evidence is above a level.
+The prior of theta, the logarithms, is normal, so elliptical slice sampling needs no step size. It rotates theta around
+the prior's mean, in the plane through theta and a new draw of the prior, until the evidence exceeds a random level.
 
 Reference: Murray, Adams, MacKay, "Elliptical slice sampling", AISTATS 2010, figure 2.
 """
@@ -17,7 +17,7 @@ from surrogym_server.gp.fit import NOISE_FLOOR, FitOptions, _blas, _Objective
 from surrogym_server.gp.kernel import Hyperparameters
 from surrogym_server.gp.posterior import Posterior
 
-BURN_IN, THINNING = 30, 10  # updates before the first sample, and from each sample to the next
+BURN_IN, THINNING = 30, 10  # updates before the first sample, and between samples
 NARROWEST = 1e-6  # radians; theta stays where it is when no other angle is left
 
 Array = NDArray[np.float64]
@@ -26,13 +26,14 @@ Array = NDArray[np.float64]
 def hyperparameter_samples(
     posterior: Posterior, count: int, seed: int, noise_floor: float = NOISE_FLOOR
 ) -> tuple[Hyperparameters, ...]:
-    """``count`` hyperparameters as likely as the points of a posterior make them. A pure function of its arguments.
+    """Draw ``count`` hyperparameters from their posterior given the points of a process. A pure function of its
+    arguments.
 
     Args:
-        posterior: an exact one, whose own hyperparameters are where the chain begins.
-        count: how many.
+        posterior: an exact one, whose own hyperparameters are the start of the chain.
+        count: number of samples.
         seed: of the chain.
-        noise_floor: that of the fit: the least variance of the noise, in shares of the output's.
+        noise_floor: that of the fit: the least variance of the noise, as a share of the output's variance.
     """
     hyper = posterior.hyper
     options = FitOptions(
@@ -51,7 +52,7 @@ def hyperparameter_samples(
 
 
 class _Chain:
-    """Updates of theta that leave its posterior as it is."""
+    """Updates of theta whose stationary distribution is its posterior."""
 
     def __init__(self, evidence: _Objective, rng: np.random.Generator) -> None:
         self._evidence, self._rng = evidence, rng

@@ -1,4 +1,4 @@
-"""Joint latent posterior of a process at fixed points, and what observing some of them would do to it.
+"""Joint latent posterior of a process at fixed points, and how observations at some of them would change it.
 
 Observing x_i shrinks every covariance by a product of rank one and needs no value of y:
 
@@ -51,7 +51,7 @@ class Joint:
         return shared / (self.variance[index] + self.noise).sqrt()
 
     def observe(self, index: int) -> Joint:
-        """The posterior as if the point ``index`` were observed as well."""
+        """The posterior after an observation at the point ``index``."""
         row = self.row(index)
         shrunk = (self.variance - row.square()).clamp_min(0)
         return replace(self, observed=torch.cat([self.observed, row[None]]), variance=shrunk)

@@ -42,7 +42,7 @@ class Polynomial:
 
     @classmethod
     def of(cls, linear: float, quadratic: float, reflection: Reflection | None, like: Tensor) -> Polynomial:
-        """The parts of variances ``linear`` and ``quadratic``, as far as they have the parity, at inputs (..., d)."""
+        """Build the parts of variances ``linear`` and ``quadratic`` that have the parity, at inputs (..., d)."""
         ones = like.new_ones(like.shape[-1])
         if reflection is None:
             return cls(linear, linear * ones, quadratic * ones, quadratic > 0)
@@ -63,7 +63,7 @@ class Polynomial:
 
 @dataclass(frozen=True)
 class Hyperparameters:
-    """What the marginal likelihood chooses. Units: inputs and outputs are standardised."""
+    """Hyperparameters, chosen by the marginal likelihood. Units: inputs and outputs are standardised."""
 
     lengthscale: Tensor  # (d,)
     signal_variance: float

@@ -1,15 +1,16 @@
-"""Whole functions drawn from a posterior, by Matheron's rule: what one draw is at any input, consistently.
+"""Functions drawn from a posterior by Matheron's rule. A draw has one consistent value at every input.
 
 A draw is the posterior's mean plus a residual, g(x) - k(x, X) (K + sigma_n^2 I)^-1 (g(X) + e), where g is a draw from
-the prior and e one of the noise: what is left of g once it is told to vanish at the data. g is exact in the polynomial
-parts, whose features are finitely many, and takes the squared exponential by random Fourier features (cosine and sine
+the prior and e a draw of the noise. The residual is g conditioned to vanish at the data. g is exact in the polynomial
+parts, which have finitely many features, and uses random Fourier features for the squared exponential (cosine and sine
 of the same frequency, so that its prior variance is exact). The update is exact, through the Cholesky factor.
 
-All draws share their frequencies, fixed for good, and each has weights of its own: N draws at one input each cost one
-matrix product and N scalar products. Under a reflection the features are those of (f(x) + p f(s x)) / sqrt(2). S
-frequencies leave the prior's covariance off by about sigma_f^2 / sqrt(2 S).
-Reference: Wilson et al., "Efficiently sampling functions from Gaussian process posteriors", ICML 2020, eq. 13;
-Rahimi and Recht, "Random features for large-scale kernel machines", NeurIPS 2007.
+All draws share fixed frequencies and differ in their weights: N draws at one input each cost one matrix product and N
+scalar products. Under a reflection the features are those of (f(x) + p f(s x)) / sqrt(2). With S frequencies the
+prior's covariance has an error of about sigma_f^2 / sqrt(2 S).
+
+References: Wilson et al., "Efficiently sampling functions from Gaussian process posteriors", ICML 2020, eq. 13; Rahimi
+and Recht, "Random features for large-scale kernel machines", NeurIPS 2007.
 """
 
 from __future__ import annotations
@@ -31,29 +32,30 @@ FREQUENCIES = 256  # S
 
 @dataclass(frozen=True)
 class Pathwise:
-    """Draws of one posterior. A draw is a row of ``size`` weights: those of the prior's features, then of n points."""
+    """Draws from one posterior. A draw is a row of ``size`` weights: first of the prior's features, then of the n
+    points."""
 
     posterior: Posterior
 
     @property
     def size(self) -> int:
-        """How many standard normal numbers a draw takes, and how many weights it is."""
+        """Number of standard normal numbers that a draw takes, and of its weights."""
         return self._features + len(self.posterior.y)
 
     def draw(self, noise: Tensor) -> Tensor:
-        """Weights (N, size) of the residuals that standard normal ``noise`` (N, size) stands for."""
+        """Weights (N, size) of the residuals that standard normal ``noise`` (N, size) gives."""
         posterior = self.posterior
         prior, measured = noise[:, : self._features], noise[:, self._features :]
         at_points = prior @ self._prior_at_points.T + self._noise(measured)
         return torch.cat([prior, -torch.cholesky_solve(at_points.T, posterior.factor).T], 1)
 
     def residual(self, x: Tensor, weights: Tensor) -> Tensor:
-        """How far draw i, ``weights`` (N, size), is from the posterior's mean at input i of x (N, d): (N,)."""
+        """Residual of draw i, ``weights`` (N, size), at input i of x (N, d): (N,)."""
         k = covariance(self.posterior.hyper, x, self.posterior.x)
         return (torch.cat([self._prior(x), k], 1) * weights).sum(1)
 
     def _noise(self, measured: Tensor) -> Tensor:
-        """Noise of the n points that standard normal ``measured`` (N, n) stands for, (N, n)."""
+        """Noise of the n points that standard normal ``measured`` (N, n) gives, (N, n)."""
         posterior = self.posterior
         if posterior.sparse is not None:
             return measured @ self._sparse_noise
@@ -61,7 +63,7 @@ class Pathwise:
 
     @cached
     def _sparse_noise(self) -> Tensor:
-        """Square root (n, n) of the noise that is left at inducing points, F F^T - k(Z, Z)."""
+        """Square root (n, n) of the remaining noise at inducing points, F F^T - k(Z, Z)."""
         posterior = self.posterior
         left = posterior.factor @ posterior.factor.T - covariance(posterior.hyper, posterior.x, posterior.x)
         values, vectors = torch.linalg.eigh(left)
@@ -100,6 +102,6 @@ class Pathwise:
 @cache
 @torch.inference_mode(False)
 def frequencies(d: int, device: torch.device) -> Tensor:
-    """Frequencies (d, S) of the squared exponential in length scales: standard normal, the same for ever."""
+    """Frequencies (d, S) of the squared exponential in length scales: standard normal, from a fixed seed."""
     drawn = np.random.Generator(np.random.Philox(key=d)).standard_normal((d, FREQUENCIES))
     return torch.from_numpy(drawn).to(device)

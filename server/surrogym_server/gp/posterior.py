@@ -1,4 +1,4 @@
-"""Exact posterior (eq. 6 and 7, with the inverses the paper left out).
+"""Exact posterior (eq. 6 and 7, with the inverses that the paper omits).
 
 mean(x) = k(x, X) (K + sigma_n^2 I)^-1 y,  var(x) = k(x, x) - |L^-1 k(X, x)|^2 with L L^T = K + sigma_n^2 I.
 The variance is the latent one, without noise; it is taken by a triangular solve, never through an inverse.
@@ -22,7 +22,7 @@ BLOCK = 16_384  # rows predicted at once: bounds memory at any batch size
 
 @dataclass(frozen=True)
 class LeftOut:
-    """How well a process foretells each of its points from all others."""
+    """Accuracy of a process in predicting each of its points from all others."""
 
     error: float  # root mean square, in units of y
     within_one: float  # share of the points within one predictive deviation
@@ -31,7 +31,7 @@ class LeftOut:
 
     @classmethod
     def of(cls, error: Tensor, variance: Tensor) -> LeftOut:
-        """Of errors (n,) and the variances (n,) predicted with them, noise included."""
+        """Compute it from errors (n,) and the variances (n,) predicted with them, noise included."""
         size, deviation = error.abs(), variance.sqrt()
         one, two = (float((size <= width * deviation).double().mean()) for width in (1, 2))
         log_density = -0.5 * float((size.square() / variance + (2 * math.pi * variance).log()).mean())
@@ -40,24 +40,25 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Sparse:
-    """What a process through inducing points stands for, and what it costs."""
+    """The points that a process with inducing points represents, and the loss that this causes."""
 
-    points: int  # that were learned from
-    unexplained: float  # deviation left at them, prior deviations, root mean square: 0 where nothing is lost
-    left_out: LeftOut | None = None  # of these points; None in models stored before it was kept
+    points: int  # number of points that it was fitted to
+    unexplained: float  # root mean square deviation that is left at them, in prior deviations; 0 if nothing is lost
+    left_out: LeftOut | None = None  # accuracy at these points; None in models stored by older versions
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """A process conditioned on n points, with all that prediction needs: nothing is recomputed on loading."""
+    """A process conditioned on n points. It holds all quantities that prediction needs, so loading recomputes
+    nothing."""
 
     hyper: Hyperparameters
     x: Tensor  # (n, d)
     y: Tensor  # (n,)
     factor: Tensor  # (n, n) lower Cholesky factor of K + (sigma_n^2 + jitter) I
     weights: Tensor  # (n,)
-    jitter: float  # added to the diagonal to factor it, 0 as a rule
-    sparse: Sparse | None = None  # None where the n points are all there are; see ``gp.sparse``
+    jitter: float  # added to the diagonal before factoring, usually 0
+    sparse: Sparse | None = None  # None if the n points are all the data; see ``gp.sparse``
 
     def mean(self, x: Tensor) -> Tensor:
         """Posterior mean at x (m, d), shape (m,)."""
@@ -83,7 +84,7 @@ class Posterior:
 
     @property
     def left_out(self) -> LeftOut:
-        """How well the points that were learned from are foretold by all others."""
+        """Accuracy in predicting each of the points from all others."""
         if self.sparse is not None and self.sparse.left_out is not None:
             return self.sparse.left_out
         mean, variance = self.leave_one_out()
@@ -112,7 +113,7 @@ def condition(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
     """Condition a process on x (n, d) and y (n,).
 
     Raises:
-        NumericalFailure: no jitter up to 1e-4 of the prior's variance makes the covariance factor.
+        NumericalFailure: the covariance can't be factored, even with a jitter of 1e-4 of the prior's variance.
     """
     k = covariance(hyper, x, x)
     k.diagonal().add_(hyper.noise_variance)
@@ -121,9 +122,11 @@ def condition(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
 
 
 def factorise(k: Tensor) -> tuple[Tensor, float]:
-    """Lower Cholesky factor of k (n, n) and its jitter: 0, else 1e-10 of the mean diagonal, times ten each try.
+    """Lower Cholesky factor of k (n, n), and its jitter: 0, else from 1e-10 of the mean diagonal, times ten at each
+    try.
 
-    It lies in rows, as a stored one does: LAPACK's columns would give a fresh model other last bits than a loaded one.
+    The factor is stored by rows, like a loaded one. By columns, as LAPACK returns it, a new model would differ from a
+    loaded one in the last bits.
     """
     factor, info = torch.linalg.cholesky_ex(k)
     if not bool(info):

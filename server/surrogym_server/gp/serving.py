@@ -35,9 +35,9 @@ VARIANCE_TOLERANCE = 5e-10  # of the prior's variance
 
 @dataclass(frozen=True)
 class Output:
-    """What one output is: centre + scale * process. Without a posterior it is constant.
+    """One output: centre + scale * process. Without a posterior it is constant.
 
-    ``inputs`` are the columns of x that its process reads, ``column`` is its place among the means.
+    ``inputs`` are the columns of x that its process reads, ``column`` is its column in the means.
     """
 
     column: int
@@ -66,14 +66,14 @@ class _Process:
     variance_by_differences: bool
 
     def exponent(self, x: Tensor) -> Tensor:
-        """By differences, (m, n)."""
+        """Exponent computed by differences, (m, n)."""
         a = x.index_select(-1, self.inputs) * self.inverse_lengthscale
         distance = torch.cdist(a, self.scaled, compute_mode="donot_use_mm_for_euclid_dist")
         exponent: Tensor = distance.square_().mul_(-0.5)
         return exponent
 
     def deviation(self, x: Tensor, z: Tensor, squared: Tensor, smooth: Tensor) -> Tensor:
-        """Latent deviation (m,), in the output's unit. Its columns of ``smooth`` (m, S) are used up."""
+        """Latent deviation (m,), in the output's unit. Overwrites its columns of ``smooth`` (m, S)."""
         k = smooth[:, self.span]
         if self.variance_by_differences and not self.mean_by_differences:
             k = self.exponent(x).exp_()
@@ -101,8 +101,8 @@ class Serving:
 
     @classmethod
     def of(cls, outputs: Sequence[Output], columns: int, width: int, device: torch.device = CPU) -> Serving:
-        """Compile outputs, all on a device, for ``columns`` means of inputs (m, ``width``); columns without an output
-        are 0."""
+        """Compile outputs on one device for ``columns`` means of inputs (m, ``width``). Columns without an output are
+        0."""
         total = sum(len(_points(o.posterior)) for o in outputs if o.posterior is not None)
         like = torch.zeros(0, dtype=torch.float64, device=device)
         exponents, weights = like.new_zeros(2 * width + 1, total), like.new_zeros(total, columns)
@@ -122,7 +122,7 @@ class Serving:
 
     @property
     def rows(self) -> int:
-        """How many rows are predicted at once."""
+        """Number of rows that are predicted at once."""
         return max(MIN_ROWS, BLOCK // max(1, self.exponents.shape[1]))
 
     def mean(self, x: Tensor) -> Tensor:
@@ -180,14 +180,14 @@ def _process(output: Output, posterior: Posterior, span: slice, polynomial: Tens
 
 
 def _points(posterior: Posterior) -> Tensor:
-    """Points that the squared exponential is taken at, (n, d), and their mirror images under a reflection, (2 n, d)."""
+    """Points of the squared exponential, (n, d), and their mirror images under a reflection, (2 n, d)."""
     if (reflection := posterior.hyper.reflection) is None:
         return posterior.x
     return torch.cat([posterior.x, posterior.x * reflection.signs])
 
 
 def _weights(posterior: Posterior) -> Tensor:
-    """Of the points and their mirror images in the mean."""
+    """Weights of the points and their mirror images in the mean."""
     if (reflection := posterior.hyper.reflection) is None:
         return posterior.weights
     return torch.cat([posterior.weights, reflection.parity * posterior.weights])
@@ -217,7 +217,7 @@ def _prior(hyper: Hyperparameters, inputs: Sequence[int], width: int) -> Tensor:
 
 
 def _squares_alone(coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of a function sum_j c_j x_j^2, for ``_in_z``."""
+    """The arguments for ``_in_z`` of a function sum_j c_j x_j^2."""
     column = coefficients[:, None]
     return torch.zeros_like(column), column, coefficients.new_zeros(1)
 
@@ -231,12 +231,13 @@ def _in_z(linear: Tensor, quadratic: Tensor, constant: Tensor, inputs: Sequence[
 
 
 def _error_bounds(posterior: Posterior) -> tuple[float, float]:
-    """What taking the exponent by products may cost, for x up to twice as far from the origin as the farthest point.
+    """Bounds on the error from computing exponents by products, for x up to twice as far from the origin as the
+    farthest point.
 
-    With delta the largest error of an exponent, that of the mean is at most sigma_f^2 delta |beta|_1, in prior
+    With delta the largest error of an exponent, the error of the mean is at most sigma_f^2 delta |beta|_1, in prior
     deviations, and that of the variance 2 |L^-1 k| |L^-1 dk| <= 2 s sigma_f^2 delta sqrt(n) / sigma_n, in prior
-    variances; s^2 = sigma_f^2 + sigma_l^2 is the smallest prior variance. Mirror images double both; of an odd process
-    s^2 = sigma_f^2, as its variance is nothing at the mirror, where it is known.
+    variances; s^2 = sigma_f^2 + sigma_l^2 is the smallest prior variance. Mirror images double both. For an odd process
+    s^2 = sigma_f^2, because its variance is 0 on the mirror, where it is known.
     """
     hyper, (n, d) = posterior.hyper, posterior.x.shape
     reach = float((posterior.x / hyper.lengthscale).square().sum(1).max())

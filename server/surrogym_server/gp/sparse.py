@@ -1,21 +1,21 @@
-"""Processes of many points: a few inducing points stand for all, and nothing else changes.
+"""Processes with many points: a few inducing points represent all of them, and everything else stays the same.
 
-m of the n points are chosen, Z, by pivoted Cholesky: each is the one the others explain least. With V = L^-1 k(Z, X),
-L L^T = k(Z, Z), and C = V V^T, the projected process (R&W (2006), section 8.3.4) predicts
+m of the n points are chosen, Z, by pivoted Cholesky: each is the one that the others explain least. With V = L^-1 k(Z,
+X), L L^T = k(Z, Z), and C = V V^T, the projected process (R&W (2006), section 8.3.4) predicts
 
     mean(x) = k(x, Z) L^-T (C + sigma_n^2 I)^-1 V y,
     var(x) = k(x, x) - k(x, Z) (F F^T)^-1 k(Z, x),  F = L chol(I + sigma_n^2 C^-1).
 
-So it is an exact process of the m points with the factor F, whose noise sigma_n^2 L C^-1 L^T is what is left of the
-noise where n points speak for m, and with the values y_Z = F F^T weights. It is served, stored, extended and drawn
-from as any other. Its variance goes back to the prior's away from Z.
+So it is an exact process of the m points with the factor F, the values y_Z = F F^T weights, and the noise sigma_n^2 L
+C^-1 L^T, which is the remaining noise if n points are represented by m. It is served, stored, extended and drawn from
+like any other process. Away from Z its variance returns to the prior's.
 
-Its m values are no data, as each stands for many points. So leave-one-out errors are those of the n points, with
+Its m values are not data, because each represents many points. So leave-one-out errors are those of the n points, with
 h_i = (V^T (C + sigma_n^2 I)^-1 V)_ii:
 
     y_i - mean_{-i} = (y_i - mean(x_i)) / (1 - h_i),  var_{-i} = sigma_n^2 / (1 - h_i) + what Z leaves of k(x_i, x_i).
 
-Reference: Fine and Scheinberg (2001) for the choice of Z; Seeger, Williams, Lawrence (2003) for the projected process.
+References: Fine and Scheinberg (2001) for the choice of Z; Seeger, Williams, Lawrence (2003) for the projected process.
 """
 
 from __future__ import annotations
@@ -28,18 +28,20 @@ from torch import Tensor
 from surrogym_server.gp.kernel import Hyperparameters, covariance, variance
 from surrogym_server.gp.posterior import BLOCK, LeftOut, Posterior, Sparse, condition, factorise
 
-MAX_EXACT = 2_000  # points; beyond, a process is sparse
+MAX_EXACT = 2_000  # a process with more points is sparse
 INDUCING = 1_000
 COMPARED = 2
 SHARE = 1e-12  # least share that all other points have in a prediction
-EXPLAINED, BELOW_NOISE = 1e-10, 1e-3  # of the prior's and the noise variance: a point known so well is not chosen
+EXPLAINED, BELOW_NOISE = 1e-10, 1e-3  # of the prior's and the noise variance: least variance to choose
 
 
 def condition_many(hypers: Sequence[Hyperparameters], x: Tensor, y: Tensor) -> Posterior:
-    """Condition a process on x (n, d) and y (n,): exactly up to ``MAX_EXACT`` points, with the last hyperparameters;
-    else through inducing points, with those of the last ``COMPARED`` that foretell left-out points best.
+    """Condition a process on x (n, d) and y (n,). Up to ``MAX_EXACT`` points this is exact, with the last
+    hyperparameters.
 
-    Hyperparameters of some points say little of what is rare: all points judge them. R&W (2006), section 5.4.2.
+    With more points it uses inducing points, and those of the last ``COMPARED`` hyperparameters that predict left-out
+    points best: hyperparameters fitted to a subset may miss rare points, so all points decide. R&W (2006), section
+    5.4.2.
 
     Raises:
         NumericalFailure: as ``condition``.

@@ -1,8 +1,8 @@
-"""Which of many points hyperparameters are fitted to, so that no fit grows with the third power of n.
+"""Subsets of many points to fit hyperparameters to, so that no fit takes time in the third power of n.
 
-A fit of n points evaluates the evidence some hundred times, each in O(n^3). So beyond ``FEW`` points alternatives are
-compared on ``FEW`` of them. What was chosen is fitted to ``SOME``, then, near the optimum and in few evaluations, to
-more (``gp.fit.REFINEMENTS``). The process is conditioned on all.
+A fit evaluates the evidence some hundred times, each time in O(n^3). So with more than ``FEW`` points, alternatives are
+compared on ``FEW`` of them. The chosen one is fitted to ``SOME`` points, then refined on more, near the optimum and in
+few evaluations (``gp.fit.REFINEMENTS``). The process is conditioned on all points.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ SEED = 0
 
 
 def spread(points: int, most: int) -> Tensor:
-    """Which of n points in the order they came: all up to ``most``, else one from each of ``most`` equal stretches,
-    (m,). Drawn within the stretch by a fixed seed: equal distances would see one phase of what repeats."""
+    """Select points, in the order of their arrival: all n up to ``most``, else one from each of ``most`` equal
+    stretches, (m,). A fixed seed draws the point within its stretch, because equal distances could sample one phase of
+    a periodic sequence."""
     if points <= most:
         return torch.arange(points)
     edges = np.linspace(0, points, most + 1).astype(np.int64)

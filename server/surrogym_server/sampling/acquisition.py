@@ -1,15 +1,15 @@
-"""Acquisitions: what a query is worth (eq. 12 and 13). One class a criterion; packages may add their own.
+"""Acquisitions: criteria that value a query (eq. 12 and 13). One class for each criterion; packages may add their own.
 
-An acquisition values candidates, or predicted paths, for the sake of one output of the model. Its laws:
+An acquisition values candidates, or predicted paths, with respect to one output of the model. Its laws:
 
 - it is a pure function of its arguments and its settings: no state, no random numbers of its own;
 - it returns one value for each candidate (m,), or for each beginning of each path (b, T); only their order counts;
-- more is better, and every value is finite;
-- it changes nothing that it was given.
+- larger values are better, and every value is finite;
+- it does not change its arguments.
 
-``value_of`` and ``path_value_of`` are where it is asked; they refuse what has another shape, or is not finite.
+``value_of`` and ``path_value_of`` call it, and raise if the values have another shape or are not finite.
 
-Its settings are the fields of a frozen dataclass: numbers, booleans and strings, as the specification carries them.
+Its settings are the fields of a frozen dataclass: numbers, booleans and strings, as the specification holds them.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ GROUP = "surrogym.acquisitions"
 
 @dataclass(frozen=True)
 class CandidateView:
-    """What an acquisition may know of m candidates, for the sake of one output."""
+    """View of m candidates that an acquisition reads, with respect to one output."""
 
     model: DynamicsModel
     points: Points  # m states and actions
@@ -48,16 +48,17 @@ class CandidateView:
 
     @cached_property
     def variance_reduction(self) -> Tensor:
-        """By how much each answer lowers the weighted variance over the reference, (m,); see ``reads_reference``."""
+        """Reduction of the weighted variance over the reference by an answer at each candidate, (m,); see
+        ``reads_reference``."""
         return self._reduction()
 
 
 @dataclass(frozen=True)
 class PathView:
-    """What an acquisition may know of b predicted paths of T steps, for the sake of one output."""
+    """View of b predicted paths of T steps that an acquisition reads, with respect to one output."""
 
     tolerance: float  # of the output, in its unit
-    weight: Tensor  # (b, T) how much each step counts, from 0: by where it lies and how well it can be predicted
+    weight: Tensor  # (b, T) at least 0; depends on where the step lies and how well it can be predicted
     _deviation: Callable[[], Tensor]
     _information: Callable[[], Tensor]
 
@@ -68,36 +69,41 @@ class PathView:
 
     @cached_property
     def information(self) -> Tensor:
-        """What the beginning of each path up to each step tells of the output, in nats, (b, T)."""
+        """Information about the output in the beginning of each path, up to each step, in nats, (b, T)."""
         return self._information()
 
 
 class Acquisition(ABC):
-    """One criterion. The laws are those of the module."""
+    """One criterion. It follows the laws of the module."""
 
-    adaptive: ClassVar[bool] = True  # False: the whole budget is asked before the first fit
-    reads_reference: ClassVar[bool] = False  # whether ``variance_reduction`` is asked for
-    reads_probability: ClassVar[bool] = False  # whether ``log_probability`` is asked for
+    adaptive: ClassVar[bool] = True  # False: the whole budget is queried before the first fit
+    reads_reference: ClassVar[bool] = False  # whether it uses ``variance_reduction``
+    reads_probability: ClassVar[bool] = False  # whether it uses ``log_probability``
 
     def check(self, definition: EnvironmentDefinition) -> None:  # noqa: B027  most take every environment
-        """Asked once, when a surrogate is registered, before any real step. Raises ``ValueError`` where the settings
-        do not fit its environment, with what was expected and what came."""
+        """Check that the settings fit the environment; called once, when a surrogate is registered, before any real
+        step.
+
+        Raises:
+            ValueError: they don't fit; the message says what was expected and what came.
+        """
 
     @abstractmethod
     def value(self, candidates: CandidateView) -> Tensor:
         """Value of asking each candidate, (m,)."""
 
     def path_value(self, paths: PathView) -> Tensor:
-        """Value of following each path up to each step, (b, T). Not less with each step.
+        """Value of following each path up to each step, (b, T). It does not decrease along a path.
 
-        The default adds up what each step tells after those before it, whatever the criterion of candidates is.
+        The default sums the information of the steps, each given those before it, whatever the criterion for candidates
+        is.
         """
         return paths.information
 
 
 @dataclass(frozen=True)
 class IntegratedVariance(Acquisition):
-    """How much an answer lowers the variance over the range and the visited states.
+    """Reduction of the variance over the sampling range and the visited states by an answer.
 
     Reference: D. Cohn (1993), NIPS 6.
     """
@@ -110,7 +116,7 @@ class IntegratedVariance(Acquisition):
 
 @dataclass(frozen=True)
 class Variance(Acquisition):
-    """The deviation at the candidate."""
+    """Deviation at the candidate."""
 
     def value(self, candidates: CandidateView) -> Tensor:
         return candidates.deviation
@@ -135,7 +141,7 @@ class UncertaintyIndex(Acquisition):
 
 @dataclass(frozen=True)
 class LatinHypercube(Acquisition):
-    """No criterion: the whole budget is one Latin hypercube. What is asked for beyond it fills the largest gaps."""
+    """No criterion: the whole budget is one Latin hypercube. Queries beyond it fill the largest gaps."""
 
     adaptive: ClassVar[bool] = False
 
@@ -157,13 +163,12 @@ ACQUISITIONS: Registry[Acquisition] = Registry(
 
 
 def acquisition_of(choice: Choice) -> Acquisition:
-    """The acquisition of a name and settings. Raises InvalidSpec."""
+    """Return the acquisition with a name and settings. Raises ``InvalidSpec``."""
     return ACQUISITIONS.make(choice)
 
 
 def check_acquisition(definition: EnvironmentDefinition) -> None:
-    """Raises ``InvalidSpec``: no such acquisition, settings that it does not take, or that do not fit the
-    environment."""
+    """Check that an acquisition exists, takes these settings, and fits the environment. Raises ``InvalidSpec``."""
     choice = definition.design.acquisition
     acquisition = acquisition_of(choice)
     with guarded(f"acquisition {choice.name}", InvalidSpec):
@@ -171,12 +176,13 @@ def check_acquisition(definition: EnvironmentDefinition) -> None:
 
 
 def value_of(choice: Choice, candidates: CandidateView) -> Tensor:
-    """What an acquisition gives for each of m candidates, (m,). Raises ``ChoiceFailed``: it broke the laws."""
+    """Return the acquisition's value of each of m candidates, (m,). Raises ``ChoiceFailed`` if it breaks the laws."""
     return _criterion_values(choice, acquisition_of(choice).value, candidates, candidates.distance.shape)
 
 
 def path_value_of(choice: Choice, paths: PathView) -> Tensor:
-    """What an acquisition gives for each beginning of b paths, (b, T). Raises ``ChoiceFailed``: it broke the laws."""
+    """Return the acquisition's value of each beginning of b paths, (b, T). Raises ``ChoiceFailed`` if it breaks the
+    laws."""
     return _criterion_values(choice, acquisition_of(choice).path_value, paths, paths.weight.shape)
 
 

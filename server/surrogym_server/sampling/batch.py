@@ -1,4 +1,4 @@
-"""Which points to query next (eq. 13): greedy batches over a candidate set, by an acquisition."""
+"""Greedy batches of queries from a candidate set, by an acquisition (eq. 13)."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ def choose(
     tolerances: Sequence[float],
     reserved: Tensor | None = None,
 ) -> list[int]:
-    """A greedy batch: for each output in ``wanted`` the best candidate, as if those before it had been answered.
+    """Choose a greedy batch: for each output in ``wanted`` the best candidate, given answers to those chosen before it.
 
     Args:
-        model: its deviations are what is to be lowered.
-        candidates: what to choose from.
-        taken: queries so far, answered or not: none of them is all but repeated.
-        assumed: queries asked and not answered, which count as if they had been.
-        wanted: for the sake of which output each query is, by number.
+        model: the model whose deviations the batch should lower.
+        candidates: points to choose from.
+        taken: all queries so far, answered or not; no query close to one of them is chosen.
+        assumed: unanswered queries, which are treated as answered.
+        wanted: for each query, the number of the output that it is chosen for.
         tolerances: (O,) in each output's unit.
-        reserved: (m,) bool, candidates that the first query is taken from.
+        reserved: (m,) bool, the candidates from which the first query is chosen.
 
     Returns:
-        Indices of candidates; fewer than wanted where nothing distinct is left.
+        Indices of candidates; fewer than wanted if no distinct candidate is left.
     """
     definition, points = model.definition, candidates.points
     acquisition = definition.design.acquisition
@@ -78,7 +78,8 @@ def candidate_view(
     tolerance: float,
     distance: Tensor,
 ) -> CandidateView:
-    """What an acquisition may know, from an output's outlook and distances (m,) to the queries so far."""
+    """Build an acquisition's view of the candidates from an output's outlook and the distances (m,) to the queries so
+    far."""
     return CandidateView(
         model=model,
         points=candidates.points,
@@ -92,7 +93,7 @@ def candidate_view(
 
 
 def nearest(definition: EnvironmentDefinition, points: Points, taken: Points) -> Tensor:
-    """Distance of m points to the nearest of those taken, in deviations of the sampling range, (m,)."""
+    """Distance of m points to the nearest taken query, in deviations of the sampling range, (m,)."""
     if not len(taken):
         return points.q.new_full((len(points),), torch.inf)
     return distances(definition, points, taken).amin(1)

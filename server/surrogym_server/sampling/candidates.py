@@ -1,4 +1,4 @@
-"""Points to choose queries from: the declared ranges, and the states that policies visited."""
+"""Candidate points for queries: from the declared ranges, and from the states that policies visited."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ OCCUPIED = 0.75  # share of the visited states in the reference; the rest is the
 
 @dataclass(frozen=True)
 class Candidates:
-    """Points to choose from, how likely they are, and the points that an answer should be good for."""
+    """Candidate points, their probabilities, and the reference points at which the variance should become small."""
 
     points: Points  # m
     log_p: Tensor  # (m,) log P_i; 0 unless the acquisition reads it
@@ -31,11 +31,11 @@ class Candidates:
 
 
 def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, rng: np.random.Generator) -> Candidates:
-    """Candidates from the Monte Carlo set ``points`` (m) and, as many again, visited states (v, C) under random
-    actions: few points of a set spread over the whole range lie where a policy goes.
+    """Build candidates from the Monte Carlo set ``points`` (m) and as many visited states (v, C) under random actions.
 
-    The reference is the Monte Carlo set, mixed with the visited states where there are any. Visited states outside the
-    sampling range are left out: a wrong model lets policies run away, and no real system should be set to where.
+    The visited states are needed because few points of a set over the whole range lie where a policy goes. The
+    reference is the Monte Carlo set, mixed with visited states if there are any. Visited states outside the sampling
+    range are left out: with a wrong model a policy can reach states to which the real system should not be set.
     """
     states = None if states is None else states[model.definition.in_range(states)]
     points = points[:MAX_CANDIDATES]
@@ -53,17 +53,16 @@ def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, r
 
 
 def with_more(candidates: Candidates, points: Points) -> tuple[Candidates, Tensor]:
-    """Candidates with k more points to choose from, each as likely as the likeliest of them; and which they are,
-    (m + k,) bool."""
+    """Add k candidates, each as likely as the likeliest one. Also return which candidates they are, (m + k,) bool."""
     log_p = torch.cat([candidates.log_p, candidates.log_p.max().expand(len(points))])
     joined = Points.joined([candidates.points, points])
     return replace(candidates, points=joined, log_p=log_p), torch.arange(len(joined)) >= len(candidates.points)
 
 
 def input_probability(model: DynamicsModel, points: Points, states: Tensor | None) -> Tensor:
-    """log P_i (eq. 11) at m points from visited states (v, C): (m,).
+    """log P_i (eq. 11) at m points, from visited states (v, C): (m,).
 
-    Without any, every state is equally likely, or as likely as the predicted next states are dense at it.
+    Without visited states every state is equally likely, or as likely as the density of predicted next states at it.
     """
     definition = model.definition
     if states is not None and len(states):
@@ -75,7 +74,7 @@ def input_probability(model: DynamicsModel, points: Points, states: Tensor | Non
 
 
 def under_random_actions(definition: EnvironmentDefinition, states: Tensor, rng: np.random.Generator) -> Points:
-    """States (v, C), each under an action drawn from its space."""
+    """Pair states (v, C) with random actions from the action space."""
     return Points(states, random_points(definition, len(states), rng)[1])
 
 

@@ -1,7 +1,7 @@
 """Confidence of a model over a Monte Carlo set: eq. 8 to 10, with a tolerance tau for each output.
 
-C_m = Phi(tau / sigma); tau = 1 in the output's raw unit is the paper's, which depends on units. U_m = 1 - C_m is kept
-as a logarithm: written as a difference it cancels to 0 below sigma = tau / 8.
+C_m = Phi(tau / sigma). The paper has tau = 1 in the output's raw unit, so its value depends on units. U_m = 1 - C_m is
+kept as a logarithm, because the difference rounds to 0 if sigma is below tau / 8.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from surrogym_server.models.abilities import LeaveOneOut, LeaveOneOutErrors, off
 from surrogym_server.models.guard import require_shapes
 from surrogym_server.models.port import DynamicsModel
 
-SUREST = 1e9  # tolerances over a deviation: what is known better counts as known so well
+SUREST = 1e9  # largest ratio of tolerance to deviation; larger ones are clipped to it
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a log has covered of the queries that a design would begin with. Pure."""
+"""Which initial queries of a design a log already covers. Pure."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ Bools = NDArray[np.bool_]
 
 
 def covered(definition: EnvironmentDefinition, q: Array, u: Array, logged_q: Array, logged_u: Array) -> Bools:
-    """Which of m queries a log makes unnecessary: those that a logged step lies nearer to than half the way to the
-    nearest other one.
+    """Which of m queries a log makes unnecessary, (m,) bool: a logged step lies nearer than half the distance to the
+    nearest other query.
 
     Distances are measured over states and actions, in widths of the sampling range, angles around the circle. Two
     discrete actions are 1 apart. A single query counts as covered by any log.

@@ -17,7 +17,7 @@ REDRAWS = 100
 def latin_hypercube(
     definition: EnvironmentDefinition, count: int, rng: np.random.Generator, tries: int = 1
 ) -> tuple[Tensor, Tensor]:
-    """A design of ``count`` points: coordinates (count, C) and actions (count, F).
+    """Draw a Latin hypercube of ``count`` points: coordinates (count, C) and actions (count, F).
 
     Each coordinate is stratified in probability, so truncated distributions keep their shape; discrete actions are
     balanced, no two counts differ by more than one. Of ``tries`` designs the one whose closest pair is farthest apart
@@ -30,7 +30,7 @@ def latin_hypercube(
 
 
 def random_points(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """Independent draws from the sampling distributions: coordinates (count, C) and actions (count, F)."""
+    """Draw independent points from the sampling distributions: coordinates (count, C) and actions (count, F)."""
     dimensions = len(definition.coordinates) + definition.action.size
     return from_unit(definition, torch.from_numpy(rng.random((count, dimensions))))
 
@@ -38,8 +38,11 @@ def random_points(definition: EnvironmentDefinition, count: int, rng: np.random.
 def going_on(
     definition: EnvironmentDefinition, q: Tensor, u: Tensor, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor]:
-    """The points q (n, C), u (n, F), those where the declared termination already holds replaced by independent draws
-    where it does not: no episode passes there, so a query would teach nothing. A range that is all termination stays.
+    """Replace the points q (n, C), u (n, F) at which the declared termination holds by independent draws at which it
+    does not.
+
+    No episode passes through a terminated state, so a query there would teach nothing. If the termination holds in the
+    whole range, the points stay.
     """
     q, u = q.clone(), u.clone()
     for _ in range(REDRAWS):
@@ -51,7 +54,7 @@ def going_on(
 
 
 def from_unit(definition: EnvironmentDefinition, p: Tensor) -> tuple[Tensor, Tensor]:
-    """Coordinates and actions of probabilities p (n, C + F) in [0, 1)."""
+    """Map probabilities p (n, C + F) in [0, 1) to coordinates and actions."""
     size = len(definition.coordinates)
     q = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(definition.coordinates)], -1)
     action, u = definition.action, p[:, size:]

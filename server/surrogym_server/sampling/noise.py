@@ -1,6 +1,6 @@
-"""Noise of the original environment, told from a model's misfit by steps that are taken twice.
+"""Tell noise of the original environment from misfit of the model, by steps that are taken twice.
 
-A process that does not fit its samples calls the rest noise. Only the same step, taken again, shows which it is: a
+A process that does not fit its samples explains the rest as noise. Only a repeat of the same step shows which it is: a
 deterministic environment gives the same result.
 """
 
@@ -19,21 +19,21 @@ from surrogym_server.models.abilities import LearnedNoise, offers
 from surrogym_server.models.port import DynamicsModel
 
 ENOUGH = 3  # degrees of freedom from repeated steps, before noise counts as established
-AT_MOST = 3.0  # measured deviations: more of the learned noise is misfit, whatever the chance of few repeats
-REFUTED = 0.05  # of the learned noise: where repeats differ by less, it is misfit
+AT_MOST = 3.0  # largest ratio of learned noise to measured deviation; the rest is misfit, even if there are few repeats
+REFUTED = 0.05  # share of the learned noise; if repeats differ by less, the learned noise is misfit
 SLACK = 1.25  # a leave-one-out error beyond the noise that few samples leave
 
 
 @dataclass(frozen=True)
 class Repeats:
-    """How far results of the same step differ."""
+    """Differences between results of the same step."""
 
     degrees: int  # of freedom
     deviation: Tensor  # (O,) of one result, in each output's unit
 
 
 def repeats(model: DynamicsModel, samples: Samples) -> Repeats:
-    """Deviations of repeated steps in the samples, pooled."""
+    """Pool the deviations of repeated steps in the samples."""
     targets = torch.cat([increments(model.definition, samples), samples.reward[:, None]], -1)
     groups, member = torch.unique(torch.cat([samples.q, samples.u], -1), dim=0, return_inverse=True)
     counts = torch.bincount(member, minlength=len(groups)).to(targets.dtype)
@@ -44,8 +44,8 @@ def repeats(model: DynamicsModel, samples: Samples) -> Repeats:
 
 
 def established_noise(model: DynamicsModel, samples: Samples, tolerances: Sequence[float]) -> Tensor:
-    """Deviation of each output's noise that repeated steps confirm, in its unit, (O,): 0 where there is none, or it
-    lies below the tolerance."""
+    """Deviation of each output's noise that repeated steps confirm, in its unit, (O,). It is 0 if there is none, or if
+    it is below the tolerance."""
     learned, limits = _learned(model, tolerances)
     found = repeats(model, samples)
     if found.degrees < ENOUGH:
@@ -55,8 +55,11 @@ def established_noise(model: DynamicsModel, samples: Samples, tolerances: Sequen
 
 
 def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float]) -> Points | None:
-    """Steps to take again, where a model has learned noise beyond a tolerance and nobody has tried whether that is so:
-    one first, which refutes it in a deterministic environment, and then as many as are ``ENOUGH``. None if none."""
+    """Steps to take again, if a model has learned noise beyond a tolerance that no repeat has confirmed or refuted yet.
+
+    First one step, which refutes the noise in a deterministic environment, then ``ENOUGH`` of them. None if none is
+    needed.
+    """
     learned, limits = _learned(model, tolerances)
     doubtful = learned > limits
     found = repeats(model, samples)
@@ -69,7 +72,8 @@ def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float
 
 
 def widened(tolerances: Sequence[float], noise: Tensor) -> tuple[float, ...]:
-    """Tolerances (O,) with the established noise (O,): what varies by itself can't be known better."""
+    """Widen the tolerances (O,) by the established noise (O,), because a noisy output can't be known better than its
+    noise."""
     return tuple(math.hypot(tolerance, float(one)) for tolerance, one in zip(tolerances, noise, strict=True))
 
 

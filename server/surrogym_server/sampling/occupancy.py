@@ -1,7 +1,7 @@
 """Occupancy P_i (eq. 11): a kernel density over states, as a ratio to the uniform density over the sampling range.
 
 Gaussian kernels on standardised coordinates, a von Mises kernel for angles, Scott's bandwidth n^(-1/(d+4)), and a
-uniform floor, so that no region is ever given up.
+uniform floor, so that every region keeps some probability.
 """
 
 from __future__ import annotations

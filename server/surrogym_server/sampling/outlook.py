@@ -1,4 +1,4 @@
-"""The outlook after further queries, of any model: its own, or the fallback for a family that can't look ahead."""
+"""Predicted effect of further queries on a model's variance: the model's own outlook, or a fallback by distance."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from surrogym_server.sampling.confidence import deviations
 def outlook_of(
     model: DynamicsModel, candidates: Points, reference: Points, assumed: Points
 ) -> tuple[OutputOutlook | None, ...]:
-    """Every output at m candidates and r reference points, once the queries ``assumed`` are answered."""
+    """Outlook of every output at m candidates and r reference points, after the queries ``assumed`` are answered."""
     if (able := offers(model, Lookahead)) is not None:
         return able.outlook(candidates, reference, assumed)
     return NearbyAnswers.of(model, candidates, reference, assumed)
 
 
 def path_outlook(model: DynamicsModel, steps: PredictedSteps, column: int) -> PathOutlook | None:
-    """The output ``column`` along predicted steps (b, T, ...)."""
+    """Outlook of the output ``column`` along predicted steps (b, T, ...)."""
     if (able := offers(model, Lookahead)) is not None:
         return able.along(steps, column)
     spread = deviations(model, steps.flat.q, steps.flat.u)[:, column].reshape(steps.q.shape[:-1])
@@ -34,15 +34,15 @@ def path_outlook(model: DynamicsModel, steps: PredictedSteps, column: int) -> Pa
 
 
 def as_if_answered(model: DynamicsModel, steps: PredictedSteps) -> DynamicsModel:
-    """The model as if real steps (T, ...) had been taken as predicted; unchanged where its family can't say."""
+    """Condition the model on predicted real steps (T, ...). A family that can't do this returns the model unchanged."""
     able = offers(model, Lookahead)
     return model if able is None else able.as_if_answered(steps)
 
 
 @dataclass(frozen=True)
 class NearbyAnswers(OutputOutlook):
-    """An outlook by distance alone: two points d apart, in deviations of the sampling range, are taken to be correlated
-    by exp(-d^2 / 2), and an answer to tell all there is to know at its point."""
+    """Outlook from distances alone. Two points at distance d, in deviations of the sampling range, have the correlation
+    exp(-d^2 / 2), and an answer removes all variance at its point."""
 
     definition: EnvironmentDefinition
     candidates: Points  # m
@@ -55,7 +55,7 @@ class NearbyAnswers(OutputOutlook):
     def of(
         cls, model: DynamicsModel, candidates: Points, reference: Points, assumed: Points
     ) -> tuple[NearbyAnswers, ...]:
-        """Of every output (O,), once the queries ``assumed`` are answered."""
+        """Build the outlook of every output (O,), after the queries ``assumed`` are answered."""
         own, there = (deviations(model, points.q, points.u).square() for points in (candidates, reference))
         definition, learns = model.definition, torch.ones(len(candidates), dtype=torch.bool)
         outputs = (
@@ -76,14 +76,14 @@ class NearbyAnswers(OutputOutlook):
         return self.answered(self.candidates[index : index + 1])
 
     def answered(self, query: Points) -> NearbyAnswers:
-        """As if one query had been answered as well."""
+        """Outlook after one more query is answered."""
         own, there = (_told(self.definition, points, query)[:, 0] for points in (self.candidates, self.reference))
         return replace(self, own=self.own * (1 - own), there=self.there * (1 - there))
 
 
 @dataclass(frozen=True)
 class IndependentSteps(PathOutlook):
-    """An outlook along paths whose steps count as independent ones: I(t) = 1/2 sum log(1 + (w sigma / tau)^2)."""
+    """Outlook along paths that treats steps as independent: I(t) = 1/2 sum log(1 + (w sigma / tau)^2)."""
 
     spread: Tensor  # (b, T) deviation, in the output's unit
     learns: Tensor  # (b, T) bool
@@ -97,5 +97,5 @@ class IndependentSteps(PathOutlook):
 
 
 def _told(definition: EnvironmentDefinition, points: Points, queries: Points) -> Tensor:
-    """Share of the variance at m points that the answer to each of k queries takes away, (m, k)."""
+    """Share of the variance at m points that the answer to each of k queries removes, (m, k)."""
     return (-distances(definition, points, queries).square()).exp()

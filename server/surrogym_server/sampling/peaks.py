@@ -1,9 +1,9 @@
-"""The look for where a reward that hides is highest: optimism over what is not known of it.
+"""Search for the highest reward of an environment that pays almost nowhere, by optimism about unknown rewards.
 
-A reward that pays in one place alone is known nearly everywhere, and there it does not matter. So the index says
-little, and the place that counts lies between the points of any set that is spread over the range. It is searched for:
-the highest promise (``RewardPeaks.promise``) is climbed from the best candidates, and asked for until it has been met
-and what it pays is known to the reward's tolerance.
+Such a reward is known well in nearly the whole range, where it is 0 and does not matter. So the uncertainty index does
+not find the place that pays, which lies between the points of any set spread over the range. Instead the highest
+promise (``RewardPeaks.promise``) is climbed from the best candidates, and the place is queried until it was reached and
+its reward is known to the reward's tolerance.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.models.abilities import RewardPeaks, offers
 from surrogym_server.models.port import DynamicsModel
 
-CLIMBERS, TRIES, CLIMBS = 16, 16, 24  # points that climb, steps that each tries at once, and how often
-WIDEST, SHRINK = 0.25, 0.75  # of the sampling range: deviation of the first tries, and of each next in that before
-NOTHING = torch.finfo(torch.float32).tiny  # reward: trainers compute in float32, where less is 0
-UNMET = 0.1  # of how far a foretold reward lies above the lowest: so much more than any sample was paid
-NEW = 0.01  # of the range: a place nearer to a sample than that has been asked for
+CLIMBERS, TRIES, CLIMBS = 16, 16, 24  # points that climb, random steps of each in one iteration, and iterations
+WIDEST, SHRINK = 0.25, 0.75  # of the sampling range: deviation of the first random steps; ratio to the next
+NOTHING = torch.finfo(torch.float32).tiny  # trainers compute in float32, in which a smaller reward is 0
+UNMET = 0.1  # of how far a predicted reward lies above the lowest: clearly more than any sample was paid
+NEW = 0.01  # of the range: a place nearer to a sample than this was already queried
 
 
 def highest(
     model: DynamicsModel, samples: Samples, points: Points, tolerance: float, rng: np.random.Generator
 ) -> Points | None:
-    """The step to ask for where the reward may be highest, from m points to begin at; None if that is known to the
-    tolerance, or the reward does not hide.
+    """Step to query where the reward may be highest, climbed from m points. None if the highest reward is known to the
+    tolerance, or the reward is not a hidden one.
 
-    While no sample was paid anything there is nothing to climb: then it is the one farthest from all.
+    While no sample was paid anything, there is nothing to climb. Then it is the point farthest from all samples.
     """
     definition = model.definition
     points = points[~_over(definition, points.q)]
@@ -50,13 +50,13 @@ def highest(
 
 
 def _least(samples: Samples) -> float:
-    """The least difference of rewards that a trainer could tell."""
+    """Smallest difference of rewards that a trainer can distinguish."""
     return max(NOTHING, torch.finfo(torch.float32).eps * float(samples.reward.abs().max()))
 
 
 def _unknown(model: DynamicsModel, samples: Samples, points: Points, tolerance: float) -> Tensor:
-    """Which of m points pay what is not known to the tolerance, or clearly more than any sample was paid, (m,) bool;
-    all, as long as nothing was paid that a trainer could tell from 0."""
+    """Which of m points pay an amount that is not known to the tolerance, or clearly more than any sample was paid,
+    (m,) bool. All of them, while no sample was paid more than a trainer can distinguish from 0."""
     foretold = model.transition(points.q, points.u, reward_deviation=True)
     assert foretold.reward_deviation is not None
     low, best = float(samples.reward.min()), float(samples.reward.max())
@@ -65,8 +65,8 @@ def _unknown(model: DynamicsModel, samples: Samples, points: Points, tolerance: 
 
 
 def _climbed(definition: EnvironmentDefinition, able: RewardPeaks, points: Points, rng: np.random.Generator) -> Points:
-    """Points of high promise, the highest first: the best of m points, moved by the best of random steps that grow
-    shorter."""
+    """Points of high promise, the highest first: the best of m points, moved by the best of random steps of decreasing
+    length."""
     low, high = _limits(definition)
     value = able.promise(points.q, points.u)
     best = value.topk(min(CLIMBERS, len(value))).indices
@@ -86,12 +86,13 @@ def _climbed(definition: EnvironmentDefinition, able: RewardPeaks, points: Point
 
 
 def _over(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
-    """Whether the declared termination holds at q (m, C), (m,): no episode passes there, so nothing is asked for."""
+    """Whether the declared termination holds at q (m, C), (m,). No episode passes there, so the design never queries
+    it."""
     return q.new_zeros(len(q), dtype=torch.bool) if definition.learns_termination else definition.terminated(q)
 
 
 def _in_space(definition: EnvironmentDefinition, points: Tensor) -> Tensor:
-    """Points (m, C + F) with numbers of discrete actions made whole."""
+    """Round the numbers of discrete actions in points (m, C + F)."""
     return (
         torch.cat([points[:, : len(definition.coordinates)], points[:, len(definition.coordinates) :].round()], 1)
         if definition.action.nvec

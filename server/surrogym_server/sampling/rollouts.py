@@ -1,8 +1,9 @@
-"""Action sequences for an environment that can only be reset and act: random ones first, then planned in the model.
+"""Action sequences for an environment that can't be set to a state: first random ones, then planned in the model.
 
-A sequence is worth what its acquisition gives per real step: with most of them, the information that a path tells of
-each output (``PathOutlook.information``). A step's weight is 0 outside the sampling range and after the end of an
-episode, and falls with the deviation gathered on the way: a plan ends where it can't be predicted.
+The value of a sequence is the acquisition's value per real step: for most acquisitions, the information that a path
+gives about each output (``PathOutlook.information``). A step has weight 0 outside the sampling range and after the end
+of an episode. The weight falls with the deviation accumulated along the path, so a plan ends where it can't be
+predicted.
 """
 
 from __future__ import annotations
@@ -28,21 +29,21 @@ STARTS = 6  # drawn from the start distribution for each plan
 POPULATION = 48  # action sequences compared at once
 ELITE = 12  # of them that the next generation varies
 GENERATIONS = 3
-DOUBTFUL = 0.25  # chance of an ending that is worth a rollout of its own
+DOUBTFUL = 0.25  # least chance of an ending for which a rollout is planned
 
 Sequences = NDArray[np.float64]  # (k, T, F)
 
 
 @dataclass(frozen=True)
 class Aim:
-    """What a plan is to find out."""
+    """What a plan should find out."""
 
-    columns: Sequence[int]  # outputs to learn of
+    columns: Sequence[int]  # numbers of the outputs to learn
     tolerances: Sequence[float]  # of every output
     longest: int  # actions in a sequence
-    states: Tensor | None = None  # (v, C) that policies visited: information is weighed by their density
-    ending: bool = False  # look first for an end of the episode, or a reward's edge, if one is within reach
-    ended: bool = False  # an end was seen: a declared one is not looked for
+    states: Tensor | None = None  # (v, C) visited by policies: information is weighted by their density
+    ending: bool = False  # look first for an end of the episode, or an edge of the reward, if one is within reach
+    ended: bool = False  # an end was seen, so a declared one need not be looked for
 
 
 @dataclass(frozen=True)
@@ -52,14 +53,14 @@ class Paths:
     q: Tensor  # (b, T, C)
     u: Tensor  # (b, T, F)
     q_next: Tensor  # (b, T, C)
-    running: Tensor  # (b, T) 1 while the episode goes on, 0 after its end
+    running: Tensor  # (b, T) 1 while the episode runs, 0 after its end
     ended: Tensor  # (b, T) 1 from the step on that ended it
-    drift: Tensor  # (b, T) squared deviation gathered before the step, in those of the sampling range
+    drift: Tensor  # (b, T) squared deviation accumulated before the step, in those of the sampling range
 
 
 def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random.Generator) -> list[Tensor]:
-    """Random sequences of 1, 2, 3, ... actions, each (T, F), that take ``steps`` in all: short first, and each held for
-    a time of its own, so that states spread."""
+    """Random sequences of 1, 2, 3, ... actions, each (T, F), with ``steps`` actions in all. Each sequence holds its
+    actions for a different time, so that states spread."""
     rollouts: list[Tensor] = []
     while steps > 0:
         length = min(len(rollouts) + 1, steps, definition.max_rollout or 1)
@@ -71,7 +72,8 @@ def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random
 def plan_round(
     model: DynamicsModel, aim: Aim, steps: int, pending: Sequence[Tensor], rng: np.random.Generator
 ) -> list[Tensor]:
-    """Sequences that take ``steps`` real steps in all, each as if those before it and the pending were answered."""
+    """Plan sequences with ``steps`` real steps in all, each given answers to those before it and to the
+    pending ones."""
     rollouts: list[Tensor] = []
     done = list(pending)
     while steps > 0:
@@ -85,8 +87,8 @@ def plan_round(
 
 
 def plan_rollout(model: DynamicsModel, aim: Aim, rng: np.random.Generator) -> Tensor:
-    """The sequence (T, F), 1 <= T <= ``aim.longest``, that gives most per expected real step: shooting, refined by
-    varying the best."""
+    """The sequence (T, F), 1 <= T <= ``aim.longest``, with the highest value per expected real step, found by random
+    shooting and by varying the best sequences."""
     starts = start_points(model.definition, STARTS, rng)
     population = random_sequences(model.definition, POPULATION, aim.longest, rng)
     value, length = _worth(model, aim, starts, population)
@@ -99,14 +101,14 @@ def plan_rollout(model: DynamicsModel, aim: Aim, rng: np.random.Generator) -> Te
 
 
 def as_if_done(model: DynamicsModel, actions: Tensor, rng: np.random.Generator) -> DynamicsModel:
-    """The model as if a sequence (T, F) had been answered along a predicted path: variances shrink, means stay."""
+    """Condition the model on a sequence (T, F) along a predicted path: variances shrink, means stay."""
     path = predict_paths(model, start_points(model.definition, 1, rng), actions[None])
     taken = path.running[0] > 0
     return as_if_answered(model, PredictedSteps(path.q[0, taken], path.u[0, taken], path.q_next[0, taken]))
 
 
 def start_points(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> Tensor:
-    """Starts (count, C), stratified over the declared distribution."""
+    """Start states (count, C), stratified over the declared distribution."""
     columns = [
         c.start.quantile(torch.from_numpy((rng.permutation(count) + rng.random(count)) / count))
         for c in definition.coordinates
@@ -141,7 +143,7 @@ def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor) -> Path
 
 
 def path_values(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
-    """What the acquisition gives for each beginning of paths (b, T), summed over the outputs of the aim: (b, T)."""
+    """The acquisition's value of each beginning of paths (b, T), summed over the outputs of the aim: (b, T)."""
     acquisition = model.definition.design.acquisition
     weight = _weights(model.definition, aim, paths)
     total = torch.zeros_like(weight)
@@ -153,12 +155,13 @@ def path_values(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
 
 
 def _view(output: PathOutlook, weight: Tensor, tolerance: float) -> PathView:
-    """What an acquisition may know of one output along paths, whose steps count by weight (b, T)."""
+    """Build an acquisition's view of one output along paths, whose steps have the weights (b, T)."""
     return PathView(tolerance, weight, lambda: output.deviation, lambda: output.information(weight, tolerance))
 
 
 def _worth(model: DynamicsModel, aim: Aim, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:
-    """Information per expected real step of the best beginning of each sequence (k, T, F), and its length, (k,)."""
+    """Information per expected real step of the best beginning of each sequence (k, T, F), and the length of that
+    beginning, (k,)."""
     count, lanes = len(sequences), len(starts)
     actions = torch.from_numpy(sequences).repeat_interleave(lanes, 0)
     paths = predict_paths(model, starts.repeat(count, 1), actions)
@@ -171,8 +174,8 @@ def _worth(model: DynamicsModel, aim: Aim, starts: Tensor, sequences: Sequences)
 
 
 def _endings(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
-    """The chance that the model was wrong about an end or the side of a reward's edge on the way, (b, T); also whether
-    paths have ended, where ends are declared and none was seen."""
+    """Probability that the model is wrong about an end, or about the side of a reward's edge, along the way, (b, T).
+    Also whether paths have ended, if ends are declared and none was seen."""
     q, q_next = paths.q.flatten(0, 1), paths.q_next.flatten(0, 1)
     doubt = in_doubt(model, q_next).maximum(edge_in_doubt(model, q, q_next)).reshape(paths.running.shape)
     wrong = (doubt * paths.running).cummax(1).values
@@ -180,7 +183,7 @@ def _endings(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
 
 
 def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tensor:
-    """How much each step (b, T) counts."""
+    """Weight of each step (b, T)."""
     low = torch.tensor([c.sampling.low for c in definition.coordinates], dtype=paths.q.dtype)
     high = torch.tensor([c.sampling.high for c in definition.coordinates], dtype=paths.q.dtype)
     inside = ((paths.q >= low) & (paths.q <= high)).all(-1)
@@ -201,7 +204,7 @@ def _varied(definition: EnvironmentDefinition, elite: Sequences, count: int, rng
 
 
 def _random_actions(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> Sequences:
-    """Actions (count, F); of a continuous one, half lie at its limits, which reach farthest."""
+    """Random actions (count, F). Half of the continuous ones lie at their limits, which reach farthest."""
     action = definition.action
     if action.nvec:
         return rng.integers(action.nvec, size=(count, action.size)).astype(np.float64)

@@ -1,8 +1,8 @@
-"""Tolerances that nobody set: 5 % of each output's deviation over the initial design, within what makes sense.
+"""Default tolerances: 5 % of each output's deviation over the initial design, within bounds.
 
-They are frozen after the first round, so that a design does not move its own goal. Two things are wrong with a size
-that a few samples gave: it may be nothing but rounding, and it may be that of samples that met nothing. So sizes have
-a floor, and a tolerance is taken again once something other than nothing is met.
+They are frozen after the first round, so that a design does not change its own goal. A size estimated from few samples
+can be wrong in two ways: it may be mere rounding, or the samples may have missed everything of interest. So sizes have
+a floor, and a tolerance is computed again when later samples cover a far larger range.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from surrogym_server.environment.samples import Samples, increments
 
 TOLERANCE = 0.05  # of the output's deviation over the initial design
 FLOOR = 1e-9  # of a coordinate's deviation over its range: a smaller increment is rounding
-NOTHING = 1e-3  # of the range met since: first samples that lie closer met nothing
+NOTHING = 1e-3  # of the range seen later: the first samples are useless if they lie closer together
 
 
 def sizes_of(definition: EnvironmentDefinition, samples: Samples) -> list[float]:
-    """Size of each output (O,): its deviation over the samples at hand, or that of its mean, if it never varied."""
+    """Size of each output (O,): its deviation over the samples, or that of its mean if it never varied."""
     targets = _targets(definition, samples)
     spread, mean = targets.std(0, correction=0), targets.mean(0).abs()
     return torch.where(spread > 0, spread, torch.where(mean > 0, mean, 1.0)).tolist()
 
 
 def usual_tolerances(definition: EnvironmentDefinition, sizes: Sequence[float]) -> tuple[float, ...]:
-    """Tolerance of each output, of sizes (O,), that nobody set: 5 % of its size, or as printed 1 in its unit."""
+    """Default tolerance of each output, of sizes (O,): 5 % of its size, or 1 in its unit as in the paper."""
     if definition.design.tolerance == "raw":
         return (1.0,) * len(sizes)
     floors = _floors(definition)
@@ -39,19 +39,19 @@ def usual_tolerances(definition: EnvironmentDefinition, sizes: Sequence[float]) 
 
 @dataclass(frozen=True)
 class Usual:
-    """The tolerances (O,) that a design goes by where nobody set one, and the ranges (O,) that they were taken from."""
+    """Default tolerances (O,) of a design, and the ranges (O,) that they were computed from."""
 
     tolerances: tuple[float, ...] = ()
     ranges: tuple[float, ...] = ()
 
 
 def frozen_tolerances(definition: EnvironmentDefinition, samples: Samples, before: Usual) -> Usual:
-    """The tolerances of the round before; of the samples where there are none, or where they met nothing before: what
-    has been met since lies over a range more than 1 / ``NOTHING`` times as wide.
+    """Keep the tolerances of the round before. Compute them from the samples if there are none, or if the range of the
+    targets has grown by more than 1 / ``NOTHING`` since.
 
-    A pure function of samples and state, so that a round that is taken again comes to the same. Without the ranges, as
-    in states of designs that began before they were kept, nothing changes. What a step that ends an episode pays is
-    not counted: it is beyond the reward's process.
+    A pure function of samples and state, so that a repeated round gives the same result. States of older designs have
+    no ranges; then nothing changes. Rewards of terminating steps are not counted, because the reward's process does not
+    model them.
     """
     sizes, ranges = sizes_of(definition, samples), _ranges(definition, samples)
     taken = usual_tolerances(definition, sizes)
@@ -65,7 +65,7 @@ def frozen_tolerances(definition: EnvironmentDefinition, samples: Samples, befor
 
 
 def _ranges(definition: EnvironmentDefinition, samples: Samples) -> tuple[float, ...]:
-    """How far apart the targets of steps that go on lie, (O,); 0 where that is rounding."""
+    """Range of the targets of non-terminating steps, (O,); 0 if it is mere rounding."""
     targets = _targets(definition, samples)[~samples.terminated]
     if not len(targets):
         return (0.0,) * len(definition.outputs)
@@ -78,7 +78,7 @@ def _targets(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 
 
 def _floors(definition: EnvironmentDefinition) -> list[float]:
-    """Least size of each output (O,) that is no rounding; of the reward, whose range nobody knows, 0."""
+    """Smallest size of each output (O,) that is more than rounding. For the reward, whose range is unknown, 0."""
     if definition.moves_observation:
         return [0.0] * len(definition.outputs)
     return [FLOOR * scaling(definition.coordinates[i].sampling)[1] for i in definition.moving] + [0.0]

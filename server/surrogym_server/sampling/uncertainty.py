@@ -1,4 +1,4 @@
-"""What a model knows about given points, and about where policies go, as numpy for the edge."""
+"""Uncertainty of a model at given points, and in the states that policies visit, as numpy arrays."""
 
 from __future__ import annotations
 
@@ -42,12 +42,11 @@ def query_uncertainty(
 
 
 def visited_confidence(model: DynamicsModel, states: Array, tolerances: Sequence[float]) -> float:
-    """Confidence index (eq. 8, 9) over visited states (v, C) instead of the Monte Carlo set, the smallest over outputs,
-    under tolerances (O,): how well a policy's own region is known.
+    """Confidence index (eq. 8, 9) over visited states (v, C) instead of the Monte Carlo set, under tolerances (O,): the
+    smallest over outputs. It shows how well the model is known where a policy goes.
 
-    States outside the sampling range count as well: nothing is asked there, and what is not known there stays unknown.
-    Each state is taken under one random action, as in the reference of the acquisition: a policy that learns tries
-    others than its own.
+    States outside the sampling range count as well, although the design never queries there. Each state is taken under
+    one random action, as in the acquisition's reference, because a policy that learns tries actions other than its own.
     """
     definition = model.definition
     rng = np.random.default_rng(definition.design.seed)
