@@ -53,7 +53,7 @@ def long_rollout(port: HttpSurrogate, session: str) -> np.ndarray:
 def await_rollout(url: str) -> None:
     """Wait until a session has a request at work."""
     deadline = time.monotonic() + 60
-    with httpx.Client(base_url=url) as client:
+    with httpx.Client(base_url=url, timeout=60) as client:
         while "surrogym_session_requests 1.0" not in client.get("/metrics").text:
             assert time.monotonic() < deadline
 

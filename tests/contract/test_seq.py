@@ -16,7 +16,7 @@ Post = Callable[[str, dict[str, Any]], httpx.Response]
 
 @pytest.fixture
 def http(pendulum_server):
-    with httpx.Client(base_url=pendulum_server.url, trust_env=False) as client:
+    with httpx.Client(base_url=pendulum_server.url, trust_env=False, timeout=150) as client:
         yield client
 
 

@@ -68,7 +68,7 @@ class Shell:
 
 
 def test_every_curl_line_works_in_its_order(server: ServerProcess, tmp_path: Path) -> None:
-    with httpx.Client(base_url=server.url) as client:
+    with httpx.Client(base_url=server.url, timeout=150) as client:
         shell = Shell(client, tmp_path)
         shell.trained()
         replies = [(line, shell.run(line)) for line in requests()]
