@@ -112,7 +112,7 @@ def test_other_files_are_refused_in_words(data: bytes):
 
 def test_deep_nesting_is_refused():
     text = b"[" * 100_000
-    with pytest.raises(NotASurrogateFile, match="header of JSON"):
+    with pytest.raises(NotASurrogateFile, match="header in JSON"):
         SurrogateFile.from_bytes(len(text).to_bytes(8, "little") + text)
 
 
