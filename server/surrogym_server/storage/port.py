@@ -20,6 +20,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 from surrogym_server.storage.jobs import Jobs
+from surrogym_server.storage.live_sessions import LiveSessions
 from surrogym_server.storage.policies import Blobs, Policies
 from surrogym_server.storage.records import (
     AddedSamples,
@@ -414,6 +415,7 @@ class Storage(ABC):
     models: Models
     occupancy: Occupancy
     sessions: Sessions
+    live_sessions: LiveSessions
     events: Events
     policies: Policies
     blobs: Blobs

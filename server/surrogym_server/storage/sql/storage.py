@@ -16,6 +16,7 @@ from surrogym_server.storage.sql.database import Database, connect
 from surrogym_server.storage.sql.designs import SqlDesigns
 from surrogym_server.storage.sql.jobs import SqlJobs
 from surrogym_server.storage.sql.ledger import SqlLedger
+from surrogym_server.storage.sql.live_sessions import SqlLiveSessions
 from surrogym_server.storage.sql.memory import SqlEvents, SqlOccupancy, SqlSessions
 from surrogym_server.storage.sql.migrate import migrate
 from surrogym_server.storage.sql.models import SqlModels
@@ -40,6 +41,7 @@ class SqlStorage(Storage):
         self.models = SqlModels(database)
         self.occupancy = SqlOccupancy(database)
         self.sessions = SqlSessions(database)
+        self.live_sessions = SqlLiveSessions(database)
         self.events = SqlEvents(database)
         self.policies = SqlPolicies(database)
         self.blobs = blobs

@@ -1,0 +1,121 @@
+"""Sessions of a cluster: their leases and their last checkpoints."""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection
+
+from surrogym_server.errors import IdempotencyConflict, Unavailable, UnknownSession, UnknownSurrogate
+from surrogym_server.storage.live_sessions import (
+    Checkpoint,
+    LiveSessions,
+    NewLiveSession,
+    SessionHolder,
+    SessionLease,
+    TakenSession,
+)
+from surrogym_server.storage.sql.database import Database, clock, conflict_insert
+from surrogym_server.storage.sql.tables import live_sessions as live
+from surrogym_server.storage.sql.tables import surrogates
+
+
+class SqlLiveSessions(LiveSessions):
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def add(self, new: NewLiveSession, owner: str, seconds: float) -> SessionLease:
+        with self._database.write() as connection:
+            _require_surrogate(connection, new.surrogate_id)
+            insert = conflict_insert(connection, live).values(
+                id=new.id,
+                surrogate_id=new.surrogate_id,
+                key=new.key,
+                digest=new.digest,
+                machine=new.machine,
+                fence=1,
+                seq=new.checkpoint.seq,
+                data=new.checkpoint.data,
+                **_lease(connection, owner, seconds),
+            )
+            if connection.execute(insert.on_conflict_do_nothing().returning(live.c.id)).one_or_none() is None:
+                raise IdempotencyConflict("the id of this session, or the key of its opening, is taken")
+        return SessionLease(new.id, owner, 1)
+
+    def opened(self, surrogate_id: int, key: str) -> tuple[str, str] | None:
+        with self._database.read() as connection:
+            wanted = sa.select(live.c.id, live.c.digest).where(live.c.surrogate_id == surrogate_id, live.c.key == key)
+            row = connection.execute(wanted).one_or_none()
+        return None if row is None else (row.id, row.digest)
+
+    def holder(self, id: str) -> SessionHolder | None:
+        with self._database.read() as connection:
+            left = (live.c.expires - clock(connection)).label("left")
+            row = connection.execute(sa.select(live.c.owner, live.c.machine, left).where(live.c.id == id)).one_or_none()
+        return None if row is None else SessionHolder(row.owner, row.left, row.machine)
+
+    def renew(self, owner: str, seconds: float) -> frozenset[str]:
+        with self._database.write() as connection:
+            renewed = sa.update(live).where(live.c.owner == owner).values(_lease(connection, owner, seconds))
+            return frozenset(connection.execute(renewed.returning(live.c.id)).scalars())
+
+    def record(self, lease: SessionLease, checkpoint: Checkpoint) -> bool:
+        """One row in a transaction: with more, this could wait for ``renew`` while that waits for this."""
+        with self._database.write() as connection:
+            update = _held(sa.update(live), lease).values(seq=checkpoint.seq, data=checkpoint.data)
+            return connection.execute(update).rowcount == 1
+
+    def take(self, id: str, owner: str, seconds: float) -> TakenSession:
+        with self._database.write() as connection:
+            free = (live.c.expires <= clock(connection)) | (live.c.owner == owner)
+            taken = sa.update(live).where(live.c.id == id, free)
+            values = {"fence": live.c.fence + 1, **_lease(connection, owner, seconds)}
+            row = connection.execute(taken.values(values).returning(*live.c)).one_or_none()
+            if row is None:
+                left = sa.select((live.c.expires - clock(connection)).label("left")).where(live.c.id == id)
+                raise _not_taken(id, connection.execute(left).scalar())
+        data = None if row.data is None else bytes(row.data)
+        return TakenSession(
+            SessionLease(id, owner, row.fence), row.surrogate_id, row.machine, Checkpoint(row.seq, data)
+        )
+
+    def release(self, lease: SessionLease) -> None:
+        with self._database.write() as connection:
+            connection.execute(_held(sa.update(live), lease).values(expires=clock(connection)))
+
+    def remove(self, id: str) -> None:
+        with self._database.write() as connection:
+            connection.execute(sa.delete(live).where(live.c.id == id))
+
+    def remove_all_of(self, surrogate_id: int) -> None:
+        with self._database.write() as connection:
+            connection.execute(sa.delete(live).where(live.c.surrogate_id == surrogate_id))
+
+    def sweep(self, seconds: float) -> int:
+        with self._database.write() as connection:
+            now = clock(connection)
+            too_long = sa.update(live).where(live.c.expires > now + live.c.seconds)
+            connection.execute(too_long.values(expires=now + live.c.seconds))
+            return connection.execute(sa.delete(live).where(live.c.expires <= now - seconds)).rowcount
+
+
+def _lease(connection: Connection, owner: str, seconds: float) -> dict[str, object]:
+    return {"owner": owner, "expires": clock(connection) + seconds, "seconds": seconds}
+
+
+def _held(update: sa.Update, lease: SessionLease) -> sa.Update:
+    return update.where(live.c.id == lease.id, live.c.owner == lease.owner, live.c.fence == lease.fence)
+
+
+def _require_surrogate(connection: Connection, id: int) -> None:
+    """Keep the surrogate from being deleted until the transaction ends. Raises ``UnknownSurrogate``."""
+    wanted = sa.select(surrogates.c.id).where(surrogates.c.id == id).with_for_update(read=True, key_share=True)
+    if connection.execute(wanted).one_or_none() is None:
+        raise UnknownSurrogate(f"expected the id of a surrogate, got {id}, which is not there")
+
+
+def _not_taken(id: str, seconds_left: float | None) -> UnknownSession | Unavailable:
+    if seconds_left is None:
+        return UnknownSession(f"no session {id!r}: open a new one")
+    return Unavailable(
+        f"session {id!r} belongs to another session host for {max(seconds_left, 0.0):.1f} s more: try again later"
+    )

@@ -1,0 +1,152 @@
+"""Sessions of a cluster: one owner at a time, a lease that ends by the database's clock, a checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from surrogym_server.errors import IdempotencyConflict, Unavailable, UnknownSession, UnknownSurrogate
+from surrogym_server.storage.live_sessions import Checkpoint, NewLiveSession, SessionLease, TakenSession
+from surrogym_server.storage.port import Storage
+
+LONG, SHORT, DAY = 60.0, 0.05, 86_400.0
+Until = Callable[[Callable[[], bool]], None]
+
+
+@pytest.fixture
+def surrogate(storage: Storage, make: Callable[..., str]) -> int:
+    return storage.surrogates.get(make()).id
+
+
+@pytest.fixture
+def add(storage: Storage, surrogate: int) -> Callable[..., SessionLease]:
+    def record(id: str = "s", owner: str = "a", seconds: float = LONG, key: str | None = None) -> SessionLease:
+        digest = None if key is None else f"opening under {key}"
+        new = NewLiveSession(id, surrogate, "this machine", Checkpoint(0, b"opened"), key, digest)
+        return storage.live_sessions.add(new, owner, seconds)
+
+    return record
+
+
+def test_a_session_is_taken_as_at_its_last_checkpoint(storage: Storage, surrogate: int, add, until: Until) -> None:
+    lease = add(seconds=SHORT)
+    assert storage.live_sessions.record(lease, Checkpoint(7, b"\0seven"))
+    until(lambda: seconds_left(storage, "s") < 0)
+    taken = storage.live_sessions.take("s", "b", LONG)
+    assert taken == TakenSession(SessionLease("s", "b", 2), surrogate, "this machine", Checkpoint(7, b"\0seven"))
+    assert storage.live_sessions.record(taken.lease, Checkpoint(9, None))
+    assert storage.live_sessions.take("s", "b", LONG).checkpoint == Checkpoint(9, None)
+
+
+def test_nobody_takes_a_session_under_a_living_lease(storage: Storage, add) -> None:
+    add()
+    with pytest.raises(Unavailable, match=r"belongs to another session host for (59|60)\.\d s more"):
+        storage.live_sessions.take("s", "b", LONG)
+    holder = storage.live_sessions.holder("s")
+    assert holder is not None
+    assert (holder.owner, holder.machine) == ("a", "this machine")
+
+
+def test_an_owner_whose_lease_was_replaced_changes_nothing(storage: Storage, add, until: Until) -> None:
+    old = add(seconds=SHORT)
+    until(lambda: seconds_left(storage, "s") < 0)
+    new = storage.live_sessions.take("s", "b", LONG).lease
+    assert storage.live_sessions.renew("a", LONG) == frozenset()
+    assert not storage.live_sessions.record(old, Checkpoint(99, b"late"))
+    storage.live_sessions.release(old)
+    assert seconds_left(storage, "s") > 0
+    assert storage.live_sessions.take("s", "b", LONG).checkpoint == Checkpoint(0, b"opened")
+    assert not storage.live_sessions.record(new, Checkpoint(1, b"of the lease before"))
+
+
+def test_a_lease_that_nobody_replaced_is_renewed_after_its_end(storage: Storage, add, until: Until) -> None:
+    add("s", seconds=SHORT)
+    add("t", seconds=SHORT)
+    add("u", owner="b")
+    until(lambda: seconds_left(storage, "s") < 0 and seconds_left(storage, "t") < 0)
+    assert storage.live_sessions.renew("a", LONG) == {"s", "t"}
+    with pytest.raises(Unavailable):
+        storage.live_sessions.take("s", "b", LONG)
+
+
+def test_a_released_session_is_free_at_once(storage: Storage, add) -> None:
+    storage.live_sessions.release(add())
+    assert storage.live_sessions.take("s", "b", LONG).lease.fence == 2
+
+
+def test_of_several_at_once_one_takes_a_session(storage: Storage, add) -> None:
+    storage.live_sessions.release(add())
+
+    def take(owner: str) -> str | None:
+        try:
+            return storage.live_sessions.take("s", owner, LONG).lease.owner
+        except Unavailable:
+            return None
+
+    with ThreadPoolExecutor(4) as threads:
+        won = [owner for owner in threads.map(take, ("b", "c", "d", "e")) if owner]
+    holder = storage.live_sessions.holder("s")
+    assert holder is not None
+    assert won == [holder.owner]
+
+
+def test_a_session_is_found_by_the_key_of_its_opening(storage: Storage, surrogate: int, add) -> None:
+    add("s", key="once")
+    add("t")
+    add("u")
+    assert storage.live_sessions.opened(surrogate, "once") == ("s", "opening under once")
+    assert storage.live_sessions.opened(surrogate, "never") is None
+    for again in ({"id": "other", "key": "once"}, {"id": "s"}):
+        with pytest.raises(IdempotencyConflict):
+            add(**again)
+    assert storage.live_sessions.holder("other") is None
+
+
+def test_a_removed_session_is_unknown(storage: Storage, surrogate: int, add) -> None:
+    lease = add("s", key="once")
+    add("t")
+    storage.live_sessions.remove("s")
+    storage.live_sessions.remove("s")
+    assert storage.live_sessions.holder("s") is None
+    assert not storage.live_sessions.record(lease, Checkpoint(1, b""))
+    with pytest.raises(UnknownSession):
+        storage.live_sessions.take("s", "a", LONG)
+    assert add("s", key="once").fence == 1, "its id and key are free again"
+    storage.live_sessions.remove_all_of(surrogate + 1)
+    storage.live_sessions.remove_all_of(surrogate)
+    assert storage.live_sessions.renew("a", LONG) == frozenset()
+
+
+def test_sessions_go_with_their_surrogate(storage: Storage, make, add) -> None:
+    add()
+    storage.surrogates.delete(make())
+    assert storage.live_sessions.holder("s") is None
+    with pytest.raises(UnknownSurrogate):
+        add("t")
+
+
+def test_a_session_that_nobody_took_is_swept(storage: Storage, add, until: Until) -> None:
+    add("s", seconds=SHORT)
+    add("t")
+    assert storage.live_sessions.sweep(LONG) == 0
+    until(lambda: storage.live_sessions.sweep(SHORT) == 1)
+    assert storage.live_sessions.holder("s") is None
+    assert storage.live_sessions.holder("t") is not None
+
+
+def test_a_lease_lasts_no_longer_though_the_clock_is_set_back(
+    storage: Storage, add, set_clock_back: Callable[[float], None]
+) -> None:
+    add()
+    set_clock_back(DAY)
+    assert seconds_left(storage, "s") > LONG
+    storage.live_sessions.sweep(LONG)
+    assert LONG / 2 < seconds_left(storage, "s") <= LONG
+
+
+def seconds_left(storage: Storage, id: str) -> float:
+    holder = storage.live_sessions.holder(id)
+    assert holder is not None
+    return holder.seconds_left
