@@ -117,9 +117,11 @@ def create_app(settings: Settings, design: DesignPort = DesignPort()) -> FastAPI
         Unavailable: the database is taken, or does not answer; or the cluster's session hosts do not.
     """
     _check_device(settings.device)
-    engine = pool.connect(settings) if settings.engine == "ray" else None
+    if settings.engine == "ray":
+        pool.check(settings)
     keep_private(settings)
     storage = open_storage(settings.database_url, settings.synchronous, settings.files)
+    engine = _cluster(settings, storage) if settings.engine == "ray" else None
     app = FastAPI(
         title="Surrogym",
         version=version("surrogym"),
@@ -159,6 +161,14 @@ def _check_device(name: str) -> None:
     if name == "cuda" and not torch.cuda.is_available():
         why = "this torch build has no CUDA" if torch.version.cuda is None else "torch finds no GPU that it can use"
         raise InvalidInput(f"setting device: expected cpu, got cuda, and {why}")
+
+
+def _cluster(settings: Settings, storage: Storage) -> SessionEngine:
+    try:
+        return pool.connect(settings, storage.live_sessions)
+    except BaseException:
+        storage.close()
+        raise
 
 
 def say_goodbye(app: FastAPI) -> None:

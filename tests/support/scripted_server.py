@@ -50,8 +50,8 @@ def reply(body: str, status: int = 200, content_type: str = "application/json", 
     return answer
 
 
-def problem(code: Code, detail: str = "why") -> Answer:
-    body = Problem(title=code.value, status=STATUS[code], code=code, detail=detail)
+def problem(code: Code, detail: str = "why", expected_seq: int | None = None) -> Answer:
+    body = Problem(title=code.value, status=STATUS[code], code=code, detail=detail, expected_seq=expected_seq)
     return reply(body.model_dump_json(), STATUS[code], "application/problem+json")
 
 
@@ -65,7 +65,7 @@ def upgrade(handler: BaseHTTPRequestHandler) -> None:
     handler.end_headers()
 
 
-def session_view(seq: int = 0, protocol: int = wire.PROTOCOL, delay: float = 0.0) -> Answer:
+def session_view(seq: int = 0, protocol: int = wire.PROTOCOL, delay: float = 0.0, replay: int = 0) -> Answer:
     """What opening or reading session ``abc`` of surrogate ``pendulum`` gives: two lanes, two observation entries."""
     session = wire.SessionView(
         protocol=protocol,
@@ -84,6 +84,7 @@ def session_view(seq: int = 0, protocol: int = wire.PROTOCOL, delay: float = 0.0
         action_space=wire.BoxSpace(low=[-2.0], high=[2.0]),
         outputs=["angle", "reward"],
         idle_seconds=60.0,
+        replay=replay,
     )
     return reply(session.model_dump_json(), delay=delay)
 

@@ -6,18 +6,19 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Literal, Self, TypeVar, get_args
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Self, TypeVar, get_args
 
 import numpy as np
 
-from surrogym_client.errors import ProtocolMismatch, SessionLost, refused_here
+from surrogym_client.errors import ProtocolMismatch, SeqConflict, SessionLost, SurrogymClientError, refused_here
 from surrogym_client.transport import routes
 from surrogym_client.transport.api import Api, check_protocol, new_key
 from surrogym_client.transport.connection import Connection, Retries, Timeouts
 from surrogym_client.transport.replies import parse
 from surrogym_client.transport.step_codecs import UNREADABLE, BinaryForm, Form, JsonForm
 from surrogym_client.transport.stream import Stream, StreamLost, StreamUnavailable
+from surrogym_client.transport.window import Sent, Window, digest_of
 from surrogym_shared import wire
 from surrogym_shared.acting import ActingPolicy, NoiseKey, PolicyRun
 from surrogym_shared.codes import Code
@@ -30,6 +31,7 @@ __all__ = ["Api", "HttpSurrogate", "Retries", "Timeouts", "Transport"]
 Transport = Literal["auto", "stream", "binary", "json"]
 T = TypeVar("T")
 
+_RETURNS = 5  # how often a server may go back to a checkpoint during one request
 _UPGRADE_PAUSE_SECONDS = (
     60.0  # before the next attempt to open a stream, after one was refused or broke without an answer
 )
@@ -43,6 +45,7 @@ class _Live:
     shape: Shape
     seq: int
     stream: Stream
+    window: Window | None  # None: the server never goes back
 
 
 class HttpSurrogate:
@@ -205,10 +208,10 @@ class HttpSurrogate:
         """Send a request that changes the session, with the next sequence number. After an error, the number is used
         again."""
         live = self._live.get(session) or self._look_up(session)
-        content = write(live.seq + 1, live.shape)
-        attempt = self._attempt(live, what, content, timeout)
+        sent = Sent(live.seq + 1, what, write(live.seq + 1, live.shape), read, timeout)
+        result: T
         try:
-            seq, result = self.connection.persist(lambda: read(attempt(), live.shape))
+            answer, (seq, result) = self._answered(live, sent)
         except SessionLost:
             self._forget(session)
             raise
@@ -219,7 +222,49 @@ class HttpSurrogate:
             live.stream.close()
             raise ProtocolMismatch(f"expected the answer to seq {live.seq + 1} of {session}, got {seq}")
         live.seq = seq
+        if live.window is not None:
+            live.window.keep(replace(sent, digest=digest_of(answer)))
         return result
+
+    def _answered(self, live: _Live, sent: Sent) -> tuple[bytes, tuple[int, Any]]:
+        """Send a request until it is answered. If the server has gone back to a checkpoint, send those since then
+        first."""
+        if live.window is None:
+            return self._sent(live, sent)
+        window, returns = live.window, 0
+        while True:
+            try:
+                return self._sent(live, sent)
+            except SeqConflict as conflict:
+                behind = conflict.expected_seq
+                if behind is None or behind >= sent.seq or returns == _RETURNS:
+                    raise
+                returns += 1
+                with suppress(SeqConflict):  # it went back again: the next attempt says how far
+                    self._send_again(live, window, behind)
+
+    def _send_again(self, live: _Live, window: Window, behind: int) -> None:
+        """Send the requests from ``behind`` on again. Their answers must be the same, bit for bit."""
+        if (missing := window.since(behind)) is None:
+            raise self._given_up(live, f"went back to request {behind}, which this client no longer keeps")
+        for sent in missing:
+            answer, _ = self._sent(live, sent)
+            if digest_of(answer) != sent.digest:
+                raise self._given_up(live, f"answered request {sent.seq} in another way than before")
+
+    def _given_up(self, live: _Live, what: str) -> SurrogymClientError:
+        with suppress(SurrogymClientError):
+            self.connection.send("DELETE", live.route, retries=Retries(seconds=0))
+        return refused_here(Code.UNKNOWN_SESSION, f"the session lost its host, and the next one {what}: open a new one")
+
+    def _sent(self, live: _Live, sent: Sent) -> tuple[bytes, tuple[int, Any]]:
+        attempt = self._attempt(live, sent.what, sent.content, sent.timeout)
+
+        def once() -> tuple[bytes, tuple[int, Any]]:
+            answer = attempt()
+            return answer, sent.read(answer, live.shape)
+
+        return self.connection.persist(once)
 
     def _attempt(self, live: _Live, what: str, content: bytes, timeout: float) -> Callable[[], bytes]:
         """Return a function that sends the request once. The caller repeats it after a failure."""
@@ -270,7 +315,8 @@ class HttpSurrogate:
     def _know(self, view: wire.SessionView) -> _Live:
         route = routes.session(view.id)
         stream = self.connection.stream_to(f"{route}/stream")
-        self._live[view.id] = _Live(route, Shape.of(view), view.seq, stream)
+        window = Window(view.replay) if view.replay else None
+        self._live[view.id] = _Live(route, Shape.of(view), view.seq, stream, window)
         return self._live[view.id]
 
     def _forget(self, session: str) -> None:

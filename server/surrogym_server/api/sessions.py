@@ -48,7 +48,7 @@ SESSION_ERRORS = (Code.UNKNOWN_SESSION, Code.SESSION_EXPIRED, Code.INVALID_REQUE
 async def open_session(name: str, body: Annotated[OpenSession, example(examples.OPEN)], use: Use) -> SessionView:
     """N lanes with a seed, a variant and an autoreset mode. The reply names the spaces and the seed."""
     session = await use.sessions.open(name, convert.opening(body))
-    return convert.session_view(session, use.sessions.idle_seconds)
+    return convert.session_view(session, use.sessions.idle_seconds, use.sessions.replay)
 
 
 @router.get(
@@ -65,7 +65,7 @@ async def list_sessions(name: str, use: Use) -> SessionList:
 @router.get("/sessions/{id}", summary="One session", dependencies=[TRAIN], responses=documented(*SESSION_ERRORS))
 async def get_session(id: str, use: Use) -> SessionView:
     """Its settings, the last seq answered, and the model version of each lane."""
-    return convert.session_view(await use.sessions.get(id), use.sessions.idle_seconds)
+    return convert.session_view(await use.sessions.get(id), use.sessions.idle_seconds, use.sessions.replay)
 
 
 @router.get(

@@ -4,74 +4,119 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Awaitable, Sequence
+from contextlib import suppress
 from typing import Any, cast
 from zlib import crc32
 
 import ray
-from ray.exceptions import RayActorError, RayError
+from ray.exceptions import GetTimeoutError, RayActorError, RayError
 
 from surrogym_server.cluster.host import Refused
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import Advance, Array, Open, Reply, Restore, Saved, SessionInfo, Visited
+from surrogym_server.engine.session import digest_of
 from surrogym_server.engine.tallies import Counts, Durations, SessionActivity
-from surrogym_server.errors import Unavailable
+from surrogym_server.errors import IdempotencyConflict, Overloaded, Unavailable, UnknownSession
+from surrogym_server.storage.live_sessions import LiveSessions
 
-COUNTING_SECONDS = 10.0
+COUNTING_SECONDS, ANSWERING_SECONDS, TAKING_SECONDS = 10.0, 5.0, 60.0
+MOVES = 3  # of a session, within one request
+REMEMBERED = 10_000  # sessions that are elsewhere than their ids say
+
+
+class _Gone(Exception):
+    """A session host that has died, or does not answer."""
 
 
 class RayEngine(SessionEngine):
-    """Asks the host that has a session. The id of a session ends with the number of its host, so any front server
-    finds it; an opening under an idempotency key always goes to the same host.
+    """Asks the host that has a session. The id of a session ends with the number of the host that opened it. If that
+    host does not have it, the database says which one does. If its lease has ended, another host takes it over.
 
     Args:
         hosts: actor handles of ``SessionHost``, by number.
+        machines: the kind of machine of each host.
+        store: the records of sessions.
         idle_seconds: as the hosts have it.
+        lease_seconds: as the hosts have it.
     """
 
     lasting = True
+    replay = 10_000  # of those that a session takes in a second; a checkpoint may be some seconds old
 
-    def __init__(self, hosts: Sequence[Any], idle_seconds: float) -> None:
+    def __init__(
+        self,
+        hosts: Sequence[Any],
+        machines: Sequence[str],
+        store: LiveSessions,
+        idle_seconds: float,
+        lease_seconds: float,
+    ) -> None:
         self.idle_seconds = idle_seconds
         self._hosts = tuple(hosts)
+        self._machines = tuple(machines)
+        self._store = store
+        self._patience = lease_seconds / 2
         self._turns = itertools.count()
+        self._places: OrderedDict[str, int] = OrderedDict()
 
     async def open(self, request: Open) -> SessionInfo:
-        key = request.opening.key
-        turn = next(self._turns) if key is None else crc32(f"{request.surrogate}|{key}".encode())
-        return cast(SessionInfo, await self._ask(turn % len(self._hosts), "open", request))
+        key, turn = request.opening.key, next(self._turns)
+        if key is not None:
+            if (known := await asyncio.to_thread(self._store.opened, request.surrogate_id, key)) is not None:
+                if known[1] != digest_of("open", request.opening):
+                    raise IdempotencyConflict("this idempotency key opened a session with another body")
+                return await self.describe(known[0])
+            turn = crc32(f"{request.surrogate}|{key}".encode())
+        for host in self._in_turn(turn):
+            if await self._lives(host):
+                return cast(SessionInfo, await self._reply(host, "open", request))
+        raise Unavailable("no session host answers now: try again later")
 
     async def advance(self, request: Advance) -> Reply:
-        return cast(Reply, await self._ask(self._host_of(request.session), "advance", request))
+        return cast(Reply, await self._of(request.session, "advance", request))
 
     async def describe(self, session: str) -> SessionInfo:
-        return cast(SessionInfo, await self._ask(self._host_of(session), "describe", session))
+        return cast(SessionInfo, await self._of(session, "describe", session))
 
     async def coordinates(self, session: str) -> Array:
-        return cast(Array, await self._ask(self._host_of(session), "coordinates", session))
+        return cast(Array, await self._of(session, "coordinates", session))
 
     async def submit(self, session: str) -> Visited:
-        return cast(Visited, await self._ask(self._host_of(session), "submit", session))
+        return cast(Visited, await self._of(session, "submit", session))
 
     async def close(self, session: str) -> None:
-        await self._ask(self._host_of(session), "close", session)
+        holder = await asyncio.to_thread(self._store.holder, session)
+        await asyncio.to_thread(self._store.remove, session)
+        self._places.pop(session, None)
+        with suppress(Unavailable, TimeoutError):  # a host that does not answer now finds the record gone
+            async with asyncio.timeout(ANSWERING_SECONDS):
+                await self._reply(_number(holder.owner) if holder else self._place(session), "close", session)
 
     async def forget(self, surrogate: int) -> None:
+        await asyncio.to_thread(self._store.remove_all_of, surrogate)
         await self._ask_all("forget", surrogate)
 
     async def activity(self, surrogate: str) -> list[SessionActivity]:
         return [one for of_host in await self._ask_all("activity", surrogate) for one in of_host]
 
     def counts(self) -> Counts:
-        try:
-            found: list[Counts] = ray.get([host.counts.remote() for host in self._hosts], timeout=COUNTING_SECONDS)
-        except RayError as error:
-            raise Unavailable("a session host does not answer now: try again later") from error
+        """Of the hosts that answer."""
+        asked = [host.counts.remote() for host in self._hosts]
+        found: list[Counts] = []
+        for answer in asked:
+            try:
+                found.append(ray.get(answer, timeout=COUNTING_SECONDS))
+            except GetTimeoutError as error:
+                raise Unavailable("a session host does not answer now: try again later") from error
+            except RayError:  # it has died, and holds nothing
+                continue
         return _together(found)
 
     async def sweep(self) -> None:
         await self._ask_all("sweep")
+        await asyncio.to_thread(self._store.sweep, self.idle_seconds)
 
     async def start(self) -> None:
         """The hosts have started."""
@@ -83,25 +128,119 @@ class RayEngine(SessionEngine):
         return [one for of_host in await self._ask_all("save") for one in of_host]
 
     async def restore(self, request: Restore) -> None:
-        await self._ask(self._host_of(request.saved.id), "restore", request)
+        await self._reply(self._place(request.saved.id), "restore", request)
 
-    def _host_of(self, session: str) -> int:
+    async def _of(self, session: str, operation: str, *arguments: Any) -> Any:
+        """The reply of the host that has a session, wherever it is now."""
+        host = self._place(session)
+        for _ in range(MOVES):
+            try:
+                return await self._answer(session, host, operation, *arguments)
+            except (UnknownSession, _Gone) as error:
+                host = await self._moved(session, host, error)
+        raise Unavailable(f"session {session!r} changes its host: try again later")
+
+    def _place(self, session: str) -> int:
+        if (known := self._places.get(session)) is not None:
+            return known
         number = session.rpartition(".")[2]
         if number.isascii() and number.isdigit() and len(number) <= 4 and int(number) < len(self._hosts):
             return int(number)
         return crc32(session.encode()) % len(self._hosts)  # of one that was saved by another engine
 
-    async def _ask(self, host: int, operation: str, *arguments: Any) -> Any:
+    async def _moved(self, session: str, asked: int, error: Exception) -> int:
+        """The host that has a session which the asked one doesn't have."""
+        holder = await asyncio.to_thread(self._store.holder, session)
+        if holder is None:
+            self._places.pop(session, None)
+            unknown = UnknownSession(f"no session {session!r}: open a new one")
+            raise error if isinstance(error, UnknownSession) else unknown
+        if holder.seconds_left <= 0:
+            return self._remember(session, await self._taken(session, asked, holder.machine))
+        if (host := _number(holder.owner)) == asked:
+            raise Unavailable(
+                f"session host {host} has ended, and another one takes session {session!r} in "
+                f"{holder.seconds_left:.1f} s: try again later"
+            )
+        return self._remember(session, host)
+
+    async def _taken(self, session: str, asked: int, machine: str) -> int:
+        """The host that has taken a session whose lease has ended."""
+        alike = [host for host in self._in_turn(asked + 1) if self._machines[host] == machine]
+        if not alike:
+            await asyncio.to_thread(self._store.remove, session)
+            raise UnknownSession(
+                f"session {session!r} was lost with its session host: no host of the same kind of machine is left, and "
+                "another rounds differently; open a new one"
+            )
+        for host in alike:
+            if not await self._lives(host):
+                continue
+            with suppress(Overloaded, TimeoutError):
+                async with asyncio.timeout(TAKING_SECONDS):
+                    await self._reply(host, "take", session)
+                return host
+        raise Unavailable(f"no session host can take session {session!r} now: try again later")
+
+    def _in_turn(self, first: int) -> list[int]:
+        return [(first + offset) % len(self._hosts) for offset in range(len(self._hosts))]
+
+    def _remember(self, session: str, host: int) -> int:
+        self._places[session] = host
+        self._places.move_to_end(session)
+        while len(self._places) > REMEMBERED:
+            self._places.popitem(last=False)
+        return host
+
+    async def _lives(self, host: int) -> bool:
+        """Whether a host answers at all; one that was stopped by a signal does not."""
         try:
-            reply = await cast(Awaitable[Any], self._hosts[host].ask.remote(operation, *arguments))
+            async with asyncio.timeout(ANSWERING_SECONDS):
+                await cast(Awaitable[None], self._hosts[host].ping.remote())
+        except (RayActorError, TimeoutError):
+            return False
+        return True
+
+    async def _answer(self, session: str, host: int, operation: str, *arguments: Any) -> Any:
+        """A host's reply; it is waited for as long as the session is that host's. Raises ``_Gone``, and as the host."""
+        asked = self._hosts[host].ask.remote(operation, *arguments)
+        while True:
+            try:
+                async with asyncio.timeout(self._patience):
+                    return _said(await cast(Awaitable[Any], asked))
+            except RayActorError as error:
+                raise _Gone from error
+            except TimeoutError:
+                holder = await asyncio.to_thread(self._store.holder, session)
+                if holder is None or holder.seconds_left <= 0 or _number(holder.owner) != host:
+                    raise _Gone from None
+
+    async def _reply(self, host: int, operation: str, *arguments: Any) -> Any:
+        try:
+            return _said(await cast(Awaitable[Any], self._hosts[host].ask.remote(operation, *arguments)))
         except RayActorError as error:
             raise Unavailable(f"session host {host} has ended and is started again: try again later") from error
-        if isinstance(reply, Refused):
-            raise reply.error
-        return reply
 
     async def _ask_all(self, operation: str, *arguments: Any) -> list[Any]:
-        return await asyncio.gather(*(self._ask(host, operation, *arguments) for host in range(len(self._hosts))))
+        """The replies of all hosts that answer."""
+        replies = await asyncio.gather(*(self._asked(host, operation, *arguments) for host in range(len(self._hosts))))
+        return [reply for reply in replies if not isinstance(reply, _Gone)]
+
+    async def _asked(self, host: int, operation: str, *arguments: Any) -> Any:
+        if not await self._lives(host):
+            return _Gone()
+        return await self._reply(host, operation, *arguments)
+
+
+def _number(owner: str) -> int:
+    """Of the host that an owner of leases is."""
+    return int(owner.partition(" ")[0])
+
+
+def _said(reply: Any) -> Any:
+    if isinstance(reply, Refused):
+        raise reply.error
+    return reply
 
 
 def _together(found: Sequence[Counts]) -> Counts:

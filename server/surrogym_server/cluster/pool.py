@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 from collections.abc import Sequence
 from dataclasses import fields
@@ -10,10 +11,13 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from surrogym_server.cluster.host import HostSettings, SessionHost, versions
+from surrogym_server.cluster.host import HostInfo, HostSettings, SessionHost, versions
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.errors import InvalidInput, Unavailable
 from surrogym_server.settings import Settings
+from surrogym_server.storage.live_sessions import LiveSessions
+
+logger = logging.getLogger(__name__)
 
 NAMESPACE = "surrogym"
 STARTING_SECONDS, KNOCKING_SECONDS = 180.0, 10.0
@@ -30,8 +34,12 @@ def check(settings: Settings) -> None:
         )
 
 
-def connect(settings: Settings) -> SessionEngine:
+def connect(settings: Settings, store: LiveSessions) -> SessionEngine:
     """The engine of the cluster at ``ray_address``, once all hosts are ready.
+
+    Args:
+        settings: of this server.
+        store: the records of sessions, in the same database.
 
     Raises:
         InvalidInput: as ``check``; no cluster there; or one of other versions or other settings.
@@ -53,7 +61,7 @@ def connect(settings: Settings) -> SessionEngine:
         if "ersion mismatch" in said:
             raise InvalidInput(f"engine ray: expected a cluster of the same versions: {said}") from error
         raise Unavailable(f"engine ray: the cluster can't be used: {said}") from error
-    return _of_hosts(HostSettings.of(settings))
+    return _of_hosts(HostSettings.of(settings), store)
 
 
 def _knock(address: str) -> None:
@@ -69,24 +77,26 @@ def _knock(address: str) -> None:
         raise InvalidInput(f"engine ray: expected a cluster at {address!r}, got none: {error}") from error
 
 
-def _of_hosts(wanted: HostSettings) -> SessionEngine:
+def _of_hosts(wanted: HostSettings, store: LiveSessions) -> SessionEngine:
     from surrogym_server.cluster.engine import RayEngine
 
     pool = pool_name(wanted.database)
     first = _host(pool, 0, wanted)
     _require_same(wanted, _about([first], wanted))  # before any other is started
     hosts = [first, *(_host(pool, number, wanted) for number in range(1, wanted.hosts))]
-    _require_same(wanted, _about(hosts, wanted))
-    return RayEngine(hosts, wanted.idle_seconds)
+    found = _about(hosts, wanted)
+    _require_same(wanted, found)
+    for number, host in enumerate(found):
+        logger.info("session host %d: process %d on %s", number, host.pid, host.node)
+    machines = [host.machine for host in found]
+    return RayEngine(hosts, machines, store, wanted.idle_seconds, wanted.pace.lease_seconds)
 
 
-def _about(hosts: Sequence[Any], wanted: HostSettings) -> list[tuple[HostSettings, dict[str, str]]]:
+def _about(hosts: Sequence[Any], wanted: HostSettings) -> list[HostInfo]:
     import ray
 
     try:
-        found: list[tuple[HostSettings, dict[str, str]]] = ray.get(
-            [host.about.remote() for host in hosts], timeout=STARTING_SECONDS
-        )
+        found: list[HostInfo] = ray.get([host.about.remote() for host in hosts], timeout=STARTING_SECONDS)
     except ray.exceptions.GetTimeoutError as error:
         raise Unavailable(
             f"engine ray: expected {wanted.hosts} session hosts within {STARTING_SECONDS:g} s, got fewer: each takes "
@@ -119,16 +129,16 @@ def _host(pool: str, number: int, settings: HostSettings) -> Any:
     return ray.remote(SessionHost).options(**options).remote(settings, number)
 
 
-def _require_same(wanted: HostSettings, found: Sequence[tuple[HostSettings, dict[str, str]]]) -> None:
+def _require_same(wanted: HostSettings, found: Sequence[HostInfo]) -> None:
     mine = versions()
-    for settings, running in found:
-        for name, theirs in running.items():
+    for host in found:
+        for name, theirs in host.versions.items():
             if theirs != mine.get(name):
                 raise InvalidInput(
                     f"engine ray: expected {name} {theirs}, which the session hosts run, got {name} {mine.get(name)}"
                 )
         for field in fields(HostSettings):
-            theirs, ours = getattr(settings, field.name), getattr(wanted, field.name)
+            theirs, ours = getattr(host.settings, field.name), getattr(wanted, field.name)
             if theirs != ours:
                 told = f"{theirs}, got {ours}" if field.repr else "another one"
                 raise InvalidInput(

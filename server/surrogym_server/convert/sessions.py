@@ -49,7 +49,7 @@ def opening(request: replies.OpenSession) -> Opening:
     )
 
 
-def session_view(session: SessionInfo, idle_seconds: float) -> replies.SessionView:
+def session_view(session: SessionInfo, idle_seconds: float, replay: int = 0) -> replies.SessionView:
     return replies.SessionView(
         id=session.id,
         surrogate=session.surrogate,
@@ -66,6 +66,7 @@ def session_view(session: SessionInfo, idle_seconds: float) -> replies.SessionVi
         action_space=_action_space(session.definition.action),
         outputs=list(session.definition.outputs),
         idle_seconds=idle_seconds,
+        replay=replay,
     )
 
 

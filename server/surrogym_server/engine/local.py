@@ -134,7 +134,19 @@ class LocalEngine(SessionEngine):
         return await asyncio.to_thread(self._visited, found, states)
 
     async def close(self, session: str) -> None:
+        self.end(session)
+
+    def end(self, session: str) -> None:
+        """As ``close``, in this call."""
         self._live.close(session)
+
+    def session(self, id: str) -> Session:
+        """A session as it is now, which never changes. Raises ``UnknownSession`` or ``SessionExpired``."""
+        return self._live.get(id)
+
+    def sessions(self) -> list[Session]:
+        """All sessions as they are now."""
+        return list(self._live)
 
     async def forget(self, surrogate: int) -> None:
         self._live.close_all_of(surrogate)

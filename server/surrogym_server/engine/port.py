@@ -36,6 +36,7 @@ class SessionEngine(ABC):
 
     idle_seconds: float  # a session without requests for this long expires
     lasting: bool = False  # whether sessions outlive this process, and other processes can use them
+    replay: int = 0  # how many of its last requests a client should keep: a session may go back to a checkpoint
 
     @abstractmethod
     async def open(self, request: Open) -> SessionInfo:

@@ -118,6 +118,7 @@ class SessionInfo:
     model: WantedVersion
     versions: Versions  # (N,) the model each lane's episode runs under
     seq: int  # the last one answered
+    behind: bool = False  # at a checkpoint, and its client has to send the requests since then again
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import Array, Open, Opening, Restore, SampledRewards, Saved, SessionInfo
 from surrogym_server.engine.tallies import SessionActivity
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.errors import Damaged, SurrogymError
+from surrogym_server.errors import Damaged, SurrogymError, UnknownSession
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import SavedSession
@@ -30,13 +30,21 @@ class SessionService:
     def idle_seconds(self) -> float:
         return self._engine.idle_seconds
 
+    @property
+    def replay(self) -> int:
+        """How many of its last requests a client should keep."""
+        return self._engine.replay
+
     async def open(self, surrogate: str, opening: Opening) -> SessionInfo:
         """Open a session; raises ``UnknownSurrogate``, and as ``SessionEngine.open``."""
         return await self._engine.open(await asyncio.to_thread(self._asked, surrogate, opening))
 
     async def get(self, id: str) -> SessionInfo:
-        """Raises ``UnknownSession`` or ``SessionExpired``."""
-        return await self._engine.describe(id)
+        """Raises ``UnknownSession`` or ``SessionExpired``; the former also while a session is behind its last reply."""
+        info = await self._engine.describe(id)
+        if info.behind:  # whoever reads its seq here has no requests to send again
+            raise UnknownSession(f"session {id!r} lost its session host, and is behind its last reply: open a new one")
+        return info
 
     async def coordinates(self, id: str) -> Array:
         """The coordinates of all lanes, (N, C). Raises ``UnknownSession`` or ``SessionExpired``."""

@@ -117,6 +117,11 @@ class SessionView(Reply):
     action_space: ActionSpace
     outputs: list[str] = Field(description="what the model predicts, in the order of a step's deviations")
     idle_seconds: float = Field(description="the session expires when unused for so long")
+    replay: int = Field(
+        default=0,
+        description="how many of its last requests a client should keep: after a crash the server may wait for a lower "
+        "seq than the client's next one, and the client sends the requests from there again; 0: never",
+    )
 
 
 class SessionActivity(Reply):

@@ -4,49 +4,48 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Iterator
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from support.postgresql import running_postgresql
 from support.server import running_server
 from surrogym_client.original import classic
 from surrogym_client.transport import HttpSurrogate
 from surrogym_server.cluster import pool
+from surrogym_server.cluster.host import Refused
 from surrogym_server.convert import stored_definition
-from surrogym_server.engine.design_job import DesignJob, run_design_job
 from surrogym_server.engine.port import SessionEngine
-from surrogym_server.environment.samples import Samples
-from surrogym_server.errors import InvalidInput, Unavailable, UnknownSession
+from surrogym_server.engine.requests import Advance, Reply, Reset
+from surrogym_server.errors import InvalidInput, SeqConflict, Unavailable
 from surrogym_server.settings import Settings
-from surrogym_server.storage.records import NewModel, NewSurrogate
+from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import open_storage
 from surrogym_server.testing import LAWS_OF_ENGINES, EngineCase
 from surrogym_shared.wire import OpenSession
 
 ray = pytest.importorskip("ray")
 
-NAME, HOSTS = "pendulum", 2
+NAME, HOSTS, LEASE = "pendulum", 2, 2.0
 
 pytestmark = [pytest.mark.postgresql, pytest.mark.timeout(600), pytest.mark.filterwarnings("ignore::FutureWarning:ray")]
 
 
 @pytest.fixture(scope="module")
-def database(pendulum_samples: Samples) -> Iterator[str]:
+def database(fill: Callable[[Storage], int]) -> Iterator[str]:
     """A PostgreSQL with one surrogate that has a model."""
-    spec, samples = classic.pendulum(), pendulum_samples
-    arrays = (samples.q, samples.u, samples.q_next, samples.reward, samples.terminated)
-    job = DesignJob(stored_definition(spec), *(a.numpy() for a in arrays), state={}, budget=len(samples), target=0.999)
-    done = run_design_job(job)
     with running_postgresql() as postgresql:
         url = postgresql.new_database()
         storage = open_storage(url)
-        storage.surrogates.create(NewSurrogate(NAME, spec.model_dump(mode="json"), len(samples), 0.999))
-        model = NewModel(len(samples), done.data_hash, done.fidelity, done.description, 0.0, done.model)
-        storage.models.add(NAME, model)
+        fill(storage)
         storage.close()
         yield url
 
@@ -61,51 +60,115 @@ def address() -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def engine(database: str, address: str) -> SessionEngine:
-    return pool.connect(Settings(database=database, engine="ray", ray_address=address, ray_hosts=HOSTS))
+def storage(database: str) -> Iterator[Storage]:
+    opened = open_storage(database)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(scope="module")
+def settings(database: str, address: str) -> Settings:
+    fast = {"ray_lease_seconds": LEASE, "ray_checkpoint_seconds": 0.1}
+    return Settings.model_validate({"database": database, "engine": "ray", "ray_address": address, **fast})
+
+
+@pytest.fixture(scope="module")
+def engine(settings: Settings, storage: Storage) -> SessionEngine:
+    return pool.connect(settings, storage.live_sessions)
+
+
+@pytest.fixture
+def case(engine: SessionEngine, storage: Storage) -> EngineCase:
+    return EngineCase(engine, NAME, storage.surrogates.get(NAME).id, stored_definition(classic.pendulum()))
 
 
 @pytest.mark.parametrize("law", LAWS_OF_ENGINES, ids=lambda law: law.__name__)
-def test_the_engine_of_a_cluster_keeps_the_laws(law, engine: SessionEngine, database: str):
-    storage = open_storage(database)
-    surrogate = storage.surrogates.get(NAME).id
-    storage.close()
-    asyncio.run(law(EngineCase(engine, NAME, surrogate, stored_definition(classic.pendulum()))))
+def test_the_engine_of_a_cluster_keeps_the_laws(law, case: EngineCase):
+    asyncio.run(law(case))
 
 
-def test_sessions_of_a_host_that_died_are_unknown_and_new_ones_open(engine: SessionEngine, database: str):
-    """Never silently: a step is refused, and the trainer ends its episodes and opens a new session."""
-    storage = open_storage(database)
-    case = EngineCase(engine, NAME, storage.surrogates.get(NAME).id, stored_definition(classic.pendulum()))
-    storage.close()
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_session_goes_on_at_another_host_when_its_own_died_or_stopped(
+    how: signal.Signals, case: EngineCase, storage: Storage, database: str
+):
+    """What was done since the last checkpoint is asked for again. A host that wakes has lost the session."""
 
-    async def killed() -> None:
-        lost = await case.opened(key="on one host")
-        number = int(lost.rpartition(".")[2])
-        ray.kill(ray.get_actor(f"session host {number} of {pool.pool_name(database)}"), no_restart=False)
-        async with asyncio.timeout(300):
-            while True:
-                try:
-                    await engine.advance(case.steps(lost)[0])
-                except Unavailable:
-                    await asyncio.sleep(0.1)
-                except UnknownSession:
-                    break
-        again = await case.opened(key="on one host")
-        assert again != lost
-        assert again.rpartition(".")[2] == str(number)
-        assert (await engine.advance(case.steps(again)[0])).seq == 2
+    async def moved() -> None:
+        session = await case.opened()
+        requests: list[Advance] = [Reset(session, 1), *case.steps(session)]
+        before = [await case.engine.advance(request) for request in requests[:7]][1:]
+        number = int(session.rpartition(".")[2])
+        [died] = [host for host in await about(database) if host.number == number]
+        os.kill(died.pid, how)
+        await replayed(case, requests[:8])
+        holder = storage.live_sessions.holder(session)
+        assert holder is not None
+        assert not holder.owner.startswith(f"{number} ")
+        after = [await case.engine.advance(request) for request in requests[7:]]
+        if how is signal.SIGSTOP:
+            os.kill(died.pid, signal.SIGCONT)
+            late = await died.handle.ask.remote("advance", requests[-1])
+            assert isinstance(late, Refused)
+        await about(database)
+        expected = [await case.engine.advance(request) for request in case.steps(await case.opened())]
+        assert [step_of(reply) for reply in (*before, *after)] == [step_of(reply) for reply in expected]
 
-    asyncio.run(killed())
+    asyncio.run(moved())
+
+
+@dataclass(frozen=True)
+class Found:
+    number: int
+    pid: int
+    handle: Any
+
+
+async def about(database: str) -> list[Found]:
+    """The hosts of the pool, once all of them run."""
+    names = [f"session host {number} of {pool.pool_name(database)}" for number in range(HOSTS)]
+    handles = [ray.get_actor(name) for name in names]
+    async with asyncio.timeout(300):
+        while True:
+            with suppress(ray.exceptions.RayActorError):
+                infos = await asyncio.gather(*(handle.about.remote() for handle in handles))
+                return [Found(n, info.pid, handles[n]) for n, info in enumerate(infos)]
+            await asyncio.sleep(0.1)
+
+
+async def until_answered(case: EngineCase, request: Advance) -> Reply:
+    async with asyncio.timeout(300):
+        while True:
+            with suppress(Unavailable):
+                return await case.engine.advance(request)
+            await asyncio.sleep(0.1)
+
+
+async def replayed(case: EngineCase, requests: list[Advance]) -> None:
+    """Send the last request; where the session is behind, the ones before it again, as a client does."""
+    try:
+        await until_answered(case, requests[-1])
+    except SeqConflict as conflict:
+        for request in requests[conflict.expected - 1 :]:
+            await until_answered(case, request)
+
+
+def step_of(reply: Reply) -> tuple[object, ...]:
+    assert isinstance(reply.outcome, tuple)
+    [step] = reply.outcome
+    return reply.seq, step.observation.tobytes(), step.reward.tobytes(), step.terminated.tobytes()
 
 
 @pytest.mark.long
 def test_any_front_server_goes_on_with_a_session(database: str, address: str, engine: SessionEngine, tmp_path: Path):
     options = ("--database", database, "--engine", "ray", "--ray-address", address)
+    environment = {"SURROGYM_RAY_LEASE_SECONDS": str(LEASE), "SURROGYM_RAY_CHECKPOINT_SECONDS": "0.1"}
     folders = [tmp_path / name for name in ("first", "second")]
     for folder in folders:
         folder.mkdir()
-    with running_server(folders[0], *options) as first, running_server(folders[1], *options) as second:
+    with (
+        running_server(folders[0], *options, **environment) as first,
+        running_server(folders[1], *options, **environment) as second,
+    ):
         urls, action = (first.url, second.url), np.full((2, 1), 0.5)
         with HttpSurrogate(urls[0], NAME, transport="stream") as port:
             alone = port.open(OpenSession(num_envs=2, seed=0)).id
@@ -127,6 +190,39 @@ def test_any_front_server_goes_on_with_a_session(database: str, address: str, en
             client.close()
 
 
+@pytest.mark.long
+def test_a_client_goes_on_bit_for_bit_while_hosts_are_killed(
+    database: str, address: str, engine: SessionEngine, tmp_path: Path
+):
+    """Over the stream, and by frames over HTTP: the client sends its last requests again by itself."""
+    options = ("--database", database, "--engine", "ray", "--ray-address", address)
+    environment = {"SURROGYM_RAY_LEASE_SECONDS": str(LEASE), "SURROGYM_RAY_CHECKPOINT_SECONDS": "0.1"}
+    actions = np.random.default_rng(0).uniform(-2, 2, (400, 2, 1))
+    with running_server(tmp_path, *options, **environment) as server:
+        for transport in ("stream", "binary"):
+            with HttpSurrogate(server.url, NAME, transport=transport) as port:
+                found = [walked(port, actions), walked(port, actions, {120: database, 250: database})]
+            np.testing.assert_array_equal(found[0], found[1])
+
+
+def walked(port: HttpSurrogate, actions: NDArray[np.float64], kills: dict[int, str] | None = None) -> list[Any]:
+    """Observations of a new session's steps; before some of them its host is killed."""
+    session = port.open(OpenSession(num_envs=2, seed=0)).id
+    observations = [port.reset(session).observation]
+    for number, action in enumerate(actions):
+        if database := (kills or {}).get(number):
+            storage = open_storage(database)
+            holder = storage.live_sessions.holder(session)
+            storage.close()
+            assert holder is not None
+            owner = int(holder.owner.partition(" ")[0])
+            [host] = [one for one in asyncio.run(about(database)) if one.number == owner]
+            os.kill(host.pid, signal.SIGKILL)
+        observations.append(port.step(session, action).observation)
+    port.close(session)
+    return observations
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -138,20 +234,19 @@ def test_any_front_server_goes_on_with_a_session(database: str, address: str, en
     ],
 )
 def test_what_can_not_serve_a_cluster_is_one_sentence(
-    database: str, address: str, engine: SessionEngine, options: dict[str, object], said: str
+    settings: Settings, engine: SessionEngine, storage: Storage, options: dict[str, object], said: str
 ):
-    settings = Settings.model_validate({"database": database, "engine": "ray", "ray_address": address} | options)
     with pytest.raises(InvalidInput, match=said) as refused:
-        pool.connect(settings)
+        pool.connect(Settings.model_validate(settings.model_dump() | options), storage.live_sessions)
     assert "\n" not in str(refused.value)
 
 
 def test_other_versions_than_the_hosts_run_are_refused(
-    database: str, address: str, engine: SessionEngine, monkeypatch: pytest.MonkeyPatch
+    settings: Settings, engine: SessionEngine, storage: Storage, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(pool, "versions", lambda: {"Python": "2.7"})
     with pytest.raises(InvalidInput, match=r"expected Python 3\..*, which the session hosts run, got Python 2\.7"):
-        pool.connect(Settings(database=database, engine="ray", ray_address=address, ray_hosts=HOSTS))
+        pool.connect(settings, storage.live_sessions)
 
 
 def test_without_ray_one_sentence_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch):

@@ -1,0 +1,32 @@
+"""What the last bits of a step depend on, beside program and versions."""
+
+from __future__ import annotations
+
+import platform
+from pathlib import Path
+from zlib import crc32
+
+import torch
+
+PROCESSORS = Path("/proc/cpuinfo")
+NAMES = ("model name", "flags", "Features")
+
+
+def machine_kind(device: str, threads: int) -> str:
+    """The kind of processor, the number of threads of one operation, and the device.
+
+    Sums are added in another order, or rounded differently, where one of these differs.
+    """
+    parts = [platform.machine(), _processor(), f"threads {threads}"]
+    return ", ".join([*parts, torch.cuda.get_device_name() if device == "cuda" else device])
+
+
+def _processor() -> str:
+    """Name of the first processor, and a digest of what it can do."""
+    try:
+        lines = PROCESSORS.read_text().split("\n\n")[0].splitlines()
+    except OSError:
+        return platform.processor()
+    told = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+    name, *abilities = (told.get(name, "") for name in NAMES)
+    return f"{name} {crc32(' '.join(abilities).encode()):08x}"
