@@ -228,7 +228,8 @@ def _build_process(
         idle_seconds=settings.session_idle_seconds,
         device=torch.device(settings.device),
     )
-    return _Process(storage, definitions, models, engine, Fits(design.run, settings.fit_workers), Notices(), metrics)
+    notices = Notices(storage.announcements)
+    return _Process(storage, definitions, models, engine, Fits(design.run, settings.fit_workers), notices, metrics)
 
 
 def _build_services(settings: Settings, design: DesignPort, process: _Process) -> Services:

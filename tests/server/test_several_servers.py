@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from support import pendulum
-from support.postgresql import running_postgresql
+from support.postgresql import Postgresql, running_postgresql
 from support.server import ServerProcess, running_server
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.services import queries
+from surrogym_server.services.definitions import Definitions
+from surrogym_server.services.notices import Notices
+from surrogym_server.services.queries import QueryService
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import NewSurrogate
+from surrogym_server.storage.sql import open_storage
+from surrogym_shared.spec import EnvironmentSpec
 
 SECONDS = 60.0
 
@@ -20,12 +31,17 @@ pytestmark = pytest.mark.postgresql
 
 
 @pytest.fixture(scope="module")
-def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[ServerProcess]]:
+def postgresql() -> Iterator[Postgresql]:
+    with running_postgresql() as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def servers(postgresql: Postgresql, tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[ServerProcess]]:
     folders: list[Path] = [tmp_path_factory.mktemp(name) for name in ("first", "second")]
-    with running_postgresql() as postgresql:
-        options = ("--database", postgresql.new_database())
-        with running_server(folders[0], *options) as first, running_server(folders[1], *options) as second:
-            yield [first, second]
+    options = ("--database", postgresql.new_database())
+    with running_server(folders[0], *options) as first, running_server(folders[1], *options) as second:
+        yield [first, second]
 
 
 @pytest.fixture
@@ -84,3 +100,36 @@ def test_a_surrogate_deleted_and_made_anew_elsewhere_is_another_one(clients: lis
         time.sleep(0.1)
     assert reply.status_code == 404
     assert version(second, opened(second, "renewed")) >= 1
+
+
+def test_a_claim_that_waits_at_one_server_wakes_for_a_query_of_another(
+    postgresql: Postgresql, monkeypatch: pytest.MonkeyPatch
+):
+    """By an announcement alone: the look from time to time is put off."""
+    monkeypatch.setattr(queries, "POLL_SECONDS", 3_600.0)
+    url = postgresql.new_database()
+    storages = [open_storage(url) for _ in range(2)]
+    spec = EnvironmentSpec.model_validate(pendulum.spec()).model_dump(mode="json")
+    storages[0].surrogates.create(NewSurrogate("waited", spec, 10, 0.999))
+
+    async def woken() -> int:
+        definitions = Definitions(storages[0], lambda read: definition_from_spec(EnvironmentSpec.model_validate(read)))
+        here, there = (QueryService(one, definitions, Notices(one.announcements)) for one in storages)
+        waiting = asyncio.create_task(here.claim("waited", "sampler", 1, 60, SECONDS))
+        while not (waiting.done() or listening(storages[0])):
+            await asyncio.sleep(0.01)
+        await asyncio.sleep(0.1)  # it looks once, and then waits
+        await asyncio.to_thread(there.add, "waited", np.zeros((1, 2)), np.zeros((1, 1)), None)
+        return len((await asyncio.wait_for(waiting, SECONDS / 2)).queries)
+
+    try:
+        assert asyncio.run(woken()) == 1
+    finally:
+        for storage in storages:
+            storage.close()
+
+
+def listening(storage: Storage) -> bool:
+    wanted = "SELECT 1 FROM pg_stat_activity WHERE starts_with(query, 'LISTEN') AND datname = current_database()"
+    with storage._database.read() as connection:  # type: ignore[attr-defined]
+        return len(connection.exec_driver_sql(wanted).all()) == 2

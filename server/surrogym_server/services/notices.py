@@ -1,4 +1,4 @@
-"""Wake-ups between the services of one process: something happened to a surrogate."""
+"""Wake-ups in one process, and between the servers of one database: something happened to a surrogate."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import chain
+
+from surrogym_server.storage.announcements import Alone, Announcements
 
 
 class Listener:
@@ -29,24 +31,29 @@ class Listener:
 
 
 class Notices:
-    """Listeners by surrogate. ``post`` may be called from any thread, the rest from the event loop's."""
+    """Listeners by surrogate. ``post`` may be called from any thread, the rest from the event loop's.
 
-    def __init__(self) -> None:
+    Args:
+        announcements: of the database, which carry notices between its servers.
+    """
+
+    def __init__(self, announcements: Announcements | None = None) -> None:
+        self._announcements = announcements or Alone()
         self._loop = asyncio.get_running_loop()
         self._listeners: defaultdict[str, set[Listener]] = defaultdict(set)
         self._everything: set[Listener] = set()
         self.closing = False
+        self._announcements.listen(self._hear)
 
     def post(self, surrogate: str) -> None:
-        """Wake all who listen to a surrogate, and those who listen to all."""
-        with suppress(RuntimeError):  # the loop has ended, and nobody listens any more
-            self._loop.call_soon_threadsafe(self._wake, surrogate)
+        """Wake all who listen to a surrogate, and those who listen to all, in every server of the database."""
+        self._hear(surrogate)
+        self._announcements.announce(surrogate)
 
     def close(self) -> None:
         """Wake everybody for good, because the server ends."""
         self.closing = True
-        for listener in (*self._everything, *chain.from_iterable(self._listeners.values())):
-            listener.wake()
+        self._wake_all()
 
     @contextmanager
     def listen(self, surrogate: str | None = None) -> Iterator[Listener]:
@@ -60,6 +67,18 @@ class Notices:
             listeners.discard(listener)
             if surrogate is not None and not listeners:
                 self._listeners.pop(surrogate, None)
+
+    def _hear(self, surrogate: str | None) -> None:
+        """Wake in this process; None wakes everybody, as notices may have been missed."""
+        with suppress(RuntimeError):  # the loop has ended, and nobody listens any more
+            if surrogate is None:
+                self._loop.call_soon_threadsafe(self._wake_all)
+            else:
+                self._loop.call_soon_threadsafe(self._wake, surrogate)
+
+    def _wake_all(self) -> None:
+        for listener in (*self._everything, *chain.from_iterable(self._listeners.values())):
+            listener.wake()
 
     def _wake(self, surrogate: str) -> None:
         for listener in (*self._listeners.get(surrogate, ()), *self._everything):

@@ -20,7 +20,7 @@ from surrogym_server.storage.records import LeasedQuery, Phase, Purpose, QueryRe
 Array = NDArray[np.float64]
 
 NO_STEPS = (np.zeros((0, 0)), np.zeros((0, 0)))
-POLL_SECONDS = 2.0  # notices cross no process border, so another server's queries are found by looking
+POLL_SECONDS = 2.0  # a notice of another server may be lost, so its queries are also found by looking
 FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "from_log", "failed")
 
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
+from surrogym_server.storage.announcements import Announcements
 from surrogym_server.storage.jobs import Jobs
 from surrogym_server.storage.live_sessions import LiveSessions
 from surrogym_server.storage.policies import Blobs, Policies
@@ -419,6 +420,7 @@ class Storage(ABC):
     events: Events
     policies: Policies
     blobs: Blobs
+    announcements: Announcements
     jobs: Jobs
 
     @abstractmethod

@@ -7,6 +7,7 @@ import asyncio
 import pytest
 
 from surrogym_server.services.notices import Notices
+from surrogym_server.storage.announcements import Announcements, Hear
 
 PATIENCE = 60.0
 
@@ -63,3 +64,36 @@ def test_a_notice_after_the_end_of_the_loop_is_harmless():
         return Notices()
 
     asyncio.run(make()).post("a")
+
+
+class Told(Announcements):
+    """Notes what is announced, and lets a test speak for the other servers."""
+
+    def __init__(self) -> None:
+        self.announced: list[str] = []
+        self.hear: Hear | None = None
+
+    def announce(self, surrogate: str) -> None:
+        self.announced.append(surrogate)
+
+    def listen(self, hear: Hear) -> None:
+        self.hear = hear
+
+    def close(self) -> None:
+        pass
+
+
+def test_what_another_server_announces_wakes_and_is_not_announced_again():
+    async def run() -> None:
+        told = Told()
+        notices = Notices(told)
+        assert told.hear is not None
+        with notices.listen("a") as a, notices.listen("b") as b:
+            await asyncio.to_thread(told.hear, "a")
+            assert [await listener.wait(0.05) for listener in (a, b)] == [True, False]
+            await asyncio.to_thread(told.hear, None)
+            assert [await listener.wait(PATIENCE) for listener in (a, b)] == [True, True]
+        notices.post("b")
+        assert told.announced == ["b"]
+
+    asyncio.run(run())

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import shlex
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -102,6 +102,27 @@ class Database:
         if self._lock is not None and self._lock.log_is_merged():
             for statement in marks(self._lock.header()):
                 connection.exec_driver_sql(statement)
+
+    @property
+    def notifies(self) -> bool:
+        """Whether connections can be told of each other's changes."""
+        return self._engine.dialect.name == "postgresql"
+
+    def notify(self, channel: str, payloads: Sequence[str]) -> None:
+        """Send payloads to all connections that listen to a channel of this database."""
+        with self.write() as connection:
+            for payload in payloads:
+                connection.execute(sa.select(sa.func.pg_notify(channel, payload)))
+
+    def detached(self) -> Any:
+        """A connection of the driver's, outside of transactions; the caller closes it. Raises ``Unavailable``."""
+        with self._translated():
+            own = self._engine.raw_connection()
+            driver = own.driver_connection
+            own.detach()
+        assert driver is not None
+        driver.autocommit = True
+        return driver
 
     def close(self) -> None:
         if self._held is not None:

@@ -7,9 +7,11 @@ from pathlib import Path
 import sqlalchemy as sa
 
 from surrogym_server.errors import Damaged
+from surrogym_server.storage.announcements import Alone
 from surrogym_server.storage.policies import Blobs
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import Synchronous
+from surrogym_server.storage.sql.announcements import NotifiedAnnouncements
 from surrogym_server.storage.sql.blobs import FolderBlobs, RowBlobs
 from surrogym_server.storage.sql.checks import check_pages, check_tables
 from surrogym_server.storage.sql.database import Database, connect
@@ -45,12 +47,14 @@ class SqlStorage(Storage):
         self.events = SqlEvents(database)
         self.policies = SqlPolicies(database)
         self.blobs = blobs
+        self.announcements = NotifiedAnnouncements(database) if database.notifies else Alone()
         self.jobs = SqlJobs(database)
 
     def ping(self) -> None:
         self._readiness.require()
 
     def close(self) -> None:
+        self.announcements.close()
         self._readiness.close()
         self._database.close()
 

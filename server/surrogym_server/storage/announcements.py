@@ -1,0 +1,46 @@
+"""The part of the storage port by which the servers of one database wake each other."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+
+Hear = Callable[[str | None], None]  # the name of a surrogate, or None: announcements may have been missed
+
+
+class Announcements(ABC):
+    """Short messages between the servers of one database: something happened to a surrogate.
+
+    They may be lost, so whoever waits for them also looks from time to time. Any thread may call.
+    """
+
+    @abstractmethod
+    def announce(self, surrogate: str) -> None:
+        """Tell all other servers, soon. Returns at once, and never raises.
+
+        Announcements of one surrogate that wait to be sent are sent once.
+        """
+
+    @abstractmethod
+    def listen(self, hear: Hear) -> None:
+        """From now on call ``hear``, in a thread, for what other servers announce. Called once.
+
+        After a lost connection, it is called with None once the connection is back.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """End. Closing twice is harmless."""
+
+
+class Alone(Announcements):
+    """Of a database with one server: there is nobody to tell."""
+
+    def announce(self, surrogate: str) -> None:
+        """Nobody hears it."""
+
+    def listen(self, hear: Hear) -> None:
+        """Nothing comes."""
+
+    def close(self) -> None:
+        """Nothing to end."""

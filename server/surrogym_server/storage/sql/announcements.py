@@ -1,0 +1,93 @@
+"""Announcements by PostgreSQL's LISTEN and NOTIFY: one connection listens, and one thread sends."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from contextlib import closing
+from typing import TYPE_CHECKING, Any
+from uuid import uuid4
+
+from surrogym_server.errors import Unavailable
+from surrogym_server.storage.announcements import Announcements, Hear
+from surrogym_server.storage.sql.database import Database
+
+if TYPE_CHECKING:
+    from psycopg import Connection
+
+logger = logging.getLogger(__name__)
+
+CHANNEL = "surrogym"
+QUIET_SECONDS = 30.0  # of a connection, before the end of this server is looked for
+FIRST_DELAY, LONGEST_DELAY = 0.1, 10.0  # seconds before another try to connect
+CLOSING_SECONDS = 2.0
+
+
+class NotifiedAnnouncements(Announcements):
+    """The threads begin with ``listen``: a program that only reads and writes needs none."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._origin = uuid4().hex
+        self._waiting: dict[str, None] = {}  # names to announce, in order
+        self._changed = threading.Condition()
+        self._ended = threading.Event()
+        self._threads: list[threading.Thread] = []
+
+    def announce(self, surrogate: str) -> None:
+        with self._changed:
+            self._waiting[surrogate] = None
+            self._changed.notify()
+
+    def listen(self, hear: Hear) -> None:
+        self._threads = [
+            threading.Thread(target=self._send, name="announce", daemon=True),
+            threading.Thread(target=self._listen, args=(hear,), name="listen", daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        if not self._threads or self._ended.is_set():
+            return
+        self._ended.set()
+        self.announce("")  # wakes both threads
+        for thread in self._threads:
+            thread.join(CLOSING_SECONDS)
+
+    def _send(self) -> None:
+        while self._waiting or not self._ended.is_set():
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting)
+                names, self._waiting = list(self._waiting), {}
+            try:
+                self._database.notify(CHANNEL, [f"{self._origin} {name}" for name in names])
+            except Unavailable as error:  # the others look by themselves
+                logger.debug("other servers were not told of %s: %s", names, error)
+
+    def _listen(self, hear: Hear) -> None:
+        import psycopg  # where it is needed: a server on SQLite starts without it
+
+        delay, missed = FIRST_DELAY, False
+        while not self._ended.is_set():
+            try:
+                with closing(self._database.detached()) as connection:
+                    connection.execute(f"LISTEN {CHANNEL}")
+                    delay = FIRST_DELAY
+                    if missed:
+                        hear(None)
+                    self._hear_all(connection, hear)
+            except (Unavailable, psycopg.Error) as error:
+                logger.warning("what other servers announce does not come, the next try follows: %s", error)
+                missed = True
+                self._ended.wait(delay)
+                delay = min(2 * delay, LONGEST_DELAY)
+
+    def _hear_all(self, connection: Connection[Any], hear: Hear) -> None:
+        while not self._ended.is_set():
+            for notice in connection.notifies(timeout=QUIET_SECONDS):
+                if self._ended.is_set():
+                    return
+                origin, _, name = notice.payload.partition(" ")
+                if origin != self._origin and name:
+                    hear(name)
