@@ -16,6 +16,7 @@ from support.policies import store
 from support.server import ServerProcess
 from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
+from surrogym_shared import wire
 
 Open = Callable[..., Page]
 
@@ -29,6 +30,15 @@ def url(pendulum_server: ServerProcess) -> Iterator[str]:
             api.create_surrogate(name, pendulum())
             for number, mean in enumerate(means):
                 store(api, name, seed=100 * len(name) + number, mean=mean)
+        reference = wire.AddEvaluation(
+            controller="reference",
+            first_seed=10_000,
+            returns=[-200.0, -220.0],
+            lengths=[200] * 2,
+            note="declared starts",
+            idempotency_key="reference",
+        )
+        api.policies.evaluate("better", 2, reference)
         api.create_surrogate("bare", pendulum())
         yield pendulum_server.url
         for name in ("worse", "better", "bare"):
@@ -44,10 +54,11 @@ def test_promise_and_real_return_stand_beside_each_other(url: str, open_page: Op
     expect(part.locator("summary").first).to_contain_text("the promise was kept")
     picture = part.locator(".ranges")
     expect(picture).to_have_attribute(
-        "aria-label", re.compile(r"better@2: promise −150 between −170 and −130, real .*without")
+        "aria-label", re.compile(r"better@2: promise −150 between −170 and −130, real .*without .*, reference −210 ")
     )
     part.locator("summary").first.click()
     expect(part.get_by_role("region", name="Real episodes of version 2")).to_contain_text("an action of zero")
+    expect(part.get_by_role("region", name="Real episodes of version 2")).to_contain_text("the reference controller")
     expect(part.locator(".episodes canvas")).to_have_count(2)  # a picture for each coordinate
     part.get_by_role("button", name="Make it production").click()
     expect(part.locator("summary").first).to_contain_text("production")

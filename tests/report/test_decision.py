@@ -13,7 +13,7 @@ import pytest
 from support.server import ServerProcess
 from surrogym_client.report.decision import decision, share
 from surrogym_client.report.files import NoPdf, as_pdf
-from surrogym_client.report.known import Known, chosen_real, chosen_without
+from surrogym_client.report.known import Known, chosen_real, chosen_reference, chosen_without
 from surrogym_client.transport import Api
 from surrogym_shared import wire
 
@@ -115,6 +115,20 @@ def test_a_tested_policy_is_told_whole(modelled: Known):
     assert "Another unit of the machine" in parts["What was not tested"]
     assert "not every start succeeded" in parts["What to do next"]
     assert "What could not be read" not in parts
+
+
+def test_a_reference_controller_stands_beside_the_policy(modelled: Known):
+    other = evaluation(3, controller="reference", mean=-214.0, returns=[-150.0] * 60 + [-310.0] * 40)
+    listed = policy(evaluations=[evaluation(), other])
+    found = chosen_reference(listed, evaluation())
+    assert found is not None
+    assert found.id == 3
+    parts = told(replace(modelled, policy=listed, real=evaluation(), without=without(), reference=other))
+    assert "The reference controller earned -214.0 (-160.0 to -127.0) there." in parts[""]
+    beside = parts["With and without the controller"]
+    assert "with the reference controller: 10.0 more with it (95 %: 10.0 to 10.0)" in beside
+    assert beside.count("[picture]") == 1
+    assert "A controller of reference" not in parts["What was not tested"]
 
 
 def test_a_broken_promise_is_said_first_of_what_to_do(modelled: Known):

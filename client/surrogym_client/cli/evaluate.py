@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from surrogym_client.cli.beside import Beside
 from surrogym_client.cli.groups import Output, PolicyReading, Service, add
 from surrogym_client.cli.options import SpecFile, read_spec
 from surrogym_client.cli.pushing import push_or_say
@@ -20,13 +21,12 @@ if TYPE_CHECKING:
     from surrogym_client.original.episodes import Episode
     from surrogym_client.policies.card import PolicyCard
     from surrogym_client.policies.evidence import Promise
-    from surrogym_client.policies.predict import Predict
+    from surrogym_client.policies.predict import Acting
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
     from surrogym_shared.wire import Controller
 
 
-Compare = Literal["zero", "random"]
 FEWEST_TO_JUDGE = 30  # episodes: the mean of fewer is too uncertain to judge a promise
 
 
@@ -47,13 +47,6 @@ Where = Annotated[
 Ledger = Annotated[
     str | None,
     typer.Option(help="Surrogate whose ledger counts the real steps. [default: as noted beside the policy]"),
-]
-Compared = Annotated[
-    Compare | None,
-    typer.Option(
-        help="Also run the same starts without the policy: with an action of zero, or with random actions. These "
-        "real steps count too."
-    ),
 ]
 
 
@@ -115,7 +108,7 @@ def command(
     reading: PolicyReading,
     where: Where = False,
     surrogate: Ledger = None,
-    compare: Compared = None,
+    beside: Beside,
     push: Annotated[
         bool, typer.Option("--push/--no-push", help="Store the policy and its episodes on the server as well.")
     ] = True,
@@ -139,7 +132,7 @@ def command(
     ledger = _ledger(surrogate, service.server, card, card_path(policy), quiet=output.quiet)
     enter = partial(_enter, ledger, service.server, service.token_for(context), quiet=output.quiet)
     run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
-    reports = _reports(_controllers(policy, card, reading, opener, compare), run, enter, settings, policy)
+    reports = _reports(beside.controllers(policy, card, reading, opener), run, enter, settings, policy)
     result = reports[0][1]
     version = None
     if push and ledger is not None:
@@ -150,31 +143,24 @@ def command(
     if where or left(promise, result):
         found = differ_from(ledger, service.server, token, result, settings.first_seed, quiet=output.quiet)
     judged = {"promise_kept": _kept(promise, result), "version": version, "disagreements": found and found.as_json()}
-    summary = {"policy": str(policy), **_settings(settings), **_summary(reports), **judged}
+    summary = {"policy": str(policy), **_settings(settings), **_summary(reports, beside.reference), **judged}
     more = [] if found is None else found.in_words(card.spec)
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
 
 
-def _summary(reports: Sequence[tuple[Controller, Evaluation]]) -> dict[str, Any]:
-    """Return the policy's episodes as JSON, together with those of ``--compare``."""
+def _summary(reports: Sequence[tuple[Controller, Evaluation]], reference: str | None) -> dict[str, Any]:
+    """Return the policy's episodes as JSON, together with those of ``--compare`` and ``--reference``."""
     summary = reports[0][1].summary()
-    for actions, without in reports[1:]:
-        summary["without"] = {"actions": actions, **without.summary()}
+    for actions, other in reports[1:]:
+        if actions == "reference":
+            summary["reference"] = {"controller": reference, **other.summary()}
+        else:
+            summary["without"] = {"actions": actions, **other.summary()}
     return summary
 
 
-def _controllers(
-    policy: Path, card: PolicyCard, reading: PolicyReading, opener: Callable[[], Episode], compare: Compare | None
-) -> dict[Controller, Callable[[], Predict]]:
-    """Return loaders of whatever chooses the actions: the policy, and the baseline of ``--compare``."""
-    controllers: dict[Controller, Callable[[], Predict]] = {"policy": lambda: reading.load(policy, card)}
-    if compare is not None:
-        controllers[compare] = lambda: _baseline(opener, compare)
-    return controllers
-
-
 def _reports(
-    controllers: Mapping[Controller, Callable[[], Predict]],
+    controllers: Mapping[Controller, Callable[[], Acting]],
     run: Callable[..., Evaluation],
     enter: Callable[[int, int, str], None],
     settings: EvaluationSettings,
@@ -183,25 +169,12 @@ def _reports(
     """Run the episodes of each controller, and enter their real steps into the ledger."""
     reports: list[tuple[Controller, Evaluation]] = []
     for controller, load in controllers.items():
-        actions = "" if controller == "policy" else f"{controller} actions"
+        actions = {"policy": "", "reference": "the reference controller"}.get(controller, f"{controller} actions")
         result = run(load, what=actions or str(policy))
         note = f"{settings.episodes} episodes from seed {settings.first_seed}"
         enter(result.steps, settings.episodes, f"{note}, {actions}" if actions else note)
         reports.append((controller, result))
     return reports
-
-
-def _baseline(opener: Callable[[], Episode], compare: Compare) -> Predict:
-    from surrogym_client.cli.errors import CommandError
-    from surrogym_client.evaluation.uncontrolled import baseline
-
-    episode = opener()
-    try:
-        return baseline(episode.spec, compare)
-    except ValueError as error:
-        raise CommandError(f"--compare: {error}") from error
-    finally:
-        episode.close()
 
 
 def _keep(
@@ -234,7 +207,7 @@ def _keep(
 
 
 def _run(
-    load: Callable[[], Predict],
+    load: Callable[[], Acting],
     what: str,
     opener: Callable[[], Episode],
     settings: EvaluationSettings,

@@ -14,7 +14,7 @@ from surrogym_client.original.actions import decode_actions
 from surrogym_client.original.episodes import Episode, Moment, draw
 from surrogym_client.original.errors import EvaluationFailed, PolicyMisfit
 from surrogym_client.original.protocol import LONGEST_EPISODE
-from surrogym_client.policies.predict import Predict
+from surrogym_client.policies.predict import Acting, PerEpisode
 from surrogym_client.runtime.lifetime import signals_between_steps
 from surrogym_shared.spec import EnvironmentSpec, Success
 from surrogym_shared.terms import holds
@@ -119,7 +119,7 @@ class EvaluationInterrupted(KeyboardInterrupt):
 
 
 def evaluate(
-    policy: Predict,
+    policy: Acting,
     open_episode: Callable[[], Episode],
     settings: EvaluationSettings | None = None,
     progress: Progress | None = None,
@@ -131,7 +131,8 @@ def evaluate(
     steps, a second Ctrl-C at once. Every instance is closed in any case.
 
     Args:
-        policy: function from observations (N, D) to actions.
+        policy: function from observations (N, D) to actions, or a controller that also gets the numbers of
+            the episodes.
         open_episode: opens one instance of the environment.
         settings: number of episodes, their starts and the environment's perturbation.
         progress: called after every step.
@@ -181,6 +182,7 @@ def interquartile_mean(values: Array) -> float:
 class _Tally:
     """Running sums of one episode, which begins at the present state of ``episode``."""
 
+    number: int  # from 0, in the order of the seeds
     episode: Episode
     moment: Moment
     total: float = 0.0
@@ -213,7 +215,7 @@ class _Tally:
 class _Run:
     """Runs episodes in the order of their seeds, each as soon as an instance is free."""
 
-    def __init__(self, policy: Predict, settings: EvaluationSettings, progress: Progress | None) -> None:
+    def __init__(self, policy: Acting, settings: EvaluationSettings, progress: Progress | None) -> None:
         self.settings = settings
         self.begun = 0  # real steps begun, including interrupted and failed ones
         self._policy = policy
@@ -237,7 +239,7 @@ class _Run:
         """Begin the next episodes, one in each free instance, until all have begun."""
         first = len(self._tallies)
         begun = [
-            _Tally(episode, _start(episode, self.settings, first + i))
+            _Tally(first + i, episode, _start(episode, self.settings, first + i))
             for i, episode in enumerate(free[: self.settings.episodes - first])
         ]
         self._tallies += begun
@@ -252,9 +254,14 @@ class _Run:
         """Return the policy's actions (N, F)."""
         observations = np.stack([tally.moment.observation for tally in running]).astype(np.float32)
         try:
-            return decode_actions(running[0].episode.spec, self._policy(observations), len(running))
+            return decode_actions(running[0].episode.spec, self._act(running, observations), len(running))
         except ValueError as error:
             raise PolicyMisfit(f"the policy does not fit the environment: {error}") from error
+
+    def _act(self, running: Sequence[_Tally], observations: NDArray[np.float32]) -> NDArray[Any]:
+        if isinstance(self._policy, PerEpisode):
+            return self._policy.actions([tally.number for tally in running], observations)
+        return self._policy(observations)
 
     def _tell(self) -> None:
         if self._progress is not None:

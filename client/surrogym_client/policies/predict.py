@@ -1,8 +1,9 @@
-"""Type of a policy as a function: observations in, actions out."""
+"""Types of what acts in episodes: observations in, actions out."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,3 +11,14 @@ from numpy.typing import NDArray
 
 Predict = Callable[[NDArray[np.float32]], NDArray[Any]]
 """Observations (N, D) to actions (N,) or (N, F)."""
+
+
+class PerEpisode(ABC):
+    """A controller that may have a memory, so it has to know which episode an observation is of."""
+
+    @abstractmethod
+    def actions(self, episodes: Sequence[int], observations: NDArray[np.float32]) -> NDArray[Any]:
+        """Return actions (N, F) for observations (N, D) of N different episodes, which are given by their numbers."""
+
+
+Acting = Predict | PerEpisode

@@ -14,15 +14,16 @@ from surrogym_client.report.html import bullets, paragraph, picture, section, ta
 from surrogym_client.report.known import Known
 from surrogym_client.report.maps import Cut
 from surrogym_client.surrogates.advice import verdict
+from surrogym_shared.intervals import of_mean
 from surrogym_shared.wire import EpisodeTrace, EvaluationDetail, EvaluationView, Interval, OutputFidelity
 
 RETURN = "The return of an episode is the sum of its rewards. Higher is better."
 ACTIONS = {
     "zero": "with an action of zero all the time",
     "random": "with random actions",
-    "reference": "by a reference",
+    "reference": "with the reference controller",
 }
-SHORT_NAMES = {"zero": "left alone", "random": "random actions", "reference": "reference"}
+SHORT_NAMES = {"zero": "left alone", "random": "random actions", "reference": "reference controller"}
 
 
 def decision(known: Known, cuts: Sequence[Cut]) -> str:
@@ -58,6 +59,8 @@ def _in_short(known: Known) -> str:
         sentences.append(f"{successes(real)} succeeded.")
     if known.without is not None:
         sentences.append(f"Without it, from the same starts, the average was {number(known.without.mean)}.")
+    if known.reference is not None:
+        sentences.append(f"The reference controller earned {mean(known.reference)} there.")
     sentences.append(f"Learning and checking it took {steps(view.ledger.total + view.ledger.audit)}.")
     return paragraph(" ".join(sentences), "short")
 
@@ -113,30 +116,51 @@ def _result(known: Known) -> str:
 
 
 def _beside(known: Known) -> str:
-    """Controlled beside uncontrolled."""
-    real, without = known.real, known.without
-    title = "With and without the controller"
+    """Controlled beside uncontrolled, and beside a reference controller."""
+    real, title = known.real, "With and without the controller"
     if real is None:
         return section(title, paragraph("There is nothing to compare yet."))
-    if without is None:
-        return section(title, paragraph("The same starts were not run without the controller."))
-    same = min(real.episodes, without.episodes)
+    others = [one for one in (known.without, known.reference) if one is not None]
+    said = "".join(paragraph(_gained(real, other)) for other in others)
+    if known.without is None:
+        said += paragraph("The same starts were not run without the controller.")
+    return section(title, said + _from_one_start(known, real, others))
+
+
+def _gained(real: EvaluationDetail, other: EvaluationDetail) -> str:
+    """What the controller earned beyond another one from the same starts."""
+    same = min(real.episodes, other.episodes)
     with_it = sum(real.returns[:same]) / same if real.returns else real.mean
-    gain = with_it - without.mean
-    said = paragraph(
+    gain = with_it - (sum(other.returns[:same]) / same if other.returns else other.mean)
+    return (
         f"From the same {same} starts, the average return was {number(with_it)} with the controller and "
-        f"{mean(without)} {ACTIONS[without.controller]}: {number(abs(gain))} {'more' if gain > 0 else 'less'} with it. "
-        f"The {steps(without.steps)} without it are counted above."
+        f"{mean(other)} {ACTIONS[other.controller]}: {number(abs(gain))} {'more' if gain > 0 else 'less'} with it"
+        f"{_certain(real, other, same)}. The {steps(other.steps)} of the comparison are counted above."
     )
-    pair = [(_paired(real), "with the controller"), (_paired(without), SHORT_NAMES[without.controller])]
-    shown = [(name, trace) for trace, name in pair if trace is not None]
-    if len(shown) == 2 and len({trace.seed for _, trace in shown}) == 1:
-        alt = "Coordinates and actions of one episode with the controller and one without it, from the same start"
-        said += picture(svg(draw_episodes(known.view.spec, shown)), alt)
-        said += paragraph(
-            "Both begin in the same state. It is the start from which the controller had its median return."
-        )
-    return section(title, said)
+
+
+def _certain(real: EvaluationDetail, other: EvaluationDetail, same: int) -> str:
+    """The 95 % interval of the difference, start by start; nothing where single episodes are not known."""
+    if len(real.returns) < same or len(other.returns) < same:
+        return ""
+    found = of_mean([a - b for a, b in zip(real.returns[:same], other.returns[:same], strict=True)])
+    if found is None:
+        return ""
+    low, high = sorted((abs(found.low), abs(found.high)))
+    if found.low <= 0 <= found.high:
+        return f" (95 %: {number(found.low)} to {number(found.high)}, so no difference was shown)"
+    return f" (95 %: {number(low)} to {number(high)})"
+
+
+def _from_one_start(known: Known, real: EvaluationDetail, others: Sequence[EvaluationDetail]) -> str:
+    """One episode of each from the same state; nothing where those are not known."""
+    pairs = [(_paired(real), "with the controller"), *((_paired(one), SHORT_NAMES[one.controller]) for one in others)]
+    shown = [(name, trace) for trace, name in pairs if trace is not None]
+    if len(shown) < 2 or len({trace.seed for _, trace in shown}) > 1:
+        return ""
+    alt = f"Coordinates and actions of one episode each, from the same start: {', '.join(name for name, _ in shown)}"
+    words = "They begin in the same state. It is the start from which the controller had its median return."
+    return picture(svg(draw_episodes(known.view.spec, shown)), alt) + paragraph(words)
 
 
 def _prediction(known: Known) -> str:
@@ -161,9 +185,9 @@ def _prediction(known: Known) -> str:
             said.append("Reality came out as predicted: the real average lies within the predicted interval.")
     else:
         said.append("It has not been compared with reality from the same kind of starts.")
-    if known.without is not None:
-        label = SHORT_NAMES[known.without.controller]
-        ranges.append(Range(f"{label}, 95 %", known.without.mean, *_ends(known.without.mean_interval)))
+    for other in filter(None, (known.without, known.reference)):
+        label = SHORT_NAMES[other.controller]
+        ranges.append(Range(f"{label}, 95 %", other.mean, *_ends(other.mean_interval)))
     alt = "; ".join(f"{one.label}: {number(one.value)}" for one in ranges)
     return section(title, paragraph(" ".join(said)) + picture(svg(draw_ranges(ranges, "average return")), alt))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -9,6 +10,7 @@ from surrogym_client.errors import NotInstalled, SurrogymClientError, UnknownPol
 from surrogym_client.report.maps import Cut, cuts
 from surrogym_client.transport import Api
 from surrogym_shared.wire import (
+    Controller,
     EvaluationDetail,
     EvaluationView,
     ModelView,
@@ -33,6 +35,7 @@ class Known:
         policy: the one that the report is about; None: there is none.
         real: its newest real episodes from the declared starts.
         without: real episodes without the policy, from the same starts.
+        reference: real episodes of a reference controller, from the same starts.
         missing: sentences about what could not be read.
     """
 
@@ -43,6 +46,7 @@ class Known:
     policy: PolicyDetail | None = None
     real: EvaluationDetail | None = None
     without: EvaluationDetail | None = None
+    reference: EvaluationDetail | None = None
     missing: tuple[str, ...] = ()
 
 
@@ -62,15 +66,15 @@ def collect(api: Api, name: str, which: str | None = None) -> Known:
     policy, missing = _policy(api, name, which), list[str]()
     if policy is None:
         return Known(view, models, samples, server)
-    chosen = [chosen_real(policy), None]
-    chosen[1] = chosen_without(policy, chosen[0])
+    real = chosen_real(policy)
+    chosen = (real, chosen_without(policy, real), chosen_reference(policy, real))
     details: list[EvaluationDetail | None] = []
     for evaluation in chosen:
         detail = None if evaluation is None else api.policies.evaluation(name, policy.version, evaluation.id)
         if detail is not None and detail.missing:
             missing.append(f"the single episodes of evaluation {detail.id} are missing: {detail.missing}")
         details.append(detail)
-    return Known(view, models, samples, server, policy, details[0], details[1], tuple(missing))
+    return Known(view, models, samples, server, policy, details[0], details[1], details[2], tuple(missing))
 
 
 def cuts_of(api: Api, known: Known) -> tuple[list[Cut], str]:
@@ -89,13 +93,21 @@ def chosen_real(policy: PolicyView) -> EvaluationView | None:
 
 def chosen_without(policy: PolicyDetail, real: EvaluationView | None) -> EvaluationView | None:
     """The newest evaluation without the policy that has the same starts."""
+    return _beside(policy, real, ("zero", "random"))
+
+
+def chosen_reference(policy: PolicyDetail, real: EvaluationView | None) -> EvaluationView | None:
+    """The newest evaluation of a reference controller that has the same starts."""
+    return _beside(policy, real, ("reference",))
+
+
+def _beside(
+    policy: PolicyDetail, real: EvaluationView | None, controllers: Sequence[Controller]
+) -> EvaluationView | None:
     if real is None:
         return None
-    same = [
-        one
-        for one in policy.evaluations
-        if one.controller in ("zero", "random") and (one.first_seed, one.note) == (real.first_seed, real.note)
-    ]
+    starts = (real.first_seed, real.note)
+    same = [one for one in policy.evaluations if one.controller in controllers and (one.first_seed, one.note) == starts]
     return same[-1] if same else None
 
 

@@ -4,12 +4,11 @@ import { call, surrogate } from "/page/api.js";
 import { difference } from "/page/differences.js";
 import { h, shown } from "/page/dom.js";
 import { number, percent, plural } from "/page/format.js";
-import { meanWords, realMark, realOf, withoutOf } from "/page/judged.js";
+import { meanWords, realMark, realOf, referenceOf, withoutOf } from "/page/judged.js";
 import { table } from "/page/parts.js";
 import { ranges } from "/page/ranges.js";
 
 const MOST = 5; // policies of each: those with an alias, and the newest
-const ROW = 26; // of the picture
 
 const interval = ({ low, high }) => `${number(low)} to ${number(high)}`;
 const byMean = (one, other) => realOf(other.policy).mean - realOf(one.policy).mean;
@@ -34,9 +33,9 @@ function grounds(better, found, pairs, same) {
 function everyPolicy(entries, pairs) {
   const [best] = entries;
   const gap = (entry) => (entry === best ? "the best" : (({ by, ...ends }) => `${number(by)} (${interval(ends)})`)(difference(entry, best, pairs)));
-  const without = ({ policy }) => (withoutOf(policy) ? meanWords(withoutOf(policy)) : "–");
-  return table("Each policy beside the best", [["policy", ""], ["mean real return (95 %)", "num"], ["difference from the best (95 %, all together)", "num"], ["success", "num"], ["without the policy", "num"]],
-    entries.map((entry) => [entry.label, meanWords(realOf(entry.policy)), gap(entry), percent(realOf(entry.policy).success_rate), without(entry)]), "");
+  const shown = (found) => (found ? meanWords(found) : "–");
+  return table("Each policy beside the best", [["policy", ""], ["mean real return (95 %)", "num"], ["difference from the best (95 %, all together)", "num"], ["success", "num"], ["without the policy", "num"], ["reference controller", "num"]],
+    entries.map((entry) => [entry.label, meanWords(realOf(entry.policy)), gap(entry), percent(realOf(entry.policy).success_rate), shown(withoutOf(entry.policy)), shown(referenceOf(entry.policy))]), "");
 }
 
 export function compareView(main, given) {
@@ -70,7 +69,7 @@ export function compareView(main, given) {
       h("p", { class: "big" }, found ? words(better, worse, found) : "Two policies with real episodes from the declared starts are needed to say which is better."),
       found && h("p", { class: "note" }, grounds(better, found, pairs, same)),
       judged.length > 0 && [h("h2", {}, "Mean real return, the best first; a bar is its 95 % interval"),
-        ranges(judged.map(({ label, policy }) => ({ label, marks: [realMark(policy)] })), "Mean real returns of the policies of both", ROW),
+        ranges(judged.map(({ label, policy }) => ({ label, marks: [realMark(policy)] })), "Mean real returns of the policies of both", 2),
         everyPolicy(judged, pairs)],
       missing);
   });

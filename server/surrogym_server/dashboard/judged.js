@@ -7,12 +7,15 @@ const newest = (evaluations, wanted) => evaluations.filter(wanted).at(-1) ?? nul
 /** The newest real episodes of a policy from the declared starts. */
 export const realOf = ({ evaluations }) => newest(evaluations, ({ controller, declared }) => controller === "policy" && declared);
 
-/** The newest real episodes without it from the same starts. */
-export function withoutOf(policy) {
+/** The newest real episodes of other controllers from the same starts. */
+function besides(policy, controllers) {
   const real = realOf(policy);
   return real && newest(policy.evaluations, ({ controller, first_seed: seed, note }) =>
-    ["zero", "random"].includes(controller) && seed === real.first_seed && note === real.note);
+    controllers.includes(controller) && seed === real.first_seed && note === real.note);
 }
+
+export const withoutOf = (policy) => besides(policy, ["zero", "random"]);
+export const referenceOf = (policy) => besides(policy, ["reference"]);
 
 const mark = (kind, { mean, mean_interval: interval }) => ({ kind, value: mean, low: interval?.low ?? null, high: interval?.high ?? null });
 
@@ -21,11 +24,12 @@ export const realMark = (policy) => mark("real", realOf(policy));
 
 /** The marks of a policy for `ranges`. */
 export function marksOf(policy) {
-  const [real, without] = [realOf(policy), withoutOf(policy)];
+  const [real, without, reference] = [realOf(policy), withoutOf(policy), referenceOf(policy)];
   return [
     policy.promise && { kind: "promise", value: policy.promise.median, low: policy.promise.low, high: policy.promise.high },
     real && mark("real", real),
     without && mark("without", without),
+    reference && mark("reference", reference),
   ].filter(Boolean);
 }
 

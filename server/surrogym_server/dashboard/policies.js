@@ -10,7 +10,7 @@ import { ranges, rangesKey } from "/page/ranges.js";
 
 const SHOWN = 20; // in the picture
 const BYTES = ["bytes", "kB", "MB", "GB"];
-const ACTING = { policy: "the policy", zero: "an action of zero", random: "random actions", reference: "a reference" };
+const ACTING = { policy: "the policy", zero: "an action of zero", random: "random actions", reference: "the reference controller" };
 
 function size(bytes) {
   const power = Math.min(BYTES.length - 1, Math.floor(Math.log10(Math.max(1, bytes)) / 3));

@@ -4,7 +4,8 @@ import { h } from "/page/dom.js";
 import { number } from "/page/format.js";
 
 const WIDTH = 600;
-const ROW = 40; // three marks high
+const STEP = 11; // from a mark to the next in a row
+const MARKS = 3; // that a row has room for, at least
 const LABEL = 24; // characters
 const PAD = { left: 170, right: 8, top: 4, bottom: 22 };
 
@@ -18,20 +19,19 @@ function shape({ kind, value, low, high }, x, y) {
       : [h("line", { x1: x(low), x2: x(high), y1: y, y2: y }), ...[low, high].map((end) => h("line", { x1: x(end), x2: x(end), y1: y - 5, y2: y + 5 }))]);
   }
   if (kind === "without") parts.push([[-4, -4, 4, 4], [-4, 4, 4, -4]].map(([a, b, c, d]) => h("line", { x1: x(value) + a, y1: y + b, x2: x(value) + c, y2: y + d })));
+  else if (kind === "reference") parts.push(h("rect", { x: x(value) - 4, y: y - 4, width: 8, height: 8 }));
   else parts.push(h("circle", { class: kind === "promise" ? "hollow" : "", cx: x(value), cy: y, r: 4.5 }));
   return parts;
 }
 
-/** Where the first of some marks goes in a row, so that they are in its middle. */
-const middle = (top, row, many) => (row < ROW ? top + row / 2 - (11 * (many - 1)) / 2 : top + 8);
-
-/** `rows` are {label, marks: [{kind: "promise" | "real" | "without", value, low, high}]}; null where nothing is known. */
-export function ranges(rows, label, row = ROW) {
+/** `rows` are {label, marks: [{kind: "promise" | "real" | "without" | "reference", value, low, high}]}; null where nothing is known. */
+export function ranges(rows, label, least = MARKS) {
+  const row = 7 + STEP * Math.max(least, ...rows.map(({ marks }) => marks.length));
   const all = rows.flatMap(({ marks }) => marks.flatMap(({ value, low, high }) => [value, low ?? value, high ?? value]));
   if (!all.length) return null;
-  const [least, most] = [Math.min(...all), Math.max(...all)];
-  const span = most - least || Math.abs(most) || 1;
-  const [from, to] = [least - 0.04 * span, most + 0.04 * span];
+  const [lowest, most] = [Math.min(...all), Math.max(...all)];
+  const span = most - lowest || Math.abs(most) || 1;
+  const [from, to] = [lowest - 0.04 * span, most + 0.04 * span];
   const x = (value) => PAD.left + ((WIDTH - PAD.left - PAD.right) * (value - from)) / (to - from);
   const height = PAD.top + row * rows.length + PAD.bottom;
   const said = rows.map(({ label: who, marks }) => `${who}: ${marks.map(({ kind, value, low, high }) => `${kind} ${number(value)}${low === null || low === undefined ? "" : ` between ${number(low)} and ${number(high)}`}`).join(", ") || "nothing known"}`);
@@ -39,9 +39,9 @@ export function ranges(rows, label, row = ROW) {
   return h("svg", { class: "ranges", viewBox: `0 0 ${WIDTH} ${height}`, role: "img", "aria-label": `${label}. ${said.join("; ")}` },
     rows.map(({ label: who, marks }, at) => {
       const top = PAD.top + row * at;
-      const label = text(0, top + row / 2 + (row < ROW ? 4 : 2), who.length > LABEL ? `${who.slice(0, LABEL - 1)}…` : who, "start");
+      const label = text(0, top + (row + 6) / 2, who.length > LABEL ? `${who.slice(0, LABEL - 1)}…` : who, "start");
       label.append(h("title", {}, who));
-      return [label, ...marks.map((mark, which) => shape(mark, x, middle(top, row, marks.length) + 11 * which))];
+      return [label, ...marks.map((mark, which) => shape(mark, x, top + 8 + STEP * which))];
     }),
     h("line", { class: "axis", x1: PAD.left, x2: WIDTH - PAD.right, y1: height - PAD.bottom, y2: height - PAD.bottom }),
     ticks.map((value, at) => text(x(value), height - 6, number(value), ["start", "middle", "end"][at])));
@@ -50,4 +50,4 @@ export function ranges(rows, label, row = ROW) {
 /** What the shapes mean. */
 export const rangesKey = () => h("p", { class: "key" },
   h("span", { class: "shape promise" }, "promised: 90 % interval"), h("span", { class: "shape real" }, "real: mean with 95 % interval"),
-  h("span", { class: "shape without" }, "real, without the policy"));
+  h("span", { class: "shape without" }, "real, without the policy"), h("span", { class: "shape reference" }, "real, reference controller"));

@@ -1,0 +1,83 @@
+"""Options of ``surrogym evaluate`` for what runs from the same starts as the policy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from surrogym_client.cli.groups import PolicyReading
+    from surrogym_client.original.episodes import Episode
+    from surrogym_client.policies.card import PolicyCard
+    from surrogym_client.policies.predict import Acting, Predict
+    from surrogym_shared.wire import Controller
+
+Compare = Literal["zero", "random"]
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What runs from the same starts as the policy."""
+
+    compare: Annotated[
+        Compare | None,
+        typer.Option(
+            help="Also run the same starts without the policy: with an action of zero, or with random actions. These "
+            "real steps count too."
+        ),
+    ] = None
+    reference: Annotated[
+        str | None,
+        typer.Option(
+            help="Also run the same starts with a reference controller: a policy file, or package.module:name of a "
+            "function from an observation to an action, or of a class with such a method __call__. Each episode gets "
+            "an instance of the class. These real steps count too. The module's code is run."
+        ),
+    ] = None
+
+    def controllers(
+        self, policy: Path, card: PolicyCard, reading: PolicyReading, opener: Callable[[], Episode]
+    ) -> dict[Controller, Callable[[], Acting]]:
+        """Return loaders of whatever chooses the actions, the policy first.
+
+        Raises:
+            OriginalError: there is no such reference controller; nothing was run.
+        """
+        found: dict[Controller, Callable[[], Acting]] = {"policy": lambda: reading.load(policy, card)}
+        compare = self.compare
+        if compare is not None:
+            found[compare] = lambda: _baseline(opener, compare)
+        if self.reference is not None:
+            reference = _reference(self.reference, reading)
+            found["reference"] = lambda: reference
+        return found
+
+
+def _baseline(opener: Callable[[], Episode], compare: Compare) -> Predict:
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.evaluation.uncontrolled import baseline
+
+    episode = opener()
+    try:
+        return baseline(episode.spec, compare)
+    except ValueError as error:
+        raise CommandError(f"--compare: {error}") from error
+    finally:
+        episode.close()
+
+
+def _reference(given: str, reading: PolicyReading) -> Acting:
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.evaluation.reference import load_reference
+    from surrogym_client.policies.card import read_card
+
+    if Path(given).exists():
+        return reading.load(Path(given), read_card(Path(given)))
+    if ":" not in given:
+        raise CommandError(f"--reference: expected a policy file that exists, or package.module:name, got {given!r}")
+    return load_reference(given)
