@@ -35,5 +35,7 @@ def test_a_policy_of_stable_baselines3_is_continued_by_its_own_library(tmp_path:
 
 
 def test_a_tracker_is_refused_where_nothing_is_logged():
-    with pytest.raises(ValueError, match="FASTPPO logs to no tracker: expected none, or another algorithm, got mlflow"):
+    with pytest.raises(
+        ValueError, match="FASTPPO supports no tracker: expected none, or another algorithm, got mlflow"
+    ):
         search_for(TrainSettings("fastppo", tracker="mlflow"))
