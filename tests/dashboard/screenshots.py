@@ -47,7 +47,7 @@ def settle(page: Page, path: str) -> None:
     if path != "#/":
         expect(page.locator(".episodes canvas")).to_have_count(3)
         expect(page.locator("#maps")).to_contain_text("of the tolerance on this cut")
-        expect(page.locator(".facts")).to_contain_text("Least sure near")
+        expect(page.locator(".facts")).to_contain_text("Least certain near")
         expect(page.locator("#sessions tbody")).to_be_visible()
     page.wait_for_timeout(600)  # transitions
 

@@ -39,7 +39,7 @@ def opened(page: Page) -> Page:
     """The page once all that it asks for has come."""
     expect(page.locator(".episodes canvas")).to_have_count(3)
     expect(page.locator("#maps")).to_contain_text("of the tolerance on this cut")
-    expect(page.locator(".facts")).to_contain_text("Least sure near")
+    expect(page.locator(".facts")).to_contain_text("Least certain near")
     return page
 
 
@@ -164,7 +164,7 @@ def test_an_admin_pauses_asks_adds_and_deletes(url: str, open_page: Open, compla
         assert before.paused
         page.get_by_role("button", name="Add to the budget").click()
         expect(page.locator("#actions")).to_contain_text(f"The budget is now {before.budget + 10}")
-        page.get_by_role("button", name="Ask for this real step").click()
+        page.get_by_role("button", name="Request this real step").click()
         expect(page.locator("#queue tbody tr").first).to_contain_text("manual")
         page.get_by_role("button", name="Delete…").click()
         confirm = page.get_by_role("dialog").get_by_role("button", name="Delete")

@@ -49,7 +49,7 @@ def test_promise_and_real_return_stand_beside_each_other(url: str, open_page: Op
     page = open_page(f"{url}/#/s/better")
     part = page.locator("#policies")
     expect(part.locator("summary").first).to_contain_text(
-        re.compile(r"version 2 .*Promised −170 to −130; really −1[45]\d")
+        re.compile(r"version 2 .*Promised −170 to −130; real mean return −1[45]\d")
     )
     expect(part.locator("summary").first).to_contain_text("the promise was kept")
     picture = part.locator(".ranges")
@@ -123,7 +123,7 @@ def test_a_surrogate_without_a_policy_or_a_model_says_how_to_get_one(url: str, o
     expect(page.locator("#policies")).to_contain_text("No policy is stored. surrogym train bare")
     for empty in ("#learning", ".maps", "#probe .rolled"):
         expect(page.locator(empty)).to_be_hidden()
-    expect(page.get_by_role("button", name="Ask for this real step")).to_be_visible()
+    expect(page.get_by_role("button", name="Request this real step")).to_be_visible()
     assert serious(page) == []
 
 

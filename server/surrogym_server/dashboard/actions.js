@@ -44,29 +44,29 @@ export function actions(name, { role, refresh }) {
     }
   }
   const steps = () => Math.max(1, Math.round(Number(more.value) || 1));
-  pause.addEventListener("click", () => run(() => call("PATCH", path, { paused: !now.paused }), now.paused ? "It goes on." : "Paused: no query is given out."));
+  pause.addEventListener("click", () => run(() => call("PATCH", path, { paused: !now.paused }), now.paused ? "The design continues." : "Paused: samplers get no queries."));
   const add = () => run(() => call("PATCH", path, { budget: now.budget + steps() }), `The budget is now ${count(now.budget + steps())}.`);
   const improve = () => run(() => call("POST", `${path}/improve`, { queries: steps() }), ({ budget, budget_raised_by: raised }) =>
-    `${count(steps())} more real steps are asked for, where they tell most${raised ? `; that raised the budget to ${count(budget)}` : ""}.`);
+    `${count(steps())} more real steps were requested, where they help the model most${raised ? `; this raised the budget to ${count(budget)}` : ""}.`);
   const remove = async () => {
     if (!(await confirmed(name))) return;
     await run(() => call("DELETE", path), "Deleted.");
     location.hash = "#/";
   };
   buttons.append(pause,
-    h("span", { class: "group" }, more, h("button", { type: "button", onclick: add }, "Add to the budget"), h("button", { type: "button", onclick: improve }, "Ask for that many queries")),
+    h("span", { class: "group" }, more, h("button", { type: "button", onclick: add }, "Add to the budget"), h("button", { type: "button", onclick: improve }, "Request that many queries")),
     h("button", { type: "button", class: "danger", onclick: remove }, "Delete…"));
 
   return {
     element: section("actions", "Steer", null, body),
     /** A query by hand at a point; the probe's button. */
-    ask: (point) => run(() => call("POST", `${path}/queries`, { coordinates: [[...point.coordinates]], action: [[...point.action]] }), "Asked: a sampler will take this real step.").then(() => said.scrollIntoView({ block: "center", behavior: "smooth" })),
+    ask: (point) => run(() => call("POST", `${path}/queries`, { coordinates: [[...point.coordinates]], action: [[...point.action]] }), "Requested: a sampler will take this real step.").then(() => said.scrollIntoView({ block: "center", behavior: "smooth" })),
     show(surrogate) {
       now = surrogate;
       pause.textContent = surrogate.paused ? "Resume" : "Pause";
       const may = role() === "admin";
       buttons.hidden = !may;
-      if (!may) said.textContent = `This token's role is ${role() ?? "unknown"}. One with role admin may pause, add budget, ask for queries and delete.`;
+      if (!may) said.textContent = `This token's role is ${role() ?? "unknown"}. A token with role admin may pause, add budget, request queries and delete.`;
     },
   };
 }

@@ -70,7 +70,7 @@ function failed(error) {
 
 function lost(seconds) {
   say("gone", "server gone");
-  banner.textContent = "The server does not answer. What you see is what it said last; this page tries again "
+  banner.textContent = "The server does not answer. The page shows the last state that it received, and tries again "
     + (seconds ? `in ${seconds} s.` : "by itself.");
 }
 
@@ -111,9 +111,9 @@ function locked(error) {
     const known = token.get();
     const input = h("input", { id: "token", type: "password", autocomplete: "off", spellcheck: "false", required: true });
     const form = h("form", { class: "lock card" },
-      h("h1", {}, "This server wants a token"),
-      h("p", {}, "Role ", h("code", {}, "read"), " is enough to look; ", h("code", {}, "admin"), " may pause, change and delete. It is kept in this tab alone and forgotten with it."),
-      known && h("p", { class: "bad", role: "alert" }, `That one was refused: ${error.message}`),
+      h("h1", {}, "This server needs a token"),
+      h("p", {}, "Role ", h("code", {}, "read"), " is enough to view this page; ", h("code", {}, "admin"), " may pause, change and delete. The token is kept only in this tab, until the tab is closed."),
+      known && h("p", { class: "bad", role: "alert" }, `The server refused this token: ${error.message}`),
       h("label", { for: "token" }, "Token"), input, h("button", { class: "main" }, "Open"));
     form.addEventListener("submit", (event) => {
       event.preventDefault();
@@ -133,7 +133,7 @@ function keys(access) {
   const button = document.getElementById("role");
   button.hidden = !access.tokens;
   document.getElementById("docs").hidden = access.tokens; // a link carries no token
-  button.textContent = `Role: ${access.role}, leave`;
+  button.textContent = `Role: ${access.role}, sign out`;
 }
 
 function theme(next) {

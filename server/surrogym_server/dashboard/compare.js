@@ -19,7 +19,7 @@ function words(better, worse, found) {
   const by = `${number(Math.abs(found.by))} (95 %: ${interval(found)})`;
   return found.low > 0
     ? `${better.label} is better than ${worse.label} by ${by}.`
-    : `${better.label} and ${worse.label} can't be told apart: the difference is ${by}, which includes none.`;
+    : `${better.label} and ${worse.label} can't be told apart: the difference is ${by}, and the interval includes 0.`;
 }
 
 function grounds(better, found, pairs, same) {

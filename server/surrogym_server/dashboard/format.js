@@ -52,9 +52,9 @@ export const PHASES = {
 export const MEANING = {
   collecting: "the first real steps are being taken",
   fitting: "the model is learning from new real steps",
-  sampling: "the design chooses real steps where the model is not sure",
-  ready: "the model is as sure as it was asked to be",
-  over_budget: "the budget is spent before the target was reached; it is served all the same",
-  from_log: "the model holds what the log shows, and no real step is asked for",
+  sampling: "the design queries real steps where the model is uncertain",
+  ready: "the model has reached its target",
+  over_budget: "the budget is spent and the target is not reached; the model can be used all the same",
+  from_log: "the model is fitted to the log, and the design requests no real steps",
   failed: "the design stopped with an error",
 };

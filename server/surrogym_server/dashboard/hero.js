@@ -42,27 +42,27 @@ export function sure({ confidence_index: index, target, fidelity, phase, error }
   const least = fidelity.outputs.reduce((a, b) => (b.confidence_index < a.confidence_index ? b : a));
   return card("How sure",
     h("p", { class: index >= target ? "big good" : "big" }, percent(index)), confidenceMeter(index, target),
-    h("p", { class: "note" }, `${index >= target ? "Above" : "Below"} its target of ${percent(target)}; least sure of ${least.name}.`),
+    h("p", { class: "note" }, `${index >= target ? "Above" : "Below"} the target of ${percent(target)}. Least certain output: ${least.name}.`),
     h("p", { class: error ? "bad" : "note" }, error ?? `${MEANING[phase][0].toUpperCase()}${MEANING[phase].slice(1)}.`));
 }
 
 export function where(found, names, onshow, model) {
-  if (!found && model) return card("Where it is unsure", h("p", { class: "big" }, "looking…"), h("p", { class: "note" }, `Asking the model about ${LOOKS} points.`));
-  if (!found) return card("Where it is unsure", h("p", { class: "big" }, "everywhere"), h("p", { class: "note" }, "Nothing is known before the first model."));
+  if (!found && model) return card("Where it is unsure", h("p", { class: "big" }, "looking…"), h("p", { class: "note" }, `The model is being evaluated at ${LOOKS} points.`));
+  if (!found) return card("Where it is unsure", h("p", { class: "big" }, "everywhere"), h("p", { class: "note" }, "There is no model yet."));
   const { times, within, output, coordinates, action } = found;
   const place = `${told(names, coordinates)}, action ${action.map((value) => number(value, 2)).join(", ")}`;
   return card("Where it is unsure",
     h("p", { class: times <= 1 ? "big good" : "big" }, `${count(Math.round((1 - within) * LOOKS))} of ${LOOKS} points`),
     h("p", { class: "note" }, times <= 1
-      ? `None of the states and actions looked at is beyond tolerance; ${output} comes closest, with ${number(times, 2)} of it.`
-      : `of all states and actions are beyond tolerance. Worst: ${output}, ${number(times, 2)} tolerances.`),
-    h("p", { class: "note" }, `Least sure near ${place}. `, h("button", { type: "button", class: "link", onclick: () => onshow(coordinates, action) }, "Show it")));
+      ? `All of them are within tolerance. Largest uncertainty: ${output}, ${number(times, 2)} of its tolerance.`
+      : `are beyond tolerance. Largest uncertainty: ${output}, ${number(times, 2)} times its tolerance.`),
+    h("p", { class: "note" }, `Least certain near ${place}. `, h("button", { type: "button", class: "link", onclick: () => onshow(coordinates, action) }, "Show it")));
 }
 
 export function cost({ ledger, budget, queries }) {
   const open = queries.pending + queries.leased;
   return card("What it cost",
     h("p", { class: "big" }, plural(ledger.total, "real step")), costBar(ledger, budget),
-    h("p", { class: "note" }, `${count(ledger.initial)} initial, ${count(ledger.adaptive)} adaptive${ledger.manual ? `, ${count(ledger.manual)} by hand` : ""}; the budget is ${count(budget)}${ledger.logged ? `; ${count(ledger.logged)} more came in a log, at no cost` : ""}${open ? `, ${count(open)} asked now` : ""}.`),
-    h("p", { class: "note" }, `${ledger.unresolved ? `At most ${count(ledger.unresolved)} more under leases that failed or ran out. ` : ""}Evaluation, apart: ${count(ledger.evaluation)}.`));
+    h("p", { class: "note" }, `${count(ledger.initial)} initial, ${count(ledger.adaptive)} adaptive${ledger.manual ? `, ${count(ledger.manual)} by hand` : ""}; the budget is ${count(budget)}${ledger.logged ? `; ${count(ledger.logged)} more came from a log, at no cost` : ""}${open ? `; ${count(open)} ${open === 1 ? "query is" : "queries are"} open` : ""}.`),
+    h("p", { class: "note" }, `${ledger.unresolved ? `At most ${count(ledger.unresolved)} more may have been taken under leases that failed or expired. ` : ""}Evaluation, counted separately: ${count(ledger.evaluation)}.`));
 }

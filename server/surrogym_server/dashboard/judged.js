@@ -40,9 +40,9 @@ export function meanWords({ mean, mean_interval: interval }) {
 /** One sentence: what it promised, and what came. */
 export function sentence(policy) {
   const [real, { promise }] = [realOf(policy), policy];
-  const said = promise ? `Promised ${number(promise.low)} to ${number(promise.high)}` : "Nothing was promised";
-  if (!real) return `${said}; no real episode from the declared starts yet.`;
+  const said = promise ? `Promised ${number(promise.low)} to ${number(promise.high)}` : "No promise";
+  if (!real) return `${said}; no real episodes from the declared starts yet.`;
   const kept = real.promise_kept === null ? "" : real.promise_kept ? ": the promise was kept" : ": the promise was broken";
   const success = real.success_rate === null ? "" : `; ${percent(real.success_rate)} succeeded`;
-  return `${said}; really ${meanWords(real)} in ${plural(real.episodes, "episode")}${success}${kept}.`;
+  return `${said}; real mean return ${meanWords(real)} in ${plural(real.episodes, "episode")}${success}${kept}.`;
 }

@@ -10,7 +10,7 @@ const ADDRESS = HOME.includes(location.origin) ? "" : `export SURROGYM_URL=${loc
 
 const EMPTY = () => h("div", { class: "card welcome" },
   h("h2", {}, "No surrogate yet"),
-  h("p", {}, "Register an environment, and let a sampler answer the questions about it. This page follows by itself."),
+  h("p", {}, "Register an environment, and let a sampler answer its queries. This page updates itself."),
   h("p", {}, h("a", { href: "#/register" }, "Register from a specification"), ", or by commands:"),
   h("pre", {}, `${ADDRESS}surrogym register Pendulum-v1 --name pendulum\nsurrogym sample pendulum`));
 

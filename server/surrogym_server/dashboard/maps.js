@@ -84,7 +84,7 @@ export function maps(name, spec, controls) {
     const show = (kind, values, [low, high], [lowText, highText], remark) =>
       kinds[kind].show({ ...base, values, low, high, lowText, highText, remark });
     if (!state.said) {
-      for (const kind of Object.keys(kinds)) show(kind, null, [0, 1], ["", ""], state.version === null ? "No model yet." : "Asking the model…");
+      for (const kind of Object.keys(kinds)) show(kind, null, [0, 1], ["", ""], state.version === null ? "No model yet." : "Waiting for the model…");
       return;
     }
     const { deviation, input_probability: occupancy, log_uncertainty_index: index } = state.said;
@@ -94,11 +94,11 @@ export function maps(name, spec, controls) {
     const visited = occupancy.map((row) => row[0]);
     const [least, most] = [Math.min(...visited), Math.max(...visited)];
     kinds.occupancy.figure.hidden = most - least < 1e-9; // the same everywhere: no training has submitted its states
-    show("occupancy", visited, [0, most], ["never", "often"], "States of the training that submitted them last.");
+    show("occupancy", visited, [0, most], ["never", "often"], "States visited by the training that submitted its states last.");
     const log = chosen(index).map((value) => value / LOG_10);
     const high = Math.max(...log);
-    if (high < NOTHING) show("index", null, [0, 1], ["least", "most"], "Nothing on this cut is worth a real step: all of it is far within tolerance.");
-    else show("index", log, [high - DECADES, high], ["a millionth", "the most"], "Relative to the highest index on this cut (eq. 12), by powers of ten.");
+    if (high < NOTHING) show("index", null, [0, 1], ["least", "most"], "No real step is needed on this cut: the whole cut is far within tolerance.");
+    else show("index", log, [high - DECADES, high], ["a millionth", "the most"], "Relative to the highest index on this cut (eq. 12), on a logarithmic scale.");
   }
 
   return {
@@ -106,14 +106,14 @@ export function maps(name, spec, controls) {
       h("div", { class: "picks cuts" }, x.label, y.label, h("label", { class: "pick" }, "of", output)),
       h("p", { class: "key" },
         ["initial", "adaptive", "manual"].map((purpose) => h("span", { class: `mark ${purpose}` }, purpose)),
-        h("label", { class: "pick" }, marks, "show them"), many,
+        h("label", { class: "pick" }, marks, "show samples"), many,
         h("span", { class: "mark cross" }, "the point"), h("span", { class: "mark path" }, "episodes from there")),
       h("div", { class: "maps" }, Object.values(kinds).map((kind) => kind.figure)),
     ],
     moved: () => { draw(); ask(); },
     show({ samples, fidelity, version }) {
       state.samples = samples;
-      many.textContent = samples.length > MOST_MARKS ? `${thinned(samples).length} of ${samples.length} are drawn.` : "";
+      many.textContent = samples.length > MOST_MARKS ? `${thinned(samples).length} of ${samples.length} are shown.` : "";
       if (fidelity && version !== state.version) {
         state.tolerances = fidelity.outputs.map((entry) => entry.tolerance);
         const kept = output.value;

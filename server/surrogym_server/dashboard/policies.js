@@ -23,10 +23,10 @@ export function policyList(name, spec, { role, refresh }) {
   const list = h("div", { class: "policies" });
   const trouble = h("p", { class: "bad", role: "alert", hidden: true });
   const charts = new Set();
-  const element = section("policies", "Policies", "What each promised beside what it gave in the original environment. Higher is better.", place, trouble, list);
+  const element = section("policies", "Policies", "The promise of each policy, and its return in the original environment. Higher is better.", place, trouble, list);
   const draw = shown(place, (policies) => (policies.length
     ? [rangesKey(), ranges(policies.slice(0, SHOWN).map((policy) => ({ label: who(policy), marks: marksOf(policy) })), "Returns of the newest policies"), h("a", { href: `#/compare/${encodeURIComponent(name)}` }, "Compare with the policies of another surrogate")].filter(Boolean)
-    : [h("p", { class: "empty" }, "No policy is stored. ", h("code", {}, `surrogym train ${name}`), " stores its policy as it ends, ", h("code", {}, "surrogym policy push"), " sends one that is a file.")]));
+    : [h("p", { class: "empty" }, "No policy is stored. ", h("code", {}, `surrogym train ${name}`), " stores the policy that it trains; ", h("code", {}, "surrogym policy push"), " stores a policy from a file.")]));
   const rows = keyed(list, one);
 
   const who = ({ version, aliases }) => [`${name}@${version}`, ...aliases].join(", ");
@@ -52,11 +52,11 @@ export function policyList(name, spec, { role, refresh }) {
 
   async function fill(policy, inside) {
     const detail = await call("GET", `${url}/${policy.version}`);
-    const trusted = policy.trusted === null ? "Nobody judged the promise." : `The promise was ${policy.trusted ? "" : "not "}trusted: ${policy.reason}.`;
+    const trusted = policy.trusted === null ? "Nobody checked whether the promise can be trusted." : `The promise was ${policy.trusted ? "" : "not "}trusted: ${policy.reason}.`;
     const parts = [h("p", {}, trusted)];
-    if (policy.differs) parts.push(h("p", { class: "bad" }, `It was made for another specification: that differs in ${policy.differs}.`));
+    if (policy.differs) parts.push(h("p", { class: "bad" }, `The policy was made for another specification, which differs in ${policy.differs}.`));
     parts.push(table(`Real episodes of version ${policy.version}`, [["actions of", ""], ["starts", ""], ["episodes", "num"], ["mean return (95 %)", "num"], ["success", "num"], ["real steps", "num"], ["", ""]],
-      policy.evaluations.map((each) => [ACTING[each.controller], each.note || "–", each.episodes, meanWords(each), percent(each.success_rate), each.steps, episodesOf(policy, each)]), "No real episode yet: surrogym evaluate runs some."));
+      policy.evaluations.map((each) => [ACTING[each.controller], each.note || "–", each.episodes, meanWords(each), percent(each.success_rate), each.steps, episodesOf(policy, each)]), "No real episodes yet; run some with surrogym evaluate."));
     inside.replaceChildren(...parts, files(policy), naming(policy));
     if (detail.curve.length > 1) inside.append(...curve(detail.curve));
     await episodes(policy, inside);
@@ -67,7 +67,7 @@ export function policyList(name, spec, { role, refresh }) {
   function files(policy) {
     const links = policy.files.map((file) => (file.stored
       ? h("button", { type: "button", onclick: () => attempt(() => download(`${url}/${policy.version}/files/${file.form}`, `${name}-${policy.version}.${file.form}`)) }, `Download ${file.form}, ${size(file.bytes)}`)
-      : h("span", { class: "bad" }, `The ${file.form} file is missing: it never came, or it made room for newer ones.`)));
+      : h("span", { class: "bad" }, `The ${file.form} file is missing: it was never sent, or it was removed to make room for newer files.`)));
     return h("div", { class: "buttons" }, links);
   }
 

@@ -10,7 +10,7 @@ const DRAWS = 12;
 
 export function probe(name, spec, controls, { onepisodes, ask }) {
   const { ranges, entries, point } = controls;
-  const answer = h("div", { class: "answer", "aria-live": "polite" }, h("p", { class: "empty" }, "The probe answers as soon as there is a model."));
+  const answer = h("div", { class: "answer", "aria-live": "polite" }, h("p", { class: "empty" }, "The probe needs a model. There is none yet."));
   const charts = episodeCharts(ranges);
   const steps = h("input", { type: "number", min: 1, max: 500, value: Math.min(60, spec.time_limit ?? 60), "aria-label": "steps of the episode" });
   const how = h("select", { "aria-label": "actions of the episode" }, h("option", { value: "hold" }, "this action held"), h("option", { value: "random" }, "random actions"));
@@ -49,7 +49,7 @@ export function probe(name, spec, controls, { onepisodes, ask }) {
     charts.show(imagined);
     onepisodes([...imagined.draws.map(({ coordinates }) => ({ coordinates })), { coordinates: imagined.mean.coordinates, mean: true }]);
     const total = imagined.mean.reward.reduce((sum, value) => sum + value, 0);
-    episode.textContent = `Imagined return of the mean over ${imagined.mean.reward.length} steps: ${number(total, 4)}${imagined.mean.terminated ? ", then it ends" : ""}. Thin lines: ${DRAWS} functions the data allow.`;
+    episode.textContent = `Imagined return of the mean over ${imagined.mean.reward.length} steps: ${number(total, 4)}${imagined.mean.terminated ? ", then it ends" : ""}. Thin lines: ${DRAWS} functions drawn from the posterior.`;
   });
 
   const refused = (error) => {
@@ -67,7 +67,7 @@ export function probe(name, spec, controls, { onepisodes, ask }) {
     parts: [
       trouble,
       h("div", { class: "probe" }, answer,
-        ask && h("button", { type: "button", class: "main", onclick: () => ask(point) }, "Ask for this real step")),
+        ask && h("button", { type: "button", class: "main", onclick: () => ask(point) }, "Request this real step")),
       h("div", { class: "rolled" }, h("h3", {}, "An episode from there"),
         h("div", { class: "picks" }, h("label", { class: "pick" }, "steps", steps), h("label", { class: "pick" }, "with", how)),
         episode, charts.place),

@@ -104,10 +104,10 @@ function build(main, name, spec, context) {
   main.replaceChildren(title, facts,
     h("nav", { class: "jumps", "aria-label": "Parts of this page" }, LINKS.map(([id, text]) => h("a", { href: `#${id}`, onclick: jump(id) }, text))),
     stored.element,
-    section("learning", "Learning", "How sure the model was after so many real steps, and how wrong it was where it left each of them out.", curves.parts),
-    section("maps", "Maps", "Two coordinates at a time; the sliders set the others. Click a map, or move with the arrow keys.",
+    section("learning", "Learning", "Confidence index and leave-one-out error of each output, against the number of real steps in the model.", curves.parts),
+    section("maps", "Maps", "Each map shows two coordinates; the sliders set the others. Click a map, or use the arrow keys, to move the point.",
       h("div", { class: "cut" }, controls.form, h("div", {}, map.parts))),
-    section("probe", "Probe", "What the model says of one step from the point above, with its standard deviations.", probing.parts),
+    section("probe", "Probe", "The model's prediction of one step from the point above, with standard deviations.", probing.parts),
     queue.element, sessions.element, h("div", { class: "two" }, ledger.element, steer.element), versions.element, log.element, files.element);
 
   let found = null;

@@ -24,11 +24,11 @@ export function queueTable() {
       h("span", { class: `badge ${query.status}` }, STATUS[query.status] ?? query.status),
       vector(query.coordinates), query.actions.length > 1 ? `${query.actions.length} actions` : vector(query.actions[0]),
       query.attempts, lease(query), query.sampler ?? "–", query.error ? h("span", { class: "bad" }, query.error) : ""]),
-    filter.value === "all" ? "No query was asked yet." : "None."));
+    filter.value === "all" ? "There are no queries yet." : "None."));
   const draw = () => render(queries.filter(FILTERS[filter.value]).slice(0, ROWS));
   filter.addEventListener("change", draw);
   return {
-    element: section("queue", "Queue", "Queries to samplers, the newest first. A lease is one attempt, and a sampler at work renews it; a query that keeps failing is set aside.", h("div", { class: "picks" }, h("label", { class: "pick" }, "show", filter)), place),
+    element: section("queue", "Queue", "Queries, the newest first. A sampler holds a query under a lease, which it renews while it works. A query that keeps failing is set aside.", h("div", { class: "picks" }, h("label", { class: "pick" }, "show", filter)), place),
     show(given) { queries = given.toReversed(); draw(); },
   };
 }
@@ -37,13 +37,13 @@ export function ledgerTable() {
   const place = h("div");
   const render = shown(place, (ledger) => table("Ledger", [["real steps", ""], ["", "num"], ["", "wide"]], [
     ["initial", count(ledger.initial), "a Latin hypercube, before anything is known"],
-    ["adaptive", count(ledger.adaptive), "chosen where the model was not sure"],
-    ["manual", count(ledger.manual), "asked for, or handed in, by a person"],
-    [h("strong", {}, "total"), h("strong", {}, count(ledger.total)), "what the design cost"],
-    ["audit", count(ledger.audit), "tested the promise of a policy; they cost no budget"],
-    ["logged", count(ledger.logged), "recorded before, by somebody else; they cost no budget"],
-    ["unresolved", count(ledger.unresolved), `leases that ran out, or failed (${count(ledger.failed)}): at most so many more were taken`],
-    ["evaluation", count(ledger.evaluation), "to judge policies; not seen by the model"],
+    ["adaptive", count(ledger.adaptive), "chosen where the model was uncertain"],
+    ["manual", count(ledger.manual), "requested or submitted by a person"],
+    [h("strong", {}, "total"), h("strong", {}, count(ledger.total)), "initial, adaptive and manual: what the budget counts"],
+    ["audit", count(ledger.audit), "tests of a policy's promise; they cost no budget"],
+    ["logged", count(ledger.logged), "recorded before, from a log; they cost no budget"],
+    ["unresolved", count(ledger.unresolved), `steps that may have been taken under leases that expired or failed (${count(ledger.failed)} failed)`],
+    ["evaluation", count(ledger.evaluation), "real episodes of policies; the model does not learn from them"],
   ], ""));
   return { element: section("ledger", "Ledger", "Every real step, by purpose.", place), show: render };
 }
@@ -67,7 +67,7 @@ export function modelTable() {
   const rows = keyed(list, model);
   const empty = h("p", { class: "empty" }, "No model yet: the first fit follows the initial queries.");
   return {
-    element: section("models", "Model versions", "Open one for its structure and hyperparameters.", empty, list),
+    element: section("models", "Model versions", "Open a version to see its structure and hyperparameters.", empty, list),
     show(models) { empty.hidden = models.length > 0; rows(models.toReversed(), (record) => record.version); },
   };
 }
@@ -85,7 +85,7 @@ export function sessionTable(name) {
         session.returns.length ? number(mean(session.returns), 4) : "–", sparkline(session.returns), session.returns.length && before ? percent(taken / before) : "–"];
     }), `No session is open. A trainer opens one: surrogym train ${name}`));
   return {
-    element: section("sessions", "Sessions", "Virtual environments in use. Returns are means of the last hundred episodes, and imagined: no sign of success in the original environment.", place),
+    element: section("sessions", "Sessions", "Virtual environments in use. Returns are means of the last 100 virtual episodes; they do not show success in the original environment.", place),
     show: render,
   };
 }
