@@ -1,1 +1,1 @@
-"""One environment as the core sees it: definition, terms, actions, features, samples, and the rules of a step."""
+"""One environment as the core represents it: definition, terms, actions, features, samples, and the rules of a step."""

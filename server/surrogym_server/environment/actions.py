@@ -1,4 +1,4 @@
-"""Actions: what a policy sends, what the model is fed, and the check at the door between them."""
+"""Actions: those of a policy, those of the model, and the checks and conversions between them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FLOAT32_SLACK = 1e-6
 
 
 def policy_actions(action: ActionDefinition, raw: NDArray[Any], num_envs: int) -> Array:
-    """Check a policy's actions, (N, F) or (N,) where F = 1, and give the model's, (N, F).
+    """Check a policy's actions, (N, F) or (N,) if F = 1, and convert them to the model's, (N, F).
 
     Raises:
         InvalidInput: wrong shape, not finite, not an integer, or out of bounds.
@@ -28,7 +28,7 @@ def policy_actions(action: ActionDefinition, raw: NDArray[Any], num_envs: int) -
 
 
 def model_actions(action: ActionDefinition, raw: NDArray[Any]) -> Array:
-    """Check actions as queries and samples carry them, (n, F): continuous values, or numbers of discrete actions.
+    """Check actions of queries and samples, (n, F): continuous values, or numbers of discrete actions.
 
     Raises:
         InvalidInput: wrong shape, not finite, not an integer, or out of bounds.
@@ -41,7 +41,7 @@ def model_actions(action: ActionDefinition, raw: NDArray[Any]) -> Array:
 
 
 def decode_bins(action: ActionDefinition, rows: Array) -> Array:
-    """Continuous values (n, F) of equally spaced bins, numbers (n, F)."""
+    """Convert numbers of equally spaced bins (n, F) to continuous values (n, F)."""
     low, high = action.limits
     values: Array = low + rows * (high - low) / (np.array(action.bins) - 1)
     return values

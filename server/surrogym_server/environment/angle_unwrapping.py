@@ -1,9 +1,9 @@
-"""Turns: an angle that moves by more than half a turn within a step comes back wrapped, and is unwrapped here.
+"""Unwrapping of angles that move by more than half a turn within one step.
 
-A fast joint with a slow clock is sampled as if it were a slow one, with a jump wherever its increment crosses half a
-turn. No smooth function predicts that. What an angle moves by is close to linear in the speeds, so the turns that are
-missing are those under which it is: linear regression on a circle (Fisher & Lee, Biometrics 48, 1992), where wrong
-turns leave residuals all round it.
+A fast joint with a slow clock looks like a slow one, with a jump wherever its increment crosses half a turn. No smooth
+function predicts such jumps. The true increment of an angle is close to linear in the speeds, so the missing turns are
+those that make it linear: linear regression on a circle (Fisher & Lee, Biometrics 48, 1992), in which wrong turns leave
+residuals all round the circle.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ CLEARLY = 0.25  # of the squared residuals without turns
 
 
 def angle_increments(definition: EnvironmentDefinition, q: Tensor, q_next: Tensor) -> Tensor:
-    """What each angle moved by in the steps from q (n, C) to q_next (n, C), turns included, (n, A) in radians."""
+    """Increments of each angle in the steps from q (n, C) to q_next (n, C), with whole turns, (n, A) in radians."""
     change = wrap((q_next - q)[:, definition.angles])
     moved_by = [i for i in definition.moving if definition.coordinates[i].kind == "linear"]
     if not moved_by or len(q) < POINTS_A_WEIGHT * (len(moved_by) + 1):
@@ -33,10 +33,11 @@ def angle_increments(definition: EnvironmentDefinition, q: Tensor, q_next: Tenso
 
 
 def _unwrapped(speeds: Tensor, change: Tensor) -> Tensor:
-    """Increments (n,) with the turns that make them most linear in speeds (n, L); as they are if none clearly do.
+    """Add the turns to increments (n,) that make them most linear in the speeds (n, L). Leave them if no turns clearly
+    do.
 
-    Starts from every slope of every speed that explains up to ``MAX_TURNS`` turns, alternates between turns and least
-    squares, and takes the start that ends with the least residual.
+    The search starts from every slope of every speed that explains up to ``MAX_TURNS`` turns, alternates between turns
+    and least squares, and takes the start with the smallest final residual.
     """
     basis = torch.cat([torch.ones(len(speeds), 1, dtype=torch.float64), speeds], 1)
     solve = torch.linalg.pinv(basis)

@@ -1,4 +1,4 @@
-"""Inequalities over terms, in groups of which all must hold."""
+"""Inequalities over terms, in groups. A group holds if all its inequalities hold."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Inequality:
 
 @dataclass(frozen=True)
 class Conditions:
-    """G groups of K inequalities in all, compiled: every one as sign * term >= threshold, exactly."""
+    """G groups of K inequalities in all, compiled: each one as sign * term >= threshold, exactly."""
 
     terms: TermSet
     sign: Tensor  # (K,)
@@ -34,7 +34,7 @@ class Conditions:
 
     @classmethod
     def of(cls, groups: Sequence[Sequence[Inequality]], coordinates: int, device: torch.device = CPU) -> Conditions:
-        """Compile groups over C coordinates on a device. A group of none always holds."""
+        """Compile groups over C coordinates on a device. An empty group always holds."""
         inequalities = [i for group in groups for i in group]
         belongs = [g for g, group in enumerate(groups) for _ in group]
         sign = np.array([1.0 if i.relation in (">", ">=") else -1.0 for i in inequalities])

@@ -1,4 +1,4 @@
-"""A reward that is known: a sum of weighted shapes of quantities of state and action. Data, never code."""
+"""A declared reward: a sum of weighted shapes of quantities of state and action. It is data, never code."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class RewardTerm:
-    """weight * shape(x_1, x_2, ...) where every inequality in ``when`` holds, else 0.
+    """weight * shape(x_1, x_2, ...) if every inequality in ``when`` holds, else 0.
 
     ``one``: 1. ``linear``: sum x_i. ``absolute``: sum |x_i|. ``square``: sum x_i^2. ``bump``: exp(-1/2 sum x_i^2).
     """
@@ -38,16 +38,16 @@ class RewardTerm:
 
 @dataclass(frozen=True)
 class DeclaredReward:
-    """The sum of its terms at the state before the step, or after it, and the action."""
+    """The sum of its terms at the action and the state, before or after the step."""
 
     terms: tuple[RewardTerm, ...]
     after: bool
-    terminal: float  # what a step that ends the episode pays beyond
+    terminal: float  # added to the reward of a step that ends the episode
     coordinates: int
     device: torch.device = CPU  # where its tensors are
 
     def __call__(self, q: Tensor, u: Tensor) -> Tensor:
-        """Reward (m,) of the state q (m, C) that counts and the action u (m, F)."""
+        """Reward (m,) of the state q (m, C), before or after the step, and the action u (m, F)."""
         values, weights, conditions = self._compiled
         x = values(q) + u @ weights
         holds = conditions(q)
@@ -61,7 +61,7 @@ class DeclaredReward:
 
     @cached
     def _compiled(self) -> tuple[TermSet, Tensor, Conditions]:
-        """All quantities' terms and action weights (F, X), and when each term counts."""
+        """All quantities' terms and action weights (F, X), and the conditions of each term."""
         quantities = [quantity for term in self.terms for quantity in term.of]
         weights = torch.tensor([quantity.action for quantity in quantities], dtype=torch.float64)
         terms = compile_terms([quantity.term for quantity in quantities], self.coordinates)

@@ -1,4 +1,4 @@
-"""EnvironmentDefinition: the core's own frozen view of an environment. Specifications are converted at the edge."""
+"""EnvironmentDefinition: the core's own frozen description of an environment, converted from the specification."""
 
 from __future__ import annotations
 
@@ -42,14 +42,15 @@ class CoordinateDefinition:
 
     @property
     def settable(self) -> tuple[float, float]:
-        """What the original environment can be set to: its bounds, or the sampling range where it has none."""
+        """The values to which the original environment can be set: the bounds, or the sampling range if there
+        are none."""
         low = self.low if np.isfinite(self.low) else self.sampling.low
         return low, self.high if np.isfinite(self.high) else self.sampling.high
 
 
 @dataclass(frozen=True)
 class ActionDefinition:
-    """A box (low, high), offered to policies as ``bins`` where given, or discrete counts ``nvec``."""
+    """A box (low, high), offered to policies as ``bins`` if these are given, or discrete counts ``nvec``."""
 
     kind: Literal["box", "discrete", "multi_discrete"]
     low: tuple[float, ...] = ()
@@ -59,7 +60,7 @@ class ActionDefinition:
 
     @cached_property
     def limits(self) -> tuple[Array, Array]:
-        """``low`` and ``high`` as arrays, (F,) each, made once: every step of a policy is checked against them."""
+        """``low`` and ``high`` as arrays, (F,) each; cached, because every step of a policy is checked against them."""
         return np.array(self.low), np.array(self.high)
 
     @property
@@ -68,7 +69,7 @@ class ActionDefinition:
 
     @property
     def policy_counts(self) -> tuple[int, ...]:
-        """How many values a policy chooses from in each entry; empty for a continuous policy."""
+        """Number of values in each entry of a policy's action; empty for a continuous policy."""
         return self.nvec or self.bins or ()
 
 
@@ -137,21 +138,21 @@ class EnvironmentDefinition:
     learns_termination: bool = False  # from samples; no groups are declared then
     declared_reward: DeclaredReward | None = None
     max_rollout: int | None = None  # longest action sequence from a reset; None where any state can be set
-    starts: tuple[tuple[float, ...], ...] = ()  # states that episodes start at; none: the coordinates' distributions
-    outside_reward: float | None = None  # of each step that an episode lacks which left the sampling range
-    device: torch.device = CPU  # where its tensors are, and those of states and actions that it is given
+    starts: tuple[tuple[float, ...], ...] = ()  # states at which episodes start; empty: the coordinates' distributions
+    outside_reward: float | None = None  # for each step that an episode misses after it left the sampling range
+    device: torch.device = CPU  # of its tensors, and of the states and actions that it is given
 
     def on(self, device: torch.device) -> EnvironmentDefinition:
-        """The same for states on another device."""
+        """The same definition for states on another device."""
         return self if device == self.device else to_device(self, device)
 
     def tolerances_over(self, usual: Sequence[float]) -> tuple[float, ...]:
-        """Tolerance of each output: the declared one, else the usual one of these (O,)."""
+        """Tolerance of each output: the declared one, or else the one in ``usual`` (O,)."""
         declared = dict(self.tolerances)
         return tuple(declared.get(name, value) for name, value in zip(self.outputs, usual, strict=True))
 
     def with_tolerances(self, tolerances: Mapping[str, float]) -> EnvironmentDefinition:
-        """The same with these tolerances, by output, in the place of its own."""
+        """The same definition with these tolerances, by output."""
         return replace(self, tolerances=tuple((dict(self.tolerances) | dict(tolerances)).items()))
 
     @property
@@ -170,12 +171,12 @@ class EnvironmentDefinition:
 
     @cached
     def moving_columns(self) -> Tensor:
-        """``moving`` as a tensor of the device."""
+        """``moving`` as a tensor on the device."""
         return torch.tensor(self.moving, device=self.device)
 
     @cached_property
     def outputs(self) -> tuple[str, ...]:
-        """Modelled outputs by name: the moving coordinates or the observation entries, then the reward."""
+        """Names of the modelled outputs: the moving coordinates or the observation entries, then the reward."""
         if self.moves_observation:
             return (*self.observation_names, REWARD)
         return (*(self.coordinates[i].name for i in self.moving), REWARD)
@@ -187,13 +188,13 @@ class EnvironmentDefinition:
 
     @cached_property
     def observation_combines(self) -> bool:
-        """Whether an observation entry says more than one coordinate, its cosine or its sine does."""
+        """Whether an observation entry is more than a coordinate, its cosine or its sine."""
         terms = self.observation_terms
         return any(len(t.parts) > 1 or any(np.count_nonzero(p.weights) > 1 for p in t.parts) for t in terms)
 
     @cached
     def observation_scaling(self) -> tuple[Tensor, Tensor]:
-        """Mean and deviation of the observation over the sampling range, (D,) each; an entry that never varies has
+        """Mean and deviation of the observation over the sampling range, (D,) each. An entry that never varies has
         deviation 1."""
         drawn = np.random.default_rng(0).uniform(size=(SCALING_POINTS, len(self.coordinates)))
         p = torch.from_numpy(drawn).to(self.device)
@@ -210,8 +211,8 @@ class EnvironmentDefinition:
 
     @cached
     def reach(self) -> tuple[Tensor, Tensor]:
-        """Saturation bounds, (C,) each; where there is none, ``REACH`` widths of the sampling range beyond it, so that
-        a model that diverges stays finite."""
+        """Saturation bounds, (C,) each. A side without a bound has one ``REACH`` widths of the sampling range beyond
+        that range, so that a diverging model stays finite."""
         low, high = self.bounds
         begin, end = self._sampled
         room = REACH * (end - begin)
@@ -234,7 +235,7 @@ class EnvironmentDefinition:
         return tuple(i for i, c in enumerate(self.coordinates) if c.kind == "angle")
 
     def terminated(self, q: Tensor) -> Tensor:
-        """Whether an episode ends at q (..., C) as declared, shape (...): any group all of whose inequalities hold."""
+        """Whether the declared termination holds at q (..., C), shape (...): in any group all inequalities hold."""
         if not self.termination_groups:
             return torch.zeros(q.shape[:-1], dtype=torch.bool, device=q.device)
         return self._termination(q).any(-1)
@@ -245,7 +246,7 @@ class EnvironmentDefinition:
 
     @cached
     def start_states(self) -> Tensor:
-        """States that episodes start at, (k, C)."""
+        """States at which episodes start, (k, C)."""
         return torch.tensor(self.starts, dtype=torch.float64, device=self.device).reshape(-1, len(self.coordinates))
 
     @cached
@@ -259,5 +260,5 @@ class EnvironmentDefinition:
 
 
 def wrap(angle: Tensor) -> Tensor:
-    """Angle in [-pi, pi)."""
+    """Wrap an angle to [-pi, pi)."""
     return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi

@@ -1,6 +1,6 @@
-"""One-dimensional distributions of coordinates, through their inverse distribution functions.
+"""One-dimensional distributions of coordinates, by their inverse distribution functions.
 
-Everything random is drawn as a uniform number first, so that Latin hypercubes and counter-based noise share one path.
+Every random value is first drawn as a uniform number, so that Latin hypercubes and counter-based noise share one path.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class Uniform:
     high: float
 
     def quantile(self, p: Tensor) -> Tensor:
-        """Value below which a share p lies."""
+        """The value with a share p of the distribution below it."""
         return self.low + (self.high - self.low) * p
 
 
@@ -32,7 +32,7 @@ class Normal:
     high: float
 
     def quantile(self, p: Tensor) -> Tensor:
-        """Value below which a share p lies."""
+        """The value with a share p of the distribution below it."""
         edges = torch.tensor([self.low, self.high], dtype=p.dtype, device=p.device)
         below, above = torch.special.ndtr((edges - self.mean) / self.std)
         value: Tensor = self.mean + self.std * torch.special.ndtri(below + (above - below) * p)
@@ -52,7 +52,7 @@ class Fixed:
         return self.value
 
     def quantile(self, p: Tensor) -> Tensor:
-        """The value, whatever p."""
+        """The value, for any p."""
         return torch.full_like(p, self.value)
 
 

@@ -23,17 +23,18 @@ Drift = tuple[tuple[float, ...], ...]  # weights (C,) of q for each angle
 
 @dataclass(frozen=True)
 class FeatureMap:
-    """How (q, u) is shown to one output's process.
+    """Encoding of (q, u) for one output's process.
 
-    ``state``: angles as cos and sin, as the wrapped angle, or both; or the observation: as it is in the paper,
-    standardised elsewhere; or none of coordinates and action, but the lead alone.
-    ``action``: discrete actions as evenly spaced values, or one-hot, or no action at all. ``lead``: the predicted,
-    clipped next value of saturating coordinates is an input as well, so that what follows from it (an angle from its
-    speed) sees no kink. ``after``: the state that the step led to is shown, not the one it began in; only for the
-    reward. ``drift``: weights (C,) of q for each angle; cos and sin of where the angle turns to by them are inputs as
-    well. ``parity``: what the
-    output does when every coordinate and the action change their sign: nothing in particular, or it does so too
-    (odd), or it stays (even).
+    Attributes:
+        state: angles as cos and sin, as the wrapped angle, or both; or the observation, standardised except in preset
+            paper; or no coordinates and no action, only the lead.
+        action: discrete actions as evenly spaced values, or one-hot, or no action at all.
+        lead: the predicted, clipped next value of saturating coordinates is an input too. Then an output that follows
+            from it (an angle from its speed) has no kink.
+        after: encode the state after the step instead of the one before it; for the reward alone.
+        drift: weights (C,) of q for each angle; cos and sin of the angle that they predict are inputs too.
+        parity: how the output changes if every coordinate and the action change their sign: without a rule, its sign
+            changes too (odd), or it stays (even).
     """
 
     state: State = "cos_sin"
@@ -49,7 +50,7 @@ class FeatureMap:
 
 
 def leading(definition: EnvironmentDefinition) -> tuple[int, ...]:
-    """Coordinates that saturate on both sides without being a wall: limited speeds. They are predicted first."""
+    """Coordinates that saturate on both sides without a wall, such as limited speeds. They are predicted first."""
     return tuple(
         i
         for i in definition.moving
@@ -62,13 +63,13 @@ class Feature(NamedTuple):
 
     function: Literal["affine", "cos", "sin", "turned_cos", "turned_sin", "wrapped", "equal", "observed", "lead"]
     entry: int
-    centre: float = 0.0  # "equal": the value it is compared with
+    centre: float = 0.0  # "equal": the value that it is compared with
     scale: float = 1.0
     weights: tuple[float, ...] = ()  # (C,), "turned"
 
 
 def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tuple[Feature, ...]:
-    """The features of a map, in their order."""
+    """The features of a map, in order."""
     made = [] if feature_map.state == "none" else _of_point(definition, feature_map)
     if feature_map.lead:
         made += [
@@ -98,7 +99,7 @@ def encode(
 
 @dataclass(frozen=True)
 class Encoder:
-    """The features of several maps, each computed once and all of a function together."""
+    """The features of several maps. Each is computed once, and all features of one function are computed together."""
 
     definition: EnvironmentDefinition
     groups: tuple[tuple[str, slice | Tensor, Tensor, Tensor], ...]  # function, entries (weights), centres, scales
@@ -106,7 +107,7 @@ class Encoder:
 
     @classmethod
     def of(cls, definition: EnvironmentDefinition, maps: Iterable[FeatureMap]) -> Encoder:
-        """Compile maps: their features by function, the lead's last."""
+        """Compile maps: their features grouped by function, those of the lead last."""
         wanted = {feature for feature_map in maps for feature in features(definition, feature_map)}
         ordered = sorted(wanted, key=lambda f: (f.function == "lead", f))
         groups = tuple(
@@ -120,17 +121,17 @@ class Encoder:
         return tuple(self.columns[feature] for feature in features(self.definition, feature_map))
 
     def width(self, lead: bool) -> int:
-        """How many features there are, with or without the lead's."""
+        """Number of features, with or without those of the lead."""
         return sum(lead or feature.function != "lead" for feature in self.columns)
 
     def __call__(self, q: Tensor, u: Tensor) -> Tensor:
-        """All features of coordinates q (..., C) and actions u (..., F) but those of the lead."""
+        """All features of coordinates q (..., C) and actions u (..., F), except those of the lead."""
         raw = torch.cat([q, u], -1)
         values = [self._values(*group, raw) for group in self.groups if group[0] != "lead"]
         return torch.cat(values, -1) if values else raw[..., :0]
 
     def with_lead(self, x: Tensor, lead: Tensor) -> Tensor:
-        """All features: x (..., d) of a call, and those of the lead (..., L)."""
+        """All features: x (..., d) of a call, with those of the lead (..., L) added."""
         return torch.cat([x, *(self._values(*group, lead) for group in self.groups if group[0] == "lead")], -1)
 
     def _values(self, function: str, entries: slice | Tensor, centre: Tensor, scale: Tensor, raw: Tensor) -> Tensor:
@@ -159,7 +160,7 @@ class Encoder:
 
 
 def _of_point(definition: EnvironmentDefinition, feature_map: FeatureMap) -> list[Feature]:
-    """Features of coordinates and action, without the lead's."""
+    """Features of coordinates and action, without those of the lead."""
     made: list[Feature] = []
     if feature_map.state == "observation":
         made += _of_observation(definition)
@@ -201,7 +202,7 @@ def _of_action(definition: EnvironmentDefinition, feature_map: FeatureMap, entry
 
 
 def _group(same: tuple[Feature, ...], device: torch.device) -> tuple[slice | Tensor, Tensor, Tensor]:
-    """Entries, as a slice where they are neighbours, or weights (C, k); centres and scales."""
+    """Entries, as a slice if they are neighbours, or weights (C, k); centres and scales."""
     centre, scale = torch.tensor([(f.centre, f.scale) for f in same], dtype=torch.float64, device=device).T
     if same[0].weights:
         return torch.tensor([f.weights for f in same], dtype=torch.float64, device=device).T, centre, scale

@@ -1,7 +1,7 @@
-"""Coordinates read back from an observation, where the outputs move the observation itself.
+"""Read coordinates back from an observation, for models whose outputs move the observation.
 
-An angle needs both its cosine and its sine among the entries (their mean leaves the circle, the angle does not);
-a linear coordinate needs an entry that is the coordinate itself.
+An angle needs both its cosine and its sine among the entries. Their mean leaves the circle, but the angle is still
+defined. A linear coordinate needs an entry that is the coordinate itself.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from surrogym_server.errors import InvalidSpec
 
 @dataclass(frozen=True)
 class ObservationInverse:
-    """For each moving coordinate the entries it is read from: (value,) or (cos, sin)."""
+    """For each moving coordinate, the entries from which it is read: (value,) or (cos, sin)."""
 
     sources: tuple[tuple[int, tuple[int, ...]], ...]
 
     @classmethod
     def of(cls, definition: EnvironmentDefinition) -> ObservationInverse:
-        """Raises InvalidSpec where the observation does not determine a coordinate."""
+        """Find the entries. Raises ``InvalidSpec`` if the observation does not determine a coordinate."""
         return cls(tuple((i, _source(definition, i)) for i in definition.moving))
 
     def __call__(self, o: Tensor, q: Tensor) -> Tensor:
-        """Coordinates (m, C) of observations o (m, D); constants are kept from q (m, C)."""
+        """Coordinates (m, C) of observations o (m, D). Constants are taken from q (m, C)."""
         recovered = q.clone()
         for index, entries in self.sources:
             if len(entries) == 2:
@@ -54,7 +54,7 @@ def _source(definition: EnvironmentDefinition, index: int) -> tuple[int, ...]:
 
 
 def _entry(definition: EnvironmentDefinition, part: Part, low: float, high: float) -> int | None:
-    """Where the observation has this part by itself, not clipped within [low, high]."""
+    """Index of the observation entry that is this part alone, not clipped within [low, high]."""
     for position, term in enumerate(definition.observation_terms):
         if term.parts == (part,) and term.low <= low and term.high >= high:
             return position

@@ -1,4 +1,4 @@
-"""States with actions: where a model is asked."""
+"""States with actions, as inputs of a model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Samples: the real steps a model is learned from."""
+"""Samples: the real steps from which a model is learned."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Samples:
 
     @property
     def digest(self) -> str:
-        """Hash of the data, byte for byte: two models of equal digest saw the same samples."""
+        """Hash of the data, byte for byte. Two models with equal digests were learned from the same samples."""
         sha = hashlib.sha256()
         for tensor in (self.q, self.u, self.q_next, self.reward, self.terminated):
             sha.update(tensor.cpu().contiguous().numpy().tobytes())
@@ -35,8 +35,8 @@ class Samples:
 
 
 def increments(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
-    """Targets of the transition outputs, (n, M): q' - q of the moving coordinates, angles by what they turned; or
-    o' - o where the outputs move the observation."""
+    """Targets of the transition outputs, (n, M): q' - q of the moving coordinates, angles with whole turns; or o' - o
+    if the outputs move the observation."""
     if definition.moves_observation:
         return definition.observe(samples.q_next) - definition.observe(samples.q)
     change = samples.q_next - samples.q
@@ -45,7 +45,7 @@ def increments(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 
 
 def saturated(definition: EnvironmentDefinition, q_next: Tensor) -> Tensor:
-    """Which samples (n,) ended at a declared bound: their increments were cut, and say little about the dynamics."""
+    """Which samples (n,) ended at a declared bound. Their increments are cut, so they say little about the dynamics."""
     low, high = definition.bounds
     slack = 1e-9 * torch.where(torch.isfinite(high - low), high - low, 1.0)
     return ((q_next <= low + slack) | (q_next >= high - slack)).any(-1)

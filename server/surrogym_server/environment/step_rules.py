@@ -1,4 +1,4 @@
-"""Rules of a step, whatever model predicts it: limits, walls, wrapped angles, and what an end pays."""
+"""Rules of a step for every model: limits, walls, wrapped angles, and the reward of an ending."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from surrogym_server.environment.observation_inverse import ObservationInverse
 
 
 def paid(terminal_reward: float, reward: Tensor, terminated: Tensor) -> Tensor:
-    """Rewards (m,), with what steps that end the episode, terminated (m,), pay beyond."""
+    """Add to the rewards (m,) what terminating steps, terminated (m,), pay in addition."""
     return reward + terminal_reward * terminated if terminal_reward else reward
 
 
 def clip(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
-    """Coordinates q (..., C) inside their saturation bounds, and a diverging model's within its reach."""
+    """Clip coordinates q (..., C) to their saturation bounds, or to their reach if a model diverges."""
     low, high = definition.reach
     return torch.clamp(q, low, high)
 
 
 def settle(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
-    """Coordinates as the environment leaves them: clipped, stopped at walls, angles wrapped. q (..., C)."""
+    """Apply the rules of the environment to coordinates q (..., C): clipped, stopped at walls, angles wrapped."""
     inside = clip(definition, q)
     for index, coordinate in enumerate(definition.coordinates):
         if coordinate.stops is not None:
@@ -35,8 +35,8 @@ def settle(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
 
 
 def placed(definition: EnvironmentDefinition, change: Tensor) -> Tensor:
-    """Changes (m, M) of the moving coordinates as changes (m, C) of all, as ``moved`` takes them. Changes of the
-    observation stay as they are."""
+    """Convert changes (m, M) of the moving coordinates to changes (m, C) of all coordinates, as ``moved`` takes them.
+    Changes of the observation stay unchanged."""
     if definition.moves_observation:
         return change
     every = change.new_zeros(len(change), len(definition.coordinates))
@@ -44,7 +44,7 @@ def placed(definition: EnvironmentDefinition, change: Tensor) -> Tensor:
 
 
 def moved(definition: EnvironmentDefinition, inverse: ObservationInverse | None, q: Tensor, change: Tensor) -> Tensor:
-    """Where coordinates q (m, C) arrive that change by (m, C), or whose observation does, by (m, D), given its inverse;
-    as the environment leaves them."""
+    """Next coordinates after a change (m, C) of coordinates q (m, C), or after a change (m, D) of their observation,
+    given its inverse. The rules of the environment are applied."""
     arrived = q + change if inverse is None else inverse(definition.observe(q) + change, q)
     return settle(definition, arrived)

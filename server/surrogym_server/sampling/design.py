@@ -1,4 +1,5 @@
-"""The rounds of Algorithm 1: fit, judge, choose. Pure: state and samples in, decision and new state out."""
+"""The rounds of Algorithm 1: fit the model, judge it, choose queries. Pure: state and samples in, decision and state
+out."""
 
 from __future__ import annotations
 
@@ -29,19 +30,19 @@ from surrogym_server.sampling.tolerances import Usual, frozen_tolerances
 
 Verdict = Literal["continue", "ready", "over_budget", "from_log"]
 SHORTEST_ROUND = 4  # real steps
-WARM = "thetas"  # in stored states, as it was called when it was always hyperparameters
-FEW_POINTS = 500  # more of them leave no gap worth a comparison of all pairs, whose memory grows with their square
+WARM = "thetas"  # name in stored states, from the time when only hyperparameters were stored
+FEW_POINTS = 500  # more points leave no large gap, and comparing all pairs takes memory in the square of their number
 
 
 @dataclass(frozen=True)
 class DesignState:
-    """What one round leaves for the next; JSON-able."""
+    """State that one round passes to the next; can be written as JSON."""
 
     round: int = 0
-    usual: tuple[float, ...] = ()  # tolerances, per output, where nobody set one; see ``tolerances``
-    warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # what the fit leaves for the next one
-    ended_with: tuple[float, ...] = ()  # steps of the budget, budget, target and tolerances, where the design ended
-    ranges: tuple[float, ...] = ()  # of the targets that each tolerance was taken from
+    usual: tuple[float, ...] = ()  # default tolerances, per output; see ``tolerances``
+    warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # what a fit passes to the next one
+    ended_with: tuple[float, ...] = ()  # steps of the budget, budget, target and tolerances at the end of the design
+    ranges: tuple[float, ...] = ()  # of the targets, from which each tolerance was computed
 
     def to_json(self) -> dict[str, Any]:
         warm = {key: array.tolist() for key, array in self.warm.items()}
@@ -57,16 +58,16 @@ class DesignState:
 
 @dataclass(frozen=True)
 class Request:
-    """What a round is asked to do.
+    """Input of a round.
 
-    Pending queries, open or set aside, count as if they had been answered: against the budget, so that a design whose
-    every query fails comes to an end, and in the acquisition, so that the next ones go elsewhere.
+    Pending queries, open or set aside, are treated as answered. They count towards the budget, so that a design whose
+    queries all fail comes to an end, and in the acquisition, so that the next queries go elsewhere.
     """
 
     budget: int
     target: float
     pending: Points  # p
-    extra: int = 0  # real steps to choose whatever the verdict
+    extra: int = 0  # real steps to choose even if the design has ended
     states: Tensor | None = None  # (v, C) visited by policies
     pending_rollouts: tuple[Tensor, ...] = ()  # each (T, F)
     logged: int = 0  # of the samples, from a log
@@ -74,7 +75,7 @@ class Request:
 
     @property
     def free(self) -> int:
-        """Samples that cost none of the budget."""
+        """Number of samples that don't count towards the budget."""
         return self.logged + self.audited
 
 
@@ -82,16 +83,16 @@ class Request:
 class Decision:
     model: DynamicsModel
     confidences: tuple[OutputConfidence, ...]  # per output
-    tolerances: tuple[float, ...]  # per output, those that it was judged by
+    tolerances: tuple[float, ...]  # per output, used for the verdict
     state: DesignState
     verdict: Verdict
     q: Tensor  # (m, C) next queries
     u: Tensor  # (m, F)
-    rollouts: tuple[Tensor, ...] = ()  # next ones where it can only reset and act, each (T, F)
+    rollouts: tuple[Tensor, ...] = ()  # next rollouts if the environment can't be set to a state, each (T, F)
 
 
 def initial_design(definition: EnvironmentDefinition, budget: int) -> tuple[Tensor, Tensor]:
-    """The Latin hypercube that everything starts from: coordinates (n, C), actions (n, F), n at most the budget."""
+    """Draw the initial Latin hypercube: coordinates (n, C), actions (n, F), n at most the budget."""
     count = min(definition.design.initial, budget)
     if not acquisition_of(definition.design.acquisition).adaptive:
         count = budget
@@ -101,14 +102,15 @@ def initial_design(definition: EnvironmentDefinition, budget: int) -> tuple[Tens
 
 
 def initial_rollouts(definition: EnvironmentDefinition, budget: int) -> list[Tensor]:
-    """What everything starts from where no state can be set: action sequences (T, F), in all at most the budget."""
+    """Draw the initial rollouts of an environment that can't be set to a state: action sequences (T, F), with at most
+    as many steps as the budget has."""
     planned = acquisition_of(definition.design.acquisition).adaptive
     steps = min(definition.design.initial, budget) if planned else budget
     return first_rollouts(definition, steps, _rng(definition, "initial"))
 
 
 def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignState, request: Request) -> Decision:
-    """One round.
+    """Do one round.
 
     Raises:
         InvalidInput, NumericalFailure: as ``Learner.learn`` does.
@@ -127,7 +129,7 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         *definition.tolerances_over(usual),
     )
     if verdict == "continue" and now == state.ended_with:
-        verdict = "over_budget"  # audits and logs alone have come since it ended: they ask for no further real step
+        verdict = "over_budget"  # only audits and logs have come since it ended, and they need no further real step
     candidates, reserved = judged.candidates, judged.reserved
     chosen, rollouts = candidates.points[:0], tuple[Tensor, ...]()
     if definition.max_rollout is None:
@@ -138,7 +140,7 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         rng = _rng(definition, f"rollouts {state.round}")
         rollouts = _plan(learned.model, samples, confidences, tolerances, verdict, request, rng, reserved is not None)
     if verdict == "continue" and not len(chosen) and not rollouts:
-        verdict = "over_budget"  # the rest of the budget is pending, or nothing distinct is left to ask
+        verdict = "over_budget"  # the rest of the budget is pending, or no distinct query is left
     ended = now if verdict != "continue" and not len(chosen) and not rollouts else ()
     new_state = DesignState(state.round + 1, usual, learned.warm, ended, frozen.ranges)
     return Decision(learned.model, confidences, tolerances, new_state, verdict, chosen.q, chosen.u, rollouts)
@@ -146,19 +148,19 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
 
 @dataclass(frozen=True)
 class Judged:
-    """How well a model is known, and what follows."""
+    """Verdict on a model."""
 
     confidences: tuple[OutputConfidence, ...]  # per output
     tolerances: tuple[float, ...]  # per output
     verdict: Verdict
     candidates: Candidates  # m
-    reserved: Tensor | None  # (m,) bool: which of them are to be asked first; see ``endings`` and ``peaks``
+    reserved: Tensor | None  # (m,) bool: candidates to be queried first; see ``endings`` and ``peaks``
 
 
 def judge_model(
     model: DynamicsModel, samples: Samples, usual: Sequence[float], request: Request, round_: int
 ) -> Judged:
-    """Judge a model by the ``usual`` tolerances (O,), over which those of its definition go. Raises PluginFailed."""
+    """Judge a model by its definition's tolerances, or else by the ``usual`` ones (O,). Raises ``PluginFailed``."""
     definition = model.definition
     with plugin_calls(definition):
         noise = established_noise(model, samples, definition.tolerances_over(usual))
@@ -177,14 +179,14 @@ def judge_model(
         peak = highest(model, samples, candidates.points, tolerances[-1], _rng(definition, f"peak {round_}"))
     if peak is not None:
         settled = False
-        if reserved is None or round_ % 2:  # both are asked in turn
+        if reserved is None or round_ % 2:  # the two alternate
             candidates, reserved = with_more(candidates, peak)
     verdict = judge(definition, confidences, tolerances, len(samples), request, settled)
     return Judged(confidences, tolerances, verdict, candidates, reserved)
 
 
 def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
-    """The Monte Carlo set of eq. 8, the same in every round: coordinates (m, C), actions (m, F)."""
+    """Draw the Monte Carlo set of eq. 8, the same in every round: coordinates (m, C), actions (m, F)."""
     rng = _rng(definition, "monte carlo")
     return going_on(definition, *random_points(definition, definition.design.monte_carlo, rng), rng)
 
@@ -197,9 +199,13 @@ def judge(
     request: Request,
     settled: bool = True,
 ) -> Verdict:
-    """Whether to continue. A ``tested_confidence`` counts only when leave-one-out errors are known and agree, it is
-    settled where episodes end, and adaptive queries, half as many as the initial design had, have tried to disprove
-    it. Logged samples stand for initial queries, never for adaptive ones: nobody chose them to disprove anything."""
+    """Decide whether the design continues.
+
+    With ``tested_confidence`` the index counts only if leave-one-out errors are known and within the tolerances, if the
+    end of episodes is known, and if adaptive queries, half as many as the initial design had, have failed to disprove
+    the model. Logged samples can replace initial queries but not adaptive ones, because nobody chose them to disprove
+    the model.
+    """
     initial, spent = definition.design.initial, samples - request.free
     sure = all(c.confidence_index >= request.target for c in confidences)
     if definition.design.stopping == "tested_confidence":
@@ -221,7 +227,7 @@ def _agrees(confidence: OutputConfidence, tolerance: float) -> bool:
 def _repeated(
     model: DynamicsModel, samples: Samples, usual: Sequence[float], verdict: Verdict, request: Request
 ) -> Points:
-    """Steps to take again, to tell noise from misfit: in the second half of a budget, where the model is not sure."""
+    """Steps to repeat, to tell noise from misfit: in the second half of a budget, if the model is uncertain."""
     none = Points(samples.q[:0], samples.u[:0])
     design, spent = model.definition.design, len(samples) - request.free
     if verdict != "continue" or design.stopping != "tested_confidence":
@@ -244,7 +250,8 @@ def _choose(
     request: Request,
     reserved: Tensor | None,
 ) -> Points:
-    """One query for each output below its target, least confident first; the first one of those reserved."""
+    """Choose one query for each output below its target, the least confident first. The first query is a
+    reserved one."""
     below = _below(confidences, request.target)
     if verdict == "continue":
         wanted = below[: max(0, request.budget + request.free - len(samples) - len(request.pending))]
@@ -264,8 +271,10 @@ def _plan(
     rng: np.random.Generator,
     ending: bool,
 ) -> tuple[Tensor, ...]:
-    """Rollouts for the outputs below their target: a quarter as many real steps as there are samples, so that a model
-    is trusted with longer plans the more it has seen, and fits are few."""
+    """Plan rollouts for the outputs below their target, with a quarter as many real steps as there are samples.
+
+    So plans become longer as the model sees more, and fits are few.
+    """
     steps = request.extra
     if verdict == "continue":
         pending = sum(len(actions) for actions in request.pending_rollouts)
@@ -278,7 +287,7 @@ def _plan(
 
 
 def _below(confidences: tuple[OutputConfidence, ...], target: float) -> list[int]:
-    """Outputs below their target, least confident first; where there is none, the least confident."""
+    """Outputs below their target, the least confident first. If there is none, the least confident output."""
     order = sorted(range(len(confidences)), key=lambda i: confidences[i].confidence_index)
     return [i for i in order if confidences[i].confidence_index < target] or order[:1]
 

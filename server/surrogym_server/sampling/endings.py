@@ -1,5 +1,5 @@
-"""Queries reserved for the end of an episode and a reward's edge: what an ending pays, and where both are, must be
-seen."""
+"""Queries reserved for the end of an episode and for edges of the reward, where the model needs samples from both
+sides."""
 
 from __future__ import annotations
 
@@ -13,16 +13,18 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.models.abilities import RewardEdges, offers
 from surrogym_server.models.port import DynamicsModel
 
-FRONTIER = 0.1  # of what was seen of the coordinates: a shorter way beyond it is not worth a query
-DOUBT = 0.005  # chance of a wrong ending, averaged over the candidates, that is good enough
+FRONTIER = 0.1  # of the seen range of the coordinates: states that lie less far beyond it are not worth a query
+DOUBT = 0.005  # acceptable probability of a wrong ending, averaged over the candidates
 
 
 def ending(model: DynamicsModel, samples: Samples, points: Points) -> Tensor | None:
-    """Which of m points to take a query from for the sake of the episodes' end, (m,) bool; None if none is needed.
+    """Which of m candidate points, (m,) bool, are reserved for a query about the end of episodes. None if none is
+    needed.
 
-    Declared: those predicted to end one, as long as no sample has. Learned: those most in doubt, until little doubt is
-    left; then those that go farthest beyond where episodes are known to go on, for there may be another end. Either
-    way, where the reward jumps, those of which it is in doubt on which side they lie.
+    Declared termination: the points predicted to end an episode, until a sample has ended one. Learned termination: the
+    most doubtful points, until little doubt is left; then the points farthest beyond the states known to be
+    non-terminal, because another end may lie there. In both cases, if the reward jumps, the points at which the side of
+    the jump is doubtful.
     """
     q_next = model.transition(points.q, points.u).q_next
     if not model.definition.learns_termination:
@@ -38,14 +40,14 @@ def ending(model: DynamicsModel, samples: Samples, points: Points) -> Tensor | N
 
 
 def in_doubt(model: DynamicsModel, q_next: Tensor) -> Tensor:
-    """Chance that the model errs about an ending at q_next (m, C), (m,); 0 where termination is declared."""
+    """Probability that the model is wrong about an ending at q_next (m, C), (m,); 0 if termination is declared."""
     probability = model.termination_probability(q_next)
     return probability.minimum(1 - probability)
 
 
 def edge_in_doubt(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Tensor:
-    """Chance that the model errs about the side of a reward's edge, the largest of all edges, for steps from q (m, C)
-    to q_next (m, C), (m,)."""
+    """Probability that the model is wrong about the side of a reward's edge, for steps from q (m, C) to q_next (m, C),
+    (m,): the largest over all edges."""
     doubt = q.new_zeros(len(q))
     for of_one in _edge_doubts(model, q, q_next):
         doubt = doubt.maximum(of_one)
@@ -53,7 +55,7 @@ def edge_in_doubt(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Tensor:
 
 
 def _edges(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor | None:
-    """Where it is most in doubt on which side of a reward's edge points lie."""
+    """Points at which the side of a reward's edge is the most doubtful."""
     for doubt in _edge_doubts(model, points.q, q_next):
         if float(doubt.mean()) > DOUBT:
             return doubt >= 0.5 * doubt.max()
@@ -61,7 +63,7 @@ def _edges(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor | Non
 
 
 def _edge_doubts(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Iterator[Tensor]:
-    """For each edge of the reward the chance that the model errs about the side, (m,)."""
+    """For each edge of the reward, the probability that the model is wrong about the side, (m,)."""
     edged = offers(model, RewardEdges)
     return iter(()) if edged is None else edged.reward_edge_doubts(q, q_next)
 
@@ -72,8 +74,8 @@ def _predicted(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor |
 
 
 def unexplored(definition: EnvironmentDefinition, seen: Tensor, q: Tensor) -> Tensor:
-    """How far q (m, C) lies beyond the states seen (n, C), (m,): the sum over both ends of every moving coordinate, in
-    units of what was seen of it. Before any ending was seen, that is where one may be."""
+    """Distance of q (m, C) beyond the seen states (n, C), (m,): the sum over both ends of every moving coordinate, in
+    units of the seen range. An unseen ending may lie there."""
     columns = list(definition.moving)
     if not len(seen):
         return q.new_ones(len(q))

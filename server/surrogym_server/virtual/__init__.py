@@ -1,4 +1,4 @@
-"""The virtual environment: N lanes at once, frozen state in, new state out; noise is a pure function of its key."""
+"""The virtual environment: N lanes at once, frozen state in, new state out. Noise is a pure function of its key."""
 
 from surrogym_server.virtual.environment import LaneTransition, VirtualSettings, create, expected_bytes, reset
 from surrogym_server.virtual.lanes import LaneState

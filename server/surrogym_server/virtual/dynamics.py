@@ -18,12 +18,12 @@ from surrogym_server.virtual.paths import function_draws
 
 Weighting = Literal["inverse_variance", "uniform"]
 WEIGHT_FLOOR = 1e-12  # of the reward's variance, so that a certain particle's weight stays finite
-LEAST_VARIANCE = 1e-290  # squares of what a hidden reward pays may be 0
+LEAST_VARIANCE = 1e-290  # smaller, because a hidden reward's variance may be 0
 
 
 @dataclass(frozen=True)
 class Moved:
-    """What the model says of one step of N lanes."""
+    """The model's prediction for one step of N lanes."""
 
     q: Tensor  # (N, C) output state
     particles: Tensor  # (N, P, C)
@@ -44,8 +44,13 @@ def move_mean(
     paths: Tensor | None = None,
     functions: int | None = None,
 ) -> Moved:
-    """AUR-D: q (N, C) under u (N, F) goes to the mean of the next state, or along each lane's own function, ``paths``
-    (N, W), of so many ``functions`` that lanes share; ``process`` (N, M), standard normal, adds the learned noise."""
+    """AUR-D: move q (N, C) under u (N, F) to the mean of the next state, or along each lane's drawn function.
+
+    Args:
+        paths: (N, W), the drawn functions.
+        functions: number of functions that the lanes share.
+        process: (N, M), standard normal; adds the learned noise.
+    """
     step = model.transition if paths is None else partial(function_draws(model, functions).transition_along, paths)
     transition = step(q, u, process=process, deviations=deviations, reward_deviation=deviations or penalty > 0)
     require_shapes(model, transition, q)
@@ -69,12 +74,11 @@ def move_particles(
     process: Tensor | None = None,
     steps: ArraySteps | None = None,
 ) -> Moved:
-    """AUR-P: particles (N, P, C) under one action a lane, u (N, F).
+    """AUR-P: move particles (N, P, C) under one action for each lane, u (N, F).
 
-    With ``noise`` (N, P, M) each particle moves by a draw, without by the mean, and with ``process`` (N, P, M) by the
-    learned noise as well, both standard normal. The output state is the particles'
-    mean; the reward is the mean of their penalised rewards, weighted by 1/U with U the variance of eq. 7. With
-    ``steps`` particles move by compiled code.
+    With ``noise`` (N, P, M) each particle moves by a draw, otherwise by the mean. ``process`` (N, P, M) adds the
+    learned noise. Both are standard normal. The output state is the particles' mean. The reward is the mean of their
+    penalised rewards, weighted by 1/U with U the variance of eq. 7. With ``steps`` particles move in compiled code.
     """
     lanes, count, size = particles.shape
     q, action = particles.flatten(0, 1), u.repeat_interleave(count, 0)
@@ -114,7 +118,7 @@ def _compiled_transition(
     deviations: bool,
     reward_deviation: bool,
 ) -> Transition:
-    """As ``DynamicsModel.transition``, by compiled code."""
+    """Predict like ``DynamicsModel.transition``, in compiled code."""
     shaken, shaped = (None if n is None else n.contiguous().numpy() for n in (noise, process))
     moved = steps(
         q.contiguous().numpy(),
@@ -132,12 +136,12 @@ def _compiled_transition(
 
 
 def penalised(reward: Tensor, penalty: float, deviation: Tensor) -> Tensor:
-    """Rewards (m,) less ``penalty`` of their deviations (m,)."""
+    """Subtract ``penalty`` deviations (m,) from rewards (m,)."""
     return reward - penalty * deviation  # eq. 14
 
 
 def mean_state(definition: EnvironmentDefinition, particles: Tensor) -> Tensor:
-    """Mean of particles (N, P, C), (N, C); an angle's is the direction of the mean of its cosines and sines."""
+    """Mean of particles (N, P, C), (N, C). An angle's mean is the direction of the mean of its cosines and sines."""
     mean = particles.mean(1)
     for index in definition.angles:
         angle = particles[..., index]
@@ -146,7 +150,7 @@ def mean_state(definition: EnvironmentDefinition, particles: Tensor) -> Tensor:
 
 
 def _weights(spread: Tensor, scale: Tensor, weighting: Weighting) -> Tensor:
-    """Normalised weights (N, P) of particles whose rewards deviate by spread (N, P)."""
+    """Normalised weights (N, P) of particles with reward deviations ``spread`` (N, P)."""
     if weighting == "uniform":
         return torch.full_like(spread, 1 / spread.shape[1])
     precision = 1 / (spread.square() + WEIGHT_FLOOR * scale**2).clamp_min(LEAST_VARIANCE)

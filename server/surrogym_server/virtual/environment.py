@@ -1,4 +1,4 @@
-"""reset and step of N lanes, autoreset included, in Gymnasium's three modes."""
+"""Reset and step N lanes, with autoreset in Gymnasium's three modes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Ints = NDArray[np.integer[Any]]
 
 @dataclass(frozen=True)
 class VirtualSettings:
-    """What a session chose when it was opened."""
+    """Options of a session, chosen when it was opened."""
 
     num_envs: int
     variant: Literal["deterministic", "probabilistic", "pathwise"] = "deterministic"
@@ -40,16 +40,16 @@ class VirtualSettings:
     propagation: Literal["mean", "sample"] = "sample"
     weighting: Weighting = "inverse_variance"
     spread: float = 0.01  # first deviation of particles, as a share of each coordinate's range
-    functions: int | None = None  # that lanes of variant pathwise share; None: each has its own
+    functions: int | None = None  # number of functions that lanes of variant pathwise share; None: one for each lane
     process_noise: bool = False  # the learned noise moves the state, w of eq. 2
     reward_limits: tuple[float, float] | None = None  # of mean rewards; None: none
-    trust: float | None = None  # an episode ends where an output deviates by more, in its deviations over the samples
-    compiled: bool = False  # steps by compiled code where the model offers it; chosen when the session opens
+    trust: float | None = None  # truncate an episode if an output deviates by more, in its deviations over the samples
+    compiled: bool = False  # compute steps in compiled code if the model offers it; chosen when the session opens
 
 
 @dataclass(frozen=True)
 class LaneTransition:
-    """What one step of N lanes gives, as numpy. Lanes outside the mask have reward 0 and no flags."""
+    """Results of one step of N lanes, as numpy. Lanes outside the mask have reward 0 and no flags."""
 
     observation: Floats  # (N, D) float32
     reward: Floats  # (N,)
@@ -57,22 +57,23 @@ class LaneTransition:
     truncated: Bools  # (N,)
     final_lanes: Ints  # (K,) lanes that ended and were reset within this step (same_step)
     final_observation: Floats  # (K, D) float32
-    reset_lanes: Bools  # (N,) lanes that a new episode began in
+    reset_lanes: Bools  # (N,) lanes in which a new episode began
     reward_mean: Floats  # (N,)
     deviation: Floats | None  # (N, O)
     untrusted: Bools | None  # (N,) truncated for leaving the trusted range; None without one
-    left: Bools | None = None  # (N,) ended and paid for leaving the sampling range; None where nobody is
+    left: Bools | None = None  # (N,) ended with the outside reward; None if no lane can leave the sampling range
 
 
 def expected_bytes(definition: EnvironmentDefinition, settings: VirtualSettings, path_size: int) -> int:
-    """Memory of the lanes of a session, roughly: coordinates, particles, and functions of ``path_size`` numbers."""
+    """Approximate memory of a session's lanes, in bytes: coordinates, particles, and functions of ``path_size``
+    numbers."""
     particles = settings.particles if settings.variant == "probabilistic" else 0
     path = path_size if settings.variant == "pathwise" else 0
     return 8 * settings.num_envs * (len(definition.coordinates) * (1 + particles) + path)
 
 
 def create(definition: EnvironmentDefinition, settings: VirtualSettings, seed: int) -> LaneState:
-    """N lanes that have not been reset yet."""
+    """Create N lanes that have not been reset yet."""
     count, size = settings.num_envs, len(definition.coordinates)
     particles = settings.particles if settings.variant == "probabilistic" else 0
     zeros = torch.zeros(count, dtype=torch.int64, device=definition.device)
@@ -96,13 +97,13 @@ def reset(
     seed: int | Sequence[int] | None = None,
     mask: Bools | None = None,
 ) -> tuple[LaneState, Floats]:
-    """New episodes in all lanes, or those of the mask (N,); gives lanes and observations (N, D).
+    """Begin new episodes in all lanes, or in those of the mask (N,). Returns lanes and observations (N, D).
 
-    An int seed s gives lane i the key (s, i), a list gives lane i the key (s_i, 0), both from episode 0 on; without a
-    seed each lane goes on to its next episode. Lanes outside the mask keep their state.
+    An int seed s gives lane i the key (s, i), and a list gives lane i the key (s_i, 0), both from episode 0 on. Without
+    a seed each lane begins its next episode. Lanes outside the mask keep their state.
 
     Raises:
-        InvalidInput: mask or list of seeds of another length, or a seed that is negative or too large.
+        InvalidInput: the mask or the list of seeds has another length, or a seed is negative or too large.
     """
     chosen = chosen_lanes(mask, lanes)
     if seed is not None:
@@ -111,7 +112,7 @@ def reset(
     return lanes, _observe(definition, lanes)
 
 
-@torch.inference_mode()  # its tensors keep no account of themselves for a gradient: a sixth less time
+@torch.inference_mode()  # without records for gradients, which saves a sixth of the time
 def step(
     model: DynamicsModel,
     settings: VirtualSettings,
@@ -121,9 +122,9 @@ def step(
     deviations: bool = False,
     particle_steps: ArraySteps | None = None,
 ) -> tuple[LaneState, LaneTransition]:
-    """The reference form of ``virtual.step``, by torch; arguments and errors are those there.
+    """Step lanes in torch: the reference form of ``virtual.step``, with the same arguments and errors.
 
-    With ``particle_steps`` particles move by compiled code.
+    With ``particle_steps`` particles move in compiled code.
     """
     definition = model.definition
     moving, beginning = divided(settings, lanes, chosen_lanes(mask, lanes))
@@ -167,7 +168,8 @@ def step(
 
 
 def divided(settings: VirtualSettings, lanes: LaneState, chosen: Chosen) -> tuple[Chosen, Tensor | None]:
-    """Which of the chosen lanes this step moves, and which (N,) it resets instead, None where that is nobody."""
+    """Divide the chosen lanes into those that this step moves, and those (N,) that it resets, None if there
+    are none."""
     running = lanes.phase == RUNNING
     if bool(running.all()):
         return chosen, None
@@ -221,7 +223,7 @@ def _move(
 
 
 def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> Tensor | None:
-    """Which lanes (N,) left the trusted range: some output deviates by more than ``trust`` of its own deviations."""
+    """Which lanes (N,) left the trusted range: the deviation of an output exceeds ``trust`` of its own deviations."""
     if settings.trust is None:
         return None
     assert moved.deviation is not None
@@ -229,7 +231,7 @@ def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) ->
 
 
 def _left(definition: EnvironmentDefinition, moved: Moved, untrusted: Tensor | None) -> Tensor | None:
-    """Which lanes (N,) end as they left the sampling range or the trusted one; None where nobody does for that."""
+    """Which lanes (N,) end because they left the sampling range or the trusted range; None if no lane can end so."""
     if definition.outside_reward is None:
         return None
     left = ~definition.in_range(moved.q)
@@ -239,8 +241,8 @@ def _left(definition: EnvironmentDefinition, moved: Moved, untrusted: Tensor | N
 def _paid_outside(
     definition: EnvironmentDefinition, settings: VirtualSettings, before: LaneState, moved: Moved, left: Tensor
 ) -> Moved:
-    """The move, with the lanes ended that left, (N,). They are paid the outside reward for this step and for those that
-    are missing up to the time limit; where a session has none, for this step."""
+    """The move, in which the lanes (N,) that left have ended. They get the outside reward for this step and for each
+    missing step up to the time limit. In a session without a time limit they get it for this step."""
     lacking = torch.ones_like(moved.reward)
     if settings.time_limit is not None:
         lacking = (settings.time_limit - before.elapsed).clamp(min=1).to(moved.reward.dtype)
@@ -253,7 +255,8 @@ def _paid_outside(
 def _advanced(
     settings: VirtualSettings, before: LaneState, moved: Moved, untrusted: Tensor | None
 ) -> tuple[LaneState, Tensor]:
-    """Lanes after their move, and which of them were truncated. As in Gymnasium, a step may end both ways."""
+    """Lanes after their move, and which of them were truncated. As in Gymnasium, a step may both terminate and
+    truncate."""
     elapsed = before.elapsed + 1
     cut = torch.zeros_like(moved.terminated) if settings.time_limit is None else elapsed >= settings.time_limit
     cut = cut if untrusted is None else cut | untrusted
@@ -298,13 +301,13 @@ def _observe(definition: EnvironmentDefinition, lanes: LaneState) -> Floats:
 
 
 def _array(values: Tensor) -> NDArray[Any]:
-    """As the wire wants it, wherever it was computed."""
+    """Convert a tensor of any device to the array that the wire takes."""
     array: NDArray[Any] = values.cpu().numpy()
     return array
 
 
 def chosen_lanes(mask: Bools | None, lanes: LaneState) -> Chosen:
-    """The lanes of a mask (N,), or all."""
+    """The lanes of a mask (N,), or all lanes."""
     if mask is None:
         return EVERY
     if len(mask) != len(lanes):
@@ -313,7 +316,7 @@ def chosen_lanes(mask: Bools | None, lanes: LaneState) -> Chosen:
 
 
 def _scatter(chosen: Chosen, values: Tensor) -> Tensor:
-    """Values of the chosen lanes among all N, zero elsewhere."""
+    """Spread values of the chosen lanes over all N lanes, with zero elsewhere."""
     if isinstance(chosen, slice):
         return values
     full = values.new_zeros(len(chosen), *values.shape[1:])

@@ -1,4 +1,5 @@
-"""Episodes from a given state under given actions: the mean's, and those of functions drawn from the posterior.
+"""Episodes from a given state under given actions: one along the mean, and some along functions drawn from the
+posterior.
 
 Shapes: C coordinates, F action entries, T actions, K draws.
 """
@@ -33,7 +34,7 @@ class Imagined:
 
 
 def imagine(model: DynamicsModel, q: Array, u: Array, *, draws: int, seed: int) -> Imagined:
-    """Episodes from q (C,) under u (T, F), the model's actions. The same seed draws the same functions."""
+    """Imagine episodes from q (C,) under u (T, F), the model's actions. The same seed draws the same functions."""
     mean = _episodes(model, VirtualSettings(1, autoreset_mode="disabled"), q, u, seed)[0]
     if not draws:
         return Imagined(mean, ())

@@ -12,16 +12,16 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 NEW, RUNNING, ENDED = 0, 1, 2  # phase of a lane
-EVERY = slice(None)  # in place of a mask of all lanes: nothing is copied
+EVERY = slice(None)  # replaces a mask of all lanes, so that nothing is copied
 Chosen = Tensor | slice  # a mask (N,), or EVERY
 
 
 @dataclass(frozen=True)
 class LaneState:
-    """State of N lanes. P is 0 but in the probabilistic variant, W but in the pathwise one.
+    """State of N lanes. P is 0 except in variant probabilistic, W is 0 except in variant pathwise.
 
-    Functions of models of several sizes lie side by side: rows are filled up with zeros to the longest, and a model
-    reads as many of W as it has.
+    Functions of models of different sizes lie side by side. Shorter rows are filled up with zeros, and a model reads as
+    many of the W numbers as it has.
     """
 
     seed: Tensor  # (N,) int64, key of the noise
@@ -37,14 +37,14 @@ class LaneState:
         return len(self.seed)
 
     def take(self, index: NDArray[Any] | Chosen) -> LaneState:
-        """The lanes of an index or mask, in its order."""
+        """Select the lanes of an index or mask, in its order."""
         if isinstance(index, slice):
             return self
         at = torch.as_tensor(index, device=self.seed.device)
         return LaneState(*(getattr(self, f.name)[at] for f in fields(self)))
 
     def put(self, index: NDArray[Any] | Chosen, other: LaneState) -> LaneState:
-        """These lanes with those of an index or mask replaced by ``other``."""
+        """Replace the lanes of an index or mask by ``other``."""
         if isinstance(index, slice):
             return other
         at = torch.as_tensor(index, device=self.seed.device)
@@ -62,7 +62,7 @@ class LaneState:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of memory."""
+        """Memory in bytes."""
         return sum(int(getattr(self, f.name).nbytes) for f in fields(self))
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
@@ -74,5 +74,5 @@ class LaneState:
 
 
 def _widened(path: Tensor, width: int) -> Tensor:
-    """Weights (n, W), filled up with zeros to ``width``."""
+    """Fill weights (n, W) up with zeros to ``width``."""
     return path if path.shape[1] == width else pad(path, (0, width - path.shape[1]))

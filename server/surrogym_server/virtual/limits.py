@@ -1,4 +1,4 @@
-"""Limits of virtual rewards: what lies far beyond every sample is the model's invention."""
+"""Limits of virtual rewards: values far beyond all samples are errors of the model."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ Limits = tuple[float, float]
 
 
 def reward_limits(low: float, high: float) -> Limits:
-    """Limits of virtual rewards, from the least and the largest reward of all samples: as far beyond them as they lie
-    apart, or from 0, whichever is more. They always include 0."""
+    """Limits of virtual rewards, from the smallest and largest reward of all samples. On each side they lie beyond
+    these by the distance between them, or by their distance from 0, whichever is larger. They always include 0."""
     room = max(high - low, abs(low), abs(high))
     return low - room, high + room
 
 
 def within(limits: Limits | None, transition: LaneTransition) -> LaneTransition:
-    """A transition whose mean rewards keep to the limits; a penalty comes off after that.
+    """Clip the mean rewards of a transition to the limits; a penalty is subtracted after that.
 
-    What a lane is paid for leaving the sampling range is none of the model's rewards, and stays.
+    The outside reward is not predicted by the model, so it is not clipped.
     """
     if limits is None:
         return transition

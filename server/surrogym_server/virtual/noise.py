@@ -17,7 +17,7 @@ STEP_BITS = 24  # of the counter's third word; the purpose has the other eight
 
 
 class Purpose(IntEnum):
-    """What a number is drawn for, so that no two uses share one."""
+    """Purpose of a random number, so that no two uses share one."""
 
     START = 0
     BOX_START = 1
@@ -38,7 +38,7 @@ def normal_noise(lanes: LaneState, purpose: Purpose, particles: int, size: int) 
 
 
 def _words(lanes: LaneState, purpose: Purpose, particles: int, size: int) -> Tensor:
-    """Random words, (N, particles, ceil(size / 4), 4): one counter gives four of them."""
+    """Random words, (N, particles, ceil(size / 4), 4): one counter gives four words."""
     blocks = -(-size // 4)
     third = lanes.elapsed | (int(purpose) << STEP_BITS)
     if lanes.seed.device == CPU and compiled.available():

@@ -1,5 +1,4 @@
-"""Variant ``pathwise``: each episode of a lane follows one function drawn from what the model believes (TS-infinity of
-PETS)."""
+"""Variant ``pathwise``: each episode of a lane follows one function drawn from the posterior (TS-infinity of PETS)."""
 
 from __future__ import annotations
 
@@ -14,10 +13,10 @@ from surrogym_server.virtual.noise import Purpose, normal_noise
 
 
 def function_draws(model: DynamicsModel, functions: int | None = None) -> FunctionDraws:
-    """What draws functions of a model: itself, or the fallback for a family that draws none.
+    """Return the object that draws functions of a model: the model itself, or a fallback if its family draws none.
 
-    Where lanes share a number of ``functions`` these stand for all that the samples allow, so that hyperparameters
-    count as uncertain.
+    If lanes share a number of ``functions``, hyperparameters are drawn too, so that the few functions cover their
+    uncertainty.
     """
     if functions is not None and (able := offers(model, UncertainHyperparameters)) is not None:
         return able.uncertain_functions
@@ -26,7 +25,7 @@ def function_draws(model: DynamicsModel, functions: int | None = None) -> Functi
 
 @dataclass(frozen=True)
 class ConstantErrors(FunctionDraws):
-    """Functions that lie the same number of deviations from the mean everywhere; the reward's is its mean.
+    """Functions that have the same distance from the mean everywhere, in deviations. The reward's function is its mean.
 
     A draw is one standard normal number for each transition output.
     """
@@ -61,11 +60,11 @@ class ConstantErrors(FunctionDraws):
 
 
 def with_paths(model: DynamicsModel, lanes: LaneState, functions: int | None = None) -> LaneState:
-    """Lanes whose functions are drawn: those in the first step of their episode draw it now, under its model.
+    """Draw the functions of the lanes that are in the first step of their episode, under the model of that episode.
 
-    A draw is a pure function of model, seed, lane and episode; with a number of ``functions`` the lane counts modulo
-    that, so that lanes share functions. It is kept in the state all the same: solving for other
-    lanes beside it could change its last bits.
+    A draw is a pure function of model, seed, lane and episode. With a number of ``functions`` the lane counts modulo
+    that number, so that lanes share functions. The draw is still kept in the state, because solving for other lanes in
+    the same batch could change its last bits.
     """
     fresh = lanes.elapsed == 0
     if not bool(fresh.any()):

@@ -1,7 +1,7 @@
 """Philox4x32-10, a counter-based generator, on integer tensors.
 
-Reference: Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011. Words are 32 bits wide
-and kept in int64; a product wraps at 64 bits, which leaves both of its halves right.
+Reference: Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011. Words have 32 bits and
+are kept in int64. A product wraps at 64 bits, which leaves both of its halves right.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ ROUNDS = 10
 
 
 def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor, Tensor]) -> Tensor:
-    """Four random words for each counter and key; tensors broadcast; result (..., 4) int64 in [0, 2^32)."""
+    """Four random words for each counter and key. Tensors broadcast; the result (..., 4) is int64 in [0, 2^32)."""
     c0, c1, c2, c3 = counter
     k0, k1 = key
     for _ in range(ROUNDS):

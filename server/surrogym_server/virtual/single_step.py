@@ -1,4 +1,4 @@
-"""The stateless transition, as numpy for the edge."""
+"""The stateless transition, as numpy arrays."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class PointPrediction:
 
 
 def predict_points(model: DynamicsModel, q: Array, u: Array) -> PointPrediction:
-    """One mean step from each of q (n, C) under u (n, F)."""
+    """Predict one mean step from each of q (n, C) under u (n, F)."""
     at, action = torch.from_numpy(q), torch.from_numpy(u)
     predicted = model.transition(at, action, reward_deviation=True)
     require_shapes(model, predicted, at)

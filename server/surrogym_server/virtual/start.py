@@ -1,4 +1,4 @@
-"""The start of an episode: declared distribution or anywhere in the sampling range, and the first particles."""
+"""Start of an episode: from the declared distribution or anywhere in the sampling range, and the initial particles."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from surrogym_server.virtual.noise import Purpose, normal_noise, uniform_noise
 
 
 def start_coordinates(definition: EnvironmentDefinition, lanes: LaneState, box_share: float) -> Tensor:
-    """Start of each lane's present episode, (N, C); a share of the episodes starts anywhere in the sampling range."""
+    """Start of each lane's current episode, (N, C). A share of the episodes starts anywhere in the sampling range."""
     coordinates = definition.coordinates
     p = uniform_noise(lanes, Purpose.START, len(coordinates))
     if definition.starts:
@@ -32,7 +32,8 @@ def start_coordinates(definition: EnvironmentDefinition, lanes: LaneState, box_s
 def start_particles(
     definition: EnvironmentDefinition, lanes: LaneState, q: Tensor, count: int, spread: float
 ) -> Tensor:
-    """Particles around starts q (N, C), (N, P, C): normal with a fixed low deviation in each dimension (section 4)."""
+    """Initial particles (N, P, C) around starts q (N, C): normal, with a fixed small deviation in each dimension
+    (section 4)."""
     each = [_deviation(definition, i, spread) for i in range(len(definition.coordinates))]
     deviation = torch.tensor(each, dtype=q.dtype, device=q.device)
     noise = normal_noise(lanes, Purpose.SPREAD, count, len(definition.coordinates))

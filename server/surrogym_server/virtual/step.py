@@ -1,4 +1,4 @@
-"""A step of N lanes, in the form that the session chose when it was opened."""
+"""Step N lanes, in the form that the session chose when it was opened."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ logger = logging.getLogger(__name__)
 
 
 def in_fastest_form(settings: VirtualSettings, model: DynamicsModel) -> VirtualSettings:
-    """Settings of a session that opens: its steps are compiled where they can be and where that is faster."""
+    """Settings of a new session, with compiled steps if they work here and are faster."""
     deviations = settings.variant == "probabilistic" or settings.penalty > 0 or settings.trust is not None
     able = offers(model, CompiledSteps)
     if able is None or not able.compiled_pays(deviations=deviations):
         return settings
     try:
         return replace(settings, compiled=_array_steps(model, replace(settings, compiled=True)) is not None)
-    except Exception:  # of numba or of its compiler, on a platform where they don't work
+    except Exception:  # of numba or its compiler, on an unsupported platform
         logger.warning("steps can't be compiled on this machine, so torch computes them", exc_info=True)
         return settings
 
@@ -53,7 +53,7 @@ def step(
 def _array_steps(model: DynamicsModel, settings: VirtualSettings) -> ArraySteps | None:
     if not settings.compiled:
         return None
-    if model.definition.outside_reward is not None:  # what is paid outside a log is known to the reference alone
+    if model.definition.outside_reward is not None:  # only the reference knows the outside reward
         return None
     if settings.variant != "pathwise":
         able = offers(model, CompiledSteps)

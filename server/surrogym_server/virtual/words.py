@@ -24,8 +24,8 @@ LOW, HALF = np.uint64(0xFFFFFFFF), np.uint64(32)
     types.int64[:, :, ::1],
 )
 def fill(seed: Ints, lane: Ints, episode: Ints, third: Ints, words: Ints) -> None:
-    """Words (N, counters, 4) of lanes whose counters' words are lane, episode and third, (N,), and 0, 1, ...; ``seed``
-    (N,) are their keys."""
+    """Fill in words (N, counters, 4). The counters of a lane are the words (0, 1, ...), lane, episode and third, (N,);
+    its key is ``seed`` (N,)."""
     for n in range(len(words)):
         key0, key1 = np.uint64(seed[n]) & LOW, (np.uint64(seed[n]) >> HALF) & LOW
         for i in range(words.shape[1]):

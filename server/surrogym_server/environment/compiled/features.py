@@ -1,4 +1,4 @@
-"""Features of coordinates and action, as ``environment.features.Encoder`` gives them."""
+"""Features of coordinates and action, as ``environment.features.Encoder`` computes them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ UNIT_ANGLE = math.sqrt(3) / math.pi
 
 
 def add_features(tables: TablesBuilder, definition: EnvironmentDefinition, encoder: Encoder) -> int:
-    """Put an encoder's features; gives their place. Those of the lead read it behind coordinates and action."""
+    """Add an encoder's features, and return their place. Features of the lead read it behind coordinates and action."""
     size = len(definition.coordinates)
     rows, weights = np.zeros((len(encoder.columns), 4)), np.zeros((len(encoder.columns), size))
     for feature, column in encoder.columns.items():
@@ -40,8 +40,8 @@ def add_features(tables: TablesBuilder, definition: EnvironmentDefinition, encod
 def encode(
     numbers: Floats, places: Ints, at: int, observe: int, raw: Floats, size: int, x: Floats, begin: int, end: int
 ) -> None:
-    """Features ``begin`` to ``end`` of coordinates, action and lead, raw (C + F + L, B), into the same rows of
-    x (d, B); ``size`` is C, ``observe`` the place of the observation's terms."""
+    """Compute features ``begin`` to ``end`` of coordinates, action and lead, raw (C + F + L, B), into the same rows of
+    x (d, B). ``size`` is C, and ``observe`` is the place of the observation's terms."""
     rows, weights = matrix(numbers, places, at + ROWS), matrix(numbers, places, at + WEIGHTS)
     lanes = raw.shape[1]
     other, phase = np.empty(lanes), np.empty(lanes)

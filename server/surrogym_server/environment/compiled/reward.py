@@ -1,4 +1,4 @@
-"""A declared reward."""
+"""A declared reward in compiled code."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HEAD, WEIGHTS, TERMS = range(3)  # places of terms and conditions; action weight
 
 
 def add_reward(tables: TablesBuilder, reward: DeclaredReward) -> int:
-    """Put a declared reward; gives its place."""
+    """Add a declared reward, and return its place."""
     values, weights, conditions = reward._compiled
     head = [add_terms(tables, values), add_conditions(tables, conditions)]
     terms = [(term.weight, SHAPES[term.shape], len(term.of)) for term in reward.terms]

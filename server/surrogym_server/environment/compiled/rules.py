@@ -1,4 +1,4 @@
-"""Rules of a step: limits, walls, wrapped angles, and coordinates read back from an observation."""
+"""Rules of a step in compiled code: limits, walls, wrapped angles, and coordinates read back from an observation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ REACH_LOW, REACH_HIGH, LOW, HIGH, STOPS, ANGLE = range(6)
 
 
 def add_rules(tables: TablesBuilder, definition: EnvironmentDefinition) -> int:
-    """Put what ``settle`` reads; gives its place."""
+    """Add the data that ``settle`` reads, and return its place."""
     low, high = (end.tolist() for end in definition.reach)
     return tables.add(
         [
@@ -32,7 +32,7 @@ def add_rules(tables: TablesBuilder, definition: EnvironmentDefinition) -> int:
 
 
 def add_inverse(tables: TablesBuilder, inverse: ObservationInverse | None) -> int:
-    """Put where moving coordinates are read from, coordinate and entries, -1 for none; gives its place."""
+    """Add the entries from which moving coordinates are read, -1 for none, and return their place."""
     sources = () if inverse is None else inverse.sources
     rows = [(index, *entries, *[-1] * (2 - len(entries))) for index, entries in sources]
     return tables.add(np.array(rows).reshape(-1, 3))
@@ -40,14 +40,14 @@ def add_inverse(tables: TablesBuilder, inverse: ObservationInverse | None) -> in
 
 @compiled
 def clipped(rules: Floats, c: int, value: float) -> float:
-    """A value of coordinate c within its reach."""
+    """Clip a value of coordinate c to its reach."""
     low, high = rules[c, REACH_LOW], rules[c, REACH_HIGH]
     return low if value < low else (high if value > high else value)
 
 
 @inlined
 def settle(rules: Floats, q: Floats) -> None:
-    """Leave coordinates q (C, B) as the environment does."""
+    """Apply the rules of the environment to coordinates q (C, B)."""
     size, lanes = q.shape
     for c in range(size):
         for b in range(lanes):

@@ -1,4 +1,4 @@
-"""Terms and inequalities over them."""
+"""Terms, and inequalities over them, in compiled code."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ TERMS, RULES = range(2)  # of conditions: where their term set is; sign, thresho
 
 
 def add_terms(tables: TablesBuilder, terms: TermSet) -> int:
-    """Put a term set; gives its place."""
+    """Add a term set, and return its place."""
     unlimited = np.full((2, len(terms.constant)), np.inf) * [[-1], [1]]
     limits = unlimited if terms.low is None or terms.high is None else [terms.low.numpy(), terms.high.numpy()]
     return tables.add(terms.constant, terms.frequencies.T, terms.coefficients, limits)
 
 
 def tables_of(terms: TermSet) -> Tables:
-    """A term set by itself, at place 0."""
+    """The tables of a single term set, at place 0."""
     tables = TablesBuilder()
     add_terms(tables, terms)
     return tables.build()
 
 
 def add_conditions(tables: TablesBuilder, conditions: Conditions) -> int:
-    """Put conditions; gives their place."""
+    """Add conditions, and return their place."""
     terms = add_terms(tables, conditions.terms)
     group = conditions.membership.numpy().argmax(1) if conditions.membership.numel() else np.zeros(0)
     rules = np.stack([conditions.sign, conditions.threshold, group], 1)
@@ -42,7 +42,7 @@ def add_conditions(tables: TablesBuilder, conditions: Conditions) -> int:
 
 @compiled
 def evaluate(numbers: Floats, places: Ints, at: int, q: Floats) -> Floats:
-    """Terms of coordinates q (C, B), (T, B)."""
+    """Values of terms at coordinates q (C, B), (T, B)."""
     constant, frequencies = matrix(numbers, places, at + CONSTANT), matrix(numbers, places, at + FREQUENCIES)
     coefficients, limits = matrix(numbers, places, at + COEFFICIENTS), matrix(numbers, places, at + LIMITS)
     size, lanes = q.shape

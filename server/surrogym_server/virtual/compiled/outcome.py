@@ -1,4 +1,4 @@
-"""What a move makes of lanes: their state, rewards, ends and observations."""
+"""Outcome of a move: state, rewards, ends and observations of lanes."""
 
 from __future__ import annotations
 
@@ -69,15 +69,16 @@ def conclude(
     rewards: Floats,
     ends: Bools,
 ) -> int:
-    """Take the moving lanes (N,) one step on, whose move is given in rows (K, ...), in place.
+    """Complete the step of the moving lanes (N,), whose moves are given in rows (K, ...), in place.
 
     Args:
-        trust, time_limit: infinite and -1 where there is none.
+        trust, time_limit: infinite and -1 if there is none.
         q, elapsed, phase: of all lanes.
-        rewards: penalised ones and means, (2, N).
+        rewards: penalised rewards and means, (2, N).
         ends: terminated, truncated, untrusted, and any of them, (4, N).
 
-    Returns: how many lanes ended.
+    Returns:
+        The number of lanes that ended.
     """
     row = count = 0
     for n in range(len(moving)):

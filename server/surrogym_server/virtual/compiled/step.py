@@ -1,6 +1,6 @@
-"""A step of N lanes by compiled functions; ``virtual.environment.step`` is the reference.
+"""Step N lanes in compiled code; ``virtual.environment.step`` is the reference.
 
-Arrays here share memory with the tensors of a lane state. What a step changes is copied first.
+Arrays here share memory with the tensors of a lane state. A step copies whatever it changes.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ NO_LANES = np.zeros(0, dtype=np.int64)
 
 @dataclass(frozen=True)
 class _Changed:
-    """Copies of what a step changes of N lanes, changed in place, and what it gives."""
+    """Copies of the arrays that a step of N lanes changes in place, and the arrays of its results."""
 
     q: Floats  # (N, C)
     episode: Ints  # (N,)
@@ -65,7 +65,7 @@ def compiled_step(
     mask: Bools | None,
     deviations: bool,
 ) -> tuple[LaneState, LaneTransition]:
-    """As ``virtual.environment.step``, where ``move`` are the model's compiled steps."""
+    """Step lanes as ``virtual.environment.step`` does; ``move`` holds the model's compiled steps."""
     definition, changed = model.definition, _Changed.of(lanes)
     running, moving, beginning = _divided(settings, lanes, changed.phase, mask)
     if settings.variant == "pathwise":
@@ -96,7 +96,7 @@ def compiled_step(
 def _divided(
     settings: VirtualSettings, lanes: LaneState, phase: NDArray[np.int8], mask: Bools | None
 ) -> tuple[Bools, Chosen, Bools | None]:
-    """Which lanes (N,) this step moves, twice, and which it resets instead, None where that is nobody."""
+    """The lanes (N,) that this step moves, twice, and those that it resets instead, None if there are none."""
     running = phase == RUNNING
     if mask is None and running.all():
         return running, EVERY, None
@@ -114,7 +114,7 @@ def _moved(
     moving: Chosen,
     deviations: bool,
 ) -> ArrayTransition:
-    """The move of the moving lanes, in their order."""
+    """Move the moving lanes, in their order."""
     wanted, process = deviations or settings.trust is not None, None
     if settings.process_noise:
         process = normal_noise(lanes, Purpose.PROCESS, 1, len(model.definition.outputs) - 1)[:, 0].numpy()
@@ -136,7 +136,7 @@ def _rows(moving: Chosen, values: NDArray[Any]) -> NDArray[Any]:
 def _concluded(
     model: DynamicsModel, settings: VirtualSettings, moving: Bools, moved: ArrayTransition, changed: _Changed
 ) -> int:
-    """Take the moving lanes on; how many of them ended."""
+    """Complete the step of the moving lanes, and return how many of them ended."""
     trust, limit = settings.trust, settings.time_limit
     scales = np.zeros(0) if trust is None else model.scales.numpy()
     return conclude(
@@ -161,7 +161,7 @@ def _concluded(
 def _begin(
     definition: EnvironmentDefinition, settings: VirtualSettings, lanes: LaneState, chosen: Bools, changed: _Changed
 ) -> None:
-    """New episodes in the chosen lanes."""
+    """Begin new episodes in the chosen lanes."""
     at = torch.from_numpy(chosen)
     fresh = lanes.take(at)
     fresh = replace(fresh, episode=fresh.episode + 1, elapsed=torch.zeros_like(fresh.elapsed))
@@ -184,7 +184,7 @@ def _observation_tables(steps: ArraySteps) -> Tables:
 
 
 def _scattered(moving: Bools, values: Floats) -> Floats:
-    """Values of the moving lanes among all N, zero elsewhere."""
+    """Spread values of the moving lanes over all N lanes, with zero elsewhere."""
     if len(values) == len(moving):
         return values
     full: Floats = np.zeros((len(moving), *values.shape[1:]))
