@@ -33,12 +33,12 @@ class Part:
 
 @dataclass(frozen=True)
 class Judgement:
-    """``also`` is from the task's other starts, None where it has none; ``without`` is without the policy, from the
-    first of the declared starts, None where nothing is drawn."""
+    """``also`` is from the task's other starts, None if it has none; ``without`` is without the policy, from the first
+    of the declared starts."""
 
     real: Part
     also: Part | None
-    without: Part | None
+    without: Part
     reached: bool  # the task's target
 
     @property
@@ -46,10 +46,9 @@ class Judgement:
         return [part for part in (self.real, self.also, self.without) if part is not None]
 
     @property
-    def results(self) -> tuple[Evaluation, Evaluation | None, Evaluation | None]:
+    def results(self) -> tuple[Evaluation, Evaluation | None, Evaluation]:
         """Of the policy, of the other starts, and without the policy."""
-        also, without = (None if part is None else part.result for part in (self.also, self.without))
-        return self.real.result, also, without
+        return self.real.result, None if self.also is None else self.also.result, self.without.result
 
     @property
     def steps(self) -> int:
@@ -74,14 +73,13 @@ def judge(settings: DemoSettings, policy: Path, *, quiet: bool) -> Judgement:
             update(share, f"{plain.episodes} real episodes, {ended} terminated")
 
         real = Part("policy", plain, evaluate(predict, opener, plain, look))
-        also = without = None
+        also = None
         if starts is not None:
             other = EvaluationSettings(episodes=settings.episodes, wide=starts.wide, start_scale=starts.scale)
             also = Part("policy", other, evaluate(predict, opener, other, look))
-        if settings.pictures:
-            few, spec = EvaluationSettings(episodes=min(COMPARED, settings.episodes)), settings.judged_by()
-            left_alone = default_baseline(spec)
-            without = Part(left_alone, few, evaluate(baseline(spec, left_alone, settings.seed), opener, few))
+        few, spec = EvaluationSettings(episodes=min(COMPARED, settings.episodes)), settings.judged_by()
+        left_alone = default_baseline(spec)
+        without = Part(left_alone, few, evaluate(baseline(spec, left_alone, settings.seed), opener, few))
     reached = task.target.reached(_outcome(real.result), None if also is None else _outcome(also.result))
     return Judgement(real, also, without, reached)
 

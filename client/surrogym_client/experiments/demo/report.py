@@ -53,9 +53,7 @@ def metrics_of(
         "returns": real.returns.tolist(),
         "lengths": real.lengths.tolist(),
         "also": None if also is None else {**_returns(also), "success_rate": also.success_rate},
-        "without": None
-        if judgement.without is None or without is None
-        else {**_returns(without), "actions": judgement.without.controller},
+        "without": {**_returns(without), "actions": judgement.without.controller},
         "target": settings.demo_task.target.words,
         "reached": judgement.reached,
         "settings": {"algorithm": card.algorithm, **card.settings},
@@ -90,7 +88,7 @@ def table(metrics: dict[str, Any], folder: Path) -> str:
         *_promise(metrics),
         ("success", _share(metrics["success_rate"])),
         *_also(metrics),
-        *_without(metrics),
+        _without(metrics),
         ("target", f"{metrics['target']}: {'reached' if metrics['reached'] else 'not reached'}"),
         ("run folder", str(folder)),
         *([("report", str(folder / REPORT))] if (folder / REPORT).exists() else []),
@@ -117,12 +115,10 @@ def _also(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     return [(starts.words, f"mean {_number(also['mean'])}, success {_share(also['success_rate'])}")]
 
 
-def _without(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+def _without(metrics: dict[str, Any]) -> tuple[str, str]:
     without = metrics["without"]
-    if without is None:
-        return []
     actions = "an action of zero" if without["actions"] == "zero" else "random actions"
-    return [("without the policy", f"mean {_number(without['mean'])}, {without['episodes']} starts, {actions}")]
+    return "without the policy", f"mean {_number(without['mean'])}, {without['episodes']} starts, {actions}"
 
 
 def _promise(metrics: dict[str, Any]) -> list[tuple[str, str]]:
