@@ -98,7 +98,7 @@ def test_a_log_becomes_a_surrogate_with_a_model(url: str, open_page: Open, compl
     expect(page.get_by_role("region", name="Rows that can't be used")).to_contain_text("repeats line 2")
     assert serious(page) == []
     page.get_by_role("button", name="Register reactor and store its log").click()
-    expect(page.locator(".facts")).to_contain_text("60 more came in a log")
+    expect(page.locator(".facts")).to_contain_text("60 more came from a log")
     expect(page.locator(".title")).to_contain_text("from a log", timeout=60_000)
     with Api(url) as api:
         assert api.surrogate("reactor").ledger.logged == 60

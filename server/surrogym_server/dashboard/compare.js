@@ -60,7 +60,7 @@ export function compareView(main, given) {
     const judged = all.filter(({ policy }) => realOf(policy)?.mean_interval).toSorted(byMean);
     const unjudged = all.filter((entry) => !judged.includes(entry)).map(({ label }) => label);
     const missing = unjudged.length > 0 && h("p", { class: "note" }, `Without two real episodes from the declared starts: ${unjudged.join(", ")}.`);
-    if (new Set(environments).size > 1) return h("div", { class: "card" }, h("p", { class: "bad" }, `These are different environments (${environments.join(" and ")}), so their returns don't compare.`));
+    if (new Set(environments).size > 1) return h("div", { class: "card" }, h("p", { class: "bad" }, `These are different environments (${environments.join(" and ")}), so their returns can't be compared.`));
     const pairs = (judged.length * (judged.length - 1)) / 2;
     const bests = same ? [judged[0], judged[1]] : sides.map((side) => judged.find((entry) => side.includes(entry)));
     const [better, worse] = bests.every(Boolean) ? bests.toSorted(byMean) : [];
