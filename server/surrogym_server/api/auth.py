@@ -1,4 +1,4 @@
-"""Who may do what: bearer tokens with roles. Without any token configured, everybody may do everything."""
+"""Permissions: bearer tokens with roles. Without any token configured, everybody may do everything."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DESCRIPTION = "A token of this server; not needed on loopback without tokens."
 
 
 class Gate:
-    """Role of each known token. Tokens are compared in constant time."""
+    """Roles of the known tokens. Tokens are compared in constant time."""
 
     def __init__(self, tokens: Mapping[str, Role]) -> None:
         self._tokens = [(token.encode(), role) for token, role in tokens.items()]
@@ -27,18 +27,18 @@ class Gate:
         return not self._tokens
 
     def role_of(self, token: str) -> Role:
-        """Raises ``Unauthenticated`` for an unknown token."""
+        """Return the role of a token. Raises ``Unauthenticated`` if it is unknown."""
         found = [role for known, role in self._tokens if hmac.compare_digest(known, token.encode())]
         if not found:
             raise Unauthenticated("expected a known bearer token, got an unknown one")
         return found[0]
 
     def check(self, token: str | None, allowed: tuple[Role, ...]) -> None:
-        """Let pass who may.
+        """Check that a token may call a route.
 
         Raises:
             Unauthenticated: no token, or an unknown one.
-            Forbidden: the token's role is none of ``allowed``.
+            Forbidden: the token's role is not in ``allowed``.
         """
         if self.open:
             return
@@ -50,15 +50,15 @@ class Gate:
 
 
 def bearer_token(scope: Scope) -> str | None:
-    """The token that the headers of a request carry, if any."""
+    """The token in the headers of a request, if any."""
     scheme, _, token = raw_header(scope, b"authorization").decode("latin-1").partition(" ")
     return token.strip() if scheme.lower() == "bearer" else None
 
 
 class Access(HTTPBearer):
-    """The roles that may call a route, beside admin: declared among its dependencies.
+    """The roles that may call a route, in addition to admin. A route declares it among its dependencies.
 
-    The route's door enforces it (``api.door``); as a dependency it only describes the route in OpenAPI.
+    The route's door enforces it (``api.door``). As a dependency it only describes the route in OpenAPI.
     """
 
     def __init__(self, *roles: Role) -> None:
@@ -67,7 +67,7 @@ class Access(HTTPBearer):
 
 
 def everybody() -> None:
-    """Declared by a route that needs no token."""
+    """Dependency of a route that needs no token."""
 
 
 PUBLIC = Depends(everybody)

@@ -1,4 +1,4 @@
-"""What OpenAPI says of bodies."""
+"""Descriptions of request bodies in OpenAPI."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BINARY: dict[str, Any] = {frames.MEDIA_TYPE: {"schema": {"type": "string", "form
 
 
 def described(model: type[BaseModel], example: dict[str, Any]) -> dict[str, Any]:
-    """OpenAPI of a body that comes as JSON or as a frame."""
+    """OpenAPI of a body that is accepted as JSON or as a frame."""
     schema = model.model_json_schema(ref_template=SCHEMAS)
     content = {JSON: {"schema": schema, "example": example}, **BINARY}
     return {"requestBody": {"required": True, "content": content}}

@@ -1,4 +1,4 @@
-"""Who sends a request, as far as the server can tell, and in words that name no token."""
+"""Description of a request's sender for the log, without any token."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from surrogym_server.errors import Unauthenticated
 from surrogym_shared.wire import Role
 
 SALT = b"surrogym"
-WORK = 2**12  # of scrypt: some 10 ms and 4 MB for each guess at the token behind a fingerprint
+WORK = 2**12  # of scrypt: 10 ms and 4 MB for each attempt to guess the token behind a fingerprint
 FINGERPRINT_BYTES = 5
 
 
 def role_of(scope: Scope) -> Role:
-    """The role of a request's token; admin where the server has no tokens.
+    """The role of a request's token; admin if the server has no tokens.
 
     Raises:
         Unauthenticated: an unknown token, or none.
@@ -28,14 +28,14 @@ def role_of(scope: Scope) -> Role:
 
 
 def caller(scope: Scope) -> str:
-    """Role and fingerprint of a request's token, and the address it came from. Only known tokens have a fingerprint:
-    what was mistyped may be the password of something else."""
+    """Role and fingerprint of a request's token, and the address of its sender. Only known tokens have a fingerprint,
+    because a mistyped one may be the password of something else."""
     return f"{_holder(scope)} from {_address(scope)}"
 
 
 @lru_cache(maxsize=1_024)
 def fingerprint(token: str) -> str:
-    """Ten characters that tell tokens apart, the same on every server and after every start."""
+    """Ten characters that distinguish tokens, the same on every server and after every start."""
     return hashlib.scrypt(token.encode(), salt=SALT, n=WORK, r=8, p=1, dklen=FINGERPRINT_BYTES).hex()
 
 
@@ -53,7 +53,7 @@ def _holder(scope: Scope) -> str:
 
 
 def _address(scope: Scope) -> str:
-    """Of the connection; behind a proxy on this machine the one that it forwards."""
+    """Address of the connection. If that is a proxy on this machine, the address that it forwards."""
     host, _ = scope.get("client") or ("", 0)
     try:
         return str(ip_address(host))

@@ -1,4 +1,5 @@
-"""``x-deadline-ms``: how long a caller waits for the answer to a step, so that none is computed for nobody."""
+"""``x-deadline-ms``: the time that a caller waits for a reply, so that no step is computed for a caller who
+has gone."""
 
 from __future__ import annotations
 
@@ -21,10 +22,10 @@ PARAMETER: dict[str, Any] = {
 
 
 def seconds_left(headers: Mapping[str, str]) -> float | None:
-    """Seconds that a caller will wait, None where it does not say.
+    """Seconds that a caller waits; None if the header is missing.
 
     Raises:
-        InvalidInput: no whole number of milliseconds.
+        InvalidInput: not a whole number of milliseconds.
     """
     given = headers.get(HEADER)
     if given is None:

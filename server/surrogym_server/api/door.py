@@ -1,7 +1,7 @@
 """The door of a route: who may call it, and with which body.
 
-Settled from the headers, before a byte of the body is read. A route declares its roles among its dependencies
-(``api.auth``), the media types of its body by what it reads, and the size of a JSON body by ``json_up_to``.
+Both are decided from the headers, before the body is read. A route declares its roles among its dependencies
+(``api.auth``), the media types of its body by its parameters, and the size of a JSON body by ``json_up_to``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from surrogym_server.api.headers import raw_header
 from surrogym_server.api.json_body import JSON, JsonRequest
 from surrogym_shared.wire import Role
 
-MEDIA_TYPE = "surrogym.media_type"  # in the scope: of the body, where the route reads one
+MEDIA_TYPE = "surrogym.media_type"  # in the scope: media type of the body, if the route reads one
 JSON_LIMIT = "x-max-json-bytes"  # in OpenAPI
 KIBIBYTE = 1024
 DEFAULT_JSON_BYTES = 64 * KIBIBYTE
@@ -35,24 +35,24 @@ def json_up_to(kibibytes: int) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Door:
-    """What a request must show before its body is read.
+    """Conditions for a request, checked before its body is read.
 
     Attributes:
-        roles: that may enter, beside admin; None lets everybody in.
-        bodies: the most bytes of each media type that is accepted, None for the server's own limit; empty where the
-            route reads no body.
+        roles: roles that may enter, in addition to admin; None lets everybody in.
+        bodies: largest size in bytes of each accepted media type, None for the server's own limit; empty if the route
+            reads no body.
     """
 
     roles: tuple[Role, ...] | None
     bodies: Mapping[str, int | None]
 
     def admit(self, scope: Scope) -> None:
-        """Let a request pass; its scope then has the media type and the limit of its body.
+        """Check a request, and put the media type and the size limit of its body into its scope.
 
         Raises:
             Unauthenticated: no token, or an unknown one.
             Forbidden: a token of another role.
-            HTTPException: 415 for another media type or an encoded body, 413 for one that is announced as too large.
+            HTTPException: 415 for another media type or an encoded body, 413 if the announced size is too large.
         """
         state = scope["app"].state
         gate: Gate = state.gate
@@ -81,7 +81,7 @@ class Door:
 
 
 def door_of(route: APIRoute) -> Door:
-    """The door that a route declares. Raises ``TypeError`` where it does not say who may call it."""
+    """Build the door that a route declares. Raises ``TypeError`` if the route does not declare who may call it."""
     declared = [depends.dependency for depends in route.dependencies]
     access = [one for one in declared if isinstance(one, Access)]
     if len(access) + (everybody in declared) != 1:
@@ -95,7 +95,7 @@ def door_of(route: APIRoute) -> Door:
 
 
 class DoorRoute(APIRoute):
-    """A route of FastAPI behind its door."""
+    """A FastAPI route with its door."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         door, handle = door_of(self), super().get_route_handler()

@@ -1,4 +1,4 @@
-"""Route of events: what happens to a surrogate, as server-sent events."""
+"""Routes of events: what happens to surrogates, as server-sent events."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ HEADERS = {"cache-control": "no-store", "x-accel-buffering": "no"}
     responses={200: {"content": {STREAM: {"example": "event: changed\ndata: {}\n\n"}}}},
 )
 async def changes(use: Use) -> StreamingResponse:
-    """An event ``changed`` after something happened to any surrogate, several in quick succession as one: the moment
-    to look at ``/v1/surrogates`` again."""
+    """Send an event ``changed`` after a change of any surrogate. Several changes in quick succession make one event.
+    Read ``/v1/surrogates`` again after it."""
     return StreamingResponse(_changes(use.events.changes()), media_type=STREAM, headers=HEADERS)
 
 
@@ -55,8 +55,8 @@ async def events(
     after: Annotated[int | None, Query(ge=0, le=2**63 - 1)] = None,
     last_event_id: Annotated[int | None, Header(ge=0, le=2**63 - 1)] = None,
 ) -> StreamingResponse:
-    """Queries, samples, fits and phases as they come. ``Last-Event-ID`` or ``after`` goes on behind a known
-    event; without either the stream begins with what happens from now on."""
+    """Send queries, samples, fits and phases as they happen. With ``Last-Event-ID`` or ``after`` the stream continues
+    after a known event; without either it begins with the next event."""
     newest = await run_in_threadpool(use.events.newest, name)
     start = next((id for id in (last_event_id, after) if id is not None), newest)
     return StreamingResponse(_lines(use.events.follow(name, start)), media_type=STREAM, headers=HEADERS)

@@ -1,4 +1,4 @@
-"""Example bodies of the API's documentation; a test sends each of them through its model."""
+"""Example bodies in the API's documentation. A test validates each of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Guards before the routes: the bytes of bodies, the name this server was called by, and the page that called."""
+"""Guards before the routes: sizes of bodies, host names, and pages of other sites."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from surrogym_server.api.headers import raw_header
 from surrogym_server.api.problems import RETRY_AFTER_SECONDS, problem_response
 from surrogym_shared.codes import Code
 
-BODY_LIMIT = "surrogym.body_limit"  # in the scope: the most bytes of this body, as the route's door says
+BODY_LIMIT = "surrogym.body_limit"  # in the scope: largest size of this body in bytes, set by the route's door
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
-OWN_SITE = (b"", b"same-origin", b"none")  # Sec-Fetch-Site of a program, an own page, an address typed by a person
+OWN_SITE = (b"", b"same-origin", b"none")  # Sec-Fetch-Site of programs, of our own pages, of typed addresses
 
 
 class BodyLimit:
@@ -34,7 +34,7 @@ class BodyLimit:
             nonlocal received
             message = await receive()
             limit = scope.get(BODY_LIMIT)
-            if limit is None:  # the route reads none
+            if limit is None:  # the route reads no body
                 return {**message, "body": b""} if "body" in message else message
             size = len(message.get("body", b""))
             received += size
@@ -53,7 +53,7 @@ class BodyLimit:
 
 
 class KnownHosts:
-    """Refuses other host names: a page elsewhere whose name was pointed at this machine (DNS rebinding)."""
+    """Refuses other host names, against pages that let their name point to this machine (DNS rebinding)."""
 
     def __init__(self, app: ASGIApp, hosts: frozenset[str]) -> None:
         self._app = app
@@ -68,13 +68,13 @@ class KnownHosts:
 
 
 class OwnPages:
-    """Refuses what a page of another site has a browser send, where it could change something or open a stream.
+    """Refuses requests that a page of another site sends by a browser, if they could change something or open a stream.
 
-    A browser names the page in ``Origin`` and its relation to this server in ``Sec-Fetch-Site``; programs send neither.
+    A browser names the page in ``Origin`` and its relation to this server in ``Sec-Fetch-Site``. Programs send neither.
     """
 
     def __init__(self, app: ASGIApp, public_url: str | None) -> None:
-        """``public_url`` is the address of this server as browsers see it, where a proxy stands between."""
+        """``public_url`` is the address of this server for browsers, if it is behind a proxy."""
         self._app = app
         self._public = None if public_url is None else origin_of(public_url)
 
@@ -88,7 +88,7 @@ class OwnPages:
         await self._app(scope, receive, send)
 
     def _foreign_page(self, scope: Scope) -> str | None:
-        """Which page sent this, where it is none of this server's own."""
+        """The page that sent a request, if it belongs to another site."""
         origin = raw_header(scope, b"origin").decode("latin-1").lower()
         if origin and origin not in (_called(scope), self._public):
             return f"one of {origin!r}"
@@ -99,7 +99,7 @@ class OwnPages:
 
 
 def origin_of(url: str) -> str:
-    """Scheme, host and port of an address, as browsers write them in ``Origin``."""
+    """Scheme, host and port of an address, in the form of ``Origin``."""
     parts = urlsplit(url.lower())
     default = {"http": 80, "https": 443}.get(parts.scheme)
     host = f"[{parts.hostname}]" if ":" in (parts.hostname or "") else parts.hostname
@@ -107,7 +107,7 @@ def origin_of(url: str) -> str:
 
 
 def _called(scope: Scope) -> str:
-    """The origin under which this server was called."""
+    """The origin at which this server was called."""
     scheme = {"ws": "http", "wss": "https"}.get(scope["scheme"], scope["scheme"])
     return f"{scheme}://{raw_header(scope, b'host').decode('latin-1').lower()}"
 

@@ -1,4 +1,4 @@
-"""One header of a request, for what stands in the way of every step."""
+"""Fast access to one header of a request, for the path of every step."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from starlette.types import Scope
 
 
 def raw_header(scope: Scope, name: bytes) -> bytes:
-    """The first header of a name, given in lower case; empty where there is none."""
+    """The first header of a name, which is given in lower case; empty if there is none."""
     for key, value in scope["headers"]:
         if key == name:
             found: bytes = value

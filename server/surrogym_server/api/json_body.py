@@ -1,4 +1,4 @@
-"""Bodies of JSON: strict, and never more than one long one in a turn of the event loop."""
+"""Bodies of JSON: strictly parsed, and at most one long body in a turn of the event loop."""
 
 from __future__ import annotations
 
@@ -24,16 +24,17 @@ class JsonRequest(Request):
     """A request whose body FastAPI reads with this module's parser."""
 
     async def json(self) -> Any:
-        """Raises ``HTTPException`` 400, which FastAPI lets pass."""
+        """Parse the body. Raises ``HTTPException`` 400, which FastAPI lets pass."""
         content = await self.body()
         await take_turn(self.scope, content)
         return parse(content)
 
 
 async def take_turn(scope: Scope, content: bytes) -> None:
-    """Wait until no other long body is parsed in this turn of the event loop, so that others are served in between.
+    """Wait until no other long body is parsed in this turn of the event loop, so that other requests are served in
+    between.
 
-    A thread would not help: the parser holds the interpreter's lock.
+    A thread would not help, because the parser holds the interpreter's lock.
     """
     if len(content) > LONG:
         turn: asyncio.Lock = scope["app"].state.parsing
@@ -42,10 +43,11 @@ async def take_turn(scope: Scope, content: bytes) -> None:
 
 
 def parse(content: bytes) -> Any:
-    """Python objects of a JSON text.
+    """Parse a JSON text.
 
     Raises:
-        HTTPException: 400; no JSON in UTF-8, a key twice in one object, too many levels or too many fields.
+        HTTPException: 400 if it is not JSON in UTF-8, if an object has a key twice, or if it has too many levels or
+            fields.
     """
     try:
         parsed = jiter.from_json(content, catch_duplicate_keys=True)
@@ -58,11 +60,11 @@ def parse(content: bytes) -> Any:
 
 
 def parse_as(model: type[M], content: bytes) -> M:
-    """A body, parsed and checked.
+    """Parse and validate a body.
 
     Raises:
-        HTTPException: 400, as ``parse``.
-        RequestValidationError: it is not a ``model``.
+        HTTPException: 400, like ``parse``.
+        RequestValidationError: it is not a valid ``model``.
     """
     try:
         return model.model_validate(parse(content))

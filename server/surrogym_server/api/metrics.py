@@ -1,4 +1,4 @@
-"""``GET /metrics``: what the server does, in the text format of Prometheus, read at the moment it is asked."""
+"""``GET /metrics``: counts and states of the server in the text format of Prometheus, read on request."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ router = APIRouter(tags=["service"], route_class=DoorRoute)
     responses={200: {"content": {"text/plain": {}}}, **documented(Code.UNAVAILABLE)},
 )
 def metrics(request: Request, use: Use) -> Response:
-    """Requests, steps, fits and expiries since the start of this process; samples, queries and fidelity as stored."""
+    """Requests, steps, fits and expiries since the start of this process; samples, queries and fidelity from
+    storage."""
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_Reading(request.app.version, use, request.app.state.metrics))
     text = generate_latest(registry) + exposition(use.storage.surrogates.summaries())
@@ -44,7 +45,7 @@ def metrics(request: Request, use: Use) -> Response:
 
 
 class _Reading:
-    """A collector that is asked once."""
+    """A collector for one request."""
 
     def __init__(self, version: str, use: Services, metrics: ProcessMetrics) -> None:
         self._version = version

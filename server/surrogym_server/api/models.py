@@ -1,4 +1,4 @@
-"""Routes of models: history, export, import, and what the latest says about points."""
+"""Routes of models: history, export, import, and predictions of the latest one."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def list_all(name: str, use: Use) -> ModelList:
     },
 )
 def get(name: str, version: int, use: Use, format: Literal["json", "safetensors"] = "json") -> ModelView | Response:
-    """Its structure and fidelity, or with ``format=safetensors`` the model itself, complete."""
+    """A model's structure and fidelity. With ``format=safetensors`` the complete model itself."""
     if format == "json":
         return convert.model_view(use.models.get(name, version))
     return Response(use.models.export(name, version), media_type=SAFETENSORS)
@@ -74,7 +74,7 @@ def get(name: str, version: int, use: Use, format: Literal["json", "safetensors"
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST, Code.TOO_LARGE, Code.NOT_INSTALLED),
 )
 async def add(name: str, request: Request, use: Use) -> ModelView:
-    """The body is a file that the export gave, of the same outputs. It becomes the newest version."""
+    """Import a file of the export with the same outputs. It becomes the newest version."""
     data = await request.body()
     return convert.model_view(await run_in_threadpool(use.models.add, name, data))
 
@@ -88,7 +88,7 @@ async def add(name: str, request: Request, use: Use) -> ModelView:
 async def query_uncertainty(
     name: str, body: Annotated[Points, example(examples.POINTS)], request: Request, use: Use
 ) -> Uncertainty:
-    """Per point and output: mean, deviation, model uncertainty (eq. 10), input probability (eq. 11) and the
+    """For each point and output: mean, deviation, model uncertainty (eq. 10), input probability (eq. 11) and
     uncertainty index (eq. 12) of Active Uncertainty Reduction."""
     q, u = convert.numbers("coordinates", body.coordinates), convert.numbers("action", body.action)
     said = await _in_turn(request, lambda: use.models.query_uncertainty(name, q, u, body.model))
@@ -99,7 +99,7 @@ async def query_uncertainty(
 async def predict(
     name: str, body: Annotated[Points, example(examples.POINTS)], request: Request, use: Use
 ) -> Prediction:
-    """One mean step from each point; no session is needed."""
+    """Predict one mean step from each point. No session is needed."""
     q, u = convert.numbers("coordinates", body.coordinates), convert.numbers("action", body.action)
     return convert.prediction(await _in_turn(request, lambda: use.models.predict(name, q, u, body.model)))
 
@@ -108,8 +108,8 @@ async def predict(
 async def imagine(
     name: str, body: Annotated[Imagine, example(examples.IMAGINE)], request: Request, use: Use
 ) -> Imagined:
-    """Without a session: the mean's episode, and those of functions drawn from the posterior, which part where the
-    model is not sure. An episode that terminates is shorter than ``actions``."""
+    """Imagine episodes without a session: one along the mean, and some along functions drawn from the posterior, which
+    diverge where the model is uncertain. An episode that terminates is shorter than ``actions``."""
     q, u = convert.numbers("coordinates", body.coordinates), convert.numbers("actions", body.actions)
     draws, seed, version = body.draws, body.seed, body.model
     episodes = await _in_turn(request, lambda: use.models.imagine(name, q, u, draws=draws, seed=seed, version=version))
@@ -117,6 +117,6 @@ async def imagine(
 
 
 async def _in_turn(request: Request, work: Callable[[], T]) -> T:
-    """Who may only look must not keep samplers and trainers waiting."""
+    """Limit these requests, because read-only callers must not keep samplers and trainers waiting."""
     turns: Turns = request.app.state.turns
     return await turns.take(request, work)

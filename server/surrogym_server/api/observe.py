@@ -1,5 +1,8 @@
-"""Every request gets an id, which its reply, its problem body and its log lines carry, and is timed by route. What
-changes something, and what is refused, leaves a line that says who sent it."""
+"""Request ids, timing by route, and lines in the log.
+
+Every request gets an id, which its reply, its problem body and its log lines carry. Requests that change something, and
+refused ones, leave a line in the log that names their sender.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +25,8 @@ logger = logging.getLogger("surrogym_server.requests")
 
 UNKNOWN_ROUTE = "unknown"
 METHODS = frozenset({"GET", "POST", "PUT", "PATCH", "DELETE", "HEAD", "OPTIONS"})
-CHANGING = frozenset({"POST", "PUT", "PATCH", "DELETE"})  # each leaves a line that says who, unless it is frequent
-FREQUENT = frozenset(  # routes that change nothing for long, or only look, and are called again and again
+CHANGING = frozenset({"POST", "PUT", "PATCH", "DELETE"})  # each leaves a line with its sender, unless it is frequent
+FREQUENT = frozenset(  # routes that only read or make short-lived changes, and are called again and again
     {
         "/v1/sessions/{id}/reset",
         "/v1/sessions/{id}/step",
@@ -41,11 +44,11 @@ _GIVEN = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _HEADER = REQUEST_HEADER.encode()
 # No page of another site may load a reply, not even to see whether it is one.
 _FOR_BROWSERS = ((b"cross-origin-resource-policy", b"same-origin"), (b"x-content-type-options", b"nosniff"))
-_PROCESS, _NUMBERS = secrets.token_hex(4), count(1)  # drawing each id is a call of the system
+_PROCESS, _NUMBERS = secrets.token_hex(4), count(1)  # drawing an id for each request would cost a system call
 
 
 class Observed:
-    """The outermost middleware: what it sees is what the caller sees."""
+    """The outermost middleware, so that it sees what the caller sees."""
 
     def __init__(self, app: ASGIApp, metrics: ProcessMetrics) -> None:
         self._app = app
@@ -56,7 +59,9 @@ class Observed:
             await self._app(scope, receive, send)
             return
         id = _id_of(scope)
-        REQUEST_ID.set(id)  # for good: the task is this request's own, and the handler of the unexpected is outside
+        REQUEST_ID.set(
+            id
+        )  # never reset: each request has its own task, and the handler of unexpected errors is outside
         started, status = time.perf_counter(), FAILED
         headers = (*_FOR_BROWSERS, (_HEADER, id.encode()))
 
@@ -70,11 +75,11 @@ class Observed:
         try:
             await self._app(scope, receive, identified)
         finally:
-            if scope["type"] == "http" or status != FAILED:  # of streams those that were refused
+            if scope["type"] == "http" or status != FAILED:  # of streams only the refused ones
                 self._note(scope, status, time.perf_counter() - started)
 
     def _note(self, scope: Scope, status: int, seconds: float) -> None:
-        method = scope.get("method", "GET")  # a stream begins with a GET, and its scope names none
+        method = scope.get("method", "GET")  # a stream begins with a GET, but its scope has no method
         method = method if method in METHODS else "other"
         route = getattr(scope.get("route"), "path", UNKNOWN_ROUTE)
         key = (method, route, status)
@@ -90,6 +95,6 @@ class Observed:
 
 
 def _id_of(scope: Scope) -> str:
-    """The caller's own id of a request where it is usable, else a new one."""
+    """The caller's own id of a request if it is usable, else a new one."""
     given = raw_header(scope, _HEADER).decode("latin-1")
     return given if given and _GIVEN.fullmatch(given) else f"{_PROCESS}{next(_NUMBERS):06x}"

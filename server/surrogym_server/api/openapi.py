@@ -1,4 +1,4 @@
-"""OpenAPI of the app: what FastAPI knows of the routes, and the refusals that come from no route of their own."""
+"""OpenAPI of the app: FastAPI's description, with the refusals that come from outside the routes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ WITH_TOKEN = documented(Code.UNAUTHENTICATED, Code.FORBIDDEN)
 
 
 def install(app: FastAPI) -> None:
-    """Let a refused method be told all methods of its path, which several routes may serve."""
+    """List all methods of a path, which several routes may serve, in the refusal of another method."""
     app.add_exception_handler(405, _method_not_allowed)
 
 
@@ -45,8 +45,8 @@ async def _method_not_allowed(request: Request, _: Exception) -> Response:
 def describe(app: FastAPI) -> dict[str, Any]:
     """OpenAPI of the app, complete; built once.
 
-    A guard, a limit or a token refuses on every route that it stands before, so its reply is described once, under
-    ``components/responses``, and named by each of them.
+    A guard, a limit or a token can refuse requests to many routes. Its reply is described once, under
+    ``components/responses``, and each of these routes refers to it.
     """
     if app.openapi_schema is None:
         schema = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
@@ -65,20 +65,21 @@ def describe(app: FastAPI) -> dict[str, Any]:
 
 
 def _add_refusals(operation: dict[str, Any]) -> None:
-    """Those that the route has not described itself, because it has causes of its own."""
+    """Add the refusals that the route does not describe itself."""
     for status in (*ANY_REQUEST, *(WITH_TOKEN if "security" in operation else ())):
         operation["responses"].setdefault(str(status), {"$ref": RESPONSES.format(name=status)})
 
 
 def _parts_of_body(operation: dict[str, Any]) -> dict[str, Any]:
-    """Take the schemas of nested models out of a body that FastAPI does not read, and so has no components of."""
+    """Move the schemas of nested models to the components, for a body that FastAPI does not read."""
     schema = operation.get("requestBody", {}).get("content", {}).get(JSON, {}).get("schema", {})
     parts: dict[str, Any] = schema.pop("$defs", {})
     return parts
 
 
 def _name_operations(paths: dict[str, Any]) -> None:
-    """Short names, such as ``surrogates_create``: generated clients call their functions so."""
+    """Give operations short names, such as ``surrogates_create``, because generated clients use them as
+    function names."""
     for path, methods in paths.items():
         for method, operation in methods.items():
             behind = re.sub(r"\W", "_", path) + f"_{method}"
@@ -86,7 +87,8 @@ def _name_operations(paths: dict[str, Any]) -> None:
 
 
 def _drop_object_defaults(node: Any) -> None:
-    """Leave out defaults that are objects: their own fields say theirs, and generators of clients refuse them."""
+    """Remove defaults that are objects. Their fields have defaults of their own, and generators of clients
+    refuse them."""
     if isinstance(node, dict):
         if isinstance(node.get("default"), dict):
             del node["default"]

@@ -1,4 +1,4 @@
-"""Routes of policies: store, list, give out, evaluate, name."""
+"""Routes of policies: store, list, download, evaluate, name."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ THERE = (Code.UNKNOWN_SURROGATE, Code.UNKNOWN_POLICY, Code.INVALID_REQUEST)
 
 @router.get("", summary="All policies", dependencies=[READ], responses=documented(*THERE))
 def list_all(name: str, use: Use) -> PolicyList:
-    """Newest first, each with its promise, its files and the statistics of its real episodes."""
+    """List policies, newest first, each with its promise, its files and the statistics of its real episodes."""
     return convert.policy_list(use.policies.list(name))
 
 
@@ -57,16 +57,16 @@ def list_all(name: str, use: Use) -> PolicyList:
     responses=documented(Code.UNKNOWN_SURROGATE, Code.SPEC_CONFLICT, Code.INVALID_REQUEST, Code.TOO_LARGE),
 )
 def add(name: str, body: Annotated[AddPolicy, example(examples.POLICY)], use: Use) -> PushedPolicy:
-    """Its card, the curve of its training, and which file is to come with ``PUT .../files/{form}``. A file that is
-    known is the same policy: it keeps its version, and gets this card. One that was made for other observations or
-    actions is refused; other differences of its specification are named in ``differs``."""
+    """Store a policy's card, the curve of its training, and the form of the file that follows with ``PUT
+    .../files/{form}``. A policy with a known file keeps its version and gets this card. A policy for other observations
+    or actions is refused; other differences of its specification are named in ``differs``."""
     record, created = use.policies.add(name, *convert.new_policy(body))
     return convert.pushed_policy(record, created=created)
 
 
 @router.get("/{which}", summary="One policy", dependencies=[READ], responses=documented(*THERE))
 def get(name: str, which: Which, use: Use) -> PolicyDetail:
-    """With the settings and the curve of its training. ``which`` is a version, an alias, or ``latest``."""
+    """A policy with the settings and the curve of its training. ``which`` is a version, an alias, or ``latest``."""
     return convert.policy_detail(use.policies.get(name, which))
 
 
@@ -74,7 +74,7 @@ def get(name: str, which: Which, use: Use) -> PolicyDetail:
     "/{version}", status_code=204, summary="Delete a policy", dependencies=[ADMIN], responses=documented(*THERE)
 )
 def delete(name: str, version: Version, use: Use) -> Response:
-    """With its files, evaluations and aliases. There is no way back."""
+    """Delete a policy with its files, evaluations and aliases. This can't be undone."""
     use.policies.delete(name, version)
     return Response(status_code=204)
 
@@ -96,8 +96,8 @@ async def put_file(
     request: Request,
     use: Use,
 ) -> PolicyView:
-    """The body is the file. Its size, digest and outer form are checked; it is never loaded. Beyond the room for a
-    surrogate's policies, the files of the oldest without an alias are given up."""
+    """Send a file as the body. Its size, digest and outer form are checked; it is never loaded. If the files of a
+    surrogate's policies exceed their limit, the files of the oldest policies without an alias are removed."""
     content = await request.body()
     file = convert.policy_file(FileNotice(form=form, bytes=max(1, len(content)), digest=digest))
     return convert.policy_view(await run_in_threadpool(use.policies.put_file, name, version, file, content))
@@ -111,7 +111,7 @@ async def put_file(
     responses={200: {"content": {BINARY: {}}}, **documented(*THERE, Code.DAMAGED)},
 )
 def file(name: str, which: Which, form: PolicyForm, use: Use) -> Response:
-    """As it was sent. A program that loads a zip should never unpickle what it does not trust."""
+    """The file as it was sent. A program that loads a zip should never unpickle content that it does not trust."""
     version, content = use.policies.file(name, which, form)
     disposition = f'attachment; filename="{name}-{version}.{form}"'
     media_type = MEDIA_TYPES.get(form, BINARY)
@@ -129,7 +129,7 @@ def file(name: str, which: Which, form: PolicyForm, use: Use) -> Response:
 def evaluate(
     name: str, version: Version, body: Annotated[AddEvaluation, example(examples.EVALUATION)], use: Use
 ) -> EvaluationView:
-    """Once per idempotency key. The real steps are counted by ``POST .../ledger``, apart."""
+    """Report real episodes, once for each idempotency key. ``POST .../ledger`` counts their real steps separately."""
     return convert.evaluation_view(*use.policies.evaluate(name, version, convert.episodes(body), body.idempotency_key))
 
 
@@ -141,13 +141,13 @@ def evaluation(
     use: Use,
     traces: Annotated[bool, Query(description="whether the reply has traces too; they are most of its bytes")] = True,
 ) -> EvaluationDetail:
-    """With the return of each episode, and traces of some. Where those can't be read, ``missing`` says why."""
+    """An evaluation with the return of each episode, and traces of some. ``missing`` says why they can't be read."""
     return convert.evaluation_detail(*use.policies.episodes(name, which, id), traces=traces)
 
 
 @router.put("/aliases/{alias}", summary="Name a policy", dependencies=[ADMIN], responses=documented(*THERE))
 def put_alias(name: str, alias: AliasName, body: Annotated[PutAlias, example(examples.ALIAS)], use: Use) -> PolicyView:
-    """The alias, such as ``production``, leads to this version from now on, and to no other."""
+    """Let the alias, such as ``production``, point to this version, and no longer to another one."""
     return convert.policy_view(use.policies.put_alias(name, alias, body.version))
 
 
@@ -155,6 +155,6 @@ def put_alias(name: str, alias: AliasName, body: Annotated[PutAlias, example(exa
     "/aliases/{alias}", status_code=204, summary="Take a name away", dependencies=[ADMIN], responses=documented(*THERE)
 )
 def drop_alias(name: str, alias: AliasName, use: Use) -> Response:
-    """The policy itself stays."""
+    """Remove an alias. The policy itself stays."""
     use.policies.drop_alias(name, alias)
     return Response(status_code=204)

@@ -1,4 +1,4 @@
-"""The one error table: every exception of the server becomes a problem body (RFC 9457)."""
+"""The table of errors: it maps every exception of the server to a problem body (RFC 9457)."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def install(app: FastAPI) -> None:
 
 
 async def answer_to(request: Request, error: Exception) -> Response:
-    """The reply to a request that ended in an error. Raises the error itself where it is an unexpected one."""
+    """The reply to a request that failed. Raises the error itself if it is an unexpected one."""
     for kind, answer in _ANSWERS.items():
         if isinstance(error, kind):
             return await answer(request, error)
@@ -84,12 +84,12 @@ async def answer_to(request: Request, error: Exception) -> Response:
 
 
 def code_of(error: errors.SurrogymError) -> Code:
-    """The code of an error: that of its class, or of the nearest class above it in the table."""
+    """The code of an error: that of its class, or of its nearest base class in the table."""
     return next(CODES[cls] for cls in type(error).__mro__ if cls in CODES)
 
 
 def problem_of(error: Exception) -> Problem:
-    """The problem body of an error; of one that nobody raised on purpose it says no more than that."""
+    """The problem body of an error. That of an unexpected error contains no details."""
     match error:
         case errors.SeqConflict():
             return _problem(Code.SEQ_CONFLICT, str(error), expected_seq=error.expected)
@@ -104,7 +104,7 @@ def problem_of(error: Exception) -> Problem:
 
 
 def response_of(problem: Problem, headers: Mapping[str, str] | None = None) -> Response:
-    """A problem body as a reply; ``headers`` beside those that its code needs."""
+    """A problem body as a reply. ``headers`` are added to those of its code."""
     return Response(
         problem.model_dump_json(exclude_none=True),
         status_code=problem.status,
@@ -121,7 +121,7 @@ def problem_response(
     headers: Mapping[str, str] | None = None,
     **members: Any,
 ) -> Response:
-    """A problem body as a reply, from its parts."""
+    """Build the reply with a problem body from its parts."""
     return response_of(_problem(code, detail, status=status, **members), headers)
 
 
@@ -140,16 +140,16 @@ def documented(*codes: Code) -> dict[int | str, dict[str, Any]]:
 
 
 def validation_detail(found: Sequence[Any]) -> str:
-    """The most telling error of a validation, as one sentence: where, what was expected, and what came.
+    """The most specific error of a validation in one sentence: where, what was expected, and what came.
 
-    Of a value that fits none of several types, the deepest error is about the type it nearly fits.
+    If a value fits none of several types, the deepest error is about the type that it nearly fits.
     """
     telling = _located([max(found, key=lambda error: len(error["loc"]))])[0]
     return f"{telling['field'] or 'the body'}: {telling['expected']}, got {telling['got']}"
 
 
 def shown(value: Any) -> str:
-    """What came, short enough for a message. Of a long value no more is put into words than is shown."""
+    """A value, cut to the length of a message. A long value is not converted further than it is shown."""
     text = ""
     for piece in ["nothing"] if value is None else _pieces(value):
         text += piece
@@ -188,7 +188,7 @@ def _located(found: Sequence[Any]) -> list[dict[str, str]]:
 
 
 def _is_field(part: int | str) -> bool:
-    """Whether a part of a location is a field or an index, not the place of the value or a type it was tried as."""
+    """Whether a part of a location is a field or an index. Other parts name the body, or a type that was tried."""
     return isinstance(part, int) or (part.isidentifier() and part not in NO_FIELDS)
 
 
@@ -229,7 +229,7 @@ async def _http_error(request: Request, error: Exception) -> Response:
 
 
 async def _gone(_: Request, error: Exception) -> Response:
-    """For the log alone: who would read it has left in the middle of a request."""
+    """Reply for the log only, because the caller has disconnected in the middle of the request."""
     assert isinstance(error, ClientDisconnect)
     return problem_response(
         Code.REQUEST_TIMEOUT, "expected a whole request, but the connection ended before it had arrived"

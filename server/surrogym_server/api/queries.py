@@ -1,4 +1,4 @@
-"""Routes of queries, as samplers use them: claim, renew, fail; and by hand."""
+"""Routes of queries: samplers claim, renew and fail them; people add them by hand."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ LEASE_ERRORS = documented(
 async def claim(
     name: str, body: Annotated[ClaimQueries, example(examples.CLAIM)], request: Request, use: Use
 ) -> ClaimedQueries:
-    """Up to ``max_queries`` at once, each to one sampler only. While there are none the reply waits, at most
+    """Claim up to ``max_queries`` queries, each for one sampler only. If there are none, the reply waits at most
     ``wait_seconds``, or until the design is finished."""
     claimed = await use.queries.claim(
         name, body.sampler, body.max_queries, body.lease_seconds, body.wait_seconds, request.is_disconnected
@@ -69,14 +69,15 @@ async def claim(
     responses=LEASE_ERRORS,
 )
 def renew(name: str, query_id: int, body: Annotated[RenewLease, example(examples.RENEW)], use: Use) -> Response:
-    """The heartbeat of a sampler whose real step takes long: the lease ends ``lease_seconds`` from now."""
+    """Renew the lease of a query whose real step takes long. It then ends ``lease_seconds`` from now."""
     use.queries.renew(name, query_id, body.lease_token, body.lease_seconds)
     return Response(status_code=204)
 
 
 @router.post("/queries/{query_id}:fail", summary="Give a query back", dependencies=[SAMPLE], responses=LEASE_ERRORS)
 def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.FAIL)], use: Use) -> QueryView:
-    """It goes to the next sampler; one that keeps failing is set aside, and the design goes on without it."""
+    """Return a query with an error. It goes to the next sampler. A query that keeps failing is set aside, and the
+    design continues without it."""
     return convert.query_view(use.queries.fail(name, query_id, body.lease_token, body.error, begun=body.begun))
 
 
@@ -89,7 +90,7 @@ def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.F
     responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.INVALID_REQUEST),
 )
 def add_queries(name: str, body: Annotated[AddQueries, example(examples.ADD_QUERIES)], use: Use) -> QueryList:
-    """Queued behind those of the design, whose model learns from the answers too."""
+    """Queue queries behind those of the design. The model learns from their answers too."""
     return convert.query_list(use.queries.add(name, *_asked(body)))
 
 
@@ -102,7 +103,8 @@ def add_queries(name: str, body: Annotated[AddQueries, example(examples.ADD_QUER
     responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.BEYOND_BUDGET, Code.INVALID_REQUEST),
 )
 def audit(name: str, body: Annotated[AuditModel, example(examples.ADD_QUERIES)], use: Use) -> QueryList:
-    """Where a policy goes, to hold the model against. They cost none of the budget; the model learns from them too."""
+    """Queue real steps on a policy's way, to compare them with the model. They don't count towards the budget, and the
+    model learns from them too."""
     return convert.query_list(use.queries.add(name, *_asked(body), purpose="audit"))
 
 
@@ -113,7 +115,7 @@ def audit(name: str, body: Annotated[AuditModel, example(examples.ADD_QUERIES)],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def withdraw(name: str, body: Annotated[WithdrawQueries, example(examples.WITHDRAW)], use: Use) -> WithdrawnQueries:
-    """Those of an audit that no sampler has begun; others stay."""
+    """Remove the queries of an audit that no sampler has begun. Others stay."""
     return WithdrawnQueries(withdrawn=use.queries.withdraw_audit(name, body.query_ids))
 
 
@@ -124,12 +126,12 @@ def withdraw(name: str, body: Annotated[WithdrawQueries, example(examples.WITHDR
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def list_all(name: str, use: Use, status: Annotated[list[QueryStatus], Query()] = []) -> QueryList:  # noqa: B006
-    """Oldest first; ``status`` may be given several times."""
+    """List queries, oldest first. ``status`` may be given several times."""
     return convert.query_list(use.queries.list(name, status))
 
 
 def _asked(body: AddQueries) -> tuple[Floats, Floats, str | None, list[Floats]]:
-    """Coordinates (m, C), actions (m, F), the idempotency key and action sequences, (T, F) each, of a body."""
+    """From a body: coordinates (m, C), actions (m, F), the idempotency key and action sequences, (T, F) each."""
     q = convert.numbers("coordinates", body.coordinates or ())
     u = convert.numbers("action", body.action or ())
     return q, u, body.idempotency_key, [convert.numbers("rollouts", actions) for actions in body.rollouts or ()]

@@ -1,4 +1,4 @@
-"""The OpenAPI as one plain page: no script, nothing loaded from anywhere, readable where there is no internet."""
+"""The OpenAPI document as one plain page without scripts or external resources, so that it works offline."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def _schema(name: str, schema: dict[str, Any]) -> str:
 
 
 def _table(caption: str, rows: list[tuple[str, str, str]]) -> str:
-    """Of name, type as HTML, and description."""
+    """HTML table of name, type and description."""
     lines = [
         f"<tr><td><code>{escape(name)}</code></td><td>{kind}</td><td>{escape(text)}</td></tr>"
         for name, kind, text in rows
@@ -98,7 +98,7 @@ def _example(content: dict[str, Any]) -> Any:
 
 
 def _type(schema: dict[str, Any]) -> str:
-    """A schema in a few words, as HTML; one with a name is a link."""
+    """A schema in a few words, as HTML. One with a name is a link."""
     if reference := schema.get("$ref"):
         name = escape(reference.rpartition("/")[2])
         return f'<a href="#{name}">{name}</a>'

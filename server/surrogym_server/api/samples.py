@@ -37,9 +37,9 @@ MAX_PAGE = 10_000
     ),
 )
 def add_sample(name: str, body: Annotated[AddSamples, example(examples.ADD_SAMPLE)], use: Use) -> AddedSamples:
-    """One or many, all or none, with or without a query; stored for good when the reply comes. A repeat is
-    harmless: a sample of a query is known by its lease token, a logged one by its numbers, others by the idempotency
-    key."""
+    """Store one or many samples, all or none, with or without a query. They are stored durably when the reply comes. A
+    repeat is harmless: a sample of a query is identified by its lease token, a logged one by its numbers, others by the
+    idempotency key."""
     samples = [convert.new_sample(sample) for sample in body.samples]
     logged, key = body.purpose == "logged", body.idempotency_key
     added = use.samples.add(name, body.sampler, samples, key, logged=logged, complete=body.complete)
@@ -63,7 +63,7 @@ def samples(
     limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = 1_000,
     format: Literal["json", "csv", "npz"] = "json",
 ) -> SamplePage | Response:
-    """JSON comes in pages: give ``next_after`` as ``after`` for the next. CSV and NPZ come whole."""
+    """Read samples. JSON comes in pages: give ``next_after`` as ``after`` for the next page. CSV and NPZ come whole."""
     if format == "json":
         return convert.sample_page(use.samples.page(name, after, limit), limit)
     write, media_type = (as_csv, CSV) if format == "csv" else (as_npz, NPZ)
@@ -78,7 +78,7 @@ def samples(
     responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.INVALID_REQUEST),
 )
 def report(name: str, body: Annotated[ReportSteps, example(examples.LEDGER)], use: Use) -> Ledger:
-    """Counted on a line of their own, beside what the design cost, once per idempotency key."""
+    """Count real steps of an evaluation, separately from the cost of the design, once for each idempotency key."""
     return convert.ledger(use.samples.report_steps(name, body.steps, body.episodes, body.note, body.idempotency_key))
 
 

@@ -1,5 +1,5 @@
-"""Series of surrogates in the text format of Prometheus, written here: there are a dozen of each surrogate, and its
-library takes 10 us for one."""
+"""Series of surrogates in the text format of Prometheus. They are written here, because there are a dozen for each
+surrogate and the library takes 10 us for each."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STATUSES = ("pending", "leased", "answered", "set_aside")
 
 @dataclass(frozen=True)
 class Family:
-    """Series of one name. ``label`` tells those of one surrogate apart; empty where each has one at most."""
+    """Series with one name. ``label`` distinguishes those of one surrogate; empty if there is at most one."""
 
     name: str
     kind: str
@@ -26,12 +26,13 @@ class Family:
 
 
 def exposition(summaries: Sequence[SurrogateSummary]) -> bytes:
-    """All series of these surrogates."""
+    """The text of all series of these surrogates."""
     return "".join(line for family in FAMILIES for line in _lines(family, summaries)).encode()
 
 
 def _lines(family: Family, summaries: Sequence[SurrogateSummary]) -> Iterator[str]:
-    """Names of surrogates need no escaping: letters, digits, dots, dashes and underscores."""
+    """Lines of a series. Names of surrogates need no escaping: they consist of letters, digits, dots, dashes and
+    underscores."""
     yield f"# HELP {family.name} {family.help}\n# TYPE {family.name} {family.kind}\n"
     for summary in summaries:
         begin = f'{family.name}{{surrogate="{summary.name}"'

@@ -20,21 +20,21 @@ router = APIRouter(tags=["service"], route_class=DoorRoute)
 @router.head("/healthz", include_in_schema=False, dependencies=[PUBLIC])
 @router.get("/healthz", summary="That the process lives", dependencies=[PUBLIC])
 async def healthz(request: Request) -> Health:
-    """Needs no token and no database."""
+    """Whether the process runs. Needs no token and no database."""
     return Health(version=request.app.version)
 
 
 @router.head("/readyz", include_in_schema=False, dependencies=[PUBLIC])
 @router.get("/readyz", summary="That it can work", dependencies=[PUBLIC], responses=documented(Code.UNAVAILABLE))
 def readyz(use: Use) -> Ready:
-    """Whether the database has its tables and takes writes, tried at most once a second. Needs no token."""
+    """Whether the database has its tables and accepts writes, checked at most once a second. Needs no token."""
     use.storage.ping()
     return Ready(status="ready", storage="ok")
 
 
 @router.get("/v1/access", summary="What the caller may do", dependencies=[READ])
 async def access(request: Request) -> Access:
-    """The role of the token that came with the request."""
+    """The role of the request's token."""
     gate: Gate = request.app.state.gate
     token = bearer_token(request.scope)
     return Access(role="admin" if gate.open or token is None else gate.role_of(token), tokens=not gate.open)

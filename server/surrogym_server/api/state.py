@@ -1,4 +1,4 @@
-"""What the app carries for its routes."""
+"""State of the app for its routes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from surrogym_server.storage.port import Storage
 
 @dataclass(frozen=True)
 class Services:
-    """Everything a route may call; ``app.py`` builds it."""
+    """The services that a route may call; ``app.py`` builds it."""
 
     surrogates: SurrogateService
     queries: QueryService

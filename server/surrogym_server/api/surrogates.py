@@ -41,8 +41,8 @@ MAX_PAGE = 1_000
     responses=documented(Code.INVALID_REQUEST, Code.INVALID_SPEC, Code.SPEC_CONFLICT),
 )
 def create(body: Annotated[CreateSurrogate, example(examples.CREATE)], use: Use) -> CreatedSurrogate:
-    """Create a surrogate from a specification and queue its initial queries. The same name and specification
-    again change nothing, and ``created`` is false; another specification under the name is refused."""
+    """Create a surrogate from a specification, and queue its initial queries. The same name and specification again
+    change nothing, and ``created`` is false. Another specification for the name is refused."""
     spec = body.spec
     budget = convert.default_budget(spec)
     status, created = use.surrogates.create(body.name, spec.model_dump(mode="json"), budget, spec.design.target)
@@ -57,8 +57,8 @@ def create(body: Annotated[CreateSurrogate, example(examples.CREATE)], use: Use)
     responses=documented(Code.INVALID_REQUEST, Code.INVALID_SPEC, Code.SPEC_CONFLICT),
 )
 def check(body: Annotated[CreateSurrogate, example(examples.CREATE)], use: Use) -> CheckedSurrogate:
-    """What the registration of this body would store, with every default. Nothing is stored. What a registration
-    refuses is refused here too."""
+    """Preview what the registration of this body would store, with every default. Nothing is stored. A body that a
+    registration refuses is refused here too."""
     spec = body.spec
     budget = convert.default_budget(spec)
     return convert.checked(
@@ -72,8 +72,8 @@ def list_all(
     after: Annotated[int, Query(ge=0, le=2**63 - 1)] = 0,
     limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = MAX_PAGE,
 ) -> SurrogateList:
-    """Each with its phase, number of samples and confidence, oldest first, in pages: give ``next_after`` as ``after``
-    for the next."""
+    """List surrogates with phase, number of samples and confidence, oldest first, in pages: give ``next_after`` as
+    ``after`` for the next page."""
     return convert.surrogate_list(use.surrogates.list(after, limit + 1), limit)
 
 
@@ -95,9 +95,9 @@ def get(name: str, use: Use) -> SurrogateView:
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def patch(name: str, body: Annotated[PatchSurrogate, example(examples.PATCH)], use: Use) -> SurrogateView:
-    """What is left out stays. A raised budget or target sets a finished design going again, a tolerance has the
-    model judged anew, and resuming a failed one tries it again. What the design had chosen by another target or
-    tolerance, or a larger budget, is withdrawn as far as no sampler has begun it, and chosen anew."""
+    """Change the given fields; others stay. A larger budget or target continues a finished design, a tolerance makes
+    the server judge the model again, and resuming a failed design retries it. Queries that the design chose for another
+    target or tolerance, or a larger budget, are withdrawn if no sampler has begun them, and chosen again."""
     return convert.surrogate_view(use.surrogates.change(name, **dict(body)))
 
 
@@ -109,7 +109,7 @@ def patch(name: str, body: Annotated[PatchSurrogate, example(examples.PATCH)], u
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 async def delete(name: str, use: Use) -> Response:
-    """With its samples, models and sessions. There is no way back."""
+    """Delete a surrogate with its samples, models and sessions. This can't be undone."""
     await use.surrogates.delete(name)
     return Response(status_code=204)
 
@@ -123,9 +123,9 @@ async def delete(name: str, use: Use) -> Response:
 def improve(
     name: str, body: Annotated[Improve, example(examples.IMPROVE)], request: Request, use: Use
 ) -> ImprovedSurrogate:
-    """Chosen by the acquisition, weighted by the states that policies visited and submitted. The budget has to hold
-    them, beside the steps that were taken, asked for or promised before; a token of role ``admin`` raises it to, and
-    ``budget_raised_by`` says by how much."""
+    """Request more queries from the design, chosen by the acquisition and weighted by the states that policies visited
+    and submitted. The budget must hold them, besides the steps that were taken, requested or promised before. A token
+    of role ``admin`` raises the budget, and ``budget_raised_by`` is the increase."""
     may_raise = role_of(request.scope) == "admin"
     granted = use.designer.improve(name, body.queries, body.checkpoint, body.idempotency_key, raise_budget=may_raise)
     return convert.improved(use.surrogates.status(name), granted.raised)

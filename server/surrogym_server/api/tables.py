@@ -20,7 +20,7 @@ ARRAYS = ("id", "purpose", "coordinates", "action", "next_coordinates", "reward"
 
 
 def as_csv(coordinate_names: Sequence[str], records: Sequence[SampleRecord]) -> bytes:
-    """One line a sample; coordinates are ``q.<name>``, next ones ``next.<name>``, actions ``u.0`` on."""
+    """One line for each sample. Coordinates are ``q.<name>``, next ones ``next.<name>``, actions ``u.0`` and so on."""
     text = io.StringIO()
     writer = csv.writer(text)
     actions = [f"u.{i}" for i in range(len(records[0].action))] if records else []
@@ -41,5 +41,5 @@ def as_npz(coordinate_names: Sequence[str], records: Sequence[SampleRecord]) -> 
 
 
 def _cell(value: Any) -> Any:
-    """Text that a spreadsheet can't take for a formula: a sampler's name is a stranger's."""
+    """Text that a spreadsheet does not read as a formula, because a sampler's name comes from outside."""
     return f"'{value}" if isinstance(value, str) and value[:1] in "=+-@\t\r" else value

@@ -1,4 +1,5 @@
-"""Work that takes long, for callers who only look: a few at once, a short queue, and nothing for who has gone."""
+"""Turns for long work of read-only requests: a few run at once, a few wait, and nothing is computed for a caller who
+has gone."""
 
 from __future__ import annotations
 
@@ -15,20 +16,20 @@ T = TypeVar("T")
 
 
 class Turns:
-    """Lets ``at_work`` requests work, each in a thread, and ``waiting`` wait for their turn."""
+    """Lets ``at_work`` requests run, each in a thread, and ``waiting`` wait for their turn."""
 
     def __init__(self, what: str, at_work: int, waiting: int) -> None:
-        """``what`` they are, for the message to who is refused."""
+        """``what`` names the requests, for the message of a refusal."""
         self._what = what
         self._most = at_work + waiting
         self._inside = 0
         self._turn = asyncio.Semaphore(at_work)
 
     async def take(self, request: Request, work: Callable[[], T]) -> T:
-        """The result of ``work`` when its turn has come.
+        """Do ``work`` when its turn has come, and return its result.
 
         Raises:
-            Overloaded: too many wait.
+            Overloaded: too many requests wait.
             ClientDisconnect: the caller has gone meanwhile; nothing was computed.
         """
         if self._inside >= self._most:

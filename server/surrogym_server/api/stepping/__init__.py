@@ -1,4 +1,4 @@
-"""All that low latency needs on the way of a step: lean routes, the stream, and messages answered where they arrive.
+"""The fast path of steps: lean routes, the stream, and messages that are answered as they arrive.
 
-Requests go to ``SessionEngine.advance``, or to ``SessionEngine.try_now`` where an answer must not wait.
+Requests go to ``SessionEngine.advance``, or to ``SessionEngine.try_now`` if an answer must not wait.
 """

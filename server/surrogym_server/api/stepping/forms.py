@@ -1,4 +1,4 @@
-"""reset, step and rollout in their two forms, JSON and frames: a body to a request, a reply to a body."""
+"""reset, step and rollout in their two forms, JSON and frames: from a body to a request, and from a reply to a body."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from surrogym_shared.wire import ResetSession, RolloutSession, StepSession
 Operation = Literal["reset", "step", "rollout"]
 Writers = Mapping[type[Advance], Callable[[Reply], bytes]]  # of the reply to each kind of request
 
-SHORT_ROLLOUT = 32  # steps; a longer one's reply takes milliseconds to write, and others don't wait for that
+SHORT_ROLLOUT = 32  # steps; writing a longer one's reply takes milliseconds, for which others should not wait
 
 FRAMES: Mapping[Operation, tuple[type[frames.Request], ...]] = {
     "reset": (frames.ResetRequest,),
@@ -31,7 +31,7 @@ _JSON = msgspec.json.Encoder()
 
 
 def request_in_json(operation: Operation, session: str, content: bytes, within: float | None) -> Advance:
-    """Raises what ``parse_as`` does, and ``InvalidInput``."""
+    """Read a request from JSON. Raises like ``parse_as``, and ``InvalidInput``."""
     match operation:
         case "step":
             step = parse_as(StepSession, content)
@@ -48,7 +48,7 @@ def request_in_json(operation: Operation, session: str, content: bytes, within: 
 
 
 def frame_of(operation: Operation, content: bytes) -> frames.Request:
-    """Raises ``FrameError`` where the content is no frame of this operation."""
+    """Read a frame. Raises ``FrameError`` if the content is not a frame of this operation."""
     request = frames.read_request(content)
     if not isinstance(request, FRAMES[operation]):
         expected = " or a ".join(kind.__name__ for kind in FRAMES[operation])
@@ -57,7 +57,7 @@ def frame_of(operation: Operation, content: bytes) -> frames.Request:
 
 
 def request_in_frame(frame: frames.Request, session: str, shape: frames.Shape, within: float | None = None) -> Advance:
-    """Raises ``FrameError`` where a frame does not fit the session's shape."""
+    """Read a request from a frame. Raises ``FrameError`` if it does not fit the session's shape."""
     match frame:
         case frames.StepRequest():
             action, mask = frames.action_of(frame, shape), frames.mask_of(frame, shape)
@@ -71,7 +71,7 @@ def request_in_frame(frame: frames.Request, session: str, shape: frames.Shape, w
 
 
 async def carried_out(engine: SessionEngine, request: Advance, writers: Writers) -> bytes:
-    """The reply of a request, written; a long one in a thread."""
+    """The written reply to a request; a long one is written in a thread."""
     reply = await engine.advance(request)
     write = writers[type(request)]
     return write(reply) if steps_of(reply.outcome) <= SHORT_ROLLOUT else await asyncio.to_thread(write, reply)
@@ -86,7 +86,7 @@ def _step_in_json(reply: Reply) -> bytes:
 
 
 def _rollout_in_json(reply: Reply) -> bytes:
-    """Step by step: a thread that encodes lets no other one in."""
+    """Write a rollout step by step, because a thread that encodes blocks all others."""
     steps = [msgspec.Raw(_JSON.encode(step)) for step in convert.rollout_steps(reply)]
     return _JSON.encode({"seq": reply.seq, "steps": steps, **convert.rollout_actions(reply)})
 

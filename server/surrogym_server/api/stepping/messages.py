@@ -1,4 +1,4 @@
-"""uvicorn's WebSocket for the stream: messages answered where they arrive, and limits of those that arrive in part."""
+"""uvicorn's WebSocket for the stream: messages are answered as they arrive, and partial messages have limits."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAX_FRAMES = 256  # of a WebSocket in one read, and fragments of one message
 
 
 class Unfinished:
-    """Bytes of messages that have begun and not ended, of all streams together."""
+    """Number of bytes in unfinished messages of all streams together."""
 
     def __init__(self, most: int) -> None:
         self.most = most
@@ -25,8 +25,8 @@ class Unfinished:
 
 
 def prompt(seconds: float, most_together: int) -> type[WebSocketsSansIOProtocol]:
-    """uvicorn's WebSocket, with a limit of seconds for a message to arrive whole, and of bytes of unfinished messages
-    in all streams together."""
+    """uvicorn's WebSocket with two limits: seconds for a whole message to arrive, and bytes of unfinished messages in
+    all streams together."""
     unfinished = Unfinished(most_together)
 
     class Bounded(PromptMessages):
@@ -36,18 +36,19 @@ def prompt(seconds: float, most_together: int) -> type[WebSocketsSansIOProtocol]
 
 
 class PromptMessages(WebSocketsSansIOProtocol):
-    """uvicorn's WebSocket, which offers the app to answer a message where it arrives.
+    """uvicorn's WebSocket, extended so that the app can answer a message as it arrives.
 
-    The way of ASGI wakes a task through a queue, and back, for each message. That takes as long as all else a small
-    step needs. What is no whole binary message, and what the app does not answer at once, goes that way all the same;
-    so does everything while the app is busy, and so the order of messages is kept. The library gets whole frames alone.
+    ASGI wakes a task through a queue, and back, for each message. That takes as long as the rest of a small step. The
+    usual ASGI path is still used for everything that is not a whole binary message, for messages that the app does not
+    answer at once, and while the app is busy, so that the order of messages is kept. The library receives whole frames
+    only.
     """
 
     _together = Unfinished(2**28)
     _seconds = 30.0
     _answer: Prompt | None = None
-    _oversized = False  # a frame that the library is to refuse; what follows belongs to it
-    _waiting = False  # the app has asked for the next message
+    _oversized = False  # the library will refuse this frame; the following bytes belong to it
+    _waiting = False  # the app waits for the next message
     _counted = 0  # of ``_together``
     _timer: asyncio.TimerHandle | None = None
 
@@ -80,7 +81,7 @@ class PromptMessages(WebSocketsSansIOProtocol):
         super().connection_lost(exc)
 
     def send_receive_event_to_app(self) -> None:
-        if self.curr_msg_data_type == "text":  # refused by the app, and uvicorn logs an error for what is no UTF-8
+        if self.curr_msg_data_type == "text":  # the app refuses it; uvicorn would log an error for invalid UTF-8
             self.frames = [b"".join(self.frames).decode(errors="replace").encode()]
         super().send_receive_event_to_app()
 
@@ -92,10 +93,10 @@ class PromptMessages(WebSocketsSansIOProtocol):
             self._waiting = False
 
     async def send(self, message: Any) -> None:
-        if self.close_sent:  # for a frame that is none, while the app answered the message before it
+        if self.close_sent:  # for an invalid frame, while the app answered the message before it
             raise ClientDisconnected
         await super().send(message)
-        self.handshake_complete |= self.close_sent  # by a refusal; uvicorn would call it none, and log an error
+        self.handshake_complete |= self.close_sent  # by a refusal, for which uvicorn would log an error otherwise
 
     def _take(self, answer: Prompt) -> None:
         self._answer = answer
@@ -111,7 +112,7 @@ class PromptMessages(WebSocketsSansIOProtocol):
         return True
 
     def _count(self, unfinished: int) -> None:
-        """Note how many bytes of an unfinished message are held, and end the connection where that is too much."""
+        """Count the bytes of an unfinished message, and end the connection if they are too many."""
         if unfinished == self._counted:
             return
         self._together.bytes += unfinished - self._counted
@@ -128,7 +129,7 @@ class PromptMessages(WebSocketsSansIOProtocol):
             )
 
     def _end(self, reason: str) -> None:
-        """Close the connection because of what came."""
+        """Close the connection for a reason."""
         if self.close_sent or self.transport.is_closing():
             return
         if self.conn.state is State.OPEN:

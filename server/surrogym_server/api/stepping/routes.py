@@ -31,7 +31,7 @@ from surrogym_shared.wire import ResetReply, ResetSession, RolloutReply, Rollout
 
 
 class LeanRoute(APIRoute):
-    """A route on the path of every step: FastAPI describes it, and does not stand between it and the wire.
+    """A route on the path of every step. FastAPI describes it, but does not process its requests.
 
     Its endpoint takes an id and the request.
     """
@@ -54,7 +54,7 @@ router = APIRouter(prefix="/v1/sessions/{id}", tags=["sessions"], route_class=Le
 
 
 class StreamRoute(WebSocketRoute):
-    """Says in the scope which route it is, as those of HTTP do."""
+    """Put the route into the scope, as HTTP routes do."""
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         scope["route"] = self
@@ -89,14 +89,15 @@ def _documented(body: type[BaseModel], example: dict[str, Any], reply: type[Base
 
 @router.post("/reset", summary="Start new episodes", **_documented(ResetSession, examples.RESET, ResetReply))
 async def reset(id: str, request: Request) -> Response:
-    """In all lanes, or those of the mask. A seed starts them at episode 0; without one each goes on."""
+    """Begin new episodes in all lanes, or in those of the mask. A seed starts them at episode 0; without one each lane
+    begins its next episode."""
     return await _carried("reset", id, request)
 
 
 @router.post("/step", summary="Step all lanes", **_documented(StepSession, examples.STEP, StepReply))
 async def step(id: str, request: Request) -> Response:
-    """Or those of the mask. The same ``seq`` with the same body gets the same reply, so a lost one may be
-    asked for again, over this or another transport."""
+    """Step all lanes, or those of the mask. The same ``seq`` with the same body gets the same reply, so a request whose
+    reply was lost can be repeated, over this or another transport."""
     return await _carried("step", id, request)
 
 
@@ -106,7 +107,8 @@ async def step(id: str, request: Request) -> Response:
     **_documented(RolloutSession, examples.ROLLOUT, RolloutReply, **json_up_to(128)),
 )
 async def rollout(id: str, request: Request) -> Response:
-    """With given actions, or with those of a policy that is sent as arrays, in one request; all steps or none."""
+    """Step several times in one request, with given actions or with those of a policy that is sent as arrays; all steps
+    or none."""
     return await _carried("rollout", id, request)
 
 
@@ -132,7 +134,8 @@ def _left(limit: float | None, began: float) -> float | None:
 
 
 async def _body(request: Request) -> bytes:
-    """``Request.body`` without its generator: nearly every body comes in one message. Raises ``ClientDisconnect``."""
+    """Read the body without the generator of ``Request.body``: nearly every body comes in one message. Raises
+    ``ClientDisconnect``."""
     parts = []
     while True:
         message = await request.receive()
@@ -144,10 +147,10 @@ async def _body(request: Request) -> bytes:
 
 
 class StepDoor:
-    """Middleware that takes the requests of this page straight to their routes, as the router would.
+    """Middleware that passes the requests of this file directly to their routes, as the router would.
 
-    The layers between, which these routes don't use, take as long as a small step: handlers of exceptions, a stack of
-    exits, a search through all routes.
+    It skips layers that these routes don't use, and that take as long as a small step: handlers of exceptions, a stack
+    of exits, and a search through all routes.
     """
 
     def __init__(self, app: ASGIApp) -> None:

@@ -1,10 +1,10 @@
-"""``WS /v1/sessions/{id}/stream``: the frames of reset, step and rollout, one message each, without HTTP around them.
+"""``WS /v1/sessions/{id}/stream``: the frames of reset, step and rollout, each as one message.
 
-Plain ASGI: a step over it costs little more than two messages. One request is carried out at a time, and answered
-before the next is read; the connection may be dropped at any moment, for the session is an id.
+It is plain ASGI, so that a step costs little more than two messages. Requests are carried out one at a time, and each
+is answered before the next is read. The connection may be dropped at any moment, because the session has an id.
 
-A server that offers ``EXTENSION`` may hand over a message where it arrives, without waking a task: what needs no
-waiting is answered there. Anything else takes the way of ASGI.
+A server that offers ``EXTENSION`` may pass on a message as it arrives, without waking a task. If its answer needs no
+waiting, it is given at once. Other messages use ASGI.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from surrogym_shared import frames
 logger = logging.getLogger(__name__)
 
 EXTENSION = "surrogym.prompt"  # of the scope: called with a Prompt once the connection is accepted
-Prompt = Callable[[bytes], bytes | None]  # from a message to its reply, None to have it come by ASGI
+Prompt = Callable[[bytes], bytes | None]  # from a message to its reply; None to receive the message by ASGI
 
 
 class StepStream:
-    """The stream as an ASGI app; one call serves one connection."""
+    """The stream as an ASGI app. One call serves one connection."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         engine: SessionEngine = scope["state"]["services"].engine
@@ -53,22 +53,22 @@ class StepStream:
         while (message := await receive())["type"] == "websocket.receive":
             reply = await _reply(engine, limit, id, shape, message.get("bytes"))
             await send({"type": "websocket.send", "bytes": reply})
-            await asyncio.sleep(0)  # others' turn, also while this client has sent ahead
+            await asyncio.sleep(0)  # lets other tasks run, even if this client has sent several messages ahead
 
 
 def _admit(scope: Scope) -> None:
-    """Raises ``Unauthenticated`` or ``Forbidden``."""
+    """Check the request's token. Raises ``Unauthenticated`` or ``Forbidden``."""
     gate: Gate = scope["app"].state.gate
     gate.check(bearer_token(scope), ("train",))
 
 
 def _at_once(engine: SessionEngine, limit: float | None, id: str, shape: frames.Shape, content: bytes) -> bytes | None:
-    """The reply to one message where it needs no waiting, else None and nothing is done."""
+    """The reply to one message if it needs no waiting. Otherwise None, and nothing is done."""
     try:
         frame = frames.read_request(content)
     except frames.FrameError:
         return None
-    if isinstance(frame, frames.RolloutRequest | frames.PolicyRequest):  # whose reply may take long to write
+    if isinstance(frame, frames.RolloutRequest | frames.PolicyRequest):  # writing their reply may take long
         return None
     try:
         request = request_in_frame(frame, id, shape, limit)
@@ -81,7 +81,7 @@ def _at_once(engine: SessionEngine, limit: float | None, id: str, shape: frames.
 async def _reply(
     engine: SessionEngine, limit: float | None, id: str, shape: frames.Shape, content: bytes | None
 ) -> bytes:
-    """The reply to one message, as a frame; never raises but when it is cancelled."""
+    """The reply to one message, as a frame. Raises nothing, unless it is cancelled."""
     try:
         if content is None:
             raise frames.FrameError("expected a binary message, got text")
