@@ -1,1 +1,1 @@
-"""Where work runs and where live sessions are."""
+"""Live sessions, and the processes in which fits run."""

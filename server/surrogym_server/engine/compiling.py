@@ -1,4 +1,5 @@
-"""Steps are compiled before the first session asks, in another process: numba would hold up the threads of this one."""
+"""Compile steps before the first session opens, in another process, because numba would block the threads of
+this one."""
 
 from __future__ import annotations
 
@@ -19,17 +20,17 @@ import surrogym_server.virtual.compiled.step
 import surrogym_server.virtual.words
 """
 PACKAGE = "surrogym_server"
-LONGEST = 120.0  # seconds that a session waits for it; then it compiles for itself
+LONGEST = 120.0  # seconds that a session waits for it; after that it compiles itself
 
 
 class Compiling:
-    """A process that compiles steps, while there is any."""
+    """A process that compiles steps."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        """Begin, where steps can be compiled and kept on disk, and an earlier process has not done so."""
+        """Start it, unless steps can't be compiled and kept on disk, or an earlier process has compiled them."""
         to_be_kept = compiled.available() and kept.folder(PACKAGE) is not None and not kept.has_any(PACKAGE)
         if self._process is None and to_be_kept:
             self._process = subprocess.Popen(
@@ -37,13 +38,13 @@ class Compiling:
             )
 
     def wait(self) -> None:
-        """Until it has ended, well or not. In a thread."""
+        """Wait until it has ended, with or without success. Call it in a thread."""
         if self._process is not None:
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(LONGEST)
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()

@@ -1,4 +1,4 @@
-"""What a request makes of a session: pure, and the same in every engine and in ``LocalSurrogate``."""
+"""Requests applied to sessions: pure functions, the same in every engine and in ``LocalSurrogate``."""
 
 from __future__ import annotations
 
@@ -40,17 +40,17 @@ MAX_PATHWISE_LANES = 4_096  # the function of each is some thousand numbers
 
 
 class Models(Protocol):
-    """Where the models of sessions come from; ``engine.models.ModelCache`` is one."""
+    """Source of the models of sessions; ``engine.models.ModelCache`` is one."""
 
     def get(self, surrogate: int, version: int, device: torch.device, /) -> DynamicsModel:
-        """The model of a version, on a device."""
+        """Return the model of a version, on a device."""
 
     def latest(self, surrogate: int, /) -> int:
-        """The version that new episodes run under."""
+        """Return the version for new episodes."""
 
 
 def check_size(settings: VirtualSettings, max_lanes: int) -> None:
-    """Raise ``TooLarge`` where a session has more lanes or particles than the limit."""
+    """Raise ``TooLarge`` if a session has more lanes or particles than the limit."""
     if settings.num_envs > max_lanes:
         raise TooLarge(f"expected at most {max_lanes} lanes, got {settings.num_envs}")
     particles = settings.num_envs * settings.particles
@@ -63,15 +63,15 @@ def check_size(settings: VirtualSettings, max_lanes: int) -> None:
 def opened(
     request: Open, definition: EnvironmentDefinition, model: DynamicsModel, version: int, digest: str, place: str = ""
 ) -> Session:
-    """A new session, stepped in the fastest form that its model has.
+    """Open a new session, which steps in the fastest form that its model has.
 
     Args:
-        request: what was asked for.
-        definition: of the surrogate, on the device where the lanes are to be.
+        request: the opening.
+        definition: of the surrogate, on the device of the lanes.
         model: the version that the session begins with, on the same device.
         version: of the model.
         digest: of the opening.
-        place: ending of the session's id.
+        place: suffix of the session's id.
     """
     opening = request.opening
     settings = _limited(resolved(opening, definition), request.rewards, model)
@@ -90,7 +90,7 @@ def opened(
 
 
 def resolved(opening: Opening, definition: EnvironmentDefinition) -> VirtualSettings:
-    """Settings with what the trainer left to the surrogate."""
+    """Settings in which the surrogate's values replace those that the trainer left open."""
     return replace(
         opening.settings,
         time_limit=opening.settings.time_limit or definition.time_limit,
@@ -99,19 +99,20 @@ def resolved(opening: Opening, definition: EnvironmentDefinition) -> VirtualSett
 
 
 def limits_rewards(definition: EnvironmentDefinition) -> bool:
-    """Whether the samples limit virtual rewards: not declared ones, which are exact, nor those of preset ``paper``."""
+    """Whether the samples limit virtual rewards. They don't if the reward is declared, which is exact, or in preset
+    paper."""
     return definition.declared_reward is None and definition.learning.limits_rewards
 
 
 def _limited(settings: VirtualSettings, rewards: SampledRewards | None, model: DynamicsModel) -> VirtualSettings:
-    """Settings with limits of rewards, unless an imported model has learned from more than these samples."""
+    """Add limits of rewards to settings, unless an imported model has learned from more than these samples."""
     if rewards is None or not limits_rewards(model.definition) or model.samples > rewards.samples:
         return settings
     return replace(settings, reward_limits=reward_limits(rewards.low, rewards.high))
 
 
 def fingerprint_of(request: Advance) -> Fingerprint:
-    """What a repeat of the request has to equal, whatever carried it."""
+    """The fingerprint of a request; a repeat must have the same one, on any transport."""
     match request:
         case Step():
             return Fingerprint("step", _columns(request.action, 2), request.mask, request.deviations)
@@ -119,14 +120,14 @@ def fingerprint_of(request: Advance) -> Fingerprint:
             return Fingerprint("reset", request.seed, request.mask)
         case Rollout():
             return Fingerprint("rollout", _columns(request.actions, 3))
-        case PolicySteps():  # at once: its parts would keep the policy
+        case PolicySteps():  # at once, because its parts would keep the policy in memory
             return Fingerprint(digest=digest_of("policy", *parts_of(request.run)))
         case _:
             assert_never(request)
 
 
 def steps_asked(request: Advance) -> int:
-    """How many steps a request asks for at most; a reset counts for one."""
+    """The largest number of steps that a request takes; a reset counts as one."""
     match request:
         case Rollout():
             return len(request.actions)
@@ -139,23 +140,23 @@ def steps_asked(request: Advance) -> int:
 def carried_out(
     request: Advance, models: Models, wanted: Callable[[], None], interrupts: bool, session: Session
 ) -> tuple[Session, Outcome]:
-    """The session after a request, and the outcome.
+    """Apply a request to a session. Returns the new session and the outcome.
 
     Args:
-        request: what to do.
+        request: the request.
         models: of the session's surrogate.
-        wanted: asked before each step of a rollout; raises where nobody wants it any more.
-        interrupts: whether ``KeyboardInterrupt`` in a model's code is a failure of that code: in a server, where a
-            person's Ctrl-C comes in another way.
-        session: as it is.
+        wanted: called before each step of a rollout; raises if nobody wants the rollout any more.
+        interrupts: whether ``KeyboardInterrupt`` in a model's code is a failure of that code. True in a server, where a
+            person's Ctrl-C arrives differently.
+        session: the present session.
 
     Raises:
-        InvalidInput: wrong shape, not finite, out of bounds.
+        InvalidInput: wrong shape, not finite, or out of bounds.
         NotReset: a lane to step has not been reset.
         TooLarge: a rollout of too many steps in all lanes.
         PluginFailed: the code of the model's family failed.
     """
-    if isinstance(request, Step):  # first, and by a call that costs less than a pattern: nearly all requests are steps
+    if isinstance(request, Step):  # first, and by a call that is cheaper than a pattern: most requests are steps
         u = policy_actions(session.definition.action, request.action, session.settings.num_envs)
         stepped, result = _stepped(session, u, request.mask, request.deviations, models, interrupts)
         return stepped, (result,)
@@ -176,7 +177,7 @@ def visited_states(session: Session) -> Array:
 
     Raises:
         InvalidInput: it was opened without occupancy.
-        NotReset: nothing was visited yet.
+        NotReset: it has visited no state yet.
     """
     if session.visited is None:
         raise InvalidInput("expected a session opened with occupancy=true, got one without")
@@ -203,12 +204,12 @@ def _stepped(
         )
     except SurrogymError:
         raise
-    except BaseException as error:  # of a family's code; written out, as ``plugin_calls`` costs each step more
+    except BaseException as error:  # of a family's code; written out, because ``plugin_calls`` would slow each step
         if isinstance(error, KeyboardInterrupt) and not interrupts:
             raise
         raise failure_of(session.definition, error) from error
 
 
 def _columns(action: Array, dimensions: int) -> Array:
-    """Actions with their last axis, that some transports leave out where it has one entry; for the fingerprint."""
+    """Actions with their last axis, which some transports omit if it has one entry; for the fingerprint."""
     return action[..., None] if action.ndim == dimensions - 1 else action

@@ -1,6 +1,6 @@
-"""One round of the design as a picklable job on arrays: fit all outputs, judge fidelity, choose the next queries.
+"""One round of the design as a picklable job on arrays: fit all outputs, judge the model, choose the next queries.
 
-It is a pure function of its job, so it runs in a process of its own, and the same job gives the same result.
+The result is a pure function of the job, so it can run in another process, and the same job gives the same result.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Verdict = Literal["continue", "ready", "over_budget", "from_log"]
 
 @dataclass(frozen=True)
 class DesignJob:
-    """What one round needs."""
+    """Input of one round."""
 
     definition: EnvironmentDefinition
     coordinates: Array  # (n, C) samples so far, in order of arrival
@@ -47,21 +47,21 @@ class DesignJob:
     reward: Array  # (n,)
     terminated: NDArray[np.bool_]  # (n,)
     state: dict[str, Any]  # DesignState as JSON; {} before the first round
-    budget: int  # real steps the design may take in all
+    budget: int  # limit of the design's real steps
     target: float  # confidence index
-    pending_coordinates: Array | None = None  # (p, C) queries asked and not answered: open, or set aside
+    pending_coordinates: Array | None = None  # (p, C) unanswered queries: open, or set aside
     pending_action: Array | None = None  # (p, F)
-    pending_rollouts: tuple[Array, ...] = ()  # the same where it can only reset and act, each (T, F)
-    extra_queries: int = 0  # real steps asked for with improve: chosen whatever the verdict
+    pending_rollouts: tuple[Array, ...] = ()  # unanswered rollouts, each (T, F)
+    extra_queries: int = 0  # real steps requested with improve, chosen even if the design has ended
     occupancy: Array | None = None  # (m, C) states that policies visited
     threads: int = 1
-    logged: int = 0  # of the samples: they cost none of the budget
-    audited: int = 0  # of the samples: steps of audits, which cost none of it either
+    logged: int = 0  # number of samples from logs, which don't count towards the budget
+    audited: int = 0  # number of samples from audits, which don't count either
 
 
 @dataclass(frozen=True)
 class DesignResult:
-    """``model`` is complete (safetensors with a JSON header): loading it recomputes nothing."""
+    """Result of one round. ``model`` is complete (safetensors with a JSON header), so loading it recomputes nothing."""
 
     model: bytes
     description: dict[str, Any]
@@ -76,7 +76,7 @@ class DesignResult:
 
     @property
     def phase(self) -> Literal["sampling", "ready", "over_budget", "from_log"]:
-        """What the design does next: it takes the chosen queries, or it has ended."""
+        """Next phase of the design: it takes the chosen queries, or it has ended."""
         if len(self.query_coordinates) or self.query_rollouts:
             return "sampling"
         return "over_budget" if self.verdict == "continue" else self.verdict
@@ -85,8 +85,10 @@ class DesignResult:
 def initial_queries(
     definition: EnvironmentDefinition, budget: int
 ) -> tuple[dict[str, Any], Array, Array, tuple[Array, ...]]:
-    """The first round: (state, coordinates (m, C), action (m, F), rollouts (T, F) each): a Latin hypercube, or rollouts
-    where no state can be set."""
+    """Choose the queries of the first round: (state, coordinates (m, C), action (m, F), rollouts (T, F) each).
+
+    They are a Latin hypercube, or rollouts if the environment can't be set to a state.
+    """
     state, none = DesignState().to_json(), np.zeros((0, 0))
     if budget == 0:
         return state, none, none, ()
@@ -97,16 +99,16 @@ def initial_queries(
 
 
 def run_design_job(job: DesignJob) -> DesignResult:
-    """Fit, judge, choose. Raises as ``advance``."""
+    """Fit, judge, choose. Raises like ``advance``."""
     started = time.perf_counter()
     torch.set_num_threads(job.threads)
-    with threadpool_limits(job.threads):  # many small products: threads cost more than they give
+    with threadpool_limits(job.threads):  # many small products, for which threads cost more than they save
         decision, samples = _decide(job)
     with plugin_calls(job.definition):
         stored = to_bytes(decision.model)
     return DesignResult(
         model=stored,
-        description=json.loads(json.dumps(decision.model.description)),  # plain data, whatever a family gives
+        description=json.loads(json.dumps(decision.model.description)),  # plain data, whatever a family returns
         fidelity=fidelity_fields(decision.model, decision.confidences, decision.tolerances, job.target),
         data_hash=samples.digest,
         state=decision.state.to_json(),
@@ -119,11 +121,12 @@ def run_design_job(job: DesignJob) -> DesignResult:
 
 
 def judge_stored(job: DesignJob, stored: bytes) -> DesignResult:
-    """What the round said that made a stored model of the job's samples, as far as model and samples tell: nothing is
-    fitted and nothing chosen. A model of other samples has the verdict ``continue``.
+    """Judge a stored model as the round did that made it, without fitting or choosing.
+
+    A model of other samples than the job's has the verdict ``continue``.
 
     Raises:
-        InvalidInput: no model of the job's definition.
+        InvalidInput: not a model of the job's definition.
     """
     started = time.perf_counter()
     model, samples = from_bytes(job.definition, stored), _samples(job)

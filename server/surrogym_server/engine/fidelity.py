@@ -1,4 +1,4 @@
-"""Fidelity of a model as JSON: of the one a round of the design has just fitted, or of one that came from elsewhere."""
+"""Fidelity of a model as JSON, for models that a round has fitted and for imported ones."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ def fidelity_of(model: DynamicsModel, usual: Sequence[float], target: float) -> 
     """The fields of ``wire.Fidelity`` of any model of the surrogate.
 
     Args:
-        model: what to judge.
-        usual: (O,) tolerances frozen by the design, over which those of the definition go; empty before its first
-            round, and then taken from the model's own scales.
-        target: confidence index the design aims at.
+        model: the model to judge.
+        usual: (O,) tolerances frozen by the design, for outputs without a declared one; empty before its first round,
+            when they are computed from the model's own scales.
+        target: confidence index that the design aims at.
     """
     usual = usual or usual_tolerances(model.definition, model.scales.tolist())
     tolerances = model.definition.tolerances_over(usual)

@@ -1,4 +1,4 @@
-"""Fits run in processes of their own, so that steps never wait for them, and so that any of them can be ended."""
+"""Fits run in other processes, so that steps never wait for them, and so that each of them can be stopped."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from surrogym_server.engine.port import Compute
 from surrogym_server.errors import ChoiceFailed, PluginFailed, SurrogymError, Unavailable
 from surrogym_server.plugins import in_one_line
 
-NICENESS = 10  # to a step on the same core a fit leaves nine tenths of it
+NICENESS = 10  # a step on the same core keeps nine tenths of it
 Function = Callable[[DesignJob], DesignResult]
 
 
 @dataclass(frozen=True)
 class _Failure:
-    """What a job raised, as words: the exception itself may be one that can't be sent, or that ends who receives it."""
+    """Error of a job as text, because the exception itself may not pickle, or may end the process that receives it."""
 
     kind: type[PluginFailed]
     said: str
-    details: str  # the traceback, of what nobody raised on purpose
+    details: str  # traceback of an unexpected error
 
 
 class Fits(Compute):
-    """A process for each fit that runs. They end with this one, however it ends.
+    """A process for each running fit. The processes end with this one, however it ends.
 
     Args:
-        function: what does a job.
-        kept: how many processes wait for the next jobs when theirs are done.
+        function: does a job.
+        kept: number of idle processes that are kept for the next jobs.
     """
 
     def __init__(self, function: Function = run_design_job, kept: int = 1) -> None:
@@ -49,11 +49,11 @@ class Fits(Compute):
         self._busy: list[_Process] = []
 
     def start(self) -> None:
-        """Start a process, and let it import what a fit needs before the first one comes."""
+        """Start a process, and let it import the packages of a fit before the first one comes."""
         self._idle.append(_Process())
 
     async def run(self, job: DesignJob) -> DesignResult:
-        """Do a job; a process that died is replaced and the job done once more. Raises as ``Compute.run``."""
+        """Run a job. If its process dies, the job runs once more in a new one. Raises like ``Compute.run``."""
         for _ in range(2):
             process = self._idle.pop() if self._idle else _Process()
             self._busy.append(process)
@@ -63,7 +63,7 @@ class Fits(Compute):
                 whole = True
             except BrokenProcessPool:
                 continue
-            except Exception as error:  # the result can't be sent
+            except Exception as error:  # the result can't be pickled
                 raise PluginFailed(in_one_line(error)) from error
             finally:
                 self._give_back(process, whole)
@@ -75,13 +75,14 @@ class Fits(Compute):
         )
 
     def close(self) -> None:
-        """End all processes, in the middle of a fit or of its start too; harmless when they have ended."""
+        """End all processes, even in the middle of a fit or of their start. Harmless if they have ended."""
         for process in (*self._idle, *self._busy):
             process.close()
         self._idle = []
 
     def _give_back(self, process: _Process, whole: bool) -> None:
-        """Keep a process for the next fit; end it where enough wait already, or in the middle of a job."""
+        """Keep a process for the next fit. End it if enough processes wait already, or if it is in the middle
+        of a job."""
         self._busy.remove(process)
         if whole and len(self._idle) < self._kept:
             self._idle.append(process)
@@ -90,10 +91,10 @@ class Fits(Compute):
 
 
 class _Process:
-    """A pool of one process, that ends with this one.
+    """A pool of one process, which ends with this one.
 
-    The process holds one end of a pipe whose other end is here and never written: when ours closes by death, it ends
-    at once, in the middle of a fit too.
+    The process holds one end of a pipe whose other end is here and never written. When this process dies and its end
+    closes, the other process ends at once, even in the middle of a fit.
     """
 
     def __init__(self) -> None:
@@ -107,7 +108,8 @@ class _Process:
         self._processes: list[BaseProcess] = [child for child in active_children() if child not in others]
 
     def close(self) -> None:
-        """End it, in the middle of a job or of its start too; harmless when it has ended. Any thread may call."""
+        """End the process, even in the middle of a job or of its start. Harmless if it has ended. Any thread may call
+        it."""
         with self._closing:
             for process in self._processes:
                 process.kill()
@@ -117,7 +119,7 @@ class _Process:
 
 
 def _done(function: Function, job: DesignJob) -> DesignResult | _Failure:
-    """In the other process. Nothing that a job raises leaves it as an exception, not even what would end a process."""
+    """Run the job in the other process. No error leaves it as an exception, not even one that would end a process."""
     try:
         return function(job)
     except BaseException as error:
@@ -135,8 +137,8 @@ def _failure(outcome: _Failure) -> PluginFailed:
 
 @contextmanager
 def _terminal_blocked() -> Iterator[None]:
-    """Block what a terminal sends to all its processes, by Ctrl-C or when it closes, for those started within: they
-    inherit the mask; this one takes its signals afterwards."""
+    """Block the signals that a terminal sends to all its processes, by Ctrl-C or when it closes, for processes started
+    within the context. They inherit the mask; this process receives its signals afterwards."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
     try:
         yield

@@ -1,6 +1,6 @@
-"""Loaded models by surrogate and version, the most recently used ones kept.
+"""Loaded models by surrogate and version. The most recently used ones are kept.
 
-A surrogate is known by its id: a name may be deleted and given anew, here or by another server of the database.
+A surrogate is identified by its id, because its name may be deleted and used again, here or by another server.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ CAPACITY = 64
 
 
 class ModelCache:
-    """Models of all surrogates. Any thread may call; a model is loaded when it is first asked for."""
+    """Models of all surrogates. Any thread may call it. A model is loaded when it is first needed."""
 
     def __init__(
         self,
@@ -27,12 +27,10 @@ class ModelCache:
         newest: Callable[[], Mapping[int, int]],
         capacity: int = CAPACITY,
     ) -> None:
-        """
-        Args:
-            load: the model of a surrogate's version; raises ``UnknownModel``, ``UnknownSurrogate`` or ``Damaged``.
-            newest: the newest stored version of each surrogate that has any; not one that ``load`` has set aside.
-            capacity: how many models are kept; one on another device than the CPU counts again.
-        """
+        """Args:
+        load: returns the model of a version; raises ``UnknownModel``, ``UnknownSurrogate`` or ``Damaged``.
+        newest: returns the newest stored version of each surrogate that has one, without those that were set aside.
+        capacity: number of models that are kept; a copy on another device than the CPU counts too."""
         self._load = load
         self._newest = newest
         self._capacity = capacity
@@ -41,7 +39,7 @@ class ModelCache:
         self._lock = Lock()
 
     def get(self, surrogate: int, version: int, device: torch.device = CPU) -> DynamicsModel:
-        """The model of a version, on a device. Raises ``UnknownModel``, ``UnknownSurrogate`` or ``Damaged``."""
+        """Return the model of a version, on a device. Raises ``UnknownModel``, ``UnknownSurrogate`` or ``Damaged``."""
         key = (surrogate, version, device)
         with self._lock:
             if model := self._models.get(key):
@@ -56,18 +54,18 @@ class ModelCache:
             return self._load(surrogate, version)
         except Damaged:
             with self._lock:
-                self._latest.pop(surrogate, None)  # it may have been this one
+                self._latest.pop(surrogate, None)  # it may have been this version
             raise
 
     def latest(self, surrogate: int) -> int:
-        """The newest version that is known here. Raises ``NoModel`` or ``UnknownSurrogate``."""
+        """Return the newest version that is known here. Raises ``NoModel`` or ``UnknownSurrogate``."""
         with self._lock:
             if version := self._latest.get(surrogate):
                 return version
         return self.refresh(surrogate)
 
     def refresh(self, surrogate: int) -> int:
-        """The newest version that is stored and sound, another server's too.
+        """Return the newest stored version that is not damaged, of any server.
 
         Raises:
             NoModel, UnknownSurrogate: as the classes say.
@@ -82,8 +80,8 @@ class ModelCache:
         raise NoModel("expected a surrogate with a model, but no model has been fitted yet")
 
     def look(self) -> list[int]:
-        """Publish what other servers have stored of the surrogates that are in use here, and forget those that are
-        gone; returns the latter."""
+        """Publish the versions that other servers have stored of surrogates in use here, and forget deleted surrogates.
+        Returns the latter."""
         with self._lock:
             known = list(self._latest.items())
         if not known:
@@ -98,14 +96,14 @@ class ModelCache:
         return gone
 
     def publish(self, surrogate: int, version: int) -> int:
-        """Let lanes move to a version when they reset, unless a newer one is known; returns the newest."""
+        """Let lanes use a version from their next reset on, unless a newer one is known. Returns the newest version."""
         self.get(surrogate, version)
         with self._lock:
             self._latest[surrogate] = max(version, self._latest.get(surrogate, 0))
             return self._latest[surrogate]
 
     def forget(self, surrogate: int) -> None:
-        """Drop all of a surrogate that was deleted."""
+        """Forget a surrogate that was deleted."""
         with self._lock:
             self._latest.pop(surrogate, None)
             for key in [key for key in self._models if key[0] == surrogate]:

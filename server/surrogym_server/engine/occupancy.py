@@ -16,8 +16,8 @@ CAPACITY = 4_096
 class Reservoir:
     """The ``CAPACITY`` visited coordinates of highest priority.
 
-    The priority of the t-th visit is the t-th draw of a generator keyed by ``seed``, so the sample is uniform
-    over all visits, and the same visits give the same sample whatever requests they came in.
+    The priority of the t-th visit is the t-th draw of a generator keyed by ``seed``. So the sample is uniform over all
+    visits, and does not depend on how the visits were divided into requests.
     """
 
     seed: int

@@ -25,17 +25,17 @@ OneStep = Callable[[Session, Floats], tuple[Session, StepResult]]  # by the mode
 
 
 def parts_of(run: PolicyRun) -> tuple[object, ...]:
-    """What the fingerprint of a request is made of."""
+    """Parts of a request's fingerprint."""
     policy = run.policy
     arrays = (policy.mean, policy.deviation, policy.vector, policy.log_deviations, run.until)
     return (run.steps, policy.units, policy.activation, run.noise, *arrays)
 
 
 def roll(session: Session, actions: NDArray[np.float64], step: OneStep) -> tuple[Session, tuple[StepResult, ...]]:
-    """Step with a policy's actions (T, N, F) or (T, N), all or none.
+    """Step with given actions (T, N, F) or (T, N), all or none.
 
     Raises:
-        InvalidInput: wrong shape, not finite, out of bounds; found before the first step.
+        InvalidInput: wrong shape, not finite, or out of bounds; found before the first step.
         TooLarge: too many steps in all lanes.
     """
     lanes, results = session.settings.num_envs, []
@@ -50,9 +50,9 @@ def roll_policy(session: Session, run: PolicyRun, step: OneStep) -> tuple[Sessio
     """Let a policy act, all steps or none.
 
     Raises:
-        InvalidInput: a policy of other observations or actions, ``until`` of another length, actions that are not
+        InvalidInput: the policy has other observations or actions, ``until`` has another length, or actions are not
             finite.
-        TooLarge: too many steps in all lanes, or a layer too wide for so many lanes.
+        TooLarge: too many steps in all lanes, or a layer that is too wide for so many lanes.
     """
     definition, lanes = session.definition, session.settings.num_envs
     _check_steps(run.steps, lanes)

@@ -1,4 +1,4 @@
-"""A session as bytes and back: arrays in NPZ form with a JSON header. Nothing is pickled."""
+"""Convert a session to bytes and back: arrays in NPZ form with a JSON header. Nothing is pickled."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from surrogym_server.tensors import to_device
 from surrogym_server.virtual import LaneState, VirtualSettings
 from surrogym_shared.port import PolicyRollout, ResetResult, StepResult
 
-FORMAT, WITHOUT_PATHS = 2, 1  # the one that is written, and an older one that is read as well
+FORMAT, WITHOUT_PATHS = 2, 1  # the format that is written, and an older one that can be read
 MALFORMED = (BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, ValueError, LookupError, TypeError)
-RAGGED = ("final_lanes", "final_observation")  # of another length in each step
+RAGGED = ("final_lanes", "final_observation")  # of different lengths in each step
 
 Arrays = dict[str, NDArray[Any]]
 
 
 def session_to_bytes(session: Session) -> bytes:
-    """All of a session but its definition, which its surrogate has."""
+    """Convert a session to bytes, without its definition, which its surrogate has."""
     header: dict[str, Any] = {
         "format": FORMAT,
         "id": session.id,
@@ -53,17 +53,17 @@ def session_to_bytes(session: Session) -> bytes:
 
 
 def session_from_bytes(definition: EnvironmentDefinition, data: bytes, surrogate_id: int = 0) -> Session:
-    """The session that ``session_to_bytes`` saved; its next step is bit-identical.
+    """Restore the session that ``session_to_bytes`` saved. Its next step is the same, bit for bit.
 
     Args:
         definition: of its surrogate.
-        data: what was saved.
-        surrogate_id: of the surrogate that has its surrogate's name now.
+        data: the saved bytes.
+        surrogate_id: of the surrogate that has the name of the session's surrogate now.
 
     Raises:
         InvalidInput: saved by another version of this program.
         UnknownSession: its surrogate was deleted, and another one has its name.
-        Damaged: these are not the bytes that were saved; each array is stored with a checksum.
+        Damaged: the bytes have changed; each array is stored with a checksum.
     """
     try:
         return _read(definition, data, surrogate_id)

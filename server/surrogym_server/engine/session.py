@@ -28,20 +28,20 @@ ModelOf = Callable[[int], DynamicsModel]
 Seeds = int | Sequence[int] | None
 Outcome = ResetResult | tuple[StepResult, ...] | PolicyRollout
 
-RESULT_BYTES = 2_048  # of one step's arrays, beside the numbers in them
-LANE_BYTES = 48  # of one lane in them, beside its observation and its action
+RESULT_BYTES = 2_048  # of one step's arrays, in addition to their numbers
+LANE_BYTES = 48  # of one lane in them, in addition to its observation and its action
 
 
 class Fingerprint:
-    """What tells requests apart, whatever carried them: a digest of their parts, taken when it is first asked for.
+    """Content hash of a request, equal on every transport; computed on first use.
 
-    Most requests are never repeated, and a digest costs as much as the rest of a small step's way.
+    Most requests are never repeated, and a digest takes as long as the rest of a small step.
     """
 
     __slots__ = ("_digest", "_parts")
 
     def __init__(self, *parts: object, digest: str | None = None) -> None:
-        """Parts as in ``digest_of``; arrays among them must not change. With a digest none are needed."""
+        """Take parts as in ``digest_of``; arrays among them must not change. With a digest no parts are needed."""
         self._parts = parts
         self._digest = digest
 
@@ -61,7 +61,7 @@ class Fingerprint:
 
 @dataclass(frozen=True)
 class Answer:
-    """The last reply, kept so that a repeat of its request gets it again."""
+    """The last reply, kept for a repeat of its request."""
 
     seq: int
     request: Fingerprint
@@ -70,7 +70,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Session:
-    """One trainer's virtual environment: all that its next step depends on."""
+    """One trainer's virtual environment, with everything on which its next step depends."""
 
     id: str
     surrogate: str
@@ -83,27 +83,27 @@ class Session:
     answer: Answer | None = None
     visited: Reservoir | None = None
     opened_by: tuple[str, str] | None = None  # idempotency key and digest of the opening
-    surrogate_id: int = 0  # in storage, where there is one
+    surrogate_id: int = 0  # in storage, if there is one
 
     @property
     def nbytes(self) -> int:
-        """Bytes of its lanes and of its kept answer, roughly."""
+        """Approximate memory of its lanes and its kept answer, in bytes."""
         outcome = None if self.answer is None else self.answer.outcome
         return self.lanes.nbytes + self.answer_bytes(1 if outcome is None else steps_of(outcome))
 
     def answer_bytes(self, steps: int) -> int:
-        """Bytes that the answer to so many steps takes while it is kept, roughly."""
+        """Approximate memory of the kept answer to a number of steps, in bytes."""
         lane = 8 * (len(self.definition.observation_names) + self.definition.action.size) + LANE_BYTES
         return steps * (RESULT_BYTES + self.settings.num_envs * lane)
 
     @property
     def seq(self) -> int:
-        """The last seq that was answered."""
+        """The last answered seq."""
         return 0 if self.answer is None else self.answer.seq
 
 
 def steps_of(outcome: Outcome) -> int:
-    """How many steps an outcome is of; a reset counts for one."""
+    """Number of steps in an outcome; a reset counts as one."""
     return 1 if isinstance(outcome, ResetResult) else len(outcome)
 
 
@@ -120,7 +120,7 @@ def open_session(
     opened_by: tuple[str, str] | None = None,
     surrogate_id: int = 0,
 ) -> Session:
-    """A session whose lanes are not reset yet, all under one model version."""
+    """Open a session whose lanes are not reset yet, all under one model version."""
     return Session(
         id=id,
         surrogate=surrogate,
@@ -137,10 +137,10 @@ def open_session(
 
 
 def replay(session: Session, seq: int | None, request: Fingerprint) -> Answer | None:
-    """The kept answer when the request repeats the last one; None when it is the next one.
+    """The kept answer if the request repeats the last one; None if it is the next one.
 
     Raises:
-        SeqConflict: neither.
+        SeqConflict: it is neither.
     """
     if seq is None or seq == session.seq + 1:
         return None
@@ -152,7 +152,7 @@ def replay(session: Session, seq: int | None, request: Fingerprint) -> Answer | 
 
 
 def answered(session: Session, request: Fingerprint, outcome: Outcome) -> tuple[Session, Answer]:
-    """The session with the outcome kept as its last answer."""
+    """The session with the outcome as its last answer."""
     answer = Answer(session.seq + 1, request, outcome)
     return _with(session, answer=answer), answer
 
@@ -176,7 +176,7 @@ def step_session(
 ) -> tuple[Session, StepResult]:
     """Step the lanes of the mask with actions (N, F) in the model's units.
 
-    Every lane steps under its own version; one whose episode ended and began anew goes on under ``latest``.
+    Every lane steps under its own version. A lane whose episode ended and began again continues under ``latest``.
     """
     if mask is not None:
         _check_mask(mask, session.settings.num_envs)
@@ -211,7 +211,7 @@ def _step_versions(
 
 
 def _join(parts: Sequence[tuple[NDArray[np.intp], LaneTransition]]) -> LaneTransition:
-    """One transition of all lanes from those of disjoint groups, each with its lane numbers."""
+    """Join the transitions of disjoint groups of lanes, each with its lane numbers, to one of all lanes."""
     order = np.argsort(np.concatenate([index for index, _ in parts]))
 
     def lanewise(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -266,10 +266,10 @@ def _check_mask(mask: Bools, num_envs: int) -> None:
 
 
 def check_opening(session: Session, digest: str) -> Session:
-    """The session an idempotency key opened, if its opening had the same body.
+    """The session that an idempotency key opened, if its opening had the same body.
 
     Raises:
-        IdempotencyConflict: it had another one.
+        IdempotencyConflict: the body was different.
     """
     if session.opened_by is None or session.opened_by[1] != digest:
         raise IdempotencyConflict("this idempotency key opened a session with another body")
@@ -277,7 +277,7 @@ def check_opening(session: Session, digest: str) -> Session:
 
 
 def digest_of(operation: str, *parts: object) -> str:
-    """A fingerprint of a request that does not depend on what carried it."""
+    """Hash of a request's content, equal on every transport."""
     return hashlib.sha256(b"|".join([operation.encode(), *map(_bytes_of, parts)])).hexdigest()
 
 

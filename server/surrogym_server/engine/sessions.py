@@ -1,4 +1,4 @@
-"""The live sessions of this process; everyone else knows only their ids.
+"""The live sessions of this process. Other parts of the program only know their ids.
 
 All methods but ``check_wanted`` belong to the event loop's thread.
 """
@@ -42,9 +42,9 @@ class _Live:
     session: Session
     used: float
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
-    reserved: int = 0  # bytes its lanes are expected to take
-    seconds_per_step: float = float("inf")  # measured, so unknown before the first
-    requests: int = 0  # of it that are at work or waiting
+    reserved: int = 0  # bytes that its lanes may take
+    seconds_per_step: float = float("inf")  # measured, so infinite before the first step
+    requests: int = 0  # running or waiting ones of this session
 
     @property
     def nbytes(self) -> int:
@@ -53,36 +53,36 @@ class _Live:
 
 @dataclass
 class Threads:
-    """Where long work is done."""
+    """A pool of threads for long work."""
 
     executor: Executor
-    workers: int  # how many threads it has
-    queued: list[float] = field(default_factory=list)  # seconds that the work given to it will take
+    workers: int  # number of its threads
+    queued: list[float] = field(default_factory=list)  # predicted seconds of the work in it
 
     @property
     def wait(self) -> float:
-        """Seconds until work that is given now will be begun, about."""
+        """Approximate seconds until new work would begin."""
         return sum(self.queued) / self.workers if len(self.queued) >= self.workers else 0.0
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What all sessions together may take of this process."""
+    """Limits of all sessions of this process together."""
 
     sessions: int = 256
     nbytes: int = 2048 * MEBIBYTE  # of lanes and kept answers
-    requests: int = 1_024  # at work or waiting
+    requests: int = 1_024  # running or waiting
 
 
 class LiveSessions:
-    """Sessions by id: one request at a time in each, long ones in a thread.
+    """Sessions by id. Each runs one request at a time, and long ones in a thread.
 
     Args:
-        threads: where long steps and resets are done.
-        rollouts: where long rollouts are, which may take minutes: steps don't queue behind them.
-        limits: beyond them requests are refused.
-        idle_seconds: a session that is not used for so long expires.
-        clock: seconds, of which deadlines speak too.
+        threads: for long steps and resets.
+        rollouts: for long rollouts, which may take minutes, so that steps don't queue behind them.
+        limits: requests beyond them are refused.
+        idle_seconds: a session without requests for this long expires.
+        clock: seconds, also for deadlines.
     """
 
     def __init__(
@@ -112,33 +112,33 @@ class LiveSessions:
 
     @property
     def requests(self) -> int:
-        """How many are at work or waiting."""
+        """Number of running or waiting requests."""
         return self._requests
 
     def check_room(self, nbytes: int) -> None:
-        """Whether a session of so many bytes may be opened.
+        """Check that a session of a size in bytes may be opened.
 
         Raises:
-            TooLarge: it alone takes more than all may.
-            Overloaded: as many as the limit are open, or they take too much already.
+            TooLarge: it takes more than all sessions together may.
+            Overloaded: the number of open sessions, or their memory, has reached its limit.
         """
         if len(self._live) >= self._limits.sessions:
             raise Overloaded(f"expected fewer than {self._limits.sessions} open sessions: close some, or try later")
         self._check_memory(nbytes)
 
     def add(self, session: Session, reserved: int = 0) -> Session:
-        """Keep a session, which may grow to ``reserved`` bytes. Raises as ``check_room``."""
+        """Keep a session, which may grow to ``reserved`` bytes. Raises like ``check_room``."""
         live = _Live(session, self.clock(), reserved=reserved)
         self.check_room(live.nbytes)
         self._live[session.id] = live
         return session
 
     def get(self, id: str) -> Session:
-        """The session as it is now. Raises ``SessionExpired`` or ``UnknownSession``."""
+        """Return the present session. Raises ``SessionExpired`` or ``UnknownSession``."""
         return self._get(id).session
 
     def opened_by(self, surrogate: str, key: str, digest: str) -> Session | None:
-        """The session that an idempotency key opened, if it is there. Raises ``IdempotencyConflict``."""
+        """Return the session that an idempotency key opened, if it exists. Raises ``IdempotencyConflict``."""
         for session in self:
             if session.opened_by is not None and (session.surrogate, session.opened_by[0]) == (
                 surrogate,
@@ -148,7 +148,7 @@ class LiveSessions:
         return None
 
     def prompt(self, id: str, steps: int = 1) -> bool:
-        """Whether ``advance`` would now take so many steps of a session without waiting for anything."""
+        """Whether ``advance`` would take a number of steps of a session now, without waiting."""
         live = self._live.get(id)
         if live is None or live.requests or self._requests >= self._limits.requests:
             return False
@@ -157,7 +157,7 @@ class LiveSessions:
     def advance_now(
         self, id: str, seq: int | None, request: Fingerprint, work: Work, steps: int = 1, deadline: float | None = None
     ) -> Answer:
-        """As ``advance``, in this call and this thread; only where ``prompt`` says so."""
+        """Do ``advance`` in this call and this thread. Call it only if ``prompt`` returns True."""
         live = self._get(id)
         live.used = self.clock()
         if kept := replay(live.session, seq, request):
@@ -171,21 +171,21 @@ class LiveSessions:
     ) -> Answer:
         """Do the work of a request once, and keep its outcome as the session's last answer.
 
-        The same seq with the same fingerprint gets the kept answer, also when it comes while the first is being
-        computed. Work that raises changes nothing.
+        The same seq with the same fingerprint gets the kept answer, even if it comes while the first is being computed.
+        Work that raises an error changes nothing.
 
         Args:
             id: of the session.
             seq: the session's next one, or None to give up replay.
             request: its fingerprint.
             work: from the session to the new session and the outcome; pure.
-            steps: how many virtual steps it takes, to predict how long.
+            steps: number of virtual steps, to predict the duration.
             deadline: by the clock; work that would end later is not begun.
 
         Raises:
             SeqConflict: neither the next seq nor a repeat.
-            Overloaded: too many requests are at work or waiting.
-            DeadlineExceeded: it would be late.
+            Overloaded: too many requests are running or waiting.
+            DeadlineExceeded: it would end after the deadline.
             SessionExpired, UnknownSession: as the classes say.
         """
         live = self._get(id)
@@ -206,7 +206,7 @@ class LiveSessions:
             live.requests -= 1
 
     def check_wanted(self, id: str) -> None:
-        """Let long work go on, between two of its steps. May be called from any thread.
+        """Check that long work may continue, between two of its steps. Any thread may call it.
 
         Raises:
             UnknownSession: the session was closed meanwhile.
@@ -218,11 +218,11 @@ class LiveSessions:
             raise UnknownSession(f"session {id!r} was closed during this request")
 
     def stop(self) -> None:
-        """Let long work end where it next asks ``check_wanted``."""
+        """End long work at its next call of ``check_wanted``."""
         self._stopping = True
 
     def close(self, id: str) -> None:
-        """End a session; harmless when it has ended."""
+        """End a session. Harmless if it has ended."""
         self._live.pop(id, None)
 
     def close_all_of(self, surrogate: int) -> None:
@@ -232,7 +232,7 @@ class LiveSessions:
                 self.close(session.id)
 
     def sweep(self) -> list[str]:
-        """Expire the sessions that were idle for too long; returns their ids."""
+        """Expire the sessions that were idle for too long. Returns their ids."""
         now = self.clock()
         idle = [id for id, live in self._live.items() if now - live.used > self.idle_seconds and not live.lock.locked()]
         for id in idle:
@@ -285,7 +285,7 @@ class LiveSessions:
         self._check_deadline(deadline, threads.wait + expected)
 
         def in_time(session: Session) -> tuple[Session, Outcome]:
-            self._check_deadline(deadline, expected)  # the wait may have been longer than was thought
+            self._check_deadline(deadline, expected)  # the wait may have been longer than predicted
             return work(session)
 
         threads.queued.append(expected)
@@ -302,8 +302,8 @@ class LiveSessions:
 
 
 def _learned(live: _Live, done: tuple[Session, Outcome], seconds: float, steps: int) -> tuple[Session, Outcome]:
-    """What was done, once the session's time of a step is known better."""
-    taken = len(done[1]) if isinstance(done[1], PolicyRollout) else steps  # which may have stopped early
+    """Return the result, after an update of the session's predicted time for a step."""
+    taken = len(done[1]) if isinstance(done[1], PolicyRollout) else steps  # a policy's rollout may have stopped early
     each = seconds / taken
     known = live.seconds_per_step if live.seconds_per_step < float("inf") else each
     live.seconds_per_step = (1 - FORGETTING) * known + FORGETTING * each

@@ -1,4 +1,4 @@
-"""What the sessions of an engine have done, for people to look at. Written in the event loop's thread.
+"""Activity of an engine's sessions, shown to people. Written in the event loop's thread.
 
 Shapes: N lanes, T steps.
 """
@@ -20,16 +20,16 @@ from surrogym_shared.port import PolicyRollout, ResetResult, StepResult
 
 Clock = Callable[[], float]
 
-RATE_SECONDS = 10.0  # steps per second are an exponential average over about so long
+RATE_SECONDS = 10.0  # steps per second are an exponential average over about this time
 KEPT_EPISODES = 100
-FOLD_STEPS = 32  # as many are gathered before they are summed: the path of a step is short
-FOLD_LANE_STEPS = 16_384  # or as many of all lanes
+FOLD_STEPS = 32  # steps that are collected before they are summed, so that a step stays fast
+FOLD_LANE_STEPS = 16_384  # the same limit for steps of all lanes
 BUCKETS = (1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 60.0)
 
 
 @dataclass
 class Durations:
-    """A histogram of seconds; observing costs a look into a table."""
+    """A histogram of seconds. An observation costs one lookup in a table."""
 
     sum: float = 0.0
     _counts: list[int] = field(default_factory=lambda: [0] * (len(BUCKETS) + 1))
@@ -39,7 +39,7 @@ class Durations:
         self.sum += seconds
 
     def cumulative(self) -> Iterator[tuple[str, int]]:
-        """(upper bound, how many lasted at most so long), the last bound infinite."""
+        """Pairs of upper bound and number of durations up to it; the last bound is infinite."""
         total = 0
         for bound, count in zip((*map(str, BUCKETS), "+Inf"), self._counts, strict=True):
             total += count
@@ -47,7 +47,7 @@ class Durations:
 
     @classmethod
     def together(cls, parts: Iterable[Durations]) -> Durations:
-        """Of several processes."""
+        """The sum of the histograms of several processes."""
         parts = list(parts)
         columns = zip(*(part._counts for part in parts), strict=True)
         return cls(sum(part.sum for part in parts), [sum(column) for column in columns]) if parts else cls()
@@ -58,7 +58,7 @@ class Durations:
 
 @dataclass(frozen=True)
 class Episode:
-    """One that ended. ``reward`` is the imagined return, ``penalty`` what was taken off it for its deviations."""
+    """A finished episode. ``reward`` is the imagined return, ``penalty`` the part subtracted for deviations."""
 
     reward: float
     penalty: float
@@ -66,7 +66,7 @@ class Episode:
 
 @dataclass(frozen=True)
 class SessionActivity:
-    """A session and what it did since this process knows it."""
+    """A session and its activity since this process has it."""
 
     session: SessionInfo
     steps: int  # of all lanes
@@ -77,7 +77,7 @@ class SessionActivity:
 
 
 class Tally:
-    """Sums of one session's steps."""
+    """Sums over one session's steps."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -92,7 +92,7 @@ class Tally:
         self._recent: deque[Episode] = deque(maxlen=KEPT_EPISODES)
 
     def stepped(self, answer: Reply) -> None:
-        """Take note of an answer; one that was given before counts once."""
+        """Count an answer. A repeated answer counts once."""
         if answer.seq <= self._seq or isinstance(answer.outcome, ResetResult):
             return
         self._seq = answer.seq
@@ -107,7 +107,7 @@ class Tally:
             self._fold()
 
     def reset(self, mask: NDArray[np.bool_] | None) -> None:
-        """Episodes of the lanes of the mask (N,) ended without an end: their returns count for nothing."""
+        """Forget the running episodes in the lanes of the mask (N,): they were reset, so their returns don't count."""
         self._fold()
         if self._sums is not None:
             self._sums[:, slice(None) if mask is None else mask] = 0.0
@@ -155,7 +155,7 @@ class Tallies:
         self._tallies: dict[str, Tally] = {}
 
     def of(self, id: str) -> Tally:
-        """The tally of a session; a new one where it has none."""
+        """The tally of a session; a new one if it has none."""
         tally = self._tallies.get(id)
         if tally is None:
             tally = self._tallies[id] = Tally(self._clock)
@@ -165,18 +165,18 @@ class Tallies:
         return [self.of(session.id).read(session) for session in alive]
 
     def forget_all_but(self, alive: Iterable[str]) -> None:
-        """Keep the tallies of these sessions alone, by their ids."""
+        """Keep only the tallies of these sessions, by their ids."""
         ids = set(alive)
         self._tallies = {id: tally for id, tally in self._tallies.items() if id in ids}
 
 
 @dataclass(frozen=True)
 class Counts:
-    """What an engine holds now, and what it has done since its start."""
+    """Present counts of an engine, and totals since its start."""
 
     sessions: Mapping[str, int]  # open ones by the name of their surrogate
     lanes: int  # of all of them
-    requests: int  # at work or waiting
-    steps: Durations  # requests that step, their waiting and computing included
+    requests: int  # running or waiting
+    steps: Durations  # requests with steps, waiting and computing included
     lane_steps: int  # virtual environment steps
     expired: int  # sessions that were idle for too long

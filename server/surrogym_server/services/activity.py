@@ -1,4 +1,4 @@
-"""Which samplers and trainer workers are at work, for people to look at. Kept in memory."""
+"""Samplers and trainer workers that are active, shown to people. Kept in memory."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Generic, TypeVar
 Clock = Callable[[], float]
 T = TypeVar("T")
 
-ALIVE_SECONDS = 60.0  # one that was not heard of for so long is taken for gone
+ALIVE_SECONDS = 60.0  # one that was silent for longer counts as gone
 
 
 class _Alive(Generic[T]):
-    """When each was last heard of, and what it said of itself. May be called from any thread."""
+    """When each was last heard of, and what it reported about itself. Any thread may call it."""
 
     def __init__(self, clock: Clock = time.monotonic) -> None:
         self._clock = clock
@@ -38,7 +38,7 @@ class Samplers(_Alive[None]):
         self._note(surrogate, sampler, None)
 
     def by_surrogate(self) -> dict[str, list[str]]:
-        """Names of those that asked or answered within the last minute."""
+        """Names of the samplers that claimed or answered within the last minute."""
         alive = defaultdict[str, list[str]](list)
         for surrogate, sampler, _ in self._alive():
             alive[surrogate].append(sampler)
@@ -46,14 +46,14 @@ class Samplers(_Alive[None]):
 
 
 class Workers(_Alive[int]):
-    """When each trainer worker was last heard of, and how many real episodes it takes at most."""
+    """When each trainer worker was last heard of, and the largest number of real episodes that it takes."""
 
     def heard(self, surrogate: str, worker: str, most_episodes: int | None = None) -> None:
-        """Note that a worker asked or reported; None keeps what it said before."""
+        """Note that a worker claimed or reported. None keeps what it reported before."""
         if most_episodes is None:
             _, most_episodes = self._heard.get((surrogate, worker), (0.0, 0))
         self._note(surrogate, worker, most_episodes)
 
     def of(self, surrogate: str) -> dict[str, int]:
-        """The most real episodes of each worker that was heard of within the last minute, by its name."""
+        """The largest number of real episodes of each worker heard of within the last minute, by its name."""
         return {worker: most for owner, worker, most in self._alive() if owner == surrogate}

@@ -1,4 +1,4 @@
-"""Definitions of stored surrogates, and the checks of what is sent against them."""
+"""Definitions of stored surrogates, and the checks of requests against them."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ Define = Callable[[dict[str, Any]], EnvironmentDefinition]
 
 
 class Definitions:
-    """Definition of each surrogate by name; made once.
+    """Definitions of surrogates by name; each is built once and cached.
 
-    A surrogate may outlive the package that brought its family of models or its acquisition. What reads samples and
-    states takes its definition by ``get`` and works without the package; what needs it asks here for more.
+    A surrogate may outlive the package that provides its family of models or its acquisition. ``get`` works without the
+    package and is enough to read samples and states. ``for_model`` and ``for_design`` check that the package is
+    installed.
     """
 
     def __init__(self, storage: Storage, define: Define) -> None:
@@ -35,11 +36,11 @@ class Definitions:
         self._lock = Lock()
 
     def get(self, name: str) -> EnvironmentDefinition:
-        """Raises ``UnknownSurrogate``."""
+        """The definition of a surrogate. Raises ``UnknownSurrogate``."""
         return self.of(self._storage.surrogates.get(name))
 
     def of(self, record: SurrogateRecord) -> EnvironmentDefinition:
-        """The definition of a surrogate that was read."""
+        """The definition of a surrogate whose record was read."""
         with self._lock:
             id, definition = self._made.get(record.name, (None, None))
             if definition is None or id != record.id:
@@ -48,26 +49,29 @@ class Definitions:
             return definition
 
     def for_model(self, name: str) -> EnvironmentDefinition:
-        """Where a model is to be read. Raises ``UnknownSurrogate``, or ``NotInstalled``: its family is not here."""
+        """The definition, to read a model. Raises ``UnknownSurrogate``, or ``NotInstalled`` if the model's family is
+        missing."""
         definition = self.get(name)
         _require(name, MODELS.lack(definition.learning.model))
         return definition
 
     def for_design(self, name: str) -> EnvironmentDefinition:
-        """Where a round is to be made. Raises as ``for_model``, and ``NotInstalled``: its acquisition is not here."""
+        """The definition, to do a round. Raises like ``for_model``, and ``NotInstalled`` if its acquisition
+        is missing."""
         definition = self.for_model(name)
         _require(name, ACQUISITIONS.lack(definition.design.acquisition))
         return definition
 
     def lacking(self) -> list[str]:
-        """One sentence for each stored surrogate that needs what is not here; one that can't be read is left out."""
+        """One sentence for each stored surrogate that needs a package which is not installed. Unreadable ones are left
+        out."""
         found = []
         for summary in self._storage.surrogates.summaries():
             try:
                 self.for_design(summary.name)
             except NotInstalled as error:
                 found.append(str(error))
-            except SurrogymError:  # deleted meanwhile, or damaged, which who reads it is told
+            except SurrogymError:  # deleted meanwhile, or damaged, which its readers are told
                 continue
         return found
 
@@ -78,7 +82,7 @@ def _require(name: str, lack: str | None) -> None:
 
 
 def check_coordinates(definition: EnvironmentDefinition, what: str, rows: Array) -> Array:
-    """Coordinates (n, C) as they are. Raises ``InvalidInput`` unless they have C entries."""
+    """Return coordinates (n, C). Raises ``InvalidInput`` unless they have C entries."""
     names = definition.coordinate_names
     if rows.ndim != 2 or rows.shape[1] != len(names):
         raise InvalidInput(f"{what}: expected (n, {len(names)}), one entry for each of {list(names)}, got {rows.shape}")
@@ -86,7 +90,7 @@ def check_coordinates(definition: EnvironmentDefinition, what: str, rows: Array)
 
 
 def check_points(definition: EnvironmentDefinition, q: Array, u: Array) -> tuple[Array, Array]:
-    """Points (n, C) and their actions (n, F) in the model's units.
+    """Check points (n, C) and their actions (n, F), and return them in the model's units.
 
     Raises:
         InvalidInput: another shape, another number of points than of actions, or an action out of bounds.
@@ -98,7 +102,7 @@ def check_points(definition: EnvironmentDefinition, q: Array, u: Array) -> tuple
 
 
 def check_rollouts(definition: EnvironmentDefinition, rollouts: Sequence[Array]) -> list[Array]:
-    """Action sequences, each (T, F), in the model's units.
+    """Check action sequences, each (T, F), and return them in the model's units.
 
     Raises:
         InvalidInput: one that is too long, of another shape, or out of bounds.
@@ -111,11 +115,11 @@ def check_rollouts(definition: EnvironmentDefinition, rollouts: Sequence[Array])
 
 
 def check_settable(definition: EnvironmentDefinition, q: Array) -> Array:
-    """Coordinates (n, C) that the original environment can be set to.
+    """Check that the original environment can be set to coordinates (n, C), and return them.
 
     Raises:
-        InvalidInput: another shape, or beyond a bound of the environment or, on a side without one, beyond the
-            sampling range: a sampler sets its environment to nothing else.
+        InvalidInput: another shape, or a value beyond a bound of the environment, or on a side without a bound beyond
+            the sampling range. A sampler does not set its environment to such states.
     """
     q = check_coordinates(definition, "coordinates", q)
     for index, coordinate in enumerate(definition.coordinates):

@@ -1,4 +1,4 @@
-"""The designer: whenever a surrogate is due, fit it, store model and next queries, wake who waits"""
+"""The designer: fits every surrogate that is due, stores the model and the next queries, and wakes waiting samplers."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ logger = logging.getLogger(__name__)
 
 FIT_LEASE_SECONDS = 30.0
 RENEWALS_PER_LEASE = 3
-ATTEMPTS = 5  # of a fit whose process is killed, or whose result can't be stored
-LONG_SECONDS = 60.0  # a fit that takes longer is told in the log, and others pass it
-MOST_PASSED = 3  # fits that others pass: each is a process
-PAUSE_SECONDS = 1.0  # between looks at whether a fit is still wanted
+ATTEMPTS = 5  # of a fit whose process died, or whose result could not be stored
+LONG_SECONDS = 60.0  # the log names a fit that takes longer, and other fits start beside it
+MOST_PASSED = 3  # long fits that don't count towards ``fit_workers``; each is a process
+PAUSE_SECONDS = 1.0  # between checks whether a fit is still wanted
 
 
 class _Turn:
-    """A few fits at a time; one that takes long lets others pass, as long as there are few such."""
+    """A turn to fit: a few fits run at a time. A long fit lets others start beside it, if there are few long ones."""
 
     def __init__(self, usual: asyncio.Semaphore, passed: asyncio.Semaphore) -> None:
         self._usual, self._passed, self._held = usual, passed, usual
@@ -83,20 +83,18 @@ class Designer:
         fit_seconds: float,
         fit_workers: int = 1,
     ) -> None:
-        """
-        Args:
-            storage: holds the right to fit.
-            definitions: of the surrogates in it.
-            fits: where jobs are done.
-            models: told of each new version.
-            notices: wake this designer, and are posted after each fit.
-            metrics: of this process.
-            owner: name of this server in the right to fit.
-            threads: of torch in a fit.
-            look_seconds: how often to look for what no notice told.
-            fit_seconds: a fit that takes longer is ended, and has failed.
-            fit_workers: how many fits are done at once, beside those that take long and are passed.
-        """
+        """Args:
+        storage: holds the right to fit.
+        definitions: of the surrogates in it.
+        fits: runs the jobs.
+        models: is informed of each new version.
+        notices: wake this designer, and are posted after each fit.
+        metrics: of this process.
+        owner: name of this server in the right to fit.
+        threads: of torch in a fit.
+        look_seconds: interval of searches for surrogates that became due without a notice.
+        fit_seconds: a fit that takes longer is stopped and counts as failed.
+        fit_workers: number of fits at a time, not counting long ones."""
         self._storage = storage
         self._definitions = definitions
         self._fits = fits
@@ -108,11 +106,11 @@ class Designer:
         self._look_seconds = look_seconds
         self._fit_seconds = fit_seconds
         self._usual, self._passed = asyncio.Semaphore(fit_workers), asyncio.Semaphore(MOST_PASSED)
-        self._tasks: dict[str, asyncio.Task[None]] = {}  # of the surrogates that are fitted, or wait for their turn
-        self._unavailable: dict[str, int] = {}  # fits in a row that had no process, or no storage, by surrogate
+        self._tasks: dict[str, asyncio.Task[None]] = {}  # of the surrogates that are fitted or wait for their turn
+        self._unavailable: dict[str, int] = {}  # consecutive fits without a process or storage, by surrogate
 
     async def run(self) -> None:
-        """Fit what is due, for ever; ends by cancellation, and what was being fitted stays due."""
+        """Fit due surrogates until cancelled. Surrogates whose fit is cancelled stay due."""
         try:
             with self._notices.listen() as listener:
                 while True:
@@ -141,7 +139,7 @@ class Designer:
         await asyncio.to_thread(self._give_up_hopeless)
 
     async def _fit_in_turn(self, name: str) -> None:
-        """Whatever comes of it ends this fit alone."""
+        """Run one fit. Its errors end this fit only."""
         try:
             async with _Turn(self._usual, self._passed) as turn:
                 await self._fit(name, turn)
@@ -157,12 +155,14 @@ class Designer:
     def improve(
         self, name: str, queries: int, checkpoint: str | None, key: str | None, *, raise_budget: bool
     ) -> Granted:
-        """Ask the next fit for more queries, weighted by the occupancy of a checkpoint (None: the latest, if
-        any), and for ``raise_budget`` raise the budget to hold them.
+        """Request more queries from the next fit.
+
+        The queries are weighted by the occupancy of a checkpoint (None: the latest, if any). With ``raise_budget`` the
+        budget is raised to hold them.
 
         Raises:
             InvalidInput: no occupancy was submitted under this name.
-            BeyondBudget: the budget has not as many left, and may not be raised.
+            BeyondBudget: the budget has too few left, and may not be raised.
         """
         if checkpoint is not None and self._storage.occupancy.get(name, checkpoint) is None:
             raise InvalidInput(
@@ -201,19 +201,19 @@ class Designer:
             self._notices.post(name)
 
     def _may_try_again(self, name: str) -> bool:
-        """Whether a fit that could not be done now stays due; it does for so many attempts in a row."""
+        """Whether a fit that could not run now stays due. It does for a limited number of consecutive attempts."""
         attempts = self._unavailable.pop(name, 0) + 1
         if attempts < ATTEMPTS:
             self._unavailable[name] = attempts
         return attempts < ATTEMPTS
 
     async def _result(self, lease: FitLease, turn: _Turn) -> DesignResult:
-        """What the job of a lease gives; the job is ended when nobody wants it any more, or it takes too long.
+        """Result of the job of a lease. The job is stopped if nobody wants it any more, or if it takes too long.
 
         Raises:
             LeaseExpired, UnknownSurrogate: nobody wants it any more.
             PluginFailed: it took too long.
-            Exception: whatever the job raises.
+            Exception: any error of the job.
         """
         job = await asyncio.to_thread(self._job, lease)
         work = asyncio.create_task(self._fits.run(job))
@@ -235,8 +235,8 @@ class Designer:
             await asyncio.gather(work, keeper, return_exceptions=True)
 
     async def _keep(self, lease: FitLease, turn: _Turn) -> None:
-        """Hold the right to a fit while it is wanted, and tell of one that takes long. Raises ``LeaseExpired`` or
-        ``UnknownSurrogate`` when nobody wants it any more."""
+        """Renew the right to fit while the fit is wanted, and log a long fit. Raises ``LeaseExpired`` or
+        ``UnknownSurrogate`` if nobody wants it any more."""
         began, tell_after = time.monotonic(), LONG_SECONDS
         with self._notices.listen(lease.surrogate) as listener:
             while True:
@@ -245,7 +245,7 @@ class Designer:
                     await asyncio.to_thread(self._storage.designs.renew, lease, FIT_LEASE_SECONDS)
                 except (LeaseExpired, UnknownSurrogate):
                     raise
-                except SurrogymError as error:  # the commit will say so
+                except SurrogymError as error:  # the commit will raise it
                     logger.debug("the right to fit %s is not renewed: %s", lease.surrogate, error)
                 if (took := time.monotonic() - began) > tell_after:
                     tell_after *= 2
@@ -278,7 +278,7 @@ class Designer:
             pending_coordinates=np.array([query.coordinates for query in steps]) if steps else None,
             pending_action=np.array([query.action for query in steps]) if steps else None,
             pending_rollouts=tuple(query.actions for query in pending if query.kind == "rollout"),
-            extra_queries=min(lease.extra_queries, max(0, record.budget - spoken)),  # it may have been lowered since
+            extra_queries=min(lease.extra_queries, max(0, record.budget - spoken)),  # it may be lower by now
             occupancy=None if visited is None else visited.states,
             threads=self._threads,
             logged=logged,
@@ -312,7 +312,8 @@ class Designer:
             self._storage.designs.abort(lease, error)
 
     def _give_up_hopeless(self) -> None:
-        """Fail the designs whose initial queries were all set aside: nothing to fit, and nothing to wait for."""
+        """Fail the designs whose initial queries were all set aside, because they have nothing to fit or to
+        wait for."""
         for name in self._storage.designs.hopeless():
             with suppress(UnknownSurrogate):  # deleted meanwhile
                 set_aside = self._storage.queries.list(name, ("set_aside",))
@@ -324,7 +325,7 @@ class Designer:
 
 
 def _failure(name: str, error: Exception) -> str:
-    """Why a round failed, and what to do about it, for the status of its surrogate."""
+    """Reason why a round failed, and the way out, for the status of its surrogate."""
     match error:
         case NotInstalled():
             return f"{error}; then: surrogym change {name} --resume"

@@ -1,4 +1,4 @@
-"""What happened to a surrogate, as a stream that waits for more."""
+"""Events of a surrogate, as a stream that waits for new ones."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class EventService:
         return after
 
     async def changes(self) -> AsyncIterator[bool]:
-        """True after something happened to any surrogate, False after a silence, until the server ends."""
+        """Yield True after an event of any surrogate, and False after a silence, until the server stops."""
         with self._notices.listen() as listener:
             while not self._notices.closing:
                 changed = await listener.wait(SILENCE_SECONDS)
@@ -38,7 +38,8 @@ class EventService:
                     await asyncio.sleep(CHANGE_SECONDS)
 
     async def follow(self, name: str, after: int) -> AsyncIterator[EventRecord | None]:
-        """Events with an id above ``after``, until the surrogate or the server ends; None after a silence."""
+        """Yield the events with an id above ``after``, and None after a silence, until the surrogate is deleted or the
+        server stops."""
         silent = 0.0
         with self._notices.listen(name) as listener:
             while not self._notices.closing:
@@ -46,7 +47,7 @@ class EventService:
                     page = await asyncio.to_thread(self._storage.events.list, name, after, PAGE)
                 except UnknownSurrogate:
                     return
-                except Unavailable:  # it goes on when storage is back
+                except Unavailable:  # it continues when storage is back
                     page = []
                 for event in page:
                     yield event

@@ -1,6 +1,6 @@
-"""What the services of one server process have done since its start, for ``/metrics``.
+"""Counters of the services of one server process since its start, for ``/metrics``.
 
-The engine counts steps; what lasts longer is counted in storage.
+The engine counts steps. Counts that outlive a process are computed from storage.
 """
 
 from __future__ import annotations

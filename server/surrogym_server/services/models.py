@@ -1,4 +1,4 @@
-"""Models: history, export, import, and what one says about given points."""
+"""Models: history, export, import, and predictions at given points."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Said(Generic[T]):
-    """What a model says, and which."""
+    """A model's answer, and the version of the model."""
 
     version: int
     outputs: tuple[str, ...]
@@ -41,11 +41,11 @@ class Said(Generic[T]):
 
 
 def load_model(storage: Storage, definitions: Definitions, surrogate: int, version: int) -> DynamicsModel:
-    """A stored model of a surrogate's id, ready to predict.
+    """Load a stored model of a surrogate's id.
 
     Raises:
         UnknownModel, UnknownSurrogate: as the classes say.
-        NotInstalled: its family is not here.
+        NotInstalled: its family is not installed.
         Damaged: as ``stored_model``, or this program can't read it.
     """
     name = storage.surrogates.name_of(surrogate)
@@ -58,17 +58,18 @@ def load_model(storage: Storage, definitions: Definitions, surrogate: int, versi
 
 
 def stored_tolerances(storage: Storage, surrogate: int, version: int) -> tuple[float, ...]:
-    """Tolerance of each output, (O,), that a stored model of a surrogate's id was judged by. Raises ``UnknownModel``
+    """Tolerances of the outputs, (O,), by which a stored model of a surrogate's id was judged. Raises ``UnknownModel``
     or ``UnknownSurrogate``."""
     return tuple(storage.models.get(storage.surrogates.name_of(surrogate), version).tolerances)
 
 
 def stored_model(storage: Storage, name: str, version: int) -> bytes:
-    """A stored model as a file.
+    """Read a stored model as a file.
 
     Raises:
         UnknownModel, UnknownSurrogate: as the classes say.
-        Damaged: it is not what was stored. It is set aside: the version before it serves, and a fit is due.
+        Damaged: the file has changed since it was stored. The model is set aside, the version before it is served, and
+            a new fit becomes due.
     """
     try:
         return storage.models.blob(name, version)
@@ -96,7 +97,7 @@ class ModelService:
         return self._storage.models.list(name)
 
     def get(self, name: str, version: int) -> ModelRecord:
-        """Raises ``UnknownModel``."""
+        """Return a model's record. Raises ``UnknownModel``."""
         return self._storage.models.get(name, version)
 
     def export(self, name: str, version: int) -> bytes:
@@ -107,8 +108,8 @@ class ModelService:
         """Import a safetensors file as the newest model, judged by this surrogate's tolerances.
 
         Raises:
-            InvalidInput: no model of this surrogate.
-            NotInstalled: its family is not here.
+            InvalidInput: the file is not a model of this surrogate.
+            NotInstalled: its family is not installed.
         """
         record = self._storage.surrogates.get(name)
         definition = self._definitions.for_model(name).with_tolerances(record.tolerances)
@@ -123,12 +124,12 @@ class ModelService:
         return self._storage.models.get(name, version)
 
     def predict(self, name: str, q: Array, u: Array, version: int | None) -> Said[PointPrediction]:
-        """One mean step from each of q (n, C) under u (n, F).
+        """Predict one mean step from each of q (n, C) under u (n, F).
 
         Raises:
             InvalidInput: wrong shape, or an action out of bounds.
             NoModel, UnknownModel: as the classes say.
-            PluginFailed: the family's code failed.
+            PluginFailed: the code of the model's family failed.
         """
         version, model = self._model(name, version)
         q, u = check_points(model.definition, q, u)
@@ -136,7 +137,7 @@ class ModelService:
             return Said(version, model.definition.outputs, predict_points(model, q, u))
 
     def query_uncertainty(self, name: str, q: Array, u: Array, version: int | None) -> Said[UncertaintyResult]:
-        """Uncertainty at q (n, C) under u (n, F), weighted by the latest occupancy; raises as ``predict``."""
+        """Uncertainty at q (n, C) under u (n, F), weighted by the latest occupancy. Raises like ``predict``."""
         version, model = self._model(name, version)
         q, u = check_points(model.definition, q, u)
         tolerances = np.array(self._storage.models.get(name, version).tolerances)
@@ -146,7 +147,7 @@ class ModelService:
             return Said(version, model.definition.outputs, query_uncertainty(model, q, u, tolerances, states))
 
     def imagine(self, name: str, q: Array, u: Array, *, draws: int, seed: int, version: int | None) -> Said[Imagined]:
-        """Episodes from q (C,) under u (T, F); raises as ``predict``."""
+        """Imagine episodes from q (C,) under u (T, F). Raises like ``predict``."""
         version, model = self._model(name, version)
         start = check_coordinates(model.definition, "coordinates", q[None])[0]
         actions = model_actions(model.definition.action, u)

@@ -1,4 +1,4 @@
-"""Wake-ups in one process, and between the servers of one database: something happened to a surrogate."""
+"""Notices of changes of a surrogate, which wake those who wait in this process and in other servers of the database."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from surrogym_server.storage.announcements import Alone, Announcements
 
 
 class Listener:
-    """One who waits. A notice that comes while it looks elsewhere is remembered."""
+    """A waiting service. A notice that comes while it does not wait is remembered."""
 
     def __init__(self) -> None:
         self._event = asyncio.Event()
@@ -21,7 +21,7 @@ class Listener:
         self._event.set()
 
     async def wait(self, seconds: float) -> bool:
-        """Until the next notice since the last wait, but no longer than ``seconds``; whether there was one."""
+        """Wait for the next notice since the last wait, at most ``seconds``. Returns whether there was one."""
         with suppress(TimeoutError):
             async with asyncio.timeout(seconds):  # wait_for of Python 3.11 can swallow a cancellation
                 await self._event.wait()
@@ -46,18 +46,18 @@ class Notices:
         self._announcements.listen(self._hear)
 
     def post(self, surrogate: str) -> None:
-        """Wake all who listen to a surrogate, and those who listen to all, in every server of the database."""
+        """Wake the listeners to a surrogate, and the listeners to all, in every server of the database."""
         self._hear(surrogate)
         self._announcements.announce(surrogate)
 
     def close(self) -> None:
-        """Wake everybody for good, because the server ends."""
+        """Wake everybody for good, because the server stops."""
         self.closing = True
         self._wake_all()
 
     @contextmanager
     def listen(self, surrogate: str | None = None) -> Iterator[Listener]:
-        """A listener to one surrogate, or to all, for the time of the context."""
+        """Listen to one surrogate, or to all, within the context."""
         listener = Listener()
         listeners = self._everything if surrogate is None else self._listeners[surrogate]
         listeners.add(listener)

@@ -1,4 +1,4 @@
-"""Policies: stored with their trainings and evaluations, given out again as they came."""
+"""Policies: stored with their trainings and evaluations, and returned unchanged."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import JSON
 from surrogym_shared import intervals
 
-MUST_AGREE = ("observation", "action")  # of two specifications: what a policy sees, and what it gives
+MUST_AGREE = ("observation", "action")  # of two specifications: a policy's inputs and outputs
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """Real episodes that somebody reports; lists have one entry for each."""
+    """Real episodes of a report; lists have one entry for each episode."""
 
     controller: str
     note: str
@@ -37,23 +37,22 @@ class Episodes:
 
 class PolicyService:
     def __init__(self, storage: Storage, complete: Complete, notices: Notices, most_bytes: int) -> None:
-        """
-        Args:
-            storage: holds them.
-            complete: a specification with every field that this program knows, as JSON.
-            notices: of this process.
-            most_bytes: of all files of one surrogate's policies.
-        """
+        """Args:
+        storage: holds the policies.
+        complete: returns a specification with every field that this program knows, as JSON.
+        notices: of this process.
+        most_bytes: limit for all files of one surrogate's policies."""
         self._storage = storage
         self._complete = complete
         self._notices = notices
         self._most_bytes = most_bytes
 
     def add(self, name: str, card: JSON, curve: list[JSON], file: PolicyFile) -> tuple[PolicyRecord, bool]:
-        """Store a policy whose file is to come; says whether it is new, or known by its file.
+        """Store a policy before its file is sent. Returns it, and whether it is new: a policy with the same file is
+        known.
 
         Raises:
-            SpecConflict: it was made for another specification: it sees, or does, something else.
+            SpecConflict: it was made for a specification with other observations or actions.
         """
         differs = self._difference(name, card["spec"])
         kept = {**card, "spec": card["spec"] if differs else None, "differs": differs}
@@ -66,14 +65,14 @@ class PolicyService:
         return self._storage.policies.list(name)
 
     def get(self, name: str, which: str) -> PolicyRecord:
-        """Raises ``UnknownPolicy``."""
+        """Return a policy. Raises ``UnknownPolicy``."""
         return self._storage.policies.get(name, which)
 
     def put_file(self, name: str, version: int, file: PolicyFile, content: bytes) -> PolicyRecord:
-        """Store a file as it was announced; a policy's own file has its announcement from ``add``.
+        """Store an announced file. ``add`` announces a policy's own file.
 
         Raises:
-            InvalidInput: it is not what was announced, or not of its form.
+            InvalidInput: it differs from the announcement, or does not have its form.
             TooLarge: there is no room for it.
         """
         record = self._storage.policies.get(name, str(version))
@@ -89,11 +88,11 @@ class PolicyService:
         return self._storage.policies.get(name, str(version))
 
     def file(self, name: str, which: str, form: str) -> tuple[int, bytes]:
-        """A file and the version that it belongs to.
+        """Return a file, and the version to which it belongs.
 
         Raises:
-            UnknownPolicy: no such policy, or it has no such file.
-            Damaged: it is no longer what was stored.
+            UnknownPolicy: there is no such policy, or it has no such file.
+            Damaged: the file has changed since it was stored.
         """
         record = self._storage.policies.get(name, which)
         place = f"version {record.version} of {name!r}'s policies"
@@ -104,7 +103,7 @@ class PolicyService:
         return record.version, self._content(file.blob, file.digest, f"the {form} file of {place}")
 
     def evaluate(self, name: str, version: int, episodes: Episodes, key: str) -> tuple[PolicyRecord, EvaluationRecord]:
-        """Store real episodes of a policy, once per key; gives the policy and the evaluation.
+        """Store real episodes of a policy, once for each key. Returns the policy and the evaluation.
 
         Raises:
             InvalidInput: lists of different lengths.
@@ -124,10 +123,10 @@ class PolicyService:
     def episodes(
         self, name: str, which: str, id: int
     ) -> tuple[PolicyRecord, EvaluationRecord, JSON | None, str | None]:
-        """An evaluation, its episodes, and why they are missing where they are.
+        """Return an evaluation and its episodes, or why these are missing.
 
         Raises:
-            UnknownPolicy: no such policy, or it has no such evaluation.
+            UnknownPolicy: there is no such policy, or it has no such evaluation.
         """
         record = self._storage.policies.get(name, which)
         found = next((one for one in record.evaluations if one.id == id), None)
@@ -142,7 +141,8 @@ class PolicyService:
             return record, found, None, str(error)
 
     def put_alias(self, name: str, alias: str, version: int) -> PolicyRecord:
-        """Let an alias lead to a version. Raises ``UnknownPolicy``, or ``InvalidInput`` for what means the newest."""
+        """Let an alias point to a version. Raises ``UnknownPolicy``, or ``InvalidInput`` for the reserved alias of the
+        newest."""
         if alias == LATEST:
             raise InvalidInput(f"expected another alias than {LATEST!r}, which is always the newest version")
         self._storage.policies.put_alias(name, alias, version)
@@ -150,7 +150,7 @@ class PolicyService:
         return self._storage.policies.get(name, alias)
 
     def drop_alias(self, name: str, alias: str) -> None:
-        """Raises ``UnknownPolicy``."""
+        """Remove an alias. Raises ``UnknownPolicy``."""
         self._storage.policies.drop_alias(name, alias)
         self._changed(name)
 
@@ -160,8 +160,11 @@ class PolicyService:
 
     @contextmanager
     def _removed_if_refused(self, blob: str) -> Iterator[None]:
-        """Remove a blob whose row was refused. Where a connection was lost nobody knows whether the row is there, and a
-        row must not lead to nothing: the blob stays, and is swept where there is none."""
+        """Remove a blob if its row was refused.
+
+        After a lost connection it is unknown whether the row was stored, and a row must not point to a missing blob. So
+        the blob stays then, and is swept later if there is no row.
+        """
         try:
             yield
         except (InvalidInput, NotThere):
@@ -176,7 +179,7 @@ class PolicyService:
         return content
 
     def _difference(self, name: str, spec: JSON | None) -> str | None:
-        """Where the specification of a card differs from the surrogate's."""
+        """Name the part in which the specification of a card differs from the surrogate's."""
         own = self._complete(self._storage.surrogates.get(name).spec)
         if spec is None or own == spec:
             return None

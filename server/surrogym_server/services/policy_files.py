@@ -1,4 +1,4 @@
-"""What a file of a policy looks like from outside. Nothing is loaded: neither arrays nor objects, let alone code."""
+"""Checks of a policy's file from outside. Nothing in it is loaded, neither arrays nor objects nor code."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from surrogym_server.errors import InvalidInput
 from surrogym_shared import network
 
 MOST_ENTRIES = 10_000  # of a zip
-ENTRY = b"PK\x01\x02"  # begins each of them in its directory
-STABLE_BASELINES = {"data", "policy.pth"}  # entries of what Stable-Baselines3 saves
+ENTRY = b"PK\x01\x02"  # first bytes of each entry in the zip's directory
+STABLE_BASELINES = {"data", "policy.pth"}  # entries of a file of Stable-Baselines3
 
 
 def check_file(form: str, content: bytes, size: int, digest: str) -> None:
     """Check a file against its announcement and its form.
 
     Raises:
-        InvalidInput: another size or digest, or it does not look like a file of this form.
+        InvalidInput: the size or digest differs, or the content does not have this form.
     """
     if len(content) != size:
         raise InvalidInput(f"expected a file of {size} bytes, as announced, got {len(content)}")
@@ -32,8 +32,8 @@ def check_file(form: str, content: bytes, size: int, digest: str) -> None:
 
 
 def _names(content: bytes) -> set[str]:
-    """Names of a zip's entries; none where it is no zip, or has too many. Those are counted before they are read: each
-    takes a server ten times the memory that it takes in the file."""
+    """Names of a zip's entries; none if it is not a zip, or has too many entries. They are counted before they are
+    read, because each takes ten times the memory that it takes in the file."""
     if content.count(ENTRY) > MOST_ENTRIES:
         return set()
     try:
@@ -51,7 +51,7 @@ def _is_policy(content: bytes) -> bool:
 
 FORMS: dict[str, tuple[str, Callable[[bytes], bool]]] = {
     "zip": (f"a zip of Stable-Baselines3, or of a network of arrays ({network.HEAD})", _is_policy),
-    "onnx": ("a model in ONNX", lambda content: content[:1] == b"\x08"),  # the version of its format comes first
+    "onnx": ("a model in ONNX", lambda content: content[:1] == b"\x08"),  # it begins with the version of its format
     "pt2": ("a program of torch.export", lambda content: bool(_names(content))),
     "mp4": ("an MP4 video", lambda content: content[4:8] == b"ftyp"),
     "gif": ("a GIF", lambda content: content[:6] in (b"GIF87a", b"GIF89a")),

@@ -1,4 +1,4 @@
-"""The queue of queries as samplers see it: claim with a long poll, renew, fail, ask by hand."""
+"""The queue of queries for samplers: claim with a long poll, renew, fail, add by hand."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from surrogym_server.storage.records import LeasedQuery, Phase, Purpose, QueryRe
 Array = NDArray[np.float64]
 
 NO_STEPS = (np.zeros((0, 0)), np.zeros((0, 0)))
-POLL_SECONDS = 2.0  # a notice of another server may be lost, so its queries are also found by looking
+POLL_SECONDS = 2.0  # a notice of another server may be lost, so its queries are also found by polling
 FINISHED: tuple[Phase, ...] = ("ready", "over_budget", "from_log", "failed")
 
 
@@ -49,12 +49,12 @@ class QueryService:
         wait_seconds: float,
         gone: Callable[[], Awaitable[bool]] | None = None,
     ) -> Claim:
-        """Lease up to ``limit`` queries; while there are none, wait for some, or for the design to finish.
+        """Lease up to ``limit`` queries. If there are none, wait for some, or for the end of the design.
 
-        ``gone`` says whether the sampler has left meanwhile: it then gets no lease.
+        ``gone`` says whether the sampler has disconnected meanwhile; then it gets no lease.
 
         Raises:
-            UnknownSurrogate: no such surrogate, or it was deleted meanwhile.
+            UnknownSurrogate: there is no such surrogate, or it was deleted meanwhile.
         """
         deadline = time.monotonic() + wait_seconds
         with self._notices.listen(name) as listener:
@@ -70,13 +70,13 @@ class QueryService:
             return claim
 
     def renew(self, name: str, query_id: int, token: str, lease_seconds: float) -> None:
-        """The sampler's heartbeat. Raises ``UnknownQuery``, ``ForeignLease`` or ``LeaseExpired``."""
+        """Renew a lease. Raises ``UnknownQuery``, ``ForeignLease`` or ``LeaseExpired``."""
         self._storage.queries.renew(name, query_id, token, lease_seconds)
         if sampler := self._storage.queries.get(name, query_id).sampler:
             self._samplers.heard(name, sampler)
 
     def fail(self, name: str, query_id: int, token: str, error: str, *, begun: bool) -> QueryRecord:
-        """Give a query back with an error, and whether a step of it may have been taken.
+        """Return a query with an error, and whether a step of it may have been taken.
 
         Raises:
             UnknownQuery, ForeignLease, LeaseExpired: as the storage says.
@@ -98,9 +98,9 @@ class QueryService:
         """Queue queries by hand, or of an audit: coordinates (m, C) and action (m, F), or action sequences (T, F).
 
         Raises:
-            InvalidInput: wrong shape, out of bounds, or of another kind than the original environment can answer.
+            InvalidInput: wrong shape, out of bounds, or a kind that the original environment can't answer.
             IdempotencyConflict: the same key with other queries.
-            BeyondBudget: all audits together would take more real steps than the design.
+            BeyondBudget: all audits together would take more real steps than the design may.
         """
         definition = self._definitions.get(name)
         if definition.max_rollout is None:
@@ -122,7 +122,8 @@ class QueryService:
         return [self._storage.queries.get(name, id) for id in ids]
 
     def withdraw_audit(self, name: str, query_ids: Sequence[int]) -> int:
-        """Remove those of these queries that belong to an audit and that no sampler has begun; returns how many."""
+        """Remove those of the given queries that belong to an audit and that no sampler has begun. Returns their
+        number."""
         pending = self._storage.queries.list(name, ("pending",))
         audits = [query.id for query in pending if query.purpose == "audit" and query.id in set(query_ids)]
         withdrawn = self._storage.queries.withdraw(name, audits) if audits else 0

@@ -57,14 +57,14 @@ class SampleService:
         logged: bool = False,
         complete: bool = True,
     ) -> Added:
-        """Store real steps, all or nothing; committed when it returns.
+        """Store real steps, all or nothing. They are committed when it returns.
 
-        ``logged`` ones were recorded before the design. When their log is ``complete``, the initial queries that it
+        ``logged`` steps were recorded before the design. When their log is ``complete``, the initial queries that it
         covers are withdrawn.
 
         Raises:
-            InvalidInput: wrong shape, action out of bounds, or samples without a query and without a key. It names the
-                sample by its index.
+            InvalidInput: wrong shape, an action out of bounds, or samples without a query and without a key. The
+                message names the sample by its index.
             UnknownQuery, ForeignLease, IdempotencyConflict: as the classes say.
         """
         definition = self._definitions.get(name)
@@ -119,19 +119,19 @@ class SampleService:
         return records
 
     def coordinate_names(self, name: str) -> tuple[str, ...]:
-        """What the entries of a sample's coordinates are called."""
+        """Names of the entries of a sample's coordinates."""
         return self._definitions.get(name).coordinate_names
 
     def report_steps(self, name: str, steps: int, episodes: int, note: str, key: str) -> LedgerRecord:
-        """Count evaluation steps, once per key."""
+        """Count evaluation steps, once for each key."""
         return self._storage.ledger.report(name, steps, key=key, episodes=episodes, note=note)
 
 
 def check_trajectories(samples: Sequence[NewSample]) -> None:
-    """Check that each step of a rollout begins where the one before it ended, and that none follows an end.
+    """Check that each step of a rollout begins where the one before it ended, and that no step follows an end.
 
     Raises:
-        InvalidInput: says which does not.
+        InvalidInput: names the sample.
     """
     steps = {(s.query_id, s.lease_token, s.step): s for s in samples}
     for index, sample in enumerate(samples):

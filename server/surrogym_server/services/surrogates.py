@@ -31,12 +31,12 @@ Plan = Callable[[EnvironmentDefinition, int], tuple[dict[str, Any], Array, Array
 Complete = Callable[[dict[str, Any]], dict[str, Any]]
 
 ABSENT = object()
-SHOWN = 120  # characters of a value in an error
+SHOWN = 120  # largest number of characters of a value in an error
 
 
 @dataclass(frozen=True)
 class Listed:
-    """What a list shows of a surrogate, and who works with it."""
+    """Entry of a list: a surrogate, its samplers and its sessions."""
 
     summary: SurrogateSummary
     samplers: tuple[str, ...]  # heard of within the last minute
@@ -50,12 +50,12 @@ class SurrogateStatus(Listed):
     record: SurrogateRecord
     outputs: tuple[str, ...]
     model: ModelRecord | None
-    budget_left: int  # real steps that may still be asked for within it
+    budget_left: int  # real steps that may still be requested within the budget
 
 
 @dataclass(frozen=True)
 class Checked:
-    """What a registration would store."""
+    """Preview of what a registration would store."""
 
     initial: int  # real steps of the initial queries
     outputs: tuple[str, ...]
@@ -94,13 +94,13 @@ class SurrogateService:
         self._samplers = samplers
 
     def create(self, name: str, spec: dict[str, Any], budget: int, target: float) -> tuple[SurrogateStatus, bool]:
-        """Create a surrogate with its initial queries; the same name and spec again changes nothing.
+        """Create a surrogate with its initial queries. The same name and specification again change nothing.
 
         Returns its status, and whether this call made it.
 
         Raises:
-            SpecConflict: the name exists with another spec.
-            InvalidSpec: a spec that the preset can't represent.
+            SpecConflict: the name exists with another specification.
+            InvalidSpec: the preset can't represent the specification.
         """
         state, coordinates, action, rollouts = self._plan(self._define(spec), budget)
         present, created = self._storage.surrogates.create(
@@ -134,7 +134,7 @@ class SurrogateService:
         return Checked(len(coordinates) + sum(map(len, rollouts)), definition.outputs, exists)
 
     def status(self, name: str) -> SurrogateStatus:
-        """Raises ``UnknownSurrogate``."""
+        """Return the status of a surrogate. Raises ``UnknownSurrogate``."""
         return self._status(self._storage.surrogates.get(name))
 
     def spec(self, name: str) -> dict[str, Any]:
@@ -158,7 +158,7 @@ class SurrogateService:
         target: float | None = None,
         tolerances: dict[str, float | None] | None = None,
     ) -> SurrogateStatus:
-        """Change what is not None; None in ``tolerances`` takes back what was set.
+        """Change everything that is not None. None in ``tolerances`` removes a tolerance that was set.
 
         Raises:
             UnknownSurrogate: there is none of this name.
@@ -196,7 +196,7 @@ class SurrogateService:
 
 
 def check_same(name: str, had: Any, got: Any) -> None:
-    """Raises ``SpecConflict`` where two specs differ, which says where."""
+    """Raise ``SpecConflict`` if two specifications differ; the message names the place."""
     if had != got:
         where, old, new = difference(had, got)
         raise SpecConflict(
@@ -205,7 +205,7 @@ def check_same(name: str, had: Any, got: Any) -> None:
 
 
 def difference(had: Any, got: Any, where: str = "") -> tuple[str, Any, Any]:
-    """The first place where two JSON values differ, as ``coordinates.0.name``, and what stands there."""
+    """The first place where two JSON values differ, as ``coordinates.0.name``, and both values there."""
     if isinstance(had, dict) and isinstance(got, dict):
         pairs = [(key, had.get(key, ABSENT), got.get(key, ABSENT)) for key in {**had, **got}]
     elif isinstance(had, list) and isinstance(got, list) and len(had) == len(got):

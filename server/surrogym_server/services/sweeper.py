@@ -1,4 +1,4 @@
-"""The sweeper: ends the leases and the sessions whose time has come, and sees what other servers have stored."""
+"""The sweeper: ends expired leases and sessions, and finds the models that other servers have stored."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from surrogym_server.storage.port import Storage
 
 logger = logging.getLogger(__name__)
 
-ORPHAN_SECONDS = 3_600.0  # before files that nothing leads to are removed; an upload takes less
+ORPHAN_SECONDS = 3_600.0  # wait before unreferenced files are removed; an upload takes less
 
 
 class Sweeper:
@@ -27,14 +27,14 @@ class Sweeper:
         self._looked_at_files = -ORPHAN_SECONDS
 
     async def run(self) -> None:
-        """Sweep every so many seconds, for ever; ends by cancellation."""
+        """Sweep in fixed intervals, until cancelled."""
         while True:
             await self.sweep()
             await asyncio.sleep(self._seconds)
 
     async def sweep(self) -> None:
-        """Sweep once. A lease that ends here leaves its query to the next sampler, or sets it aside; a session whose
-        surrogate another server has deleted ends."""
+        """Sweep once. The query of an expired lease goes to the next sampler or is set aside. A session whose surrogate
+        another server has deleted ends."""
         await self._try(self._engine.sweep)
         await self._try(self._sweep_leases)
         await self._try(partial(asyncio.to_thread, self._sweep_files))
@@ -48,11 +48,11 @@ class Sweeper:
             await sweep()
         except SurrogymError as error:
             logger.warning("a sweep stopped early; it is repeated shortly: %s", error)
-        except Exception:  # leases must go on to end, whatever one sweep meets
+        except Exception:  # leases must continue to expire, whatever error one sweep raises
             logger.exception("a sweep failed; it is repeated shortly")
 
     def _sweep_files(self) -> None:
-        """Once in ``ORPHAN_SECONDS``, remove the files whose policy or surrogate was deleted, or never stored."""
+        """Once in ``ORPHAN_SECONDS``, remove the files whose policy or surrogate was deleted or never stored."""
         now = time.monotonic()
         if now - self._looked_at_files < ORPHAN_SECONDS:
             return
