@@ -17,12 +17,12 @@ from surrogym_server.models.registry import GAUSSIAN_PROCESS, learner_of
 
 METADATA = "surrogym"
 FAMILY, CHECKSUM = "family", "checksum"
-SHOWN = 80  # characters of a name from a file
+SHOWN = 80  # largest number of characters of a name from a file
 MALFORMED = (SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError)
 
 
 def to_bytes(model: DynamicsModel) -> bytes:
-    """The whole model, serving arrays included."""
+    """Write the whole model, serving arrays included."""
     family = model.definition.learning.model
     stored = learner_of(family).codec.encode(model)
     header = {FAMILY: family.name, **stored.header}
@@ -30,10 +30,11 @@ def to_bytes(model: DynamicsModel) -> bytes:
 
 
 def from_bytes(definition: EnvironmentDefinition, data: bytes) -> DynamicsModel:
-    """The model that ``to_bytes`` stored. A file that names no family is one of Gaussian processes, as all were once.
+    """Read the model that ``to_bytes`` wrote. A file without a family is one of Gaussian processes, from older
+    versions.
 
     Raises:
-        InvalidInput: not such a file, one that is damaged, of another family than the definition's, or of an
+        InvalidInput: not such a file, or a damaged one, or one of another family than the definition's, or of an
             environment with other outputs.
     """
     try:
@@ -56,7 +57,7 @@ def _read(definition: EnvironmentDefinition, data: bytes) -> DynamicsModel:
 
 
 def _checksum(header: dict[str, Any], tensors: dict[str, Tensor]) -> str:
-    """SHA-256 of all that the file says, however its arrays are laid out in it."""
+    """SHA-256 of the content, independent of the order of the arrays in the file."""
     total = hashlib.sha256(json.dumps(header).encode())
     for name in sorted(tensors):
         total.update(f"{name} {tensors[name].dtype} {list(tensors[name].shape)}".encode())
@@ -65,7 +66,7 @@ def _checksum(header: dict[str, Any], tensors: dict[str, Tensor]) -> str:
 
 
 def _require_whole(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
-    """Raise ``InvalidInput`` where something is not as it was written; files from before have no checksum."""
+    """Raise ``InvalidInput`` if the content has changed. Files of older versions have no checksum."""
     written = header.pop(CHECKSUM, None)
     if written is not None and written != _checksum(header, tensors):
         raise InvalidInput("expected the checksum that the model was written with, got another: the file is damaged")

@@ -1,4 +1,4 @@
-"""What stands between a family's code, which may be anybody's, and all else: its errors in words, its arrays checked.
+"""Guard around a family's code, which anybody may have written: its errors become messages, and its arrays are checked.
 
 Shapes as in ``models.port``.
 """
@@ -19,25 +19,26 @@ from surrogym_server.models.port import DynamicsModel, Learned, Transition, Warm
 from surrogym_server.models.registry import learner_of
 from surrogym_server.plugins import failed, guarded, in_one_line
 
-POINTS = 16  # at which a model is tried before it is taken
+POINTS = 16  # number of samples at which a new model is tried
 
 
 def failure_of(definition: EnvironmentDefinition, error: BaseException) -> SurrogymError:
-    """What a family's code raised, as one sentence that names the family."""
+    """Describe an error of a family's code in one sentence that names the family."""
     return failed(_family(definition), PluginFailed, error)
 
 
 def plugin_calls(definition: EnvironmentDefinition, *, interrupts: bool = False) -> AbstractContextManager[None]:
-    """Whatever the code of a definition's family raises within is a ``PluginFailed``; see ``guarded``."""
+    """Turn every error of the code of a definition's family within the context into ``PluginFailed``; see
+    ``guarded``."""
     return guarded(_family(definition), PluginFailed, interrupts=interrupts)
 
 
 def learn(definition: EnvironmentDefinition, samples: Samples, warm: Warm | None) -> Learned:
-    """A model of the specified family, tried at a few of its own samples.
+    """Learn a model of the specified family, and try it at a few of its own samples.
 
     Raises:
         InvalidInput, NumericalFailure: as ``Learner.learn``.
-        PluginFailed: the family's code raised anything else, or what it gave is no model.
+        PluginFailed: the family's code raised another error, or returned something that is not a model.
     """
     with plugin_calls(definition):
         learned = learner_of(definition.learning.model).learn(definition, samples, warm)
@@ -55,8 +56,8 @@ def learn(definition: EnvironmentDefinition, samples: Samples, warm: Warm | None
 
 
 def require_sound(model: DynamicsModel, q: Tensor, u: Tensor) -> None:
-    """Raise ``PluginFailed`` unless what a model says of itself, and predicts at q (m, C) under u (m, F), has the
-    shapes of the port and is finite, deviations are not negative, and chances are within 0 and 1."""
+    """Raise ``PluginFailed`` unless a model's attributes, and its predictions at q (m, C) under u (m, F), have the
+    shapes of the port and are finite, deviations are not negative, and probabilities lie in 0 to 1."""
     definition, outputs = model.definition, len(model.definition.outputs)
     predicted = model.transition(q, u, deviations=True, reward_deviation=True)
     require_shapes(model, predicted, q, deviations=True)
@@ -79,8 +80,8 @@ def require_sound(model: DynamicsModel, q: Tensor, u: Tensor) -> None:
 
 
 def require_shapes(model: DynamicsModel, predicted: Transition, q: Tensor, *, deviations: bool = False) -> None:
-    """Raise ``PluginFailed`` unless a prediction from q (m, C) has the shapes of the port; ``deviations`` says that
-    they have to be there."""
+    """Raise ``PluginFailed`` unless a prediction from q (m, C) has the shapes of the port. With ``deviations`` these
+    must be present."""
     definition, rows = model.definition, len(q)
     if not isinstance(predicted, Transition):
         raise _wrong(definition, "expected transition to return a Transition", type(predicted).__name__)
@@ -115,7 +116,7 @@ def _require_shape(definition: EnvironmentDefinition, what: str, values: Tensor 
 
 
 def _worst(values: Tensor) -> float:
-    """One that is not finite, or else the one farthest from 0."""
+    """A value that is not finite, or else the one farthest from 0."""
     return float(values.flatten()[torch.where(values.isfinite(), values.abs(), torch.inf).argmax()])
 
 

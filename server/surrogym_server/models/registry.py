@@ -23,5 +23,5 @@ MODELS: Registry[Learner] = Registry(
 
 
 def learner_of(choice: Choice) -> Learner:
-    """The learner of a family's name and settings. Raises InvalidSpec."""
+    """Return the learner with a family's name and settings. Raises ``InvalidSpec``."""
     return MODELS.make(choice)

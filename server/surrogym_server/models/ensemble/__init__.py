@@ -1,4 +1,4 @@
-"""The family of network ensembles: what is not known is where networks that saw the same samples disagree."""
+"""The family of network ensembles, whose uncertainty is the disagreement of networks trained on the same samples."""
 
 from surrogym_server.models.ensemble.family import NetworkEnsembles
 

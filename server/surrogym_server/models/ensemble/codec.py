@@ -1,4 +1,4 @@
-"""NetworkEnsembleCodec: weights as named arrays, and back, every shape and number checked."""
+"""NetworkEnsembleCodec: weights to named arrays and back, with every shape and number checked."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class NetworkEnsembleCodec(ModelCodec):
 def _checked(
     definition: EnvironmentDefinition, arrays: Arrays, terminal_reward: float, samples: int, digest: str, label: object
 ) -> NetworkEnsembleModel:
-    """The model of these arrays, every shape that of the environment."""
+    """Build the model of these arrays, after a check of every shape against the environment."""
     inputs = Inputs(definition)
     q = torch.zeros(1, len(definition.coordinates), dtype=torch.float64)
     u = torch.zeros(1, definition.action.size, dtype=torch.float64)

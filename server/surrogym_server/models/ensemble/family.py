@@ -1,4 +1,4 @@
-"""NetworkEnsembles: a few anchored networks, as the registry of models has them."""
+"""NetworkEnsembles: a few anchored networks, as a family for the registry of models."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ LEAST = {"members": 2, "units": 1, "steps": 1, "seed": 0}
 
 @dataclass(frozen=True)
 class NetworkEnsembles(Learner):
-    """Networks of two hidden layers, each pulled to weights of its own. There is no warm start: networks that go on
-    from fewer samples would remember them better than those that came since.
+    """Networks of two hidden layers, each anchored to its own initial weights.
+
+    There is no warm start, because continued networks would remember the first samples better than later ones.
 
     Attributes:
-        members: how many networks.
+        members: number of networks.
         units: of each hidden layer.
         steps: of gradient descent.
-        seed: of first weights and of batches.
+        seed: of initial weights and of batches.
     """
 
     members: int = 5

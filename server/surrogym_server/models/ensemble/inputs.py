@@ -1,4 +1,5 @@
-"""What the networks of one environment read: features near mean 0 and deviation 1, without a choice by evidence."""
+"""Inputs of the networks of one environment: features with mean near 0 and deviation near 1, without a choice by
+evidence."""
 
 from __future__ import annotations
 
@@ -19,11 +20,11 @@ class Inputs:
     definition: EnvironmentDefinition
 
     def of_transition(self, q: Tensor, u: Tensor) -> Tensor:
-        """What moves the state, at q (m, C) and u (m, F): (m, d)."""
+        """Inputs of the transition at q (m, C) and u (m, F): (m, d)."""
         return self._of_transition(q, u)
 
     def of_reward(self, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
-        """What a step pays by, before and after it as the reward's timing says, (m, d)."""
+        """Inputs of the reward, before or after the step as the reward's timing says, (m, d)."""
         match self.definition.reward_timing:
             case "before":
                 return self._of_state(q, u)
@@ -33,7 +34,7 @@ class Inputs:
                 return torch.cat([self._of_state(q, u), self._of_state(q_next, u)], -1)
 
     def of_end(self, q: Tensor) -> Tensor:
-        """What an end is told by, at the state q (m, C) that a step led to: (m, d)."""
+        """Inputs of the learned termination at the next state q (m, C): (m, d)."""
         return self._of_state(q, q.new_zeros(len(q), self.definition.action.size))
 
     @cached
@@ -42,7 +43,7 @@ class Inputs:
 
     @cached
     def _of_state(self) -> Encoder:
-        """Coordinates, and the observation where it says more."""
+        """Coordinates, and the observation if it combines coordinates."""
         combined = self.definition.observation_combines or self.definition.moves_observation
         more: tuple[State, ...] = ("observation",) if combined else ()
         return self._encoder("both", *more)

@@ -1,4 +1,4 @@
-"""From samples to networks: targets, what is left out, and what an end pays."""
+"""Learning of networks from samples: targets, left-out samples, and the terminal reward."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from surrogym_server.models.ensemble.training import Training, cross_entropy, sq
 
 MIN_POINTS = 2
 CONSTANT = 1e-9  # an output whose deviation is below this share of its own size never varied
-REWARD_SEED, END_SEED = 1, 2  # beyond the seed, so that the networks of each are others
+REWARD_SEED, END_SEED = 1, 2  # added to the seed, so that reward and end have other networks than the transition
 
 
 def learn(training: Training, definition: EnvironmentDefinition, samples: Samples) -> NetworkEnsembleModel:
-    """As ``Learner.learn``. Raises InvalidInput for fewer than two samples."""
+    """Learn as ``Learner.learn`` says. Raises ``InvalidInput`` for fewer than two samples."""
     if len(samples) < MIN_POINTS:
         raise InvalidInput(f"a model needs at least {MIN_POINTS} samples, got {len(samples)}")
     inputs = Inputs(definition)
@@ -36,7 +36,7 @@ def learn(training: Training, definition: EnvironmentDefinition, samples: Sample
 
 
 def _reward(training: Training, inputs: Inputs, samples: Samples) -> tuple[Regression | None, float]:
-    """The reward of steps that end no episode, and what one that does pays beyond it on average."""
+    """The reward of non-terminating steps, and the mean of what terminating steps pay in addition."""
     if (known := inputs.definition.declared_reward) is not None:
         return None, known.terminal
     goes_on = _enough(~samples.terminated)
@@ -49,7 +49,7 @@ def _reward(training: Training, inputs: Inputs, samples: Samples) -> tuple[Regre
 
 
 def _ending(training: Training, x: Tensor, ended: Tensor) -> Networks | float:
-    """Networks that tell which states end an episode; the only label, where there is one alone."""
+    """Networks that predict which states end an episode. If there is only one label, that label."""
     if bool(ended.all()) or not bool(ended.any()):
         return float(ended[0])
     return train(training, x, ended.double()[:, None], cross_entropy)
@@ -64,7 +64,7 @@ def _regression(training: Training, x: Tensor, y: Tensor, *, quadratic: bool = F
 
 
 def _enough(chosen: Tensor) -> Tensor:
-    """The chosen samples (n,), or all where those are too few to learn from."""
+    """The chosen samples (n,), or all of them if the chosen ones are too few to learn from."""
     return chosen if int(chosen.sum()) >= MIN_POINTS else torch.ones_like(chosen)
 
 

@@ -1,4 +1,4 @@
-"""NetworkEnsembleModel: one fit of one environment by a few networks, whose disagreement is what is not known."""
+"""NetworkEnsembleModel: a few networks fitted to one environment, whose disagreement is the uncertainty."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ ROWS = 8_192  # predicted at once
 
 @dataclass(frozen=True)
 class Regression:
-    """Networks of some outputs in their own units: centre + scale * f(x); an output that never varied has scale 0."""
+    """Networks of some outputs in their own units: centre + scale * f(x). An output that never varied has scale 0."""
 
     networks: Networks
     centre: Tensor  # (p,)
     scale: Tensor  # (p,)
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Every member at x (m, d), (K, m, p)."""
+        """Values of every member at x (m, d), (K, m, p)."""
         return self.centre + self.scale * self.networks(x)
 
 
 @dataclass(frozen=True)
 class NetworkEnsembleModel(DynamicsModel, FunctionDraws, Differentiable):
-    """K members. The mean is theirs, the deviation that of one from another; no noise is learned."""
+    """K members. The mean is the members' mean, and the deviation that between members. No noise is learned."""
 
     definition: EnvironmentDefinition
     transitions: Regression  # M outputs
     reward: Regression | None  # None where it is declared
-    ending: Networks | float | None  # logits of an end; the only label there was; None where ends are declared
+    ending: Networks | float | None  # logits of an end; the only label if there is one; None if ends are declared
     terminal_reward: float
     samples: int
     digest: str
@@ -64,7 +64,7 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, Differentiable):
         return 1
 
     def draw(self, noise: Tensor) -> Tensor:
-        """A function is a member, each as likely as any other: its number."""
+        """Draw functions. A function is a member, chosen with equal probability, and is given by its number."""
         members = self.transitions.networks.members
         number: Tensor = (members * torch.special.ndtr(noise)).floor().clamp_max(members - 1)
         return number
@@ -89,7 +89,7 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, Differentiable):
         return torch.cat([change, reward[:, None]], -1)
 
     def learned_termination(self, q: Tensor) -> Tensor:
-        """The members' mean probability; as long as all samples had one label, that one."""
+        """The members' mean probability. If all samples have the same label, that label."""
         if isinstance(self.ending, Networks):
             return self.ending(self._inputs.of_end(q))[..., 0].sigmoid().mean(0)
         return q.new_full((len(q),), self.ending or 0.0)
@@ -140,9 +140,9 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, Differentiable):
         noise: Tensor | None,
         member: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Next states (m, C), rewards (m,), and the deviations asked for, (m, M) and (m,), else (m, 0).
+        """Next states (m, C), rewards (m,), and the requested deviations, (m, M) and (m,), else (m, 0).
 
-        All follow the mean, moved by ``noise`` (m, M) deviations, or each the member (m,) of its own.
+        Rows follow the mean, moved by ``noise`` (m, M) deviations, or each its own member (m,).
         """
         changes = self.transitions(self._inputs.of_transition(q, u))
         spread = changes.std(0) if deviations or noise is not None else q.new_zeros(len(q), 0)

@@ -1,4 +1,4 @@
-"""Networks of one shape, all evaluated at once. K members, d inputs, h hidden units, p outputs.
+"""K networks of one shape, evaluated together. K members, d inputs, h hidden units, p outputs.
 
 A member is f(x) = b(x) S + tanh(tanh(x W_1 + c_1) W_2 + c_2) W_3 with b(x) = [1, x], or [1, x, x^2] of a quadratic one:
 a linear part takes no hidden units, and extrapolates.
@@ -33,7 +33,7 @@ class Networks:
         return (self.first, self.first_bias, self.second, self.second_bias, self.last)
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Every member at x (m, d), (K, m, p)."""
+        """Values of every member at x (m, d), (K, m, p)."""
         quadratic = self.skip.shape[1] > x.shape[-1] + 1
         return basis(x, quadratic) @ self.skip + nonlinear(x, self.hidden)
 
@@ -44,7 +44,7 @@ def basis(x: Tensor, quadratic: bool) -> Tensor:
 
 
 def nonlinear(x: Tensor, hidden: tuple[Tensor, ...]) -> Tensor:
-    """What the hidden layers add at x (m, d), (K, m, p)."""
+    """The part of the hidden layers at x (m, d), (K, m, p)."""
     first, first_bias, second, second_bias, last = hidden
     z = torch.tanh(torch.baddbmm(first_bias, x.expand(len(first), -1, -1), first))
     z = torch.tanh(torch.baddbmm(second_bias, z, second))

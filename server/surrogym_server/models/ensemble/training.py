@@ -1,11 +1,13 @@
-"""Training of anchored networks: each member is pulled to the random weights that it began with.
+"""Training of anchored networks: each member is pulled to the random weights with which it began.
 
 Of member k the weights minimise, over n samples (x_i, y_i) of standardised inputs and outputs,
 
     1/n sum_i |y_i - f_k(x_i)|^2 + sigma^2 / n sum_j (w_j - w_kj)^2 / v_j,
 
-w_k drawn from a normal prior of variances v, sigma the deviation of the noise. For a linear model that draws from the
-posterior; for networks nearly so, and where there is no sample the members differ as their priors do.
+with w_k drawn from a normal prior of variances v, and sigma the deviation of the noise. For a linear model these are
+draws from the posterior; for networks they are so approximately. Far from samples the members differ as their priors
+do.
+
 Reference: T. Pearce, F. Leibfried, A. Brintrup, "Uncertainty in neural networks: approximately Bayesian ensembling",
 AISTATS 2020, eq. 9.
 """
@@ -25,7 +27,7 @@ from surrogym_server.tensors import in_rows
 
 NOISE = 0.01  # sigma, in deviations of an output
 RIDGE = 1e-3  # of the skip, in samples
-RATE = 0.01  # first learning rate; it falls to 0 as a cosine does
+RATE = 0.01  # initial learning rate; it decays to 0 by a cosine
 LARGEST_BATCH = 512
 Loss = Callable[[Tensor, Tensor], Tensor]  # of predictions (K, m, p) and targets (m, p)
 
@@ -51,7 +53,7 @@ def cross_entropy(predicted: Tensor, target: Tensor) -> Tensor:
 
 
 def train(training: Training, x: Tensor, y: Tensor, loss: Loss, *, quadratic: bool = False) -> Networks:
-    """Networks fitted to inputs x (n, d) and targets y (n, p)."""
+    """Fit networks to inputs x (n, d) and targets y (n, p)."""
     generator = torch.Generator().manual_seed(training.seed)
     anchors, variances = _priors(training, x.shape[1], y.shape[1], generator)
     linear = basis(x, quadratic)
@@ -80,14 +82,14 @@ def _descend(weights: Sequence[Tensor], objective: Callable[[], Tensor], steps: 
 
 
 def _batch(count: int, generator: torch.Generator) -> Tensor | slice:
-    """Rows of one step: all, or of very many a random choice."""
+    """Rows for one step: all of them, or a random choice if there are many."""
     return slice(None) if count <= LARGEST_BATCH else torch.randint(count, (LARGEST_BATCH,), generator=generator)
 
 
 def _priors(
     training: Training, d: int, p: int, generator: torch.Generator
 ) -> tuple[tuple[Tensor, ...], tuple[float, ...]]:
-    """Random first weights of the hidden layers, and the variances they are drawn with."""
+    """Random initial weights of the hidden layers, and the variances of their distribution."""
     h, k = training.units, training.members
     shapes = ((k, d, h), (k, 1, h), (k, h, h), (k, 1, h), (k, h, p))
     variances = (1 / d, 1.0, 1 / h, 1.0, 1 / h)
@@ -96,7 +98,7 @@ def _priors(
 
 
 def _ridge(b: Tensor, target: Tensor) -> Tensor:
-    """Weights (K, s, p) of inputs b (n, s) for targets (K, n, p): where the skip begins."""
+    """Ridge regression: weights (K, s, p) of inputs b (n, s) for targets (K, n, p), which initialise the skip."""
     gram = b.T @ b + RIDGE * torch.eye(b.shape[1], dtype=b.dtype)
     weights: Tensor = torch.linalg.solve(gram, b.T @ target)
     return weights

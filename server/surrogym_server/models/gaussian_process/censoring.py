@@ -1,4 +1,4 @@
-"""Samples that ended at a bound: their increments were cut, and say little about the dynamics."""
+"""Samples that ended at a bound. Their increments are cut, so they say little about the dynamics."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ from surrogym_server.environment.samples import saturated
 def usable(
     definition: EnvironmentDefinition, column: int, q_next: Tensor, feature_map: FeatureMap, *, past_limits: bool
 ) -> Tensor:
-    """Which samples that end at q_next (m, C) the transition output ``column`` learns from under a map, (m,) bool;
-    ``past_limits`` says that it learns from those that end at a limit of another."""
+    """Which samples that end at q_next (m, C) the transition output ``column`` learns from with a map, (m,) bool.
+
+    ``past_limits`` means that it also learns from those that end at a limit of another coordinate.
+    """
     if definition.moves_observation:
         return torch.ones(len(q_next), dtype=torch.bool)
     if past_limits:
@@ -27,8 +29,8 @@ def usable(
 
 
 def stopped(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Tensor:
-    """Samples (n,) that ended at a bound which says nothing of coordinate ``index``: its own, that of a limited speed,
-    or a wall. The limit of another coordinate, such as a relief valve's, leaves its sample as good as any."""
+    """Samples (n,) that ended at a bound after which coordinate ``index`` is unknown: its own bound, that of a limited
+    speed, or a wall. The limit of another coordinate, such as a relief valve's, does not make a sample useless."""
     limits = [
         i
         for i in definition.moving
@@ -40,7 +42,7 @@ def stopped(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Te
 
 
 def saturates(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Tensor:
-    """Samples (n,) in which anything but the lead ended at a bound, coordinate ``index`` included."""
+    """Samples (n,) in which a coordinate other than the lead ended at a bound, coordinate ``index`` included."""
     others = q_next.clone()
     others[:, leading(definition)] = math.nan
     others[:, index] = q_next[:, index]

@@ -1,4 +1,4 @@
-"""Feature maps worth comparing by evidence, and the mirror image of each; nothing here knows a task."""
+"""Candidate feature maps for the choice by evidence, and the mirror image of each. Nothing here knows a task."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import Drift, Encoding, Feature, FeatureMap, Parity, State, features, leading
 from surrogym_server.gp import Reflection
 
-CENTRED = 1e-9  # of its scale: how far from 0 the middle of a range may be
+CENTRED = 1e-9  # of its scale: largest distance of the middle of a range from 0
 
 
 def reward_candidates(definition: EnvironmentDefinition) -> tuple[FeatureMap, ...]:
-    """Maps worth comparing for the reward: of the state before the step, after it, or both, as its timing says.
+    """Candidate maps of the reward: of the state before the step, after it, or both, as its timing says.
 
     Rewards often depend on features that the observation combines, such as the distance to a target.
     """
@@ -29,8 +29,11 @@ def reward_candidates(definition: EnvironmentDefinition) -> tuple[FeatureMap, ..
 def candidates(
     definition: EnvironmentDefinition, follows: bool, drift: Drift = (), parity: Parity = "odd"
 ) -> tuple[FeatureMap, ...]:
-    """Maps worth comparing for one output; ``follows`` says that it may read the lead, ``drift`` how angles turn,
-    ``parity`` which one it has if the environment is its own mirror image."""
+    """Candidate maps of one output.
+
+    ``follows`` says that it may read the lead, ``drift`` is the learned motion of angles, and ``parity`` is the
+    output's parity if the environment is its own mirror image.
+    """
     if definition.moves_observation:
         return (FeatureMap(state="observation"),)
     states: list[State] = ["cos_sin"]
@@ -48,8 +51,11 @@ def candidates(
 
 
 def reflection(definition: EnvironmentDefinition, feature_map: FeatureMap) -> Reflection | None:
-    """What a map's features do when every coordinate and the action change their sign, for its parity; None without
-    one, or where they have no such rule: ranges that are not centred at 0, one-hot actions, observations."""
+    """Signs of a map's features under a change of sign of every coordinate and the action, for its parity.
+
+    None without a parity, or if the features have no such rule: ranges that are not centred at 0, one-hot actions,
+    observations.
+    """
     if not feature_map.parity:
         return None
     signs = [_sign(definition, feature) for feature in features(definition, feature_map)]
@@ -60,7 +66,7 @@ def reflection(definition: EnvironmentDefinition, feature_map: FeatureMap) -> Re
 
 
 def _sign(definition: EnvironmentDefinition, feature: Feature) -> int:
-    """1: the feature stays when all signs change; -1: it changes its own; 0: neither."""
+    """1 if the feature stays when all signs change, -1 if it changes its own sign, 0 otherwise."""
     match feature.function:
         case "cos" | "turned_cos":
             return 1

@@ -1,4 +1,4 @@
-"""GaussianProcessModel: one fit of one environment by exact Gaussian processes. Complete in itself when stored."""
+"""GaussianProcessModel: exact Gaussian processes fitted to one environment. A stored one is complete."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from surrogym_server.models.port import DynamicsModel, Transition
 from surrogym_server.tensors import CPU, cached, to_device
 from surrogym_shared import compiled
 
-COMPILED_SOLVES = 300  # points; the triangular solves of more are faster in a library of linear algebra
+COMPILED_SOLVES = 300  # points; with more of them a library of linear algebra solves triangular systems faster
 
 
 @dataclass(frozen=True)
@@ -61,20 +61,20 @@ class GaussianProcessModel(
     Differentiable,
     CompiledSteps,
 ):
-    """One process for each output; regions for what ends an episode, and for where the reward jumps."""
+    """One process for each output, and regions in which an episode ends or the reward jumps."""
 
     definition: EnvironmentDefinition
     transitions: tuple[OutputModel, ...]  # M, in the order of definition.outputs
     reward: OutputModel
-    terminal_reward: float  # what a step that ends the episode pays beyond the reward process
+    terminal_reward: float  # reward of terminating steps, in addition to the reward process
     samples: int
     digest: str
-    ending: Region | None = None  # where episodes end, if that is learned
-    jumps: tuple[Jump, ...] = ()  # of the reward, beyond its process
+    ending: Region | None = None  # region in which episodes end, if that is learned
+    jumps: tuple[Jump, ...] = ()  # of the reward, in addition to its process
 
     @property
     def outputs(self) -> tuple[OutputModel, ...]:
-        """All of them, the reward last."""
+        """All outputs, the reward last."""
         return (*self.transitions, self.reward)
 
     def transition(
@@ -186,7 +186,7 @@ class GaussianProcessModel(
         return self.reward.warp is not None and self.reward.warp.sign > 0
 
     def promise(self, q: Tensor, u: Tensor) -> Tensor:
-        """Mean and one deviation of the reward's targets."""
+        """Mean plus one deviation of the reward's targets."""
         steps = PredictedSteps(q, u, self._predictor.transition(q, u, None, None, None, False, False).q_next)
         mean, deviation = self.reward.target(process_inputs(self.definition, self.reward, steps))
         return mean + deviation

@@ -1,4 +1,4 @@
-"""Settings of the family of Gaussian processes, as a specification may give them."""
+"""Settings of the family of Gaussian processes, as in a specification."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ CHOICES = {"kernel": ("composite", "squared_exponential"), "symmetry": ("auto", 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is compared by evidence.
+    """Candidates that are compared by evidence.
 
     Attributes:
         kernel: of every process; ``composite`` adds a linear part, and for the reward a quadratic one.
-        reward_jumps: whether the reward may jump where a learned region begins.
-        symmetry: ``auto`` compares feature maps that are their own mirror image with the others, ``none`` does not.
-        reward_peaks: whether the reward may be learned by its logarithm, where it is next to nothing nearly everywhere.
+        reward_jumps: whether the reward may jump at the edge of a learned region.
+        symmetry: ``auto`` also compares feature maps that are their own mirror image, ``none`` does not.
+        reward_peaks: whether the reward may be learned by its logarithm, if it is nearly zero almost everywhere.
     """
 
     kernel: str = "composite"

@@ -1,1 +1,1 @@
-"""A model as bytes and back."""
+"""Conversion of a model to bytes and back."""

@@ -1,4 +1,4 @@
-"""GaussianProcessCodec: a model as a header and named arrays, and back. Nothing is recomputed on loading."""
+"""GaussianProcessCodec: a model to a header and named arrays, and back. Loading recomputes nothing."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from surrogym_server.models.gaussian_process.prediction.regions import TERMINATI
 from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel
 
 FORMAT = 4
-JUMP = "jump"  # before the names of its arrays
+JUMP = "jump"  # prefix of the names of its arrays
 READABLE = (1, 2, 3, 4)  # 1: a reward's timing was the definition's alone; 2: no drift; 3: no warp
 
 
 class GaussianProcessCodec(ModelCodec):
-    """Reads the files of every version of this program."""
+    """Codec that reads the files of every version of this program."""
 
     def encode(self, model: DynamicsModel) -> StoredModel:
         if not isinstance(model, GaussianProcessModel):
@@ -92,7 +92,7 @@ def _read(definition: EnvironmentDefinition, stored: StoredModel) -> GaussianPro
 
 
 def _require_consistent(model: GaussianProcessModel) -> None:
-    """Raises InvalidInput: numbers that no fit gives, or what contradicts the definition."""
+    """Check that the numbers can come from a fit, and fit the definition. Raises ``InvalidInput``."""
     definition, reward = model.definition, model.reward
     if not math.isfinite(model.terminal_reward) or model.samples < 1:
         got = f"{model.terminal_reward} and {model.samples}"

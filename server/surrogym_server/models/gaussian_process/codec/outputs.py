@@ -1,4 +1,4 @@
-"""One output of a model as header and tensors, and back, every number and shape checked."""
+"""One output of a model to header and tensors, and back, with every number and shape checked."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ KNOWN_MAPS = frozenset(
 
 
 def output_tensors(output: OutputModel, prefix: str) -> dict[str, Tensor]:
-    """The arrays of an output by name, each name after a prefix; none for one that never varied."""
+    """The arrays of an output by name, with a prefix; none for an output that never varied."""
     if (posterior := output.posterior) is None:
         return {}
     arrays = {"x": posterior.x, "y": posterior.y, "factor": posterior.factor, "weights": posterior.weights}
@@ -38,7 +38,7 @@ def output_tensors(output: OutputModel, prefix: str) -> dict[str, Tensor]:
 
 
 def require_output(definition: EnvironmentDefinition, output: OutputModel) -> None:
-    """Raises InvalidInput: arrays of other shapes than the environment's, or numbers that no process has."""
+    """Check the shapes of an output's arrays, and that its numbers are those of a process. Raises ``InvalidInput``."""
     _require_drift(definition, output)
     _require_warp(output)
     _require_shapes(definition, output)
@@ -46,7 +46,7 @@ def require_output(definition: EnvironmentDefinition, output: OutputModel) -> No
 
 
 def output_header(output: OutputModel) -> dict[str, Any]:
-    """All of an output but its arrays, as JSON."""
+    """Everything of an output except its arrays, as JSON."""
     entry: dict[str, Any] = {
         "name": output.name,
         "feature_map": asdict(output.feature_map),
@@ -75,7 +75,8 @@ def output_header(output: OutputModel) -> dict[str, Any]:
 def read_output(
     definition: EnvironmentDefinition, entry: dict[str, Any], tensors: Mapping[str, Tensor], prefix: str
 ) -> OutputModel:
-    """The output of a header's entry. Raises LookupError, TypeError or ValueError where it is none."""
+    """Build the output of a header's entry. Raises ``LookupError``, ``TypeError`` or ``ValueError`` if it is
+    malformed."""
     feature_map = _feature_map(entry["feature_map"])
     if replace(feature_map, drift=()) not in KNOWN_MAPS:
         raise ValueError(f"unknown feature map {feature_map}")
@@ -130,7 +131,7 @@ def _require_drift(definition: EnvironmentDefinition, output: OutputModel) -> No
 
 
 def _require_warp(output: OutputModel) -> None:
-    """Of the reward alone, and of a process."""
+    """Check that only the reward has a warp, and only with a process."""
     if output.warp is None:
         return
     if output.name != REWARD or output.posterior is None or not output.warp.finite:
@@ -138,7 +139,7 @@ def _require_warp(output: OutputModel) -> None:
 
 
 def _require_numbers(output: OutputModel) -> None:
-    """Every number finite, and positive where only that makes sense."""
+    """Check that every number is finite, and positive if it must be."""
     finite, positive, least_zero, tensors = [output.centre], [output.scale], [0.0], []
     if (posterior := output.posterior) is not None:
         hyper = posterior.hyper

@@ -1,4 +1,4 @@
-"""A learned region as header and tensors, and back, every number checked."""
+"""A learned region to header and tensors, and back, with every number checked."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from surrogym_server.models.gaussian_process.prediction.regions import (
 
 
 def region_header(region: Region) -> dict[str, Any]:
-    """All of a region but its arrays, as JSON."""
+    """Everything of a region except its arrays, as JSON."""
     return {"forms": [[weight, _form_header(form)] for weight, form in region.forms], "scores": region.scores}
 
 
 def region_tensors(region: Region, prefix: str) -> dict[str, Tensor]:
-    """The arrays of a region by name, each name after a prefix."""
+    """The arrays of a region by name, with a prefix."""
     tensors: dict[str, Tensor] = {}
     for index, (_, form) in enumerate(region.forms):
         if isinstance(form, Classifier):
@@ -44,7 +44,8 @@ def region_tensors(region: Region, prefix: str) -> dict[str, Tensor]:
 def read_region(
     definition: EnvironmentDefinition, entry: Any, tensors: Mapping[str, Tensor], prefix: str
 ) -> Region | None:
-    """The region of a header's entry, None if it has none. Raises LookupError, TypeError or ValueError."""
+    """Build the region of a header's entry, None if it has none. Raises ``LookupError``, ``TypeError`` or
+    ``ValueError``."""
     if entry is None:
         return None
     forms = tuple(
@@ -57,7 +58,7 @@ def read_region(
 def read_jumps(
     definition: EnvironmentDefinition, entries: Any, tensors: Mapping[str, Tensor], prefix: str
 ) -> tuple[Jump, ...]:
-    """The jumps of a header's entries. Raises LookupError, TypeError or ValueError."""
+    """Build the jumps of a header's entries. Raises ``LookupError``, ``TypeError`` or ``ValueError``."""
     jumps = []
     for index, (size, entry) in enumerate(entries):
         region = read_region(definition, entry, tensors, f"{prefix}.{index}")
@@ -68,7 +69,7 @@ def read_jumps(
 
 
 def require_region(region: Region) -> None:
-    """Raises InvalidInput: weights that are none, processes that are none, axes that aren't there, gaps of no width."""
+    """Check weights, processes, axes and widths of gaps of a region. Raises ``InvalidInput``."""
     weights = [weight for weight, _ in region.forms]
     if not weights or min(weights) <= 0 or not math.isclose(sum(weights), 1, abs_tol=1e-6):
         raise InvalidInput(f"expected forms of a region with weights that add up to 1, got {weights[:4]}")

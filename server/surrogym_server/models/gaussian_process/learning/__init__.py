@@ -1,1 +1,1 @@
-"""From samples to a model: targets, evidence, regions, jumps of the reward."""
+"""Learning of a model from samples: targets, evidence, regions, jumps of the reward."""

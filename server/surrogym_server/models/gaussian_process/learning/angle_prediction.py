@@ -1,7 +1,7 @@
-"""Drift: where an angle turns to within a step under the motion it has, learned from samples.
+"""Drift: the angle that a joint reaches within a step by its present motion, learned from samples.
 
-A step of a fast pole takes it far round. What pulls on it underway depends on where it goes, not only on where it is,
-so cosine and sine of angle + drift are better inputs than those of the angle alone; what they are is linear regression.
+A fast pole turns far within a step. The forces on it depend on the angles along the way, not only on the first one. So
+cosine and sine of angle + drift are better inputs than those of the angle alone. The drift is a linear regression.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ POINTS_A_WEIGHT = 3
 
 
 def learn_drift(definition: EnvironmentDefinition, samples: Samples) -> Drift:
-    """For each angle the weights (C,) with which linear coordinates turn it, increment = w . q + constant, by least
-    squares; empty where there is nothing to turn, or too little to learn it from."""
+    """For each angle, the weights (C,) with which linear coordinates turn it: increment = w . q + constant, by least
+    squares. Empty if there is no angle, or too little data."""
     moved_by = [i for i in definition.moving if definition.coordinates[i].kind == "linear"]
     if not definition.angles or not moved_by or len(samples) < POINTS_A_WEIGHT * (len(moved_by) + 1):
         return ()

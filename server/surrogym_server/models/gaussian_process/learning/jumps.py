@@ -1,7 +1,7 @@
-"""Finding where a reward jumps: a split of its values that leaves a process more likely than the unsplit one.
+"""Search for jumps of a reward: a split of its values that makes the process more likely than without it.
 
-Both are compared as densities of the same rewards, in the same unit: the plain evidence against the evidence outside,
-times the probability of what was paid inside given one unknown size, times that of the labels.
+Both are compared as densities of the same rewards, in the same unit: the plain evidence against the product of the
+evidence outside, the probability of the rewards inside given one unknown jump, and the probability of the labels.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ EDGE = "reward edge"
 MAX_JUMPS = 3
 SPLITS = 3  # the widest gaps of the sorted rewards are tried ...
 GAP = 0.2  # ... if they are wider than this share of their range
-MARGIN = 2.0  # log odds for every sample that a jump must win by: smooth bumps reached 1.5, jumps began at 2.9
-WORTH = 5.0  # log odds that one more jump must win by
+MARGIN = 2.0  # log odds for each sample by which a jump must win: smooth bumps reached 1.5, jumps began at 2.9
+WORTH = 5.0  # log odds by which one more jump must win
 SIZE = 3.0  # a priori deviation of a jump, in deviations of the reward
-FLOOR = 1e-4  # deviation of the noise of what never varied
+FLOOR = 1e-4  # deviation of the noise of an output that never varied
 
 Split = tuple[float, Region, OutputModel, Tensor]
 
@@ -36,7 +36,7 @@ Split = tuple[float, Region, OutputModel, Tensor]
 def with_jumps(
     learner: OutputLearner, samples: Samples, inputs: Mapping[FeatureMap, Tensor], going: Tensor, plain: OutputModel
 ) -> tuple[OutputModel, tuple[Jump, ...]]:
-    """The reward's process and its jumps, from the samples ``going`` (n,), given the process without any."""
+    """The reward's process and its jumps, from the samples ``going`` (n,), given the process without jumps."""
     best, process, total, rest = (0.0, plain, 0), plain, 0.0, going
     regions: list[tuple[Region, Tensor]] = []
     while process.posterior is not None and len(regions) < MAX_JUMPS:
@@ -46,7 +46,7 @@ def with_jumps(
         gain, edge, process, outside = max(splits, key=lambda split: split[0])
         regions.append((edge, rest & ~outside))
         total, rest = total + gain, outside
-        if total > max(MARGIN * int(going.sum()), best[0] + WORTH):  # one jump of two may win little, both together
+        if total > max(MARGIN * int(going.sum()), best[0] + WORTH):  # one of two jumps alone may win little
             best = (total, process, len(regions))
     _, process, count = best
     residual = samples.reward - process.mean(inputs[process.feature_map])
@@ -56,9 +56,9 @@ def with_jumps(
 def _splits(
     learner: OutputLearner, samples: Samples, inputs: Mapping[FeatureMap, Tensor], going: Tensor, plain: OutputModel
 ) -> Iterator[Split]:
-    """Every split worth a look: its gain, the region, the process outside it and the samples (n,) outside.
+    """Every candidate split: its gain, the region, the process outside it and the samples (n,) outside.
 
-    One sample alone is a jump only where all others are paid the same: elsewhere it may as well be a slope.
+    A single sample counts as a jump only if all others have the same reward. Otherwise it may as well be a slope.
     """
     same = replace(plain.feature_map, after=False)
     inputs = {m: x for m, x in inputs.items() if replace(m, after=False) == same}
@@ -85,7 +85,7 @@ def _splits(
 
 
 def _levels(reward: Tensor) -> list[float]:
-    """Where to split rewards (n,): the middles of the widest gaps between them."""
+    """Levels at which to split rewards (n,): the middles of the widest gaps between them."""
     ordered = reward.sort().values
     gaps = ordered.diff()
     wide = [int(i) for i in gaps.argsort(descending=True)[:SPLITS] if gaps[i] > GAP * (ordered[-1] - ordered[0])]
@@ -93,14 +93,14 @@ def _levels(reward: Tensor) -> list[float]:
 
 
 def _evidence(process: OutputModel, points: int, unit: float) -> float:
-    """Log density of the points a process was fitted to, as multiples of ``unit``."""
+    """Log density of the points that a process was fitted to, in multiples of ``unit``."""
     if process.posterior is None:
         return -points * (math.log(FLOOR) + 0.5 * math.log(2 * math.pi))
     return dict(process.scores)[str(process.feature_map)] - points * math.log(process.scale / unit)
 
 
 def _paid_inside(residual: Tensor, spread: Tensor) -> float:
-    """Log density of residuals (i,) that share one normal size and deviate from it by spread (i,)."""
+    """Log density of residuals (i,) that share one normal jump and deviate from it by spread (i,)."""
     shared = SIZE**2 * torch.ones(len(residual), len(residual), dtype=residual.dtype)
     covariance = shared + torch.diag(spread.square() + FLOOR**2)
     factor = torch.linalg.cholesky(covariance)

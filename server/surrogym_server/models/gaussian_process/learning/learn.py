@@ -24,7 +24,7 @@ MIN_POINTS = 2
 
 
 def learn(settings: Settings, definition: EnvironmentDefinition, samples: Samples, warm: Warm) -> Learned:
-    """As ``Learner.learn``. Raises InvalidInput for fewer than two samples."""
+    """Learn as ``Learner.learn`` says. Raises ``InvalidInput`` for fewer than two samples."""
     if len(samples) < MIN_POINTS:
         raise InvalidInput(f"a model needs at least {MIN_POINTS} samples, got {len(samples)}")
     learner = OutputLearner(definition, settings, warm, {})

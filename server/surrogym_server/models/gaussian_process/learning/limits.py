@@ -1,9 +1,8 @@
-"""Whether an output learns from samples that ended at a limit of another coordinate.
+"""Decision whether an output learns from samples that ended at a limit of another coordinate.
 
-Such a limit bends what else the step does, or it does not: a wall stops the speed, a relief valve leaves the
-concentration as smooth as before. Without these samples nothing is known of where the limit is reached, and a process
-extrapolates. So both are learned, and the one is taken whose error over all of these samples is less, each foretold
-from the others.
+Such a limit may change the rest of the step or not: a wall stops the speed, but a relief valve leaves the concentration
+as smooth as before. Without these samples the process extrapolates where the limit is reached. So both are learned, and
+the one with the smaller error over all of these samples is used, each predicted from the others.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from surrogym_server.environment.features import FeatureMap
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
-WIDER = " past limits"  # after an output's name, for its hyperparameters
+WIDER = " past limits"  # suffix of an output's name, for its hyperparameters
 
 
 def past_limits(
@@ -28,7 +27,7 @@ def past_limits(
     keep: Tensor,
     more: Tensor,
 ) -> OutputModel:
-    """The output, learned from samples ``keep`` (n,) with targets (n,), or anew from ``more`` (n,) as well."""
+    """The output, learned from samples ``keep`` (n,) with targets (n,), or from ``more`` (n,) as well."""
     also = more & ~keep
     if not bool(also.any()) or output.feature_map.lead:
         return output
@@ -46,8 +45,8 @@ def past_limits(
 
 
 def _error(output: OutputModel, count: int, others: Tensor | None = None) -> float:
-    """Mean squared error over ``count`` samples: those that an output was learned from, each foretold from the others,
-    and the errors (m,) at ``others``."""
+    """Mean squared error over ``count`` samples: the leave-one-out errors of the samples that an output was learned
+    from, and the errors (m,) at ``others``."""
     found = output.leave_one_out().error ** 2
     if others is None:
         return found

@@ -1,4 +1,4 @@
-"""Fitting one output: its scaling, and the choice of its feature map by evidence."""
+"""Fit of one output: its scaling, and the choice of its feature map by evidence."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from surrogym_server.models.port import Warm
 # of the other, mirrored or not. What pays in one place alone seldom asks for the action as well.
 LEAD_ODDS, ALONE_ODDS, PARITY_ODDS, PLACE_ODDS = 3.0, -6.0, -3.0, 3.0
 CONSTANT = 1e-9  # an output whose deviation is below this share of its own size never varied
-SMALLEST = 1e-100  # deviation of an output: what is less has squares that are no numbers
+SMALLEST = 1e-100  # deviation of an output: squares of a smaller one underflow
 PEAK = "reward peak"  # the logarithm of a reward
 
 
@@ -34,18 +34,18 @@ class OutputLearner:
     definition: EnvironmentDefinition
     settings: Settings
     warm: Warm  # hyperparameters of earlier fits by "output|feature map"
-    thetas: dict[str, NDArray[np.float64]]  # those of this one
+    thetas: dict[str, NDArray[np.float64]]  # hyperparameters of this fit
 
     def allowed(self, maps: tuple[FeatureMap, ...]) -> tuple[FeatureMap, ...]:
-        """Of these maps those that the settings let compare."""
+        """The maps that the settings allow to compare."""
         return tuple(m for m in maps if self.settings.symmetry == "auto" or not m.parity)
 
     def output(
         self, name: str, target: Tensor, inputs: Mapping[FeatureMap, Tensor], keep: Tensor, keep_lead: Tensor
     ) -> OutputModel:
-        """The best of the feature maps ``inputs`` (n, d) for one output's targets (n,).
+        """Fit one output's targets (n,) with each of the feature maps ``inputs`` (n, d), and return the best.
 
-        ``keep`` (n,) marks the samples that count. Maps that read the lead may use more, ``keep_lead``; all are
+        ``keep`` (n,) marks the samples that count. Maps that read the lead may use more, ``keep_lead``. All are
         compared on the same points.
         """
         centre, scale = float(target[keep].mean()), float(target[keep].std(correction=0))
@@ -68,7 +68,8 @@ class OutputLearner:
         return OutputModel(name, best, posterior, centre, scale, int((~used).sum()), scores)
 
     def _fit(self, name: str, feature_map: FeatureMap, x: Tensor, y: Tensor, also: str = "") -> Fitted:
-        """Fit to all points; of more than a few, to some of them, and score as if all were alike."""
+        """Fit to all points. If there are many, fit to some of them, and scale the score as if the others
+        were alike."""
         key, rows = f"{name}|{feature_map}{also}", spread(len(y), subsets.FEW)
         mirror = reflection(self.definition, feature_map)
         fitted = fit(x[rows], y[rows], self._options(name), self.warm.get(key), mirror)
@@ -78,12 +79,12 @@ class OutputLearner:
     def _refined(
         self, name: str, feature_map: FeatureMap, x: Tensor, y: Tensor, theta: NDArray[np.float64]
     ) -> Posterior:
-        """The process of all points x (n, d), y (n,), given the hyperparameters of a few."""
+        """The process of all points x (n, d), y (n,), with the hyperparameters of a subset."""
         mirror = reflection(self.definition, feature_map)
         return condition_many(refine(x, y, self._options(name), theta, mirror), x, y)
 
     def _options(self, name: str) -> FitOptions:
-        """Dynamics tend to be near linear, costs to be quadratic."""
+        """Dynamics tend to be near linear, and costs to be quadratic."""
         options = FitOptions(quadratic=name in (REWARD, PEAK))
         if self.settings.kernel == "squared_exponential":
             options = FitOptions(linear=False)

@@ -1,11 +1,11 @@
-"""Learning a reward that hides: many of its samples are next to nothing beside the best, as a peak is elsewhere.
+"""Learning of a reward that is nearly zero almost everywhere, with a peak that few samples reach.
 
-Their logarithms are learned instead, where this is the better account of the samples. A process of the values has
-nothing to go by but the few that were paid, and takes what it never met for flat.
+The logarithms of its values are learned instead, if they explain the samples better. A process of the values only sees
+the few samples with a reward, and predicts a flat reward elsewhere.
 
-Samples that were paid exactly nothing say that the logarithm is below what the others were paid. They stand with what
-these foretell of them, or with the least of these, whichever is less (regression imputation of censored values), and
-have a say in the hyperparameters only where they contradict the others.
+For samples with a reward of exactly zero, the logarithm is below that of the others. Their targets are the predictions
+of the process of the others, or the smallest of the others if that is smaller (regression imputation of censored
+values). They influence the hyperparameters only if they contradict the process of the others.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from surrogym_server.models.gaussian_process.learning.output_learner import PEAK
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.warp import Warp
 
-FAINT = 0.1  # share of the samples that were paid anything: the largest of these faint ones is compared with the best
+FAINT = 0.1  # share of the samples with a reward: the largest of these faint ones is compared with the best
 SPREAD = 3.0  # decades between the two where a peak is looked for; squares in one dimension spread as far at 6 % ...
 DECADES = 10.0  # ... and where nothing else spreads so far, neither noise nor rounding
 REFITS = 3  # with samples that contradict the fit before
-BELOW = 10.0  # nats: how far below the few that were paid anything those stand that were not, before they are foretold
-FEWEST = 3  # samples that were paid anything, before others are foretold from them
-EPS = 4 * torch.finfo(torch.float64).eps  # of the base: what is closer to it is the base
-RESOLUTION = 1e-3  # of the largest: how closely accounts of the samples are compared
+BELOW = 10.0  # nats: distance of the samples without a reward below the others, before they are predicted
+FEWEST = 3  # samples with a reward that are needed to predict the others
+EPS = 4 * torch.finfo(torch.float64).eps  # of the base: a value that is closer to it equals it
+RESOLUTION = 1e-3  # of the largest: resolution at which explanations of the samples are compared
 GAIN = 3.0  # nats by which structure in the logarithms must win where the spread leaves doubt
 
 
 def hides(reward: Tensor) -> bool:
-    """Whether many of the rewards (n,) are next to nothing beside one of them, or all are nothing."""
+    """Whether many of the rewards (n,) are nearly zero compared with the largest, or all are zero."""
     return bool((reward == 0).all()) or any(True for _ in _bases(reward))
 
 
 def with_peak(
     learner: OutputLearner, reward: Tensor, inputs: Mapping[FeatureMap, Tensor], going: Tensor, plain: OutputModel
 ) -> OutputModel:
-    """The reward by its logarithm, from the samples ``going`` (n,), where that accounts for them better; else
+    """The reward learned by its logarithm from the samples ``going`` (n,), if that explains them better; else
     ``plain``."""
     accounts = [_learned(learner, reward, inputs, going, *base) for base in _bases(reward[going])]
     better = [found for found, structure in accounts if _better(found, structure, plain, reward, inputs, going)]
@@ -51,7 +51,7 @@ def with_peak(
 
 
 def _bases(reward: Tensor) -> Iterator[tuple[float, float]]:
-    """Base and sign of what may be peaks of rewards (n,): above or below 0, or the middle one of them."""
+    """Candidate base and sign of peaks of rewards (n,): above or below 0, or above or below the median reward."""
     middle = float(reward.median())
     for base in dict.fromkeys((0.0, middle)):
         for sign in (1.0, -1.0):
@@ -61,20 +61,20 @@ def _bases(reward: Tensor) -> Iterator[tuple[float, float]]:
 
 
 def _heights(reward: Tensor, base: float, sign: float) -> Tensor:
-    """Rewards (n,) above their base; 0 where that is rounding."""
+    """Heights of rewards (n,) above their base; 0 if the difference is rounding."""
     height = sign * (reward - base)
     return torch.where(height.abs() <= EPS * abs(base), 0.0, height)
 
 
 def _trace(height: Tensor, base: float) -> bool:
-    """Whether heights (n,) are the trace of something alone: above 0 in few places, and beside the base nothing that a
-    trainer could tell, which computes in float32."""
+    """Whether heights (n,) show an isolated peak: above 0 in few places, and elsewhere too small for a trainer, which
+    computes in float32."""
     known, highest = torch.finfo(torch.float32), float(height.max())
     return 0 < highest < max(known.eps * abs(base), known.tiny) and float(height.median()) == 0
 
 
 def _spread(height: Tensor) -> float:
-    """Decades between the largest and the faint of those that were paid anything, of heights (n,)."""
+    """Decades between the largest and the faint ones of the samples with a reward, of heights (n,)."""
     paid = height[height > 0]
     if len(paid) < 2:
         return 0.0
@@ -90,8 +90,11 @@ def _learned(
     base: float,
     sign: float,
 ) -> tuple[OutputModel, float]:
-    """A process of the logarithms: fitted to the samples that were paid anything, and to those paid nothing that would
-    contradict it; conditioned on all. And the structure that it found in those that it was fitted to."""
+    """A process of the logarithms, and the structure that it found in the samples that it was fitted to.
+
+    It is fitted to the samples with a reward, and to those without one that would contradict it. It is conditioned on
+    all.
+    """
     height = _heights(reward, base, sign)
     paid = going & (height > 0)
     nothing, few = going & ~paid, int(paid.sum()) < FEWEST
@@ -123,7 +126,7 @@ def _better(
     inputs: Mapping[FeatureMap, Tensor],
     going: Tensor,
 ) -> bool:
-    """Whether logarithms, with such ``structure`` in them, account for the samples better than their values do."""
+    """Whether logarithms, with such ``structure`` in them, explain the samples better than their values do."""
     if found.posterior is None:
         return False
     if plain.posterior is None:
@@ -136,7 +139,7 @@ def _better(
 
 
 def _structure(output: OutputModel) -> float:
-    """Log odds of a process that was just fitted against targets that have nothing to do with their inputs."""
+    """Log odds of a fitted process against targets that don't depend on their inputs."""
     if output.posterior is None:
         return 0.0
     count = len(output.posterior.y)
@@ -144,7 +147,7 @@ def _structure(output: OutputModel) -> float:
 
 
 def _agreement(output: OutputModel, reward: Tensor, inputs: Mapping[FeatureMap, Tensor], going: Tensor) -> float:
-    """Log probability of every sample, foretold from all others, to ``RESOLUTION`` of the largest."""
+    """Log probability of every sample, predicted from all others, to ``RESOLUTION`` of the largest."""
     posterior, warp = output.posterior, output.warp
     assert posterior is not None
     if posterior.sparse is None:

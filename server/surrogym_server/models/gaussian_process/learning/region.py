@@ -1,4 +1,4 @@
-"""Learning a region from labelled states; above all where episodes end, from samples that say whether they did."""
+"""Learning of a region from labelled states; above all of the region in which episodes end."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from surrogym_server.models.gaussian_process.learning.output_learner import Outp
 from surrogym_server.models.gaussian_process.learning.thresholds import log_probability, thresholds
 from surrogym_server.models.gaussian_process.prediction.regions import TERMINATION, Classifier, Form, Region, likely
 
-HANDICAP = 3.0  # log odds against the classifier, whose hyperparameters have seen the labels that are left out
-FAINT = 0.05  # a form of less weight beside the best one's is dropped
+HANDICAP = 3.0  # log odds against the classifier, whose hyperparameters were fitted to the left-out labels too
+FAINT = 0.05  # a form is dropped if its weight is a smaller share of the best one's
 
 
 def learn_termination(learner: OutputLearner, samples: Samples) -> Region:
-    """Where episodes end. As long as no sample ended, nothing does."""
+    """Learn the region in which episodes end. It is empty while no sample has ended an episode."""
     return learn_region(learner, TERMINATION, samples.q_next, samples.terminated)
 
 
 def learn_region(learner: OutputLearner, name: str, q: Tensor, inside: Tensor) -> Region:
-    """Which of q (n, C) lie inside (n,): thresholds and a classifier, weighed by how well they foretell left-out
-    labels."""
+    """Learn which of q (n, C) lie inside (n,): thresholds and a classifier, weighted by their leave-one-out predictions
+    of the labels."""
     found: list[tuple[Form, float]] = [_classifier(learner, name, q, inside)]
     found += thresholds(learner.definition, q, inside)
     names = [str(form.description.get("inside", "classifier")) for form, _ in found]

@@ -1,4 +1,4 @@
-"""The reward: declared, or a process of the steps that go on and what a step that ends the episode pays beyond it."""
+"""The reward: declared, or a process for non-terminating steps with an additional terminal reward."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from surrogym_server.models.gaussian_process.learning.peaks import with_peak
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.regions import Jump, jumped
 
-FEW = 2  # steps that go on: fewer tell nothing without those that end
+FEW = 2  # non-terminating steps; fewer are useless without the terminating ones
 
 
 def learn_reward(learner: OutputLearner, samples: Samples) -> tuple[OutputModel, float, tuple[Jump, ...]]:
-    """The reward process of steps that go on, what a step that ends the episode pays beyond it, and its jumps."""
+    """The reward process of non-terminating steps, the additional reward of terminating steps, and the jumps."""
     definition = learner.definition
     if (known := definition.declared_reward) is not None:
         return _declared(known, samples), known.terminal, ()
@@ -46,7 +46,7 @@ def learn_reward(learner: OutputLearner, samples: Samples) -> tuple[OutputModel,
 
 
 def _without_action(definition: EnvironmentDefinition, samples: Samples) -> dict[FeatureMap, Tensor]:
-    """Inputs of the state alone: what is paid in one place seldom depends on the action."""
+    """Inputs without the action, because a reward that is paid in one place seldom depends on it."""
     maps = {replace(m, action="none") for m in reward_candidates(definition) if not m.parity}
     return {
         m: encode(definition, m, samples.q_next if m.after else samples.q, samples.u) for m in sorted(maps, key=str)
@@ -54,7 +54,7 @@ def _without_action(definition: EnvironmentDefinition, samples: Samples) -> dict
 
 
 def _declared(known: DeclaredReward, samples: Samples) -> OutputModel:
-    """No process; its score is how far a sample's reward was off at most."""
+    """The declared reward without a process. Its score is the largest error over the samples."""
     paid = known(samples.q_next if known.after else samples.q, samples.u) + known.terminal * samples.terminated
     off = float((samples.reward - paid).abs().max())
     scores = (("declared, largest error over the samples", off),)

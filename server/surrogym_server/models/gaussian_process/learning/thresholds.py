@@ -1,7 +1,7 @@
-"""Finding thresholds from labelled states: the fewest axes that explain what lies inside, and their rivals.
+"""Search for thresholds from labelled states: the fewest axes that explain which states lie inside, and alternatives.
 
-A level that is a priori uniform over an axis' range explains labels that it separates with probability gap / range:
-the weight of a cut among those that explain the same samples.
+If the level is a priori uniform over an axis' range, the probability of labels that it separates is gap / range. This
+is the weight of a cut among those that explain the same samples.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ Bools = NDArray[np.bool_]
 Rules = tuple[tuple[Cut, ...], ...]
 SLACK = 1e-9  # of an axis' range: closer values are the same
 RIVALS = 4
-FAINT = 0.05  # rivals of less weight are dropped
+FAINT = 0.05  # alternatives of less weight are dropped
 LEFT_OUT = 100  # samples left out, one by one, to score a rule
 
 
 def thresholds(definition: EnvironmentDefinition, q: Tensor, inside: Tensor) -> list[tuple[Thresholds, float]]:
-    """Thresholds that explain which of q (n, C) lie inside (n,), and their leave-one-out log probabilities.
+    """Find thresholds that explain which of q (n, C) lie inside (n,), and their leave-one-out log probabilities.
 
     A union of them, a complement of a union of two or more (of one would be the same again), both or none.
     """
@@ -59,13 +59,14 @@ def explain(values: Floats, inside: Bools) -> Rules:
 
 
 def log_probability(probability: Tensor, inside: Tensor) -> float:
-    """Log probability of labels inside (n,), none surer than the rule of succession, 1 / (n + 2), allows."""
+    """Log probability of labels inside (n,), limited by the rule of succession, 1 / (n + 2)."""
     right = torch.where(inside, probability, 1 - probability)
     return float(right.clamp(1 / (len(right) + 2), 1).log().sum())
 
 
 def _cover(reached: Bools, share: Floats) -> list[int]:
-    """Axes that together reach every sample, greedily; of those that reach as many the one with the widest gap."""
+    """Axes that together reach every sample, chosen greedily. Of axes that reach as many, the one with the
+    widest gap."""
     chosen: list[int] = []
     left = np.ones(len(reached), dtype=bool)
     while left.any():
@@ -79,8 +80,8 @@ def _cover(reached: Bools, share: Floats) -> list[int]:
 
 
 def _assign(reached: Bools, share: Floats, chosen: list[int]) -> NDArray[np.int64]:
-    """Which of the chosen axes explains each sample (i,): the only one that can, or the one it lies farthest beyond,
-    relative to what others are surely explained by it."""
+    """Axis that explains each sample (i,): the only possible one, or the one beyond which it lies farthest, relative to
+    the samples that this axis alone explains."""
     able, distance = reached[:, chosen], share[:, chosen]
     sole = able.sum(1) == 1
     nearest = np.where(sole[:, None] & able, distance, np.inf).min(0, initial=np.inf)
@@ -101,7 +102,8 @@ def _rivals(inner: Floats, outside: Floats, width: Floats, own: Bools, axes: lis
 
 
 def _left_out(definition: EnvironmentDefinition, values: Floats, inside: Bools) -> float:
-    """Leave-one-out log probability of the labels; of more than ``LEFT_OUT`` samples, an even share stands for all."""
+    """Leave-one-out log probability of the labels. If there are more than ``LEFT_OUT`` samples, an even share
+    represents all."""
     count, rows = len(inside), torch.from_numpy(values)
     picked = np.unique(np.linspace(0, count - 1, min(count, LEFT_OUT)).astype(int))
     probabilities = torch.full((len(picked),), float(inside.mean() > 0.5), dtype=torch.float64)

@@ -1,1 +1,1 @@
-"""A fitted model, ready to predict."""
+"""Prediction with a fitted model."""

@@ -1,4 +1,4 @@
-"""What one output of a model is, for people."""
+"""Description of one output of a model, for people."""
 
 from __future__ import annotations
 

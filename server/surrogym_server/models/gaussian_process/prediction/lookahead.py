@@ -1,16 +1,16 @@
-"""What further real steps would do to the deviations of processes, before any of them is answered.
+"""Effect of further real steps on the deviations of processes, before they are taken.
 
-The deviations of a process depend on where it is observed, not on what was seen there. So the outlook after a query
-needs no guess of its answer; only processes that read a predicted value (the lead, the next state of a reward) take the
-prediction of the model at hand.
+The deviations of a process depend on where it is observed, not on the observed values. So the outlook after a query
+needs no guess of its answer. Only processes that read a predicted value (the lead, the next state of a reward) use the
+present model's prediction.
 
-Of an output the first t points of a predicted path tell
+The first t points of a predicted path give the following information about an output:
 
     I(t) = 1/2 log det(1 + W S W / tau^2),
 
-S (t, t) the posterior covariance of the process at these points, tau the output's tolerance, W a diagonal of weights.
-The determinant counts each point after those before it, so a repeat gives nothing.
-Reference: A. Krause, A. Singh, C. Guestrin (2008), JMLR 9, section 2 (information of a set of observations).
+S (t, t) is the posterior covariance of the process at these points, tau the output's tolerance, W a diagonal matrix of
+weights. The determinant evaluates each point given those before it, so a repeated point adds nothing. Reference: A.
+Krause, A. Singh, C. Guestrin (2008), JMLR 9, section 2 (information of a set of observations).
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from surrogym_server.models.abilities import OutputOutlook, PathOutlook, Predict
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
 BLOCK = 4_000_000  # numbers in a matrix of covariances at once
-SMALLEST = 1e-300  # slope: none at all
+SMALLEST = 1e-300  # a slope that counts as zero
 
 
 @dataclass(frozen=True)
 class ProcessOutlook(OutputOutlook):
-    """One output, in its own unit."""
+    """Outlook of one output, in its own unit."""
 
-    joint: Joint  # at candidates, reference and what was assumed, in this order
+    joint: Joint  # at candidates, reference and assumed queries, in this order
     learns: Tensor  # (m,) bool
-    shared: Tensor  # (r, m) covariance of reference and candidates, standardised: kept, so that it is taken once
+    shared: Tensor  # (r, m) covariance of reference and candidates, standardised; cached
     scale: float
     slope: Tensor | None = None  # (m + r,) of a warped output over its targets
 
     @classmethod
     def of(cls, output: OutputModel, x: Tensor, learns: Tensor, spans: tuple[int, int]) -> ProcessOutlook:
-        """At inputs x (m + r + p, d): m candidates, r reference points, p points assumed observed."""
+        """Build it from inputs x (m + r + p, d): m candidates, r reference points, p points assumed observed."""
         assert output.posterior is not None
         joint = Joint.of(output.posterior, x)
         for index in range(spans[1], len(x)):
@@ -59,7 +59,8 @@ class ProcessOutlook(OutputOutlook):
     def reduction(self, weights: Tensor) -> Tensor:
         """sum_r w_r k(x_r, x)^2 / (k(x, x) + sigma_n^2), Cohn (NIPS 1993), in closed form for a Gaussian process.
 
-        Of a warped output each reference point counts by its slope, in shares of the steepest: only the order counts.
+        For a warped output each reference point is weighted by its slope, as a share of the steepest. Only the order of
+        the values counts.
         """
         if self.slope is not None:
             steep = self.slope[len(self.learns) :]
@@ -77,10 +78,10 @@ class ProcessOutlook(OutputOutlook):
 
 @dataclass(frozen=True)
 class ProcessAlongPaths(PathOutlook):
-    """One output along paths."""
+    """Outlook of one output along paths."""
 
     output: OutputModel
-    x: Tensor  # (b, T, d) what its process reads
+    x: Tensor  # (b, T, d) inputs of its process
     learns: Tensor  # (b, T) bool
 
     @property
@@ -99,18 +100,18 @@ class ProcessAlongPaths(PathOutlook):
 
 
 def process_inputs(definition: EnvironmentDefinition, output: OutputModel, steps: PredictedSteps) -> Tensor:
-    """What one output's process reads along steps (..., C): (..., d)."""
+    """Inputs of one output's process along steps (..., C): (..., d)."""
     state = steps.q_next if output.feature_map.after else steps.q
     return encode(definition, output.feature_map, state, steps.u, steps.q_next[..., leading(definition)])
 
 
 def slope_at(output: OutputModel, x: Tensor) -> Tensor | None:
-    """How far a warped output moves with its targets at inputs x (m, d), (m,); None without a warp."""
+    """Slope of a warped output over its targets at inputs x (m, d), (m,); None without a warp."""
     return None if output.warp is None else output.warp.slope(*output.target(x))
 
 
 def as_if_answered(output: OutputModel, x: Tensor) -> OutputModel:
-    """The output as if its mean had been observed at inputs x (k, d)."""
+    """Condition the output on observations of its mean at inputs x (k, d)."""
     if (posterior := output.posterior) is not None:
         for point in x:
             posterior = posterior.extend(point, posterior.mean(point[None])[0])

@@ -1,4 +1,4 @@
-"""Outputs predicted at once, from one set of features: their means, and what moves them away from it."""
+"""Outputs predicted together from one set of features: their means, and deviations from these."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from surrogym_server.gp import Output, Pathwise, Serving
 
 @dataclass(frozen=True)
 class Drawn:
-    """Where the draws of one output's function are read and written. W weights of all outputs of a model."""
+    """Places of the draws of one output's function. W weights of all outputs of a model."""
 
     column: int
     span: slice  # of the W weights
@@ -26,17 +26,17 @@ class Drawn:
 
 @dataclass(frozen=True)
 class OutputGroup:
-    """Some outputs of a model; it fills their columns of O and leaves the others 0."""
+    """Some outputs of a model. It fills their columns of O, and leaves the others 0."""
 
     encoder: Encoder
     serving: Serving
     noise_deviation: Tensor  # (O,) learned noise, in each output's unit
-    drawn: tuple[Drawn, ...]  # by output; a constant one has no function to draw
-    end: int  # of its draws' weights
+    drawn: tuple[Drawn, ...]  # by output, except constant ones, which have no function to draw
+    end: int  # end of its draws' weights
 
     @classmethod
     def of(cls, encoder: Encoder, outputs: Sequence[Output], columns: int, *, lead: bool, begin: int) -> OutputGroup:
-        """Compile outputs for ``columns`` of them; their draws' weights start at ``begin``."""
+        """Compile outputs for ``columns`` of them. Their draws' weights start at ``begin``."""
         device = encoder.definition.device
         noise, drawn = torch.zeros(columns, dtype=torch.float64, device=device), []
         for output in outputs:
@@ -51,10 +51,10 @@ class OutputGroup:
     def predict(
         self, x: Tensor, wanted: tuple[int, ...], kick: Tensor | None, process: Tensor | None, paths: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Values at features x (m, d) and the latent deviations of the columns wanted, (m, O) each.
+        """Values at features x (m, d), and the latent deviations of the wanted columns, (m, O) each.
 
-        A value is the posterior's mean; with ``kick`` (m, O) so many latent deviations away, with ``process`` (m, O) so
-        many deviations of the noise, and with ``paths`` (m, W) that of a function drawn whole, one a row.
+        A value is the posterior's mean. ``kick`` (m, O) moves it by latent deviations, ``process`` (m, O) by deviations
+        of the noise, and with ``paths`` (m, W) it is that of a drawn function, one for each row.
         """
         if wanted:
             value, spread = self.serving.mean_and_deviation(x, wanted)

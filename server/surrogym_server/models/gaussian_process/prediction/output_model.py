@@ -17,8 +17,8 @@ from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE, 
 class OutputModel:
     """The process of one output, and the scaling of its targets: y = (target - centre) / scale.
 
-    ``posterior`` is None for an output that never varied: its mean is ``centre`` and its deviation 0. With a ``warp``
-    the targets are what it is taken of, and means, deviations and errors are in the output's unit all the same.
+    ``posterior`` is None for an output that never varied; its mean is ``centre`` and its deviation 0. With a ``warp``
+    the targets are logarithms, but means, deviations and errors are still in the output's unit.
     """
 
     name: str
@@ -27,7 +27,7 @@ class OutputModel:
     centre: float
     scale: float
     left_out: int = 0  # samples left out because they ended at a bound
-    scores: tuple[tuple[str, float], ...] = ()  # evidence of every feature map compared
+    scores: tuple[tuple[str, float], ...] = ()  # evidence of every candidate feature map
     warp: Warp | None = None
     past_limits: bool = False  # whether it was learned from samples that ended at a limit of another coordinate
 
@@ -56,19 +56,20 @@ class OutputModel:
 
     @property
     def noise_floor(self) -> float:
-        """The least variance of the noise that a fit may find, in shares of the targets'."""
+        """Smallest variance of the noise that a fit may find, as a share of the targets' variance."""
         return NOISE_FLOOR if self.warp is None else PEAK_NOISE
 
     @property
     def noise_deviation(self) -> float:
-        """Deviation of the learned noise, in the output's unit; of a warped one where it is as large as its size."""
+        """Deviation of the learned noise, in the output's unit; that of a warped output at a value as large as its
+        size."""
         if self.posterior is None:
             return 0.0
         noise = self.scale * math.sqrt(self.posterior.hyper.noise_variance)
         return noise if self.warp is None else noise * self.warp.size
 
     def leave_one_out(self) -> LeaveOneOutErrors:
-        """How the process without each sample in turn foretells it. One that never varied makes no error."""
+        """Leave-one-out errors of the process. An output that never varied has none."""
         if self.posterior is None:
             return LeaveOneOutErrors(0.0, 1.0, 1.0)
         found = self.posterior.left_out
@@ -78,7 +79,7 @@ class OutputModel:
         return LeaveOneOutErrors(error, found.within_one, found.within_two)
 
     def _left_out_warped(self, warp: Warp, error: float) -> float:
-        """Root mean square of what rewards are foretold wrong by, given that of their targets."""
+        """Root mean square error of predicted rewards, given that of their targets."""
         assert self.posterior is not None
         if self.posterior.sparse is not None:
             return error * warp.size
@@ -88,5 +89,5 @@ class OutputModel:
 
 
 def paid(warp: Warp | None, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and deviation (m,) of an output, given those of its targets."""
+    """Mean and deviation (m,) of the output, given those of its targets."""
     return (mean, deviation) if warp is None else (warp.value(mean), warp.deviation(mean, deviation))

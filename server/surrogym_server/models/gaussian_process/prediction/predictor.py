@@ -1,7 +1,7 @@
-"""The processes of one model compiled for prediction: outputs in groups, and the state that their changes lead to.
+"""The processes of one model, compiled for prediction: outputs in groups, and the next state from their changes.
 
 The state moves in coordinates: q' = q + f(q, u), angles wrapped, saturated coordinates clipped (eq. 1 with zero mean).
-Where the outputs move the observation instead, o' = o + f(o, u), the coordinates are read back from it.
+If the outputs move the observation instead, o' = o + f(o, u), the coordinates are read back from it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Predictor:
     definition: EnvironmentDefinition
     transitions: tuple[OutputModel, ...]  # M, in the order of definition.outputs
     reward: OutputModel
-    jumps: tuple[Jump, ...]  # of the reward, beyond its process
+    jumps: tuple[Jump, ...]  # of the reward, in addition to its process
 
     def transition(
         self,
@@ -44,7 +44,7 @@ class Predictor:
         deviations: bool,
         reward_deviation: bool,
     ) -> Transition:
-        """As ``DynamicsModel.transition``, in blocks of rows; variances only of what is asked for."""
+        """Predict like ``DynamicsModel.transition``, in blocks of rows, with variances only as requested."""
         wanted = self._columns if deviations or noise is not None else ()
         wanted += (self._reward_column,) if reward_deviation else ()
         rows = min(group.serving.rows for group in self._groups if group)
@@ -65,11 +65,12 @@ class Predictor:
 
     @cached_property
     def path_size(self) -> int:
-        """How many numbers a drawn function is, W."""
+        """Number of weights of a drawn function, W."""
         return sum(one.pathwise.size for group in self._groups if group for one in group.drawn)
 
     def draw(self, noise: Tensor) -> Tensor:
-        """Functions drawn from the posteriors of all outputs, one a row of standard normal ``noise`` (N, W): (N, W)."""
+        """Draw functions from the posteriors of all outputs, one for each row of standard normal ``noise`` (N, W): (N,
+        W)."""
         drawn = [one for group in self._groups if group for one in group.drawn]
         return torch.cat([noise[:, :0], *(one.pathwise.draw(noise[:, one.span]) for one in drawn)], 1)
 
@@ -82,9 +83,9 @@ class Predictor:
         process: Tensor | None,
         paths: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Next coordinates, changes and reward (m, columns), and the deviations of the columns ``wanted``.
+        """Next coordinates, changes and reward (m, columns), and the deviations of the wanted columns.
 
-        Each stage fills its own columns and leaves the others 0, so that they add up.
+        Each stage fills its own columns and leaves the others 0, so that the stages can be added.
         """
         first, second, after = self._groups
         kick, shake = self._in_columns(noise), self._in_columns(process)
@@ -101,8 +102,8 @@ class Predictor:
         return q_next, mean, spread
 
     def _rewarded(self, q: Tensor, u: Tensor, q_next: Tensor, mean: Tensor) -> tuple[Tensor, Tensor | float]:
-        """Rewards (m,) of steps from q (m, C) under u (m, F) to q_next (m, C), the process' mean and what jumps and a
-        declared reward add, and the variance (m,) of where the jumps are, 0 without any."""
+        """Rewards (m,) of steps from q (m, C) under u (m, F) to q_next (m, C): the process' mean, the jumps and the
+        declared reward. Also the variance (m,) that uncertain edges of jumps cause, 0 without jumps."""
         state = q_next if self.reward.feature_map.after else q
         if self.reward.warp is not None:
             mean = self.reward.warp.value(mean)
@@ -128,7 +129,7 @@ class Predictor:
 
     @cached_property
     def _columns(self) -> tuple[int, ...]:
-        """Where each transition output stands: at its coordinate, or at its observation entry."""
+        """Column of each transition output: its coordinate, or its observation entry."""
         return tuple(range(len(self.transitions))) if self.definition.moves_observation else self.definition.moving
 
     @cached_property
@@ -138,7 +139,8 @@ class Predictor:
 
     @cached
     def _groups(self) -> tuple[OutputGroup, OutputGroup | None, OutputGroup | None]:
-        """What reads (q, u), what reads the lead as well, and a reward that reads the next state."""
+        """Groups of outputs: those that read (q, u), those that also read the lead, and a reward that reads the next
+        state."""
         after = self.reward.feature_map.after
         outputs = list(zip(self._columns, self.transitions, strict=True))
         reward = [(self._reward_column, self.reward)]

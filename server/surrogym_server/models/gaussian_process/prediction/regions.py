@@ -1,6 +1,6 @@
-"""Sets of states learned from labelled ones: where episodes end, where a reward jumps.
+"""Sets of states learned from labelled states: where episodes end, and where a reward jumps.
 
-A region is a mixture of forms, of two kinds. ``Thresholds``: levels of single axes found from data, joined by *or*
+A region is a mixture of forms of two kinds. ``Thresholds``: levels of single axes found from data, joined by *or*
 (their complement by *and*), each known up to a gap between the last state seen outside and the first seen inside.
 ``Classifier``: a process on labels +-1.
 """
@@ -27,14 +27,14 @@ SIDES: tuple[Side, ...] = ("above", "below", "beyond")
 
 @dataclass(frozen=True)
 class Axes:
-    """Every way to order states: coordinates and observation entries, from each side: A = 3 T axes."""
+    """Every order of states by one value: coordinates and observation entries, from each side: A = 3 T axes."""
 
     names: tuple[str, ...]  # (T,)
     terms: TermSet
 
     @classmethod
     def of(cls, definition: EnvironmentDefinition) -> Axes:
-        """Moving coordinates, and observation entries that are not one of them."""
+        """Axes of the moving coordinates, and of the observation entries that are not one of them."""
         size, found = len(definition.coordinates), {}
         for index in definition.moving:
             weights = tuple(float(i == index) for i in range(size))
@@ -52,7 +52,7 @@ class Axes:
         return torch.cat([value, -value, value.abs()], -1)
 
     def describe(self, axis: int, level: float) -> str:
-        """The inequality that ``axis`` and its ``level`` are, for people."""
+        """The inequality of ``axis`` and its ``level``, for people."""
         name, side = self.names[axis % len(self.names)], SIDES[axis // len(self.names)]
         return {"above": f"{name} > {level:.6g}", "below": f"{name} < {-level:.6g}"}.get(
             side, f"|{name}| > {level:.6g}"
@@ -61,24 +61,24 @@ class Axes:
 
 @dataclass(frozen=True)
 class Cut:
-    """Inside from a level of one axis on, which lies anywhere between ``outside`` and ``inside``."""
+    """A cut: states lie inside beyond a level of one axis, which is somewhere between ``outside`` and ``inside``."""
 
     axis: int
     outside: float
     inside: float
-    weight: float  # how likely this axis is the one, among those that explain the same samples
+    weight: float  # probability of this axis among those that explain the same samples
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Inside where any of the rules says so; each rule is the cuts that might explain what it was found from."""
+    """States lie inside if any of the rules holds. A rule holds the cuts that may explain its samples."""
 
     definition: EnvironmentDefinition
     rules: tuple[tuple[Cut, ...], ...]
-    complement: bool = False  # inside where none says so
+    complement: bool = False  # inside if no rule holds
 
     def probability(self, q: Tensor) -> Tensor:
-        """Probability that q (m, C) lies inside, (m,), levels being uniform within their gaps."""
+        """Probability that q (m, C) lies inside, (m,), with levels uniform within their gaps."""
         return self.at(self._axes(q))
 
     def at(self, values: Tensor) -> Tensor:
@@ -130,14 +130,14 @@ class Classifier:
     process: OutputModel
 
     def probability(self, q: Tensor) -> Tensor:
-        """Probability that q (m, C) lies inside, (m,): that of the latent value being above 0."""
+        """Probability that q (m, C) lies inside, (m,): that the latent value is above 0."""
         u = q.new_zeros(len(q), self.definition.action.size)
         mean, deviation = self.process.mean_and_deviation(encode(self.definition, self.process.feature_map, q, u))
         return likely(mean, deviation)
 
     @property
     def description(self) -> Mapping[str, Any]:
-        """How it is represented."""
+        """Description for people."""
         return {"kind": "classifier", "inputs": str(self.process.feature_map)}
 
 
@@ -146,7 +146,7 @@ Form = Thresholds | Classifier
 
 @dataclass(frozen=True)
 class Region:
-    """Forms that explain the labels, each with its weight: where they disagree, the region is in doubt."""
+    """Forms that explain the labels, each with its weight. Where they disagree, the region is uncertain."""
 
     forms: tuple[tuple[float, Form], ...]  # weights add up to 1
     scores: tuple[tuple[str, float], ...]  # leave-one-out log probability of every form compared
@@ -157,23 +157,23 @@ class Region:
 
     @property
     def description(self) -> dict[str, Any]:
-        """Every form in words, and how it was judged."""
+        """Every form in words, with its score."""
         forms = [{"weight": weight, **form.description} for weight, form in self.forms]
         return {"forms": forms, "scores": dict(self.scores)}
 
 
 @dataclass(frozen=True)
 class Jump:
-    """A reward that is higher by ``size`` (lower, if negative) inside a region."""
+    """A reward that is higher by ``size`` (lower if negative) inside a region."""
 
     region: Region
     size: float
 
 
 def jumped(jumps: Sequence[Jump], q: Tensor) -> tuple[Tensor, Tensor]:
-    """What jumps add to the reward of states q (m, C), and its variance from their doubtful edges, (m,) each.
+    """Contribution of jumps to the reward of states q (m, C), and its variance from their uncertain edges, (m,) each.
 
-    Of jumps whose regions overlap the first one counts.
+    If the regions of jumps overlap, the first one counts.
     """
     added, variance, free = q.new_zeros(len(q)), q.new_zeros(len(q)), q.new_ones(len(q), dtype=torch.bool)
     for jump in jumps:
@@ -185,6 +185,6 @@ def jumped(jumps: Sequence[Jump], q: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def likely(mean: Tensor, deviation: Tensor) -> Tensor:
-    """Probability (m,) that a latent value of this mean and deviation is above 0."""
+    """Probability (m,) that a latent value with this mean and deviation is above 0."""
     probability: Tensor = torch.special.ndtr(mean / deviation.clamp_min(1e-9))
     return probability

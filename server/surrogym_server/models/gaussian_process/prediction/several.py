@@ -1,8 +1,8 @@
-"""Functions of several models of the same samples, each with hyperparameters of its own.
+"""Functions of several models of the same samples, which differ in their hyperparameters.
 
-One optimum of the hyperparameters takes a length scale for certain that five samples can't know. So a function is drawn
-in two steps: one of the models, each as likely, and a function of its processes. A drawn function is the number of its
-model, and the weights that model draws.
+A single optimum treats a length scale as certain, which five samples can't determine. So a function is drawn in two
+steps: one of the models, with equal probability, and a function of its processes. A drawn function consists of the
+number of its model and the weights that this model draws.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 from surrogym_server.models.port import Transition
 
 MODELS = 8
-MOST_POINTS = 60  # of a process whose hyperparameters are sampled; those of more are known well enough
+MOST_POINTS = 60  # of a process with sampled hyperparameters; more points determine them well enough
 
 Floats = NDArray[np.float64]
 
 
 def uncertain_outputs(outputs: Sequence[OutputModel]) -> list[list[OutputModel]]:
-    """The outputs (O,) ``MODELS`` times over, on the CPU, their processes with sampled hyperparameters where few points
-    leave these uncertain. None at all where no output has so few."""
+    """Copy the outputs (O,) ``MODELS`` times, on the CPU, with sampled hyperparameters for processes with few points.
+    Empty if no process has so few."""
     if not any(_uncertain(output) for output in outputs):
         return []
     columns = [_sampled(output, seed) for seed, output in enumerate(outputs)]
@@ -51,7 +51,7 @@ def _sampled(output: OutputModel, seed: int) -> list[OutputModel]:
 
 
 def _conditioned(posterior: Posterior, hyper: Hyperparameters) -> Posterior:
-    """The process with other hyperparameters; as it is where these can't be factored."""
+    """The process with other hyperparameters; unchanged if its covariance can't be factored with these."""
     try:
         return condition(hyper, posterior.x, posterior.y)
     except NumericalFailure:
@@ -60,7 +60,7 @@ def _conditioned(posterior: Posterior, hyper: Hyperparameters) -> Posterior:
 
 @dataclass(frozen=True)
 class FunctionsOfSeveral(FunctionDraws, CompiledSteps):
-    """Functions of several models, whose draws all take as many numbers."""
+    """Functions of several models. The draws of all take the same number of random numbers."""
 
     models: tuple[FunctionDraws, ...]
 
@@ -120,7 +120,7 @@ class FunctionsOfSeveral(FunctionDraws, CompiledSteps):
 
 @dataclass(frozen=True, eq=False)
 class StepsOfSeveral(ArraySteps):
-    """The compiled steps of several models, along functions alone."""
+    """The compiled steps of several models, along functions only."""
 
     definition: EnvironmentDefinition
     models: tuple[ArraySteps, ...]
@@ -156,7 +156,7 @@ class StepsOfSeveral(ArraySteps):
 
 
 def _members(number: Tensor, count: int) -> list[tuple[int, Tensor]]:
-    """Which rows (m,) belong to each of ``count`` models; those without any are left out."""
+    """Rows (m,) of each of ``count`` models; models without rows are left out."""
     rows = [(index, (number == index).nonzero()[:, 0]) for index in range(count)]
     return [(index, which) for index, which in rows if len(which)]
 

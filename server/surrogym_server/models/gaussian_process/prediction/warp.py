@@ -1,10 +1,10 @@
 """Rewards learned by the logarithm of their distance from a base: r = base + sign exp(y).
 
-A reward that pays in one place alone is flat nearly everywhere, and a process of its values learns that it is flat.
-Its logarithm is not: that of a bump is a parabola, which a few samples anywhere determine.
+A reward that pays in one place alone is flat almost everywhere, and a process of its values learns that it is flat. Its
+logarithm is not flat: that of a bump is a parabola, which a few samples anywhere determine.
 
-Predictions are medians, and deviations half the distance of the quantiles that lie one deviation of y apart from the
-median: both keep their meaning where y is unsure by more than a few, and the moments of a log-normal do not.
+Predictions are medians. Deviations are half the distance between the quantiles one deviation of y away from the median.
+Both stay meaningful if y is uncertain by several units; the moments of a log-normal distribution do not.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-LARGEST = 300.0  # y beyond which nothing is told apart: exp(300) is a number still
-PEAK_NOISE = 1e-10  # of the variance of y, at least: it is hundreds, and 1 % of a reward must be told
+LARGEST = 300.0  # largest y: exp(300) is still a number
+PEAK_NOISE = 1e-10  # of the variance of y, at least: y spans hundreds, and 1 % of a reward must be resolved
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Warp:
     """The transformation of one output.
 
     Attributes:
-        base: reward of nothing.
-        sign: 1 where rewards lie above it, -1 below.
-        size: deviation of the rewards over the samples, in their unit: what is ``scale`` of other outputs.
+        base: reward far from the peak.
+        sign: 1 if rewards lie above it, -1 if below.
+        size: deviation of the rewards over the samples, in their unit; it corresponds to ``scale`` of other outputs.
     """
 
     base: float
@@ -38,11 +38,11 @@ class Warp:
         return self.base + self.sign * y.clamp_max(LARGEST).exp()
 
     def deviation(self, y: Tensor, spread: Tensor) -> Tensor:
-        """Deviation of the reward where y (m,) deviates by spread (m,)."""
+        """Deviation of the reward if y (m,) has deviation spread (m,)."""
         return 0.5 * ((y + spread).clamp_max(LARGEST).exp() - (y - spread).clamp_max(LARGEST).exp())
 
     def slope(self, y: Tensor, spread: Tensor) -> Tensor:
-        """How far the reward moves with y, (m,), where y may lie as high as one deviation ``spread`` (m,) above."""
+        """Slope of the reward over y, (m,), where y may lie up to one deviation ``spread`` (m,) higher."""
         return torch.exp((y + spread).clamp_max(LARGEST))
 
     def __str__(self) -> str:
@@ -51,5 +51,5 @@ class Warp:
 
     @property
     def finite(self) -> bool:
-        """Whether it is one: what a file says may be anything."""
+        """Whether its numbers are finite, since a file may contain anything."""
         return math.isfinite(self.base) and self.sign in (1.0, -1.0) and math.isfinite(self.size) and self.size > 0

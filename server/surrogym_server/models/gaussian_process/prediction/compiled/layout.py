@@ -1,4 +1,4 @@
-"""Where the compiled functions of a model find what they read: the first matrix of its tables."""
+"""Layout of a model's tables for the compiled functions: the entries of the first matrix."""
 
 HEAD = 0  # place of the first matrix, a row of places of other matrices, sizes and flags
 NONE = -1  # in place of a place
@@ -25,4 +25,4 @@ NONE = -1  # in place of a place
     HAS_STAGE,
 ) = range(20)
 ENTRIES = HAS_STAGE + 3  # one for each stage
-BLOCK = 32  # lanes computed at once: what is held of them stays in the first cache
+BLOCK = 32  # lanes computed at once, so that their data stay in the first cache

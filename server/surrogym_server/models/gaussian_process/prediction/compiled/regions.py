@@ -1,4 +1,4 @@
-"""Learned regions and jumps of the reward."""
+"""Learned regions and jumps of the reward in compiled code."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ LEAST_DEVIATION = 1e-9
 
 
 def add_region(tables: TablesBuilder, region: Region) -> int:
-    """Put a region; gives its place."""
+    """Add a region, and return its place."""
     return tables.add([(weight, *_add_form(tables, form)) for weight, form in region.forms])
 
 
 def add_jumps(tables: TablesBuilder, jumps: Sequence[Jump]) -> int:
-    """Put jumps, size and region of each; gives their place."""
+    """Add jumps, the size and region of each, and return their place."""
     return tables.add(np.array([(jump.size, add_region(tables, jump.region)) for jump in jumps]).reshape(-1, 2))
 
 
@@ -131,7 +131,7 @@ def probability(numbers: Floats, places: Ints, at: int, observe: int, q: Floats,
 def add_jumped(
     numbers: Floats, places: Ints, at: int, observe: int, q: Floats, actions: int, reward: Floats, variance: Floats
 ) -> None:
-    """Add what jumps add to the reward of states q (C, B) and to its variance, (B,) each."""
+    """Add jumps to the reward of states q (C, B), and their uncertainty to its variance, (B,) each."""
     jumps = matrix(numbers, places, at)
     free = np.ones(q.shape[1], dtype=np.bool_)
     for j in range(len(jumps)):
@@ -167,8 +167,8 @@ def judge(
     deviation: Floats,
     terminated: Bools,
 ) -> None:
-    """What learned regions add to steps from q to q_next (N, C): jumps to ``reward`` (N,) and to its deviation, the
-    last column of ``deviation`` (N, O), and learned ends to ``terminated`` (N,). ``actions`` is F."""
+    """Apply learned regions to steps from q to q_next (N, C): jumps to ``reward`` (N,) and to its deviation, the last
+    column of ``deviation`` (N, O), and learned ends to ``terminated`` (N,). ``actions`` is F."""
     head = matrix(numbers, places, HEAD)
     observe = int(head[0, OBSERVE])
     for begin in range(0, len(q), BLOCK):

@@ -60,7 +60,7 @@ STAGES = 3
 
 
 def tables_of(predictor: Predictor, ending: Region | None) -> Tables:
-    """All that ``step`` reads of a model and its environment."""
+    """Tables of a model and its environment, for ``step``."""
     definition, tables = predictor.definition, TablesBuilder()
     place = tables.reserve()
     head = dict.fromkeys(range(ENTRIES), float(NONE))
@@ -97,7 +97,7 @@ def tables_of(predictor: Predictor, ending: Region | None) -> Tables:
 
 
 def _add_outputs(tables: TablesBuilder, predictor: Predictor) -> tuple[int, int]:
-    """Put columns of outputs, and processes by stage; gives their places."""
+    """Add columns of outputs, and processes by stage. Returns their places."""
     rows, processes = np.zeros((predictor._reward_column + 1, 3)), []
     begins = {one.column: one.span.start for group in predictor._groups if group for one in group.drawn}
     places = (*predictor._columns, predictor._reward_column)
@@ -120,10 +120,10 @@ def _add_outputs(tables: TablesBuilder, predictor: Predictor) -> tuple[int, int]
 def _encode_stage(
     numbers: Floats, places: Ints, head: Floats, stage: int, raw: Floats, arrived: Floats, mean: Floats, x: Floats
 ) -> None:
-    """Put the features that a stage reads beyond those of the stage before into x (d, B).
+    """Write the features that a stage reads, and no earlier stage has written, to x (d, B).
 
-    The first reads coordinates and actions of raw (C + F + L, B), the second the lead too, which is put behind them,
-    the third where the step arrived (C, B), which takes the place of the coordinates.
+    The first stage reads coordinates and actions of raw (C + F + L, B). The second also reads the lead, which is put
+    behind them. The third reads the next state (C, B), which replaces the coordinates.
     """
     size, lanes, observe = len(arrived), raw.shape[1], int(head[0, OBSERVE])
     width, begin, end = int(head[0, WIDTH]), 0, int(head[0, WIDTH])
@@ -182,7 +182,7 @@ def _predict_stage(
 
 @inlined
 def _arrive(numbers: Floats, places: Ints, head: Floats, raw: Floats, mean: Floats, arrived: Floats) -> None:
-    """Next coordinates (C, B) of those in raw, that change by mean (columns, B)."""
+    """Next coordinates (C, B) of those in raw, after a change by mean (columns, B)."""
     size, lanes = arrived.shape
     for c in range(size):
         for b in range(lanes):
@@ -202,7 +202,7 @@ def _arrive(numbers: Floats, places: Ints, head: Floats, raw: Floats, mean: Floa
 
 @inlined
 def _unwarp(warp: Floats, mean: Floats, spread: Floats) -> None:
-    """Turn means and deviations (B,) of a warped reward's targets into those of the reward, as ``Warp`` does."""
+    """Convert means and deviations (B,) of a warped reward's targets to those of the reward, as ``Warp`` does."""
     for b in range(len(mean)):
         y, s = mean[b], spread[b]
         spread[b] = 0.5 * (math.exp(min(y + s, LARGEST)) - math.exp(min(y - s, LARGEST)))
@@ -211,7 +211,7 @@ def _unwarp(warp: Floats, mean: Floats, spread: Floats) -> None:
 
 @inlined
 def _ended(numbers: Floats, places: Ints, head: Floats, arrived: Floats) -> Bools:
-    """Whether episodes end at coordinates (C, B) as declared, (B,)."""
+    """Whether the declared termination holds at coordinates (C, B), (B,)."""
     over = np.zeros(arrived.shape[1], dtype=np.bool_)
     if head[0, CONDITIONS] != NONE:
         holds = holding(numbers, places, int(head[0, CONDITIONS]), arrived)
@@ -251,11 +251,11 @@ def step(
     deviation: Floats,
     terminated: Bools,
 ) -> None:
-    """Steps from q (N, C) under u (N, F).
+    """Compute steps from q (N, C) under u (N, F).
 
-    Where these have rows, ``noise`` (N, M) moves the outputs by latent deviations, ``process`` (N, M) moves them by
-    deviations of the learned noise, and they follow the functions ``paths`` (N, W). Results go into ``q_next`` (N, C),
-    ``reward`` (N,), ``deviation`` (N, O), as far as it is asked for, and ``terminated`` (N,).
+    If they have rows, ``noise`` (N, M) moves the outputs by latent deviations, ``process`` (N, M) moves them by
+    deviations of the learned noise, and the outputs follow the functions ``paths`` (N, W). Results are written to
+    ``q_next`` (N, C), ``reward`` (N,), ``deviation`` (N, O) as far as requested, and ``terminated`` (N,).
     """
     head, size, actions = matrix(numbers, places, HEAD), q.shape[1], u.shape[1]
     columns, leads = len(matrix(numbers, places, int(head[0, OUTPUTS]))), int(head[0, LEADS])
@@ -303,11 +303,11 @@ class StepsOfModel(ArraySteps):
     definition: EnvironmentDefinition
     tables: Tables
     outputs: int
-    has_regions: bool  # where episodes end or the reward jumps, learned
+    has_regions: bool  # whether an ending or a jump of the reward is learned
 
     @classmethod
     def of(cls, predictor: Predictor, ending: Region | None) -> Self:
-        """``ending`` is where episodes end, if that is learned."""
+        """Compile a model. ``ending`` is the region in which episodes end, if that is learned."""
         regions = ending is not None or bool(predictor.jumps)
         return cls(predictor.definition, tables_of(predictor, ending), len(predictor.transitions) + 1, regions)
 
