@@ -1,4 +1,4 @@
-"""The part of the storage port that keeps jobs: records, and laws that every adapter is tested by.
+"""The part of the storage port that keeps jobs: records, and laws that are tested for every adapter.
 
 A job asks a trainer worker to train or to evaluate a policy. It is queued, running, done, failed or cancelled. A worker
 runs it under a lease, as a sampler answers a query: the lease ends by the database's clock, and each report renews it.
@@ -18,7 +18,7 @@ JobEnd = Literal["done", "failed", "cancelled"]
 
 MAX_JOBS = 100  # of a surrogate that have ended; older ones are removed
 MAX_OPEN = 20  # of a surrogate that are queued or running
-MAX_RUNS = 3  # of a training whose workers fall silent; an evaluation has one, as it may move a machine
+MAX_RUNS = 3  # of a training whose workers fall silent; an evaluation has one run, because it may move a machine
 SILENT = "its worker fell silent, and its lease ended"
 
 

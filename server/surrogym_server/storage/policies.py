@@ -1,8 +1,8 @@
-"""The part of the storage port that keeps policies: records, and laws that every adapter is tested by.
+"""The part of the storage port that keeps policies: records, and laws that are tested for every adapter.
 
-A policy of a surrogate has a version: 1, 2, ... What describes it is in the database, its files are blobs. A blob is
-put before the row that names it, and removed after that row, so that a row never leads to what was never there; what a
-crash leaves without a row is swept.
+A policy of a surrogate has a version: 1, 2, ... Its description is in the database, and its files are blobs. A blob is
+stored before the row that names it, and removed after that row, so that no row names a missing blob. Blobs without a
+row, which a crash can leave, are swept.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ LATEST = "latest"
 
 @dataclass(frozen=True)
 class PolicyFile:
-    """A file of a policy. ``blob`` is None where it was announced and has not come, or was removed to make room."""
+    """A file of a policy. ``blob`` is None if the file was announced but not sent, or was removed to make room."""
 
     form: str
     bytes: int
     digest: str
     blob: str | None = None
-    main: bool = False  # the one that the version came with
+    main: bool = False  # the file with which the version was created
 
 
 @dataclass(frozen=True)
@@ -58,52 +58,52 @@ class PolicyRecord:
     evaluations: tuple[EvaluationRecord, ...] = ()
 
 
-Freed = tuple[str, ...]  # names of blobs that no row leads to any more
+Freed = tuple[str, ...]  # names of blobs that no row refers to any more
 
 
 class Policies(ABC):
     """Policies by version. ``which`` is a version, an alias, or ``latest``.
 
-    An operation on a policy that is not there raises ``UnknownPolicy``.
+    An operation on a policy that does not exist raises ``UnknownPolicy``.
     """
 
     @abstractmethod
     def add(self, name: str, card: JSON, curve: list[JSON], file: PolicyFile) -> tuple[int, bool, Freed]:
-        """Store a policy whose ``file`` is to come; says its version and whether that is new.
+        """Store a policy before its ``file`` is sent. Returns its version, and whether that is new.
 
-        A main file of the same digest is the same policy: it keeps its version, and gets this card and curve. Beyond
-        ``MAX_POLICIES`` the oldest without an alias goes.
+        A main file with the same digest is the same policy: it keeps its version, and gets this card and curve. Beyond
+        ``MAX_POLICIES`` the oldest policy without an alias is removed.
 
         Raises:
-            TooLarge: there are as many, and all have aliases.
+            TooLarge: there are ``MAX_POLICIES``, and all have aliases.
         """
 
     @abstractmethod
     def list(self, name: str) -> list[PolicyRecord]:
-        """All of them, newest first, without their curves."""
+        """Return all policies, newest first, without their curves."""
 
     @abstractmethod
     def get(self, name: str, which: str) -> PolicyRecord: ...
 
     @abstractmethod
     def attach(self, name: str, version: int, file: PolicyFile, most: int) -> Freed:
-        """Store a file of a policy; one of the same form is replaced.
+        """Store a file of a policy. It replaces a file of the same form.
 
-        Where the files of the surrogate's policies then have more than ``most`` bytes together, those of the oldest
-        without an alias are given up first. What describes them stays.
+        If the files of the surrogate's policies then exceed ``most`` bytes together, files of the oldest policies
+        without an alias are removed first. Their descriptions stay.
 
         Raises:
-            TooLarge: the files of policies with aliases and of this one have more.
+            TooLarge: the files of policies with aliases and of this one exceed the limit.
         """
 
     @abstractmethod
     def evaluate(self, name: str, version: int, new: NewEvaluation, most: int) -> tuple[EvaluationRecord, bool, Freed]:
-        """Store an evaluation, once per key; says whether it is new. Beyond ``MAX_EVALUATIONS`` the oldest of the
-        policy goes. ``most`` is as of ``attach``."""
+        """Store an evaluation, once for each key. Returns whether it is new. Beyond ``MAX_EVALUATIONS`` the policy's
+        oldest evaluation is removed. ``most`` is that of ``attach``."""
 
     @abstractmethod
     def put_alias(self, name: str, alias: str, version: int) -> None:
-        """Let an alias lead to this version, and to no other any more."""
+        """Let the alias point to this version, and no longer to another one."""
 
     @abstractmethod
     def drop_alias(self, name: str, alias: str) -> None: ...
@@ -114,7 +114,7 @@ class Policies(ABC):
 
     @abstractmethod
     def blobs(self) -> set[str]:
-        """Names of all blobs that a row leads to, of all surrogates."""
+        """Return the names of all blobs that a row refers to, of all surrogates."""
 
 
 class Blobs(ABC):
@@ -122,7 +122,7 @@ class Blobs(ABC):
 
     @abstractmethod
     def put(self, content: bytes) -> str:
-        """Store them; durable when it returns. Gives their name.
+        """Store bytes durably, and return their name.
 
         Raises:
             Unavailable: they can't be stored now.
@@ -130,12 +130,12 @@ class Blobs(ABC):
 
     @abstractmethod
     def get(self, name: str) -> bytes:
-        """Raises ``Damaged`` where they are not there or can't be read."""
+        """Return the bytes. Raises ``Damaged`` if they are missing or can't be read."""
 
     @abstractmethod
     def remove(self, names: Freed) -> None:
-        """Remove them; those that are not there are no error."""
+        """Remove blobs. Missing ones are ignored."""
 
     @abstractmethod
     def older(self, seconds: float) -> set[str]:
-        """Names of those that were put more than so many seconds ago."""
+        """Return the names of the blobs that are older than a number of seconds."""

@@ -1,7 +1,7 @@
-"""What storage gives and takes: frozen records, free of any database and of the wire.
+"""Records of storage: frozen, and independent of any database and of the wire.
 
-Shapes: C coordinates, F action entries, D observation entries. Times are seconds since 1970, on the
-database's clock. ``JSON`` is what ``json.dumps`` takes and gives back unchanged.
+Shapes: C coordinates, F action entries, D observation entries. Times are seconds since 1970, on the database's clock.
+``JSON`` is a value that ``json.dumps`` and ``json.loads`` return unchanged.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ Vector = tuple[float, ...]
 Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "from_log", "failed"]
 Purpose = Literal["initial", "adaptive", "manual", "audit"]  # of queries
 SamplePurpose = Literal["initial", "adaptive", "manual", "audit", "logged"]
-FREE = ("audit", "logged")  # purposes of samples that cost none of the budget
+FREE = ("audit", "logged")  # purposes of samples that don't count towards the budget
 QueryStatus = Literal["pending", "leased", "answered", "set_aside"]
 QueryKind = Literal["step", "rollout"]
-Synchronous = Literal["full", "normal"]  # of a SQLite file: wait for the disk at every commit, or not always
+Synchronous = Literal["full", "normal"]  # of a SQLite file: whether every commit waits for the disk
 EventKind = Literal["created", "queries", "sample", "fit", "phase", "set_aside", "ledger", "damaged", "policy", "job"]
 
 OPEN_STATUSES: tuple[QueryStatus, ...] = ("pending", "leased")
@@ -63,27 +63,27 @@ class SurrogateRecord:
     round: int  # designs committed so far
     state: JSON  # of the design
     error: str | None
-    extra_queries: int  # asked for by ``Designs.ask`` and not yet chosen
-    checkpoint: str | None  # the occupancy the last ask named
+    extra_queries: int  # requested by ``Designs.improve`` and not yet chosen
+    checkpoint: str | None  # the occupancy that the last such request named
     created_at: float
 
 
 @dataclass(frozen=True)
 class Granted:
-    """What ``Designs.ask`` led to."""
+    """Result of ``Designs.improve``."""
 
-    record: SurrogateRecord  # as it is now
-    raised: int  # real steps that the budget was raised by
+    record: SurrogateRecord  # the present record
+    raised: int  # real steps by which the budget was raised
 
 
 @dataclass(frozen=True)
 class FitLease:
-    """The right to fit one surrogate, until it expires. Given back whole to renew, commit or abort."""
+    """The right to fit one surrogate, until it expires. It is passed to renew, commit or abort."""
 
     surrogate: str
     token: str
-    revision: int  # what the surrogate had seen when the fit began
-    extra_queries: int  # to be chosen by this fit whatever its verdict
+    revision: int  # revision of the surrogate when the fit began
+    extra_queries: int  # to be chosen by this fit even if the design has ended
     checkpoint: str | None
     expires: float
 
@@ -118,7 +118,7 @@ class ModelRecord:
 
 @dataclass(frozen=True)
 class NewDesign:
-    """What one fit gives: a model, the design's new state and phase, and the next queries."""
+    """Result of one fit: a model, the design's new state and phase, and the next queries."""
 
     model: NewModel
     state: JSON
@@ -126,7 +126,7 @@ class NewDesign:
     query_coordinates: Array = field(default_factory=no_rows)  # (m, C)
     query_action: Array = field(default_factory=no_rows)  # (m, F)
     query_rollouts: tuple[Array, ...] = ()  # action sequences from a reset, each (T, F)
-    extra: bool = False  # the queries are those of ``Designs.ask``, which the design itself would not have chosen
+    extra: bool = False  # the queries come from ``Designs.improve``, and the design itself would not have chosen them
 
 
 # Queries and samples
@@ -134,12 +134,12 @@ class NewDesign:
 
 @dataclass(frozen=True)
 class Asked:
-    """What a query asks for: one real step from given coordinates, or an action sequence from a reset."""
+    """Content of a query: one real step from given coordinates, or an action sequence from a reset."""
 
     kind: QueryKind
     coordinates: Vector  # (C,) of a step; () of a rollout
     action: Vector  # (F,) of a step; (T * F,) of a rollout, action after action
-    steps: int  # T: real steps it may take; 1 of a step
+    steps: int  # T: largest number of its real steps; 1 for a step
 
     @property
     def actions(self) -> Array:
@@ -153,16 +153,16 @@ class QueryRecord(Asked):
     purpose: Purpose
     status: QueryStatus
     round: int
-    attempts: int  # leases given out so far
+    attempts: int  # number of leases so far
     sampler: str | None  # the last one to claim it
     error: str | None  # of the last attempt that failed
-    lease_seconds_left: float | None = None  # of the lease that is open, by the database's clock; below 0 it ran out
+    lease_seconds_left: float | None = None  # of the open lease, by the database's clock; negative if it has expired
 
 
 @dataclass(frozen=True)
 class LeasedQuery(Asked):
     id: int
-    number: int  # of the surrogate's queries before it
+    number: int  # number of the surrogate's earlier queries
     purpose: Purpose
     attempt: int  # 1 for the first lease of this query
     token: str
@@ -183,7 +183,7 @@ class QueryCounts:
 
 @dataclass(frozen=True)
 class NewSample:
-    """One real step as reported. ``query_id`` and ``lease_token`` come together or not at all."""
+    """One real step of a report. ``query_id`` and ``lease_token`` are both present or both absent."""
 
     coordinates: Vector  # (C,)
     action: Vector  # (F,)
@@ -200,7 +200,7 @@ class NewSample:
 
 @dataclass(frozen=True)
 class AddedSamples:
-    """``ids`` are in the order of the batch; ``duplicates`` of them were already there."""
+    """``ids`` are in the order of the batch; ``duplicates`` of them existed already."""
 
     ids: tuple[int, ...]
     duplicates: int
@@ -245,8 +245,11 @@ class SampleArrays:
 
 @dataclass(frozen=True)
 class LedgerRecord:
-    """Acknowledged real steps by purpose. ``unresolved`` counts the steps that leases which ended without an answer may
-    have taken; ``failed`` of them were under leases that a sampler gave back with an error, the rest expired."""
+    """Acknowledged real steps by purpose.
+
+    ``unresolved`` counts the steps that may have been taken under leases that ended without an answer. Of these,
+    ``failed`` were under leases that a sampler returned with an error; the others expired.
+    """
 
     initial: int = 0
     adaptive: int = 0
@@ -259,18 +262,18 @@ class LedgerRecord:
 
     @property
     def total(self) -> int:
-        """What the design cost."""
+        """Cost of the design."""
         return self.initial + self.adaptive + self.manual
 
     @property
     def samples(self) -> int:
-        """What the model learns from."""
+        """Number of samples that the model learns from."""
         return self.total + self.audit + self.logged
 
 
 @dataclass(frozen=True)
 class SurrogateSummary:
-    """What a list shows of a surrogate."""
+    """Entry of a list of surrogates."""
 
     id: int
     name: str
@@ -311,5 +314,5 @@ class EventRecord:
 
 
 def fingerprint(*parts: object) -> str:
-    """Equal for equal bodies: what an idempotency key is compared by."""
+    """A hash that is equal for equal bodies, to compare requests with the same idempotency key."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""The SQL adapters of the storage port: SQLite and PostgreSQL, by one set of statements."""
+"""The SQL adapters of the storage port for SQLite and PostgreSQL, which share their statements."""
 
 from surrogym_server.storage.sql.storage import SqlStorage, open_storage
 

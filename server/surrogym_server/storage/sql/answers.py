@@ -1,6 +1,6 @@
-"""Which lease a reported sample answers, and what becomes of its query.
+"""Assignment of reported samples to leases, and the effect on their queries.
 
-Under one lease there is one answer: one sample, or the first samples of a rollout. It comes whole in one batch.
+A lease has one answer: one sample, or the first samples of a rollout. It comes whole, in one batch.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from surrogym_server.storage.sql.tables import leases, queries, samples
 
 
 class Reported(NamedTuple):
-    """A sample that is stored already."""
+    """A sample that was stored before."""
 
     sample_id: int
     fingerprint: str
@@ -33,15 +33,15 @@ class Answered:
     lease_id: int
     query_id: int
     purpose: Purpose
-    steps: int  # that the query asked for
+    steps: int  # number that the query may take
     attempt: int
     live: bool
     contested: bool  # another lease of the query is live
-    reported: dict[int, Reported]  # by step: what was reported under it before
+    reported: dict[int, Reported]  # samples reported under it before, by step
 
 
 def read_answered(connection: Connection, held: Row[Any], batch: Sequence[NewSample]) -> list[Answered | None]:
-    """For each sample the lease it was reported under, or None; locks their queries.
+    """Find the lease under which each sample was reported, or None. Locks their queries.
 
     Raises:
         UnknownQuery, ForeignLease, InvalidInput, IdempotencyConflict: as ``Samples.add`` says.
@@ -60,7 +60,7 @@ def read_answered(connection: Connection, held: Row[Any], batch: Sequence[NewSam
 
 
 def settle(connection: Connection, answered: Iterable[Answered]) -> None:
-    """Note the leases as answered, and the queries that no live lease of another keeps."""
+    """Mark the leases as answered, and their queries too unless another lease of the query is live."""
     leases_done = {one.lease_id: one for one in answered}
     if not leases_done:
         return
@@ -72,7 +72,7 @@ def settle(connection: Connection, answered: Iterable[Answered]) -> None:
 
 
 def _check_steps(lease: Answered, steps: set[int]) -> None:
-    """Refuse an answer with a gap, one that is too long, and one that grows after it was given."""
+    """Refuse an answer with a gap, one that is too long, or one that grows after it was given."""
     if lease.reported:
         if more := steps - lease.reported.keys():
             raise IdempotencyConflict(
@@ -123,7 +123,7 @@ def _leases(connection: Connection, held: Row[Any], asked: dict[int, Row[Any]]) 
 
 
 def _reported(connection: Connection, lease_ids: Sequence[int]) -> dict[int, dict[int, Reported]]:
-    """What is stored under each of these leases."""
+    """The samples stored under each of these leases."""
     columns = (samples.c.lease_id, samples.c.step, samples.c.id, samples.c.fingerprint)
     reported: dict[int, dict[int, Reported]] = defaultdict(dict)
     for lease_id, step, *stored in connection.execute(sa.select(*columns).where(samples.c.lease_id.in_(lease_ids))):

@@ -1,7 +1,7 @@
 """Blobs as files of a folder, and as rows of a table.
 
-A SQLite file has one server and lies on a disk, so its blobs are files in a folder beside it. Several servers may share
-a PostgreSQL database and no disk, so there they are rows, in a table that a backup may leave out.
+A SQLite database has one server and lies on a disk, so its blobs are files in a folder beside it. Several servers may
+share a PostgreSQL database but no disk, so there the blobs are rows, in a table that a backup may leave out.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ PART = ".part"  # of a file that is being written
 
 
 class FolderBlobs(port.Blobs):
-    """Files in a folder, which is made with the first of them; only their owner may read them."""
+    """Files in a folder, which is created with the first file. Only their owner may read them."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

@@ -1,4 +1,4 @@
-"""What is looked at when a database is opened: that its pages hang together, and that the tables are there."""
+"""Checks of a database when it is opened: of its pages and its tables."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from surrogym_server.storage.sql.tables import metadata
 
 logger = logging.getLogger(__name__)
 
-CHECK_SECONDS = 10.0  # some 25 GB that lie in memory
-INDEXES_BYTES = 128 * 2**20  # of a file whose indexes are compared with their tables: 100 MB take 1.5 s, not 0.4 s
+CHECK_SECONDS = 10.0  # enough for about 25 GB that are cached in memory
+INDEXES_BYTES = 128 * 2**20  # largest file whose indexes are checked too; for 100 MB this takes 1.5 s instead of 0.4 s
 
 
 def check_pages(connection: Connection, seconds: float = CHECK_SECONDS) -> None:
-    """Read a SQLite file once and check its structure, for at most ``seconds``, and the indexes of one that has no more
-    than ``INDEXES_BYTES``; PostgreSQL looks after its own.
+    """Read a SQLite file once and check its structure, for at most ``seconds``. The indexes are checked too if the file
+    has at most ``INDEXES_BYTES``. PostgreSQL checks its own files.
 
     Raises:
-        Damaged: says where.
+        Damaged: names the place.
     """
     if connection.dialect.name != "sqlite":
         return
@@ -43,8 +43,8 @@ def check_pages(connection: Connection, seconds: float = CHECK_SECONDS) -> None:
             raise
     finally:
         timer.cancel()
-        timer.join()  # or it might interrupt a later statement
-    if expired.is_set():  # what an interrupted check finds is not reliable
+        timer.join()  # otherwise it might interrupt a later statement
+    if expired.is_set():  # an interrupted check gives no reliable result
         logger.warning("the database is large: its check stopped after %g s, and the rest was not checked", seconds)
     elif found != "ok":
         raise damaged(" ".join(found.split()))
@@ -56,7 +56,7 @@ def _check(connection: Connection) -> str:
 
 
 def check_tables(connection: Connection) -> None:
-    """Check that every table with every column is there; costs no look at a row.
+    """Check that every table and column exists, without reading rows.
 
     Raises:
         Damaged: names what is missing.

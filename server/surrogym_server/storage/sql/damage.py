@@ -1,4 +1,4 @@
-"""Damage of a database: which errors of the drivers mean it, and how it is put."""
+"""Damage of a database: the errors of drivers that indicate it, and the message."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from surrogym_server.errors import Damaged
 SQLITE_CODES = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 SQLSTATES = ("XX001", "XX002", "42P01", "42703")  # data and index corrupted, undefined table and column
 OTHER_SCHEMA = re.compile(r"no such (table|column)|has no column|already exists")  # SQLite has no code for these
-UNDECODABLE = "Could not decode to UTF-8"  # nor Python's driver for this
+UNDECODABLE = "Could not decode to UTF-8"  # and Python's driver has none for this
 
 
 def damaged(reason: object) -> Damaged:
-    """The error for something stored that can't be what this program wrote."""
+    """The error for stored data that this program can't have written."""
     return Damaged(f"the database is damaged: {reason}")
 
 
 def means_damage(error: sa.exc.DBAPIError) -> bool:
-    """Whether an error of the driver says that what is stored can't be read, or has other tables."""
+    """Whether an error of the driver means that stored data can't be read, or that the tables differ."""
     if getattr(error.orig, "sqlstate", None) in SQLSTATES:
         return True
     said = str(error.orig)
@@ -29,5 +29,6 @@ def means_damage(error: sa.exc.DBAPIError) -> bool:
 
 
 def are_broken_pages(error: sa.exc.DBAPIError) -> bool:
-    """Whether an error of the driver says that a file's structure is broken, which nothing mends while it is open."""
+    """Whether an error of the driver means that a file's structure is broken, which can't be repaired while
+    it is open."""
     return getattr(error.orig, "sqlite_errorcode", 0) & 0xFF in SQLITE_CODES

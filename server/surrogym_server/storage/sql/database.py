@@ -1,7 +1,7 @@
-"""Connections, transactions and the clock: the only file that tells the databases apart.
+"""Connections, transactions and the clock: the only file that distinguishes between the databases.
 
-Writers of one surrogate take turns: on SQLite because ``BEGIN IMMEDIATE`` lets in one writer, on PostgreSQL
-because a write locks the surrogate's row first. Claims, which skip what is locked, and renewals lock less.
+Writers of one surrogate take turns. On SQLite ``BEGIN IMMEDIATE`` admits one writer; on PostgreSQL a write locks the
+surrogate's row first. Claims, which skip locked rows, and renewals lock less.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from surrogym_server.storage.sql.damage import are_broken_pages, damaged, means_
 from surrogym_server.storage.sql.filelock import FileLock
 from surrogym_server.storage.sql.write_ahead_log import marks
 
-BUSY_SECONDS = 5  # how long a statement waits for what another program or thread keeps
+BUSY_SECONDS = 5  # wait of a statement for locks of other programs or threads
 POOL = {"pool_size": 8, "max_overflow": 56, "pool_timeout": BUSY_SECONDS}
-POSTGRESQL = {  # text is UTF-8 whatever the database's encoding: psycopg gives bytes where that is SQL_ASCII
+POSTGRESQL = {  # text is UTF-8 whatever the database's encoding; if that is SQL_ASCII, psycopg would return bytes
     "client_encoding": "utf8",
     "connect_timeout": BUSY_SECONDS,
     "options": f"-c lock_timeout={BUSY_SECONDS}s",
@@ -39,10 +39,10 @@ CLOCKS: dict[str, sa.ColumnElement[float]] = {
 
 
 class Database:
-    """Hands out connections inside a transaction, and translates the driver's errors."""
+    """Provides connections inside a transaction, and translates the driver's errors."""
 
     def __init__(self, engine: Engine, lock: FileLock | None = None, *, way_out: str) -> None:
-        """``way_out`` says what to do when it is damaged."""
+        """``way_out`` is the advice in the error if the database is damaged."""
         self.way_out = way_out
         self._engine = engine
         self._lock = lock
@@ -53,11 +53,11 @@ class Database:
         self._broken: str | None = None
 
     def hold_open(self) -> None:
-        """Keep one connection to a SQLite file until ``close``, and watch the file and those that SQLite keeps beside.
+        """Keep one connection to a SQLite file until ``close``, and watch the file and SQLite's files beside it.
 
-        SQLite deletes its write-ahead log with the last connection. While this one is open, a log that is missing or
-        another one was changed by somebody else. What the log holds is merged first, so that no copy that was made
-        while no server ran begins as the file does from now on.
+        SQLite deletes its write-ahead log with the last connection. While this one is open, a missing or different log
+        shows that another program changed it. The content of the log is merged first, so that a copy made while no
+        server ran differs from the file in its beginning.
         """
         if self._lock is None:
             return
@@ -85,17 +85,18 @@ class Database:
                 yield connection
 
     def require_sound(self) -> None:
-        """Raise ``Damaged`` once pages of the file were found broken; other damage may be mended under the server."""
+        """Raise ``Damaged`` once broken pages of the file were found. Other damage may be repaired while the server
+        runs."""
         if self._broken is not None:
             raise Damaged(f"{self._broken}; {self.way_out}")
 
     def _require_own(self) -> None:
-        """Check that what this server wrote is what it will read; see ``FileLock``."""
+        """Check that the files are those which this server wrote; see ``FileLock``."""
         if self._lock is None:
             return
         self._lock.require_in_place()
         if not self._lock.is_as_noted():
-            with self._take_turn():  # whoever merged the log has ended then
+            with self._take_turn():  # a program that merged the log has ended by then
                 self._lock.require_own_content()
 
     def _mark_log(self, connection: Connection) -> None:
@@ -151,7 +152,7 @@ class Database:
             yield
         except UNSTORABLE as error:
             raise InvalidInput(f"expected a value the database can store: {_reason(error)}") from error
-        except UnicodeDecodeError as error:  # SQLite's message names something broken, and the driver can't read it
+        except UnicodeDecodeError as error:  # SQLite's message contains a damaged name, which the driver can't decode
             raise self._damaged(error.object.decode(errors="replace"), pages=True) from error
         except sa.exc.TimeoutError as error:
             raise Unavailable(f"the database can't be used now: {error}") from error
@@ -175,12 +176,12 @@ def clock(connection: Connection) -> sa.ColumnElement[float]:
 
 
 def conflict_insert(connection: Connection, table: sa.Table) -> sqlite.Insert | postgresql.Insert:
-    """An INSERT that knows ON CONFLICT."""
+    """An INSERT that supports ON CONFLICT."""
     return sqlite.insert(table) if connection.dialect.name == "sqlite" else postgresql.insert(table)
 
 
 def connect(url: str, synchronous: Synchronous = "full") -> Database:
-    """Make the database of ``sqlite:///path/to/file`` or ``postgresql://user@host/name``.
+    """Open the database of ``sqlite:///path/to/file`` or ``postgresql://user@host/name``.
 
     Args:
         url: its address.
@@ -236,12 +237,12 @@ def _postgresql(url: URL) -> Database:
     return Database(engine, way_out="restore a copy")
 
 
-# exactly these: IntegrityError and ProgrammingError derive from DatabaseError, and are our own bugs
+# exactly these: IntegrityError and ProgrammingError also derive from DatabaseError, and are bugs of this program
 UNUSABLE = (sa.exc.OperationalError, sa.exc.InternalError, sa.exc.InterfaceError, sa.exc.DatabaseError)
 UNSTORABLE = (sa.exc.DataError, OverflowError, UnicodeEncodeError)
 
 
 def _reason(error: Exception) -> str:
-    """What the driver says, without the place in a statement that nobody typed."""
+    """The driver's message, without the position in a statement that no person typed."""
     said = str(getattr(error, "orig", None) or error)
     return said.partition("\n")[0]

@@ -1,4 +1,4 @@
-"""The right to fit, and what a fit gives."""
+"""The right to fit, and the storage of a fit's result."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ class SqlDesigns(port.Designs):
 def _is_due(connection: Connection) -> sa.ColumnElement[bool]:
     """The law of ``Designs.due`` as a condition on a row of surrogates."""
     now, expires = clock(connection), surrogates.c.fit_expires
-    set_back = expires > now + surrogates.c.fit_seconds  # the clock: nobody knows how old the right is
+    set_back = expires > now + surrogates.c.fit_seconds  # of the clock, so the age of the right is unknown
     free = expires.is_(None) | (expires <= now) | set_back
     return sa.and_(
         surrogates.c.paused.is_(False),
@@ -135,12 +135,12 @@ def _lasting(expires: float, seconds: float) -> dict[str, float]:
 
 
 def _unspoken(connection: Connection, record: SurrogateRecord) -> int:
-    """What is left of the budget; less than nothing where it was lowered, or more was handed in by hand."""
+    """Real steps left of the budget; negative if the budget was lowered, or if people handed in more."""
     return record.budget - stored.spoken_for(connection, record.id) - record.extra_queries
 
 
 def _to_raise(connection: Connection, record: SurrogateRecord, queries: int, *, allowed: bool) -> int:
-    """By how much the budget has to be raised for so many further queries. Raises ``BeyondBudget``."""
+    """Increase of the budget that a number of further queries needs. Raises ``BeyondBudget``."""
     unspoken = _unspoken(connection, record)
     missing = max(0, queries - unspoken)
     if missing and not allowed:

@@ -1,4 +1,4 @@
-"""How a lease ends: by the database's clock alone. Shared by all tables whose rows have ``expires`` and ``seconds``."""
+"""End of a lease, by the database's clock alone. Shared by all tables whose rows have ``expires`` and ``seconds``."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ Held = sa.ColumnElement[bool]  # whether a row of the table is leased
 
 
 def has_ended(connection: Connection, table: sa.Table, held: Held) -> sa.ColumnElement[bool]:
-    """Whether the time of a lease has come."""
+    """Whether a lease has expired."""
     return held & (table.c.expires <= clock(connection))
 
 
 def is_too_long(connection: Connection, table: sa.Table, held: Held) -> sa.ColumnElement[bool]:
-    """Whether a lease has more time left than it was given, as the clock was set back since."""
+    """Whether a lease has more time left than it was given, because the clock was set back since."""
     return held & (table.c.expires > clock(connection) + table.c.seconds)
 
 
 def shorten(connection: Connection, table: sa.Table, held: Held) -> None:
-    """Give the leases that are too long the time that they were given, from now: who lives keeps its own."""
+    """Limit the time left of leases that are too long to the time that they were given, so that a live caller keeps its
+    own."""
     too_long = sa.update(table).where(is_too_long(connection, table, held))
     connection.execute(too_long.values(expires=clock(connection) + table.c.seconds))

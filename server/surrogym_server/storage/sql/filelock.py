@@ -1,4 +1,4 @@
-"""One server per SQLite file: a lock on the file itself, which ends with whoever holds it, however they end."""
+"""One server for each SQLite file: a lock on the file itself, which ends with its process, however that ends."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from surrogym_server.storage.sql import write_ahead_log
 
 LOCKED_BYTE = 2**62  # beyond any database, and far from the bytes at 2**30 that SQLite locks
 WHOLE_DESCRIPTION = getattr(fcntl, "F_OFD_SETLK", None)  # Linux
-SQLITE_SHARED = (2**30 + 2, 510)  # the bytes that SQLite's readers lock together, and who merges the log alone
+SQLITE_SHARED = (2**30 + 2, 510)  # bytes that SQLite's readers share a lock on; who merges the log locks them alone
 BUSY = (BlockingIOError, PermissionError)  # EAGAIN, EACCES
 
-BESIDE = ("-wal", "-shm")  # what SQLite puts behind the name of a database: its write-ahead log, and the log's index
+BESIDE = ("-wal", "-shm")  # suffixes of SQLite's files beside a database: its write-ahead log, and the log's index
 
 Identity = tuple[int, int]  # device and inode
 
@@ -26,7 +26,7 @@ _turn = threading.Lock()
 
 
 class FileLock:
-    """Held from construction to ``close`` or the end of the process; never inherited by a child process.
+    """A lock held from construction to ``close`` or the end of the process; child processes never inherit it.
 
     It belongs to the file, under whatever name the file is opened. A file that does not exist is created, empty.
     Close it after SQLite's connections: closing any descriptor of a file drops the locks that SQLite has on it.
@@ -38,7 +38,7 @@ class FileLock:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        resolved = path.resolve()  # SQLite keeps its files where a symbolic link leads
+        resolved = path.resolve()  # SQLite keeps its files beside the target of a symbolic link
         self._log, self._index = (resolved.with_name(resolved.name + suffix) for suffix in BESIDE)
         self._beside: dict[Path, Identity | None] = {}
         self._noted: bytes | None = None
@@ -46,7 +46,7 @@ class FileLock:
         with _turn:
             if not path.exists():
                 self._require_own_log(b"")
-            if _identity(path) in _held:  # and don't open it, for the reason above
+            if _identity(path) in _held:  # and don't open it, for the reason in the docstring of the class
                 raise _taken(path)
             self._descriptors = [_lock_byte(path)] if WHOLE_DESCRIPTION else [_lock_beside(path), _open(path)]
             self._index_descriptor: int | None = None
@@ -61,22 +61,22 @@ class FileLock:
             raise
 
     def header(self) -> bytes:
-        """The first bytes of the file as it lies on the disk, without what only its log has."""
+        """The first bytes of the file on the disk, without data that are only in its log."""
         return os.pread(self._descriptors[-1], write_ahead_log.HEADER_BYTES, 0)
 
     def log_is_merged(self) -> bool:
-        """Whether the next transaction may begin a new log; to be asked by whoever has the right to write."""
+        """Whether the next transaction may begin a new log. Only a caller with the right to write may ask."""
         if self._index_descriptor is None:
             self._index_descriptor = os.open(self._index, os.O_RDONLY | os.O_CLOEXEC)  # SQLite has made it by now
         return write_ahead_log.is_merged(os.pread(self._index_descriptor, write_ahead_log.INDEX_BYTES, 0))
 
     def watch(self) -> None:
-        """Note what the file begins with from now on, and which write-ahead log and index belong to it."""
+        """Note the present beginning of the file, and its write-ahead log and index."""
         self._beside = {path: _identity(path) for path in (self._log, self._index)}
         self._noted = self.header()
 
     def require_in_place(self) -> None:
-        """Check that the path still leads to the locked file, with the files beside it that were noted.
+        """Check that the path still points to the locked file, with the noted files beside it.
 
         Raises:
             Unavailable: one of them was moved, replaced or deleted, or the file was found overwritten.
@@ -92,15 +92,16 @@ class FileLock:
                 )
 
     def is_as_noted(self) -> bool:
-        """Whether the file begins as it was noted: nobody wrote to it, and no log was merged into it."""
+        """Whether the file still has its noted beginning: nobody wrote to it, and no log was merged into it."""
         return self._noted is None or self.header() == self._noted
 
     def require_own_content(self) -> None:
-        """Find out whether a file that doesn't begin as it was noted has got its beginning from its log, and note it.
+        """Find out whether a changed beginning of the file comes from its own log, and note it if so.
+
         The caller keeps others from writing.
 
         Raises:
-            Unavailable: something else was written over it. Nothing is merged into it from then on.
+            Unavailable: another program has overwritten the file. Nothing is merged into it from then on.
         """
         if self.is_as_noted():
             return
@@ -129,7 +130,7 @@ class FileLock:
             )
 
     def _forbid_merging(self) -> None:
-        """Or SQLite would merge the log of the file as it was, when its last connection is closed."""
+        """Keep SQLite from merging the old file's log into the new one when its last connection is closed."""
         if WHOLE_DESCRIPTION:
             with contextlib.suppress(OSError):
                 fcntl.fcntl(self._descriptors[-1], WHOLE_DESCRIPTION, _range(fcntl.F_RDLCK, *SQLITE_SHARED))
@@ -151,7 +152,7 @@ def _identity(path: Path) -> Identity | None:
 
 
 def _lock_byte(path: Path) -> int:
-    """An open file description lock: no other kind of lock meets it on this byte, and only its descriptor ends it."""
+    """An open file description lock: no other kind of lock uses this byte, and only its descriptor releases it."""
     descriptor = _open(path)
     assert WHOLE_DESCRIPTION is not None
     try:
@@ -168,7 +169,8 @@ def _range(kind: int, first: int, count: int) -> bytes:
 
 
 def _lock_beside(path: Path) -> int:
-    """Where a byte can't be locked so, the lock of a file beside the database: the same for every symbolic link."""
+    """A lock on a file beside the database, for systems that can't lock a byte this way. It is the same for every
+    symbolic link."""
     resolved = path.resolve()
     descriptor = _open(resolved.with_name(resolved.name + ".lock"))
     try:

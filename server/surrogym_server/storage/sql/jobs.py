@@ -59,7 +59,7 @@ class SqlJobs(port.Jobs):
             return id
 
     def claim(self, name: str, worker: str, most_episodes: int, seconds: float) -> LeasedJob | None:
-        with self._database.read() as connection:  # a worker that waits keeps no writer waiting
+        with self._database.read() as connection:  # waiting workers don't block writers
             own = jobs.c.surrogate_id == find(connection, name)
             waiting = (jobs.c.status == "queued") | expiry.has_ended(connection, jobs, RUNNING)
             if not connection.execute(sa.select(sa.exists().where(own, waiting))).scalar():
@@ -149,7 +149,7 @@ class SqlJobs(port.Jobs):
 
 
 def _sweep(connection: Connection, held: Row[Any]) -> int:
-    """End the leases of the surrogate's jobs whose time has come; returns how many."""
+    """End the expired leases of the surrogate's jobs. Returns their number."""
     again = (jobs.c.kind == "train") & (jobs.c.attempts < MAX_RUNS) & ~jobs.c.cancelling
     status = sa.case((jobs.c.cancelling, "cancelled"), (again, "queued"), else_="failed")
     ended = connection.execute(
@@ -169,7 +169,7 @@ def _sweep(connection: Connection, held: Row[Any]) -> int:
 
 
 def _require_room(connection: Connection, surrogate: int, name: str) -> None:
-    """Refuse a job beyond those that may wait, and remove those that ended long ago."""
+    """Refuse a job if too many wait, and remove jobs that ended long ago."""
     own = jobs.c.surrogate_id == surrogate
     waiting = sa.select(sa.func.count()).select_from(jobs).where(own, OPEN)
     if connection.execute(waiting).scalar_one() >= MAX_OPEN:

@@ -1,4 +1,4 @@
-"""Leases of queries: how they begin and end. The caller holds the surrogate, unless it says otherwise."""
+"""Leases of queries: how they begin and end. The caller holds the surrogate unless a docstring says otherwise."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _new(held: Row[Any], query: LeasedQuery, sampler: str, seconds: float) -> di
 
 
 def of_query(connection: Connection, surrogate_id: int, query_id: int, token: str) -> Row[Any]:
-    """The lease of this token: (id, expires, outcome). Nothing needs to be held.
+    """The lease with this token: (id, expires, outcome). The caller need not hold the surrogate.
 
     Raises:
         UnknownQuery: the surrogate has no such query.
@@ -95,7 +95,7 @@ def set_outcome(connection: Connection, lease_ids: Sequence[int], outcome: str) 
 
 
 def share(connection: Connection, name: str) -> Row[Any]:
-    """Keep the surrogate from being deleted, but keep no writer waiting: (id, paused, now)."""
+    """Keep the surrogate from being deleted, without blocking writers: (id, paused, now)."""
     columns: list[Any] = [surrogates.c.id, surrogates.c.paused, clock(connection).label("now")]
     share = sa.select(*columns).where(surrogates.c.name == name).with_for_update(read=True, key_share=True)
     found = connection.execute(share).one_or_none()
@@ -105,7 +105,7 @@ def share(connection: Connection, name: str) -> Row[Any]:
 
 
 def sweep_if_needed(connection: Connection, name: str) -> None:
-    """Hold and sweep the surrogate if it has leases to end; one that is not there has none."""
+    """Hold and sweep the surrogate if it exists and has leases to end."""
     own = sa.select(surrogates.c.id).where(surrogates.c.name == name).scalar_subquery()
     ended = expiry.has_ended(connection, leases, IS_OPEN)
     wanted = sa.select(leases.c.id).where(leases.c.surrogate_id == own, ended).limit(1)
@@ -114,7 +114,7 @@ def sweep_if_needed(connection: Connection, name: str) -> None:
 
 
 def sweep(connection: Connection, held: Row[Any]) -> int:
-    """End the surrogate's leases whose time has come; returns how many."""
+    """End the surrogate's expired leases. Returns their number."""
     ended = connection.execute(
         sa.update(leases)
         .where(leases.c.surrogate_id == held.id, leases.c.outcome == "open", leases.c.expires <= held.now)
@@ -128,8 +128,11 @@ def sweep(connection: Connection, held: Row[Any]) -> int:
 
 
 def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], error: str, *, begun: bool) -> None:
-    """Make leased queries pending again, or set them aside after the last of the attempts that they have each time they
-    are asked; one that was not ``begun`` is none. The leases have their outcome."""
+    """Make leased queries pending again, or set them aside after their last attempt.
+
+    A query has the same number of attempts each time it is requeued. A lease that was not ``begun`` does not count as
+    an attempt. The leases already have their outcome.
+    """
     spent = (
         sa.select(sa.func.count())
         .where(leases.c.query_id == queries.c.id, leases.c.outcome.in_(("failed", "expired")))
@@ -151,12 +154,12 @@ def give_back(connection: Connection, held: Row[Any], query_ids: Sequence[int], 
 
 
 def is_unbegun(surrogate_id: int) -> sa.ColumnElement[bool]:
-    """Whether a row of queries is a pending one of this surrogate that no sampler has begun."""
+    """Whether a row of queries is a pending query of this surrogate that no sampler has begun."""
     begun = sa.select(leases.c.id).where(leases.c.query_id == queries.c.id, leases.c.outcome != "unbegun")
     return (queries.c.surrogate_id == surrogate_id) & (queries.c.status == "pending") & ~sa.exists(begun)
 
 
 def requeue_set_aside(connection: Connection, held: Row[Any]) -> int:
-    """Make the queries that were set aside pending, with as many attempts as a new one has; returns how many."""
+    """Make the queries that were set aside pending, with as many attempts as a new query. Returns their number."""
     set_aside = (queries.c.surrogate_id == held.id) & (queries.c.status == "set_aside")
     return connection.execute(sa.update(queries).where(set_aside).values(status="pending")).rowcount

@@ -1,4 +1,4 @@
-"""Real steps by purpose, counted from what is stored."""
+"""Real steps by purpose, counted from the stored samples and leases."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class SqlLedger(port.Ledger):
 
 
 def ledgers(connection: Connection, span: Span) -> dict[int, LedgerRecord]:
-    """The ledger of each surrogate of the span that has anything to count."""
+    """The ledger of each surrogate of the span that has any steps."""
     counted: defaultdict[int, dict[str, int]] = defaultdict(dict)
     statement = sa.union_all(_samples_of(span), _evaluations_of(span), _unresolved_of(connection, span))
     for surrogate, what, steps in connection.execute(statement).all():
@@ -72,7 +72,7 @@ def _evaluations_of(span: Span) -> sa.Select[Any]:
 
 
 def _unresolved_of(connection: Connection, span: Span) -> sa.Select[Any]:
-    """Steps that leases were given out for which failed, or expired, swept or not."""
+    """Steps of leases that failed or expired, whether swept or not."""
     unswept = (leases.c.outcome == "open") & (leases.c.expires <= clock(connection))
     ended = leases.c.outcome.in_(("failed", "expired")) | unswept
     how = sa.case((leases.c.outcome == "failed", "failed"), else_="expired").label("how")

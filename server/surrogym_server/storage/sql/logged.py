@@ -1,7 +1,7 @@
-"""Logged samples: known by what they are, and looked at by the design when their log is complete.
+"""Logged samples: identified by their content, and used by the design when their log is complete.
 
 ``logged_revision`` is the revision of the surrogate that has all of the last log. While a log is incomplete it is one
-ahead of ``revision``, so that the call that completes it makes a fit due even if it brings nothing new itself.
+ahead of ``revision``, so that the call that completes it makes a fit due even if it brings no new sample.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from surrogym_server.storage.sql.tables import samples, surrogates
 
 
 def store_logged(connection: Connection, held: Row[Any], sampler: str, batch: Sequence[NewSample]) -> AddedSamples:
-    """Insert what is new of the batch: what no logged sample of the surrogate equals in every number.
+    """Insert the new samples of the batch: those that no logged sample of the surrogate equals in every number.
 
     Raises:
         InvalidInput: a sample that names a query.
@@ -38,14 +38,14 @@ def store_logged(connection: Connection, held: Row[Any], sampler: str, batch: Se
 
 
 def complete_log(connection: Connection, held: Row[Any]) -> None:
-    """Have the design look at what has come of a log."""
+    """Make a fit due for the samples of a complete log."""
     ahead = sa.select(surrogates.c.logged_revision > surrogates.c.revision).where(surrogates.c.id == held.id)
     if connection.execute(ahead).scalar():
         touch(connection, held)
 
 
 def _known(connection: Connection, held: Row[Any], fingerprints: Sequence[str]) -> dict[str, int]:
-    """The logged samples of these fingerprints that are stored, by fingerprint."""
+    """The stored logged samples with these fingerprints, by fingerprint."""
     same = samples.c.fingerprint.in_(set(fingerprints))
     wanted = sa.select(samples.c.fingerprint, samples.c.id).where(samples.c.surrogate_id == held.id, same)
     return {row.fingerprint: row.id for row in connection.execute(wanted.where(samples.c.purpose == "logged"))}

@@ -1,4 +1,4 @@
-"""What is kept beside the design: occupancy, saved sessions, events."""
+"""Data beside the design: occupancy, saved sessions, events."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bring a database to this program's schema when it is opened."""
+"""Migration of a database to this program's schema when it is opened."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ MIGRATION_LOCK = 0x5355_5252  # one server migrates at a time; any number will d
 
 
 def migrate(database: Database) -> None:
-    """Run the migrations that are missing.
+    """Run the missing migrations.
 
     Raises:
         Unavailable: the database was written by a newer program.
-        Damaged: its schema is none that a program ever made.
+        Damaged: no program has ever made its schema.
     """
     known = [script.name[1:5] for script in sorted(SCRIPTS.glob("versions/r*.py"))]
     with database.write() as connection:
@@ -40,7 +40,7 @@ def _present(connection: Connection) -> list[str]:
 
 
 def _upgrade(connection: Connection) -> None:
-    from alembic import command  # a fifteenth of a server's start, and most find their schema as it should be
+    from alembic import command  # late: it takes a fifteenth of a server's start, and most schemas are up to date
     from alembic.config import Config
     from alembic.util import CommandError
 
@@ -49,13 +49,13 @@ def _upgrade(connection: Connection) -> None:
     config.set_main_option("path_separator", "os")
     try:
         command.upgrade(config, "head")
-    except CommandError as error:  # what the database says of its own schema makes no sense
+    except CommandError as error:  # the database's record of its own schema is invalid
         raise damaged(error) from error
 
 
 def _take_turn(connection: Connection) -> None:
     if connection.dialect.name == "postgresql":
-        connection.execute(sa.text("SET LOCAL lock_timeout = 0"))  # the one before may take its time
+        connection.execute(sa.text("SET LOCAL lock_timeout = 0"))  # the server before may take its time
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(MIGRATION_LOCK)))
 
 

@@ -89,7 +89,7 @@ def newest_of(connection: Connection, span: Span) -> dict[int, tuple[int, float]
 
 
 def insert_model(connection: Connection, held: Row[Any], model: NewModel) -> int:
-    """Store a model as the newest version; the surrogate is held, so that versions have no gaps."""
+    """Store a model as the newest version. The surrogate is held, so that versions have no gaps."""
     newest = sa.select(sa.func.max(models.c.version)).where(models.c.surrogate_id == held.id)
     version = (connection.execute(newest).scalar() or 0) + 1
     connection.execute(
@@ -112,10 +112,10 @@ def insert_model(connection: Connection, held: Row[Any], model: NewModel) -> int
 
 
 def _confidence_index(fidelity: str) -> float:
-    """The one field of a fidelity: parsing all of it takes ten times as long."""
+    """One field of a fidelity, because parsing all of it takes ten times as long."""
     try:
         return _JUDGED.decode(fidelity).confidence_index
-    except msgspec.DecodeError:  # it may hold NaN, which Python's parser alone reads
+    except msgspec.DecodeError:  # it may contain NaN, which only Python's parser reads
         try:
             return float(json.loads(fidelity)["confidence_index"])
         except (ValueError, KeyError, TypeError) as error:

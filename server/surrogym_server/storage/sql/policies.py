@@ -134,7 +134,7 @@ class SqlPolicies(port.Policies):
 
 
 def _next_version(connection: Connection, surrogate: int) -> int:
-    """A version that was never given out."""
+    """A version that was never used."""
     count = sa.update(surrogates).where(surrogates.c.id == surrogate)
     given = count.values(policy_versions=surrogates.c.policy_versions + 1).returning(surrogates.c.policy_versions)
     return int(connection.execute(given).scalar_one())
@@ -149,7 +149,7 @@ def _of_file(file: PolicyFile) -> dict[str, Any]:
 
 
 def _known(connection: Connection, surrogate: int, digest: str) -> int | None:
-    """The version that came with this file."""
+    """The version with this file."""
     files = policy_files.c
     same = sa.select(files.version).where(files.surrogate_id == surrogate, files.digest == digest, files.main)
     return connection.execute(same.limit(1)).scalar()
@@ -181,7 +181,7 @@ def _unknown(name: str, which: object) -> UnknownPolicy:
 
 
 def _make_place(connection: Connection, surrogate: int, name: str) -> Freed:
-    """Let the oldest policies without an alias go until one more has a place."""
+    """Remove the oldest policies without an alias, until there is room for one more."""
     versions = _unaliased(connection, surrogate)
     own = sa.select(sa.func.count()).select_from(policies).where(policies.c.surrogate_id == surrogate)
     beyond = connection.execute(own).scalar_one() + 1 - MAX_POLICIES
@@ -193,7 +193,7 @@ def _make_place(connection: Connection, surrogate: int, name: str) -> Freed:
 
 
 def _within(connection: Connection, surrogate: int, version: int, most: int, name: str) -> Freed:
-    """Give up files of the oldest policies without an alias until all have ``most`` bytes together."""
+    """Remove files of the oldest policies without an alias, until all files have at most ``most`` bytes together."""
     sizes = _sizes(connection, surrogate)
     beyond = sum(sizes.values()) - most
     freed: list[str] = []
@@ -211,7 +211,7 @@ def _within(connection: Connection, surrogate: int, version: int, most: int, nam
 
 
 def _sizes(connection: Connection, surrogate: int) -> dict[int, int]:
-    """Bytes of the blobs of each version."""
+    """Bytes of each version's blobs."""
     sizes: defaultdict[int, int] = defaultdict(int)
     for table in OWNED:
         there = sa.select(table.c.version, table.c.bytes)
@@ -221,7 +221,7 @@ def _sizes(connection: Connection, surrogate: int) -> dict[int, int]:
 
 
 def _unaliased(connection: Connection, surrogate: int) -> list[int]:
-    """Versions that no alias leads to, oldest first."""
+    """Versions without an alias, oldest first."""
     aliased = sa.select(policy_aliases.c.version).where(policy_aliases.c.surrogate_id == surrogate)
     own = (policies.c.surrogate_id == surrogate) & policies.c.version.not_in(aliased)
     return list(connection.execute(sa.select(policies.c.version).where(own).order_by(policies.c.version)).scalars())
@@ -245,7 +245,7 @@ def _delete(connection: Connection, surrogate: int, versions: Sequence[int]) -> 
 def _records(
     connection: Connection, surrogate: int, condition: sa.ColumnElement[bool], *, curves: bool
 ) -> list[PolicyRecord]:
-    """Policies, newest first, by as many statements however many there are."""
+    """Policies, newest first. The number of statements does not depend on their number."""
     columns = [policies.c.version, policies.c.created_at, policies.c.card, *([policies.c.curve] if curves else [])]
     wanted = sa.select(*columns).where(policies.c.surrogate_id == surrogate, condition)
     rows = connection.execute(wanted.order_by(policies.c.version.desc())).all()

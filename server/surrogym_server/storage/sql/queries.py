@@ -158,7 +158,8 @@ class SqlQueries(port.Queries):
 
 
 def _require_room(connection: Connection, held: Row[Any], steps: int) -> None:
-    """Raise ``BeyondBudget`` where all audits together would take more than ``LEAST_AUDITED`` steps and the budget."""
+    """Raise ``BeyondBudget`` if all audits together would take more steps than the budget and than
+    ``LEAST_AUDITED``."""
     asked = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0), sa.func.max(surrogates.c.budget))
     own = (queries.c.surrogate_id == surrogates.c.id) & (queries.c.purpose == "audit")
     joined = asked.select_from(surrogates.outerjoin(queries, own)).where(surrogates.c.id == held.id)
@@ -172,7 +173,7 @@ def _require_room(connection: Connection, held: Row[Any], steps: int) -> None:
 
 
 def query_counts(connection: Connection, span: Span) -> dict[int, QueryCounts]:
-    """How many queries of each status there are, of each surrogate of the span that has any."""
+    """Number of queries by status, for each surrogate of the span that has any."""
     counted: defaultdict[int, dict[str, int]] = defaultdict(dict)
     wanted = sa.select(queries.c.surrogate_id, queries.c.status, sa.func.count()).where(within(queries, span))
     rows = connection.execute(wanted.group_by(queries.c.surrogate_id, queries.c.status)).all()
@@ -186,7 +187,7 @@ def _ended(query_id: int) -> LeaseExpired:
 
 
 def _records(connection: Connection) -> sa.Select[Any]:
-    """Queries with what is left of their open lease, of which each has one at most."""
+    """Queries, with the time left of their open lease. A query has at most one."""
     left = (leases.c.expires - clock(connection)).label("lease_seconds_left")
     is_open = (leases.c.query_id == queries.c.id) & (leases.c.outcome == "open")
     return sa.select(*COLUMNS, left).outerjoin(leases, is_open)

@@ -1,4 +1,4 @@
-"""Whether the database takes writes: tried at most once a second, in a thread that nobody has to wait for."""
+"""Check that the database accepts writes, at most once a second, in a thread for which nobody has to wait."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from surrogym_server.errors import Unavailable
 from surrogym_server.storage.sql.checks import check_tables
 from surrogym_server.storage.sql.database import Database
 
-FRESH_SECONDS = 1.0  # how long an answer is good: who asks all the time causes one small write a second
-PATIENCE_SECONDS = 2.0  # how long a caller waits for a new one
+FRESH_SECONDS = 1.0  # lifetime of a result, so that frequent checks cause one small write a second
+PATIENCE_SECONDS = 2.0  # longest wait of a caller for a new result
 
 schema = sa.table("alembic_version", sa.column("version_num"))
 
@@ -27,8 +27,8 @@ class Readiness:
         self._begun = 0.0
 
     def require(self) -> None:
-        """Raise ``Unavailable`` unless all tables are there, a write has just been durable, and no page was ever found
-        broken: what is written to such a file may be lost."""
+        """Raise ``Unavailable`` unless all tables exist, a write was recently made durable, and no broken page was ever
+        found: data written to such a file may be lost."""
         self._database.require_sound()
         probe = self._latest()
         wait([probe], PATIENCE_SECONDS)
@@ -41,7 +41,7 @@ class Readiness:
         self._thread.shutdown(wait=False)
 
     def _latest(self) -> Future[None]:
-        """The last probe, or a new one when that is done and old."""
+        """The last probe, or a new one if the last is finished and old."""
         with self._lock:
             now = time.monotonic()
             if self._probe is None or (self._probe.done() and now - self._begun >= FRESH_SECONDS):
@@ -52,5 +52,5 @@ class Readiness:
         with self._database.write() as connection:
             check_tables(connection)
             version = connection.execute(sa.select(schema.c.version_num)).scalar()
-            for value in ("", version):  # SQLite writes nothing where nothing changes
+            for value in ("", version):  # two different values, because SQLite writes nothing if nothing changes
                 connection.execute(sa.update(schema).values(version_num=value))

@@ -14,12 +14,12 @@ from surrogym_server.storage.records import Array, EventKind, Purpose
 from surrogym_server.storage.sql.database import clock
 from surrogym_server.storage.sql.tables import events, queries, requests, surrogates
 
-Span = tuple[int, int]  # of ids of surrogates, the first and the last
+Span = tuple[int, int]  # of ids of surrogates: the first and the last
 HELD = (surrogates.c.id, surrogates.c.phase, surrogates.c.paused, surrogates.c.round)
 
 
 def find(connection: Connection, name: str) -> int:
-    """The surrogate's id."""
+    """Return the surrogate's id."""
     found = connection.execute(sa.select(surrogates.c.id).where(surrogates.c.name == name)).scalar()
     if found is None:
         raise unknown_surrogate(name)
@@ -29,7 +29,7 @@ def find(connection: Connection, name: str) -> int:
 def hold(connection: Connection, name: str, *extra: sa.ColumnElement[Any]) -> Row[Any]:
     """Lock the surrogate until the transaction ends: (id, phase, paused, round, now, *extra).
 
-    Whoever writes holds it first, so that writers take turns and events get their ids in order.
+    Every writer calls it first, so that writers take turns and events get their ids in order.
     """
     columns = (*HELD, clock(connection).label("now"), *extra)
     wanted = sa.select(*columns).where(surrogates.c.name == name).with_for_update(key_share=True)
@@ -53,16 +53,16 @@ def append_event(connection: Connection, held: Row[Any], kind: EventKind, **body
 
 
 def touch(connection: Connection, held: Row[Any], **changes: Any) -> None:
-    """Note that there is something new for the design to look at, together with other changes."""
+    """Make the design look at the surrogate again, and change other fields with it."""
     update = sa.update(surrogates).where(surrogates.c.id == held.id)
     connection.execute(update.values(revision=surrogates.c.revision + 1, **changes))
 
 
 def recall(connection: Connection, held: Row[Any], operation: str, key: str | None, body: str) -> Any:
-    """What the operation returned for this key before; None when it is new.
+    """Return the earlier result of the operation for this key; None if the key is new.
 
     Raises:
-        IdempotencyConflict: it came with another body.
+        IdempotencyConflict: it was used with another body.
     """
     if key is None:
         return None
@@ -79,7 +79,7 @@ def recall(connection: Connection, held: Row[Any], operation: str, key: str | No
 
 
 def remember(connection: Connection, held: Row[Any], operation: str, key: str | None, body: str, result: Any) -> None:
-    """Keep what the operation returned for this key."""
+    """Keep the result of the operation for this key."""
     if key is not None:
         connection.execute(
             sa.insert(requests).values(
@@ -99,10 +99,10 @@ def insert_queries(
     *,
     extra: bool = False,
 ) -> list[int]:
-    """Queue coordinates (m, C) with action (m, F), then action sequences, each (T, F); returns the ids in order.
+    """Queue coordinates (m, C) with action (m, F), then action sequences, each (T, F). Returns the ids in order.
 
     Raises:
-        InvalidInput: not as many rows in the one as in the other.
+        InvalidInput: the numbers of coordinates and actions differ.
     """
     if len(coordinates) != len(action):
         raise InvalidInput(

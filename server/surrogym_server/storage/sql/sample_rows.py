@@ -15,12 +15,12 @@ from surrogym_server.storage.sql.tables import samples
 
 
 def body_of(sample: NewSample) -> dict[str, Any]:
-    """What a repeat has to repeat. The step is known apart, and fingerprints are older than it."""
+    """The content that a repeat must have. The step is compared separately, because fingerprints are older than it."""
     return {name: value for name, value in asdict(sample).items() if name != "step"}
 
 
 def insert_samples(connection: Connection, held: Row[Any], sampler: str, rows: list[dict[str, Any]]) -> list[int]:
-    """Insert rows of samples and append the event; returns their ids in order."""
+    """Insert rows of samples and append the event. Returns their ids in order."""
     if not rows:
         return []
     insert = sa.insert(samples).returning(samples.c.id, sort_by_parameter_order=True)
@@ -33,7 +33,7 @@ def insert_samples(connection: Connection, held: Row[Any], sampler: str, rows: l
 def row_of(
     held: Row[Any], sampler: str, sample: NewSample, lease: Answered | None = None, *, logged: bool = False
 ) -> dict[str, Any]:
-    """A sample as a row of its table: of the lease that it answers, of a log, or by hand."""
+    """A sample as a row of its table: an answer under a lease, a logged sample, or one by hand."""
     purpose: SamplePurpose = "logged" if logged else "manual"
     return {
         "surrogate_id": held.id,

@@ -1,4 +1,4 @@
-"""Samples: stored once, all or nothing, never changed."""
+"""Samples, which are stored once, all or nothing, and never changed."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def _store(
     batch: Sequence[NewSample],
     answered: Sequence[Answered | None],
 ) -> AddedSamples:
-    """Insert what is new of the batch. A step reported under one lease is one sample."""
+    """Insert the new samples of the batch. A step reported under one lease is one sample."""
     identities = [_identity(place, *told) for place, told in enumerate(zip(batch, answered, strict=True))]
     known = {(lease.lease_id, step): sample for lease in answered if lease for step, sample in lease.reported.items()}
     ids: dict[Identity, int] = {identity: sample.sample_id for identity, sample in known.items()}
@@ -141,12 +141,12 @@ def _store(
 
 
 def _identity(place: int, sample: NewSample, lease: Answered | None) -> Identity:
-    """The lease and the step; without a lease nothing but its place in the batch."""
+    """The lease and the step; without a lease, the place in the batch."""
     return (lease.lease_id, sample.step) if lease else (None, place)
 
 
 def _raw_arrays(surrogate_id: int) -> sa.Select[Any]:
-    """Rows of bytes, reward and flag: a bulk read makes no Python float of a coordinate."""
+    """Rows of bytes, reward and flag: a bulk read without a Python float for each coordinate."""
     vectors = (samples.c.coordinates, samples.c.action, samples.c.next_coordinates)
     raw: list[Any] = [sa.type_coerce(column, sa.LargeBinary()) for column in vectors]
     wanted = sa.select(*raw, samples.c.reward, samples.c.terminated, samples.c.purpose)
@@ -154,5 +154,5 @@ def _raw_arrays(surrogate_id: int) -> sa.Select[Any]:
 
 
 def _matrix(rows: Sequence[bytes]) -> Array:
-    """(n, k) of n rows of bytes."""
+    """A matrix (n, k) from n rows of bytes."""
     return np.frombuffer(b"".join(rows), dtype="<f8").reshape(len(rows), -1).astype(np.float64)

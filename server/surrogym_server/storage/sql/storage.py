@@ -1,4 +1,4 @@
-"""The stores of one database, put together."""
+"""All stores of one database."""
 
 from __future__ import annotations
 
@@ -63,17 +63,17 @@ def open_storage(url: str, synchronous: Synchronous = "full", files: Path | None
     """Open a database, and bring its schema up to date.
 
     Args:
-        url: ``sqlite:///path/to/file`` (made if it is not there, for one server at a time) or
+        url: ``sqlite:///path/to/file`` (created if it does not exist, for one server at a time) or
             ``postgresql://user:password@host/name`` (for several).
         synchronous: as in ``connect``.
-        files: folder for the files of policies; None is ``<database>.files`` beside a SQLite file, and the database
+        files: folder for the files of policies. None means ``<database>.files`` beside a SQLite file, and the database
             itself for PostgreSQL.
 
     Raises:
         InvalidInput: another kind of address.
-        Unavailable: another server holds the SQLite file, PostgreSQL does not answer, or the database was
-            written by a newer program.
-        Damaged: pages, tables or columns are broken or missing; says the way out.
+        Unavailable: another server holds the SQLite file, PostgreSQL does not answer, or the database was written by a
+            newer program.
+        Damaged: pages, tables or columns are broken or missing; the message says how to recover.
     """
     database = connect(url, synchronous)
     try:

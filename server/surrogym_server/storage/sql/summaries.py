@@ -1,4 +1,4 @@
-"""What a list shows of surrogates: a few statements for all of them together, however many there are."""
+"""Entries of a list of surrogates, read by a few statements for all of them together."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ COLUMNS = [
 
 
 class _Named(msgspec.Struct):
-    """What is read of a specification: parsing all of it takes ten times as long."""
+    """The parsed part of a specification, because parsing all of it takes ten times as long."""
 
     environment: str = ""
 
@@ -34,7 +34,7 @@ _NAMED = msgspec.json.Decoder(_Named)
 def read_summaries(
     connection: Connection, condition: sa.ColumnElement[bool], limit: int | None
 ) -> list[SurrogateSummary]:
-    """Up to ``limit`` surrogates of a condition that chooses neighbours by id, oldest first."""
+    """Up to ``limit`` surrogates that meet a condition, oldest first. The condition must choose a range of ids."""
     wanted = (
         sa.select(*COLUMNS, sa.type_coerce(surrogates.c.spec, sa.Text))
         .where(condition)

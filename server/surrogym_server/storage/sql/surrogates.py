@@ -127,7 +127,7 @@ def _record(row: Row[Any]) -> SurrogateRecord:
 
 
 def _insert(connection: Connection, new: NewSurrogate) -> bool:
-    """Say whether the name was free."""
+    """Insert a surrogate, and return whether the name was free."""
     insert = conflict_insert(connection, surrogates).values(
         name=new.name,
         spec=new.spec,
@@ -154,9 +154,12 @@ def _set_or_taken_back(before: dict[str, float], changes: dict[str, float | None
 def _withdraw_unbegun(
     connection: Connection, held: Row[Any], before: SurrogateRecord, budget: int | None
 ) -> dict[str, Any]:
-    """Withdraw what the design chose by what was asked of it before, as far as no sampler has begun it, and the right
-    of a fit that is running. What was asked for beyond the design is asked for again, unless there is a smaller
-    ``budget``, beyond which initial queries are withdrawn too. Gives the changes of the surrogate that follow."""
+    """Withdraw the queries that the design chose for another target, tolerance or budget and that no sampler has begun,
+    and the right of a running fit.
+
+    Queries added by ``improve`` are requested again, unless there is a smaller ``budget``; initial queries beyond that
+    are withdrawn too. Returns the resulting changes of the surrogate.
+    """
     unbegun = is_unbegun(held.id)
     chosen = sa.delete(queries).where(unbegun, queries.c.purpose == "adaptive")
     withdrawn = connection.execute(chosen.returning(queries.c.steps, queries.c.extra)).all()
@@ -177,8 +180,8 @@ def _withdraw_unbegun(
 
 
 def spoken_for(connection: Connection, surrogate_id: int) -> int:
-    """Samples that cost a real step, and those that queries without an answer stand for: open ones, and those set
-    aside, of which steps may have been taken."""
+    """Number of real steps that count towards the budget: samples, and the steps of unanswered queries. These are open,
+    or set aside, in which case steps may have been taken."""
     taken = sa.select(sa.func.count()).where(samples.c.surrogate_id == surrogate_id, samples.c.purpose.not_in(FREE))
     awaited = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0)).where(
         queries.c.surrogate_id == surrogate_id, queries.c.status != "answered", queries.c.purpose.not_in(FREE)

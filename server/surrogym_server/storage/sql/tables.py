@@ -1,6 +1,6 @@
-"""The tables. Vectors are little-endian float64 bytes, so they come back bit for bit; JSON is text.
+"""The tables. Vectors are little-endian float64 bytes, so that they are read back bit for bit; JSON is text.
 
-What belongs to a surrogate goes with it (``ON DELETE CASCADE``). Ids are never used twice.
+Rows of a surrogate are deleted with it (``ON DELETE CASCADE``). Ids are never used twice.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Floats(sa.types.TypeDecorator[Vector]):
 
 
 class Json(sa.types.TypeDecorator[Any]):
-    """Anything that JSON can say; ``place`` is its table and column."""
+    """Any JSON value; ``place`` is its table and column."""
 
     impl = sa.Text
     cache_ok = True
@@ -104,7 +104,7 @@ PLAIN: dict[type[sa.types.TypeEngine[Any]], tuple[str, tuple[type, ...]]] = {
 
 
 class Checked(sa.types.TypeDecorator[Any]):
-    """A number or a text. SQLite keeps any value in any column, so a damaged file may hold something else there."""
+    """A number or a text. SQLite stores any value in any column, so a damaged file may hold a value of another type."""
 
     impl = sa.Text
     cache_ok = True
@@ -122,7 +122,7 @@ class Checked(sa.types.TypeDecorator[Any]):
 
 
 def _check_plain_columns() -> None:
-    """Checks what is read from columns without a type of ours; not from ids, which only lead to rows."""
+    """Check the values of columns without a type of this file. Ids are not checked, because they only refer to rows."""
     for table in metadata.tables.values():
         for column in table.columns:
             if type(column.type) in PLAIN and column.type is not Id:

@@ -1,9 +1,9 @@
-"""Which database a write-ahead log of SQLite was written for: told from the first bytes of the one and the frames of
-the other (formats: sqlite.org/fileformat2.html, sqlite.org/walformat.html).
+"""Find out for which database a write-ahead log of SQLite was written, from the first bytes of the database and the
+frames of the log (formats: sqlite.org/fileformat2.html, sqlite.org/walformat.html).
 
-SQLite itself would merge any log into any database of that name. So the first transaction of each log carries, in the
-header of page 1, a mark of the database that it builds on: the checksum of that database's header, and a random number
-that makes the next header unlike any before it.
+SQLite itself would merge any log into any database of that name. So the first transaction of each log writes a mark of
+its database into the header of page 1: the checksum of that database's header, and a random number that makes the next
+header different from any before it.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from pathlib import Path
 from typing import BinaryIO
 
 HEADER_BYTES = 100  # of a database
-USER_VERSION, APPLICATION_ID = slice(60, 64), slice(68, 72)  # of it; SQLite leaves both to the program
+USER_VERSION, APPLICATION_ID = slice(60, 64), slice(68, 72)  # of it; SQLite leaves both to applications
 LOG_HEADER, FRAME_HEADER = struct.Struct(">8I"), struct.Struct(">6I")
-BIG_ENDIAN = 1  # bit of the log's magic number: of the words in its checksums
-INDEX_BYTES = 136  # of the log's index: two headers, then what was merged
+BIG_ENDIAN = 1  # bit of the log's magic number: byte order of the words in its checksums
+INDEX_BYTES = 136  # of the log's index: two headers, then the position up to which the log was merged
 INDEX_VERSION = 3_007_000
 WORD = 0xFFFF_FFFF
 
 
 def marks(header: bytes) -> tuple[str, ...]:
-    """The statements that mark a new log as one of the database with this header; to run in its first transaction."""
+    """The statements that mark a new log as one of the database with this header, for its first transaction."""
     number = 1 + secrets.randbelow(2**31 - 1)
     return f"PRAGMA user_version={number}", f"PRAGMA application_id={_signed(zlib.crc32(header))}"
 
 
 def belongs(log: Path, header: bytes) -> bool:
-    """Whether SQLite may merge what lies in ``log`` into the database that begins with ``header``.
+    """Whether SQLite may merge the file ``log`` into the database that begins with ``header``.
 
-    It may where there is nothing to merge, where the log begins with the mark of this database, and where the header
-    came out of the log, as merging has begun. A log without a mark is an older program's; it may go with a database
+    It may if there is nothing to merge, if the log begins with the mark of this database, or if the header comes from
+    the log because merging has begun. A log without a mark is from an older program, and may belong to a database
     without a mark.
     """
     try:
@@ -55,10 +55,12 @@ def belongs(log: Path, header: bytes) -> bool:
 
 
 def is_merged(index: bytes) -> bool:
-    """Whether all of a log is in the database, so that the next transaction may begin a new log; ``index`` is the
-    beginning of the log's index, read by whoever has the right to write."""
+    """Whether all of a log is in the database, so that the next transaction may begin a new log.
+
+    ``index`` is the beginning of the log's index, read by a caller with the right to write.
+    """
     if len(index) < INDEX_BYTES or struct.unpack_from("=I", index)[0] != INDEX_VERSION:
-        return True  # a mark too many does no harm
+        return True  # an unnecessary mark does no harm
     frames, merged = struct.unpack_from("=I", index, 16)[0], struct.unpack_from("=I", index, 96)[0]
     return bool(frames == merged)
 
@@ -72,7 +74,7 @@ def _signed(number: int) -> int:
 
 
 def _frames(file: BinaryIO) -> Iterator[tuple[tuple[int, ...], int]]:
-    """The headers of the frames that belong to the log's present generation, and where their pages begin."""
+    """The headers of the frames of the log's present generation, and the positions of their pages."""
     file.seek(0)
     begin = file.read(LOG_HEADER.size)
     if len(begin) < LOG_HEADER.size:
@@ -90,7 +92,7 @@ def _frames(file: BinaryIO) -> Iterator[tuple[tuple[int, ...], int]]:
 
 
 def _first_pages(file: BinaryIO) -> Iterator[bytes]:
-    """The database's header, in each version that lies in the log."""
+    """The database's header, in each version in the log."""
     for (page, *_), place in _frames(file):
         if page == 1:
             file.seek(place)
@@ -98,7 +100,7 @@ def _first_pages(file: BinaryIO) -> Iterator[bytes]:
 
 
 def _has_a_whole_transaction(file: BinaryIO) -> bool:
-    """Whether the log holds anything that SQLite would merge: after a loss of power its checksums may not fit."""
+    """Whether the log holds anything that SQLite would merge. After a loss of power its checksums may be wrong."""
     file.seek(0)
     begin = file.read(LOG_HEADER.size)
     if len(begin) < LOG_HEADER.size:
@@ -113,7 +115,7 @@ def _has_a_whole_transaction(file: BinaryIO) -> bool:
         sums = _checksum(struct.pack(">2I", page, size) + file.read(page_size), order, sums)
         if sums != (first, second):
             return False
-        if size:  # of the database: the last frame of a transaction has it
+        if size:  # of the database; the last frame of a transaction has it
             return True
     return False
 
