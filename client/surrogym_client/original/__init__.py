@@ -1,4 +1,4 @@
-"""The original environment's side: the protocol, adapters for Gymnasium and MuJoCo, and loading one's own.
+"""Original environments: the protocol, adapters for Gymnasium and MuJoCo, and loading of users' own environments.
 
 Examples:
     >>> from surrogym_client import original

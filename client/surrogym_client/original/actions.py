@@ -1,4 +1,4 @@
-"""Actions of a policy as the original environment takes them."""
+"""Conversion of a policy's actions to those of the original environment."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, Mul
 
 
 def decode_actions(spec: EnvironmentSpec, raw: NDArray[Any], num_envs: int) -> Array:
-    """A policy's actions as the environment takes them, (N, F); the bins of a continuous action are undone.
+    """Convert a policy's actions to those of the environment, (N, F). Bins are converted to continuous values.
 
     Raises:
         ValueError: wrong shape.
@@ -35,7 +35,7 @@ def decode_actions(spec: EnvironmentSpec, raw: NDArray[Any], num_envs: int) -> A
 
 
 def _counts(action: BoxAction | DiscreteAction | MultiDiscreteAction) -> tuple[int, ...]:
-    """How many values a policy chooses from in each dimension."""
+    """Number of values in each dimension of a policy's action."""
     match action:
         case BoxAction(bins=bins):
             return bins or ()

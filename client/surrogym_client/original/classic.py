@@ -1,7 +1,6 @@
-"""Gymnasium's classic control tasks and the swing-up of this package: specifications, and how their state is written
-and read.
+"""Gymnasium's classic control tasks and the swing-up of this package: specifications, and access to their state.
 
-Source of every number: the task's own Gymnasium class. Angles are in radians.
+The source of every number is the task's Gymnasium class. Angles are in radians.
 """
 
 from __future__ import annotations
@@ -39,9 +38,9 @@ CIRCLE = Uniform(low=-math.pi, high=math.pi)
 class Task:
     """One known environment.
 
-    ``write`` puts coordinates (C,) into the unwrapped environment and clears what it remembers of earlier
-    steps. ``perturbable`` names the physical attributes that ``--perturb`` may change; ``settle`` recomputes
-    what follows from them.
+    ``write`` puts coordinates (C,) into the unwrapped environment and clears its memory of earlier steps.
+    ``perturbable`` names the physical attributes that ``--perturb`` may change; ``settle`` recomputes the attributes
+    that depend on them.
     """
 
     spec: Callable[[], EnvironmentSpec]
@@ -52,7 +51,7 @@ class Task:
 
 
 def pendulum() -> EnvironmentSpec:
-    """Pendulum-v1: swing up and stay; the reward is that of the state before the step."""
+    """Pendulum-v1: swing up and stay. The reward is that of the state before the step."""
     return EnvironmentSpec(
         environment="Pendulum-v1",
         coordinates=(
@@ -73,7 +72,7 @@ def pendulum() -> EnvironmentSpec:
 
 
 def cartpole() -> EnvironmentSpec:
-    """CartPole-v1: keep the pole up; reward 1 a step, the failing one included."""
+    """CartPole-v1: keep the pole up. The reward is 1 for each step, including the failing one."""
     return _cartpole(
         x=2.4,
         pole=math.radians(12),
@@ -130,7 +129,7 @@ def mountain_car_continuous() -> EnvironmentSpec:
 
 
 def mountain_car() -> EnvironmentSpec:
-    """MountainCar-v0: the same with three actions and a reward of -1 a step."""
+    """MountainCar-v0: like MountainCarContinuous-v0, with three actions and a reward of -1 for each step."""
     return _mountain_car("MountainCar-v0", DiscreteAction(n=3), goal=0.5, time_limit=200)
 
 
@@ -161,7 +160,7 @@ def _mountain_car(
 
 
 def acrobot() -> EnvironmentSpec:
-    """Acrobot-v1: swing the tip above the bar by one link's length; -1 a step, 0 for the last."""
+    """Acrobot-v1: swing the tip one link's length above the bar. The reward is -1 for each step, and 0 for the last."""
     height = -1 * Term.cos(theta1=1) + -1 * Term.cos(theta1=1, theta2=1)
     speeds = {"speed1": (2.5, 4 * math.pi), "speed2": (5.0, 9 * math.pi)}
     return EnvironmentSpec(
@@ -246,7 +245,7 @@ TASKS: dict[str, Task] = {
     SWING_UP_NARROW: Task(swing_up_narrow, _write_state, _read_state, _SWING_UP_PHYSICS),
 }
 
-# Tasks that the paper states otherwise than Gymnasium does.
+# Tasks that the paper defines differently from Gymnasium.
 PAPER_TASKS: dict[str, Task] = {
     "CartPole-v1": Task(
         cartpole_of_the_paper, _write_cartpole_of_the_paper, _read_state, _CARTPOLE_PHYSICS, _settle_cartpole

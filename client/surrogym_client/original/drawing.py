@@ -1,6 +1,6 @@
-"""Pictures by numpy alone: each stroke is blended by how far every pixel is from it.
+"""Pictures by numpy alone: a stroke colours each pixel by its distance.
 
-Shapes: a frame is (height, width, 3) float64, 0 to 255; points are in the world's units, y upwards from the middle.
+Shapes: a frame is (height, width, 3) float64, 0 to 255. Points are in the world's units, y upwards from the middle.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ WHITE = 255.0
 
 
 class Canvas:
-    """A white frame that strokes are drawn on.
+    """A white frame for strokes.
 
     Args:
         width: pixels.
@@ -31,7 +31,7 @@ class Canvas:
         self._y = (height / 2 - np.arange(height) - 0.5)[:, None] / scale  # (height, 1)
 
     def stroke(self, start: Point, end: Point, thickness: float, colour: Colour) -> None:
-        """A line with round ends; a disc where both ends are the same point."""
+        """Draw a line with round ends; if both ends are the same point, a disc."""
         (ax, ay), (bx, by) = start, end
         dx, dy = bx - ax, by - ay
         along = ((self._x - ax) * dx + (self._y - ay) * dy) / max(dx**2 + dy**2, 1e-12)

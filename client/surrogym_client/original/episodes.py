@@ -31,18 +31,20 @@ from surrogym_shared.terms import observe
 
 @dataclass(frozen=True)
 class Moment:
-    """What one step of an episode gave."""
+    """Results of one step of an episode."""
 
     observation: Array  # (D,)
     reward: float
     terminated: bool
     coordinates: Array  # (C,)
-    truncated: bool = False  # by the environment itself: it takes no further step
+    truncated: bool = False  # by the environment itself, which then takes no further step
 
 
 class Episode(ABC):
-    """The running episode of one instance of an environment. The next one begins where this is called again in the same
-    order: ``perturb`` if at all, then ``reset`` or ``place``, then steps."""
+    """The running episode of one instance of an environment.
+
+    To begin the next one, call ``perturb`` if needed, then ``reset`` or ``place``, then ``step``.
+    """
 
     parallel = False  # whether several instances may be open at once
 
@@ -63,7 +65,7 @@ class Episode(ABC):
 
     @abstractmethod
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
-        """Multiply the original's physical attributes by normal factors of mean 1 and deviation sigma."""
+        """Multiply the physical attributes by normal factors with mean 1 and deviation sigma."""
 
     @abstractmethod
     def close(self) -> None:
@@ -76,7 +78,7 @@ class Episode(ABC):
 
 
 class GymnasiumEpisode(Episode):
-    """An episode of a Gymnasium environment that has a built-in adapter; its observation is the environment's own."""
+    """An episode of a Gymnasium environment with a built-in adapter. Its observation is the environment's own."""
 
     parallel = True
 
@@ -93,7 +95,7 @@ class GymnasiumEpisode(Episode):
         return gymnasium.make(self.spec.environment).unwrapped
 
     def _read_physics(self) -> Any:
-        """The attributes that ``perturb`` changes, as they are in the original."""
+        """The attributes that ``perturb`` changes, with their original values."""
         return {name: getattr(self._env, name) for name in self._task.perturbable}
 
     def _read(self) -> Array:
@@ -132,9 +134,9 @@ class GymnasiumEpisode(Episode):
 
 
 class SimulatedEpisode(Episode):
-    """An episode of a simulator that an adapter opened; perturbed are the masses of all bodies.
+    """An episode of a simulator that an adapter opened. ``perturb`` changes the masses of all bodies.
 
-    Its observation is the environment's own where the built-in specification shows the same.
+    Its observation is the environment's own if the built-in specification shows the same.
     """
 
     parallel = True
@@ -170,7 +172,7 @@ class SimulatedEpisode(Episode):
 
 
 class OwnEpisode(Episode):
-    """An episode of one's own environment."""
+    """An episode of a user's environment."""
 
     def __init__(self, environment: Environment) -> None:
         super().__init__(environment.spec())
@@ -193,7 +195,7 @@ class OwnEpisode(Episode):
 
 
 class RolloutEpisode(OwnEpisode):
-    """One of an environment that can only be reset and acted on."""
+    """An episode of an environment that can't be set to a state."""
 
     def __init__(self, environment: RolloutEnvironment) -> None:
         super().__init__(environment)
@@ -213,7 +215,7 @@ class RolloutEpisode(OwnEpisode):
 
 
 class SteppedEpisode(OwnEpisode):
-    """One made of real steps, each from where the last one ended."""
+    """An episode of real steps, each from the end of the one before."""
 
     def __init__(self, environment: OriginalEnvironment) -> None:
         super().__init__(environment)
@@ -237,7 +239,8 @@ class SteppedEpisode(OwnEpisode):
 
 
 def open_episode(name: str, spec: EnvironmentSpec | None, factory: Factory) -> Episode:
-    """An episode of the environment called ``name``; ``factory`` makes it where no adapter knows the name."""
+    """Open an episode of the environment called ``name``. ``factory`` makes the environment if no adapter knows the
+    name."""
     if name in TASKS:
         return GymnasiumEpisode(spec or factory().spec())
     made = factory()
@@ -250,13 +253,13 @@ def open_episode(name: str, spec: EnvironmentSpec | None, factory: Factory) -> E
 
 
 def draw(spec: EnvironmentSpec, rng: np.random.Generator, *, wide: bool, scale: float = 1.0) -> Array:
-    """Start coordinates (C,): from the start distribution, or from the whole sampling range.
+    """Draw start coordinates (C,), from the start distribution or from the whole sampling range.
 
     Args:
         spec: of the environment.
-        rng: draws them.
-        wide: from the sampling range.
-        scale: how many times as far from the middle of each start distribution; bounds are kept.
+        rng: random generator.
+        wide: draw from the sampling range.
+        scale: factor for the distance from the middle of each start distribution; bounds are kept.
     """
     if spec.starts and not wide and scale == 1:
         return np.array(spec.starts[rng.integers(len(spec.starts))])
@@ -282,5 +285,5 @@ def _draw_one(distribution: Uniform | Normal | Fixed, rng: np.random.Generator) 
 
 
 def _shows_the_same(spec: EnvironmentSpec) -> bool:
-    """Whether the specification's observation is the environment's own, entry by entry."""
+    """Whether the specification's observation equals the environment's own, entry by entry."""
     return spec.environment in TASKS and TASKS[spec.environment].spec().observation == spec.observation

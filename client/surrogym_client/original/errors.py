@@ -38,11 +38,11 @@ class NotSettable(OriginalError):
 
 
 class NotRenderable(OriginalError):
-    """The environment has no renderer, it can't run here, or what is observed does not tell the state."""
+    """The environment has no renderer, the renderer can't run here, or the observation does not determine the state."""
 
 
 class NotParallel(OriginalError):
-    """A second instance was asked of an environment that runs one at a time."""
+    """A second instance was requested of an environment that runs one at a time."""
 
 
 class PolicyMisfit(OriginalError, ValueError):
@@ -58,7 +58,7 @@ class MachineFails(OriginalError):
 
 
 class EvaluationFailed(OriginalError):
-    """Something raised (see ``__cause__``) after ``steps`` real steps had been begun."""
+    """An error (see ``__cause__``) occurred after ``steps`` real steps had been begun."""
 
     def __init__(self, steps: int, cause: Exception) -> None:
         super().__init__(f"the evaluation failed after {steps} real steps: {sentence(cause)}")
@@ -70,7 +70,7 @@ class EvaluationFailed(OriginalError):
 
 
 class StepFailed(OriginalError):
-    """The environment raised, or gave something that is no step."""
+    """The environment raised an error, or returned something that is not a step."""
 
 
 class StepTimedOut(StepFailed):
@@ -83,7 +83,7 @@ class EnvironmentDied(StepFailed):
 
 def sentence(error: Exception) -> str:
     """Describe an exception of somebody's environment: its type, its message, and the line that raised it."""
-    if isinstance(error, OriginalError):  # says it all; where it was raised is of no use to who made the environment
+    if isinstance(error, OriginalError):  # complete by itself; the line does not help the environment's author
         return str(error)
     frame = traceback.extract_tb(error.__traceback__)[-1:]
     where = f" ({os.path.basename(frame[0].filename)}:{frame[0].lineno})" if frame else ""

@@ -13,10 +13,10 @@ from surrogym_shared.spec.actions import Action
 
 
 def task_for(environment: str, preset: str) -> Task:
-    """The task of a known Gymnasium id, as the preset states it.
+    """The task of a known Gymnasium id, as the preset defines it.
 
     Raises:
-        KeyError: no classic control task of this id.
+        KeyError: there is no classic control task with this id.
     """
     if preset == "paper" and environment in PAPER_TASKS:
         return PAPER_TASKS[environment]
@@ -24,7 +24,7 @@ def task_for(environment: str, preset: str) -> Task:
 
 
 class GymnasiumEnvironment:
-    """A classic control task that is set to given coordinates, or reset: unwrapped, so without a time limit."""
+    """A classic control task that can be set to coordinates or reset. It is unwrapped, so it has no time limit."""
 
     parallel = True
 
@@ -40,17 +40,17 @@ class GymnasiumEnvironment:
         return self._spec
 
     def step_from(self, coordinates: Array, action: Array) -> RealStep:
-        """Set the state to coordinates (C,), apply action (F,)."""
+        """Set the state to coordinates (C,), and apply action (F,)."""
         self._task.write(self._env, coordinates)
         return self.act(action)
 
     def begin(self, seed: int | None = None) -> Array:
-        """Reset the environment; the coordinates (C,) it starts at."""
+        """Reset the environment, and return its coordinates (C,)."""
         self._env.reset(seed=seed)
         return wrapped(self._spec, self._task.read(self._env))
 
     def act(self, action: Array) -> RealStep:
-        """Apply action (F,) where the environment stands."""
+        """Apply action (F,) in the present state."""
         achieved = wrapped(self._spec, self._task.read(self._env))
         native = native_action(self._spec.action, action)
         observation, reward, terminated, truncated, _ = self._env.step(native)
@@ -69,7 +69,7 @@ class GymnasiumEnvironment:
 
 
 def native_action(space: Action, action: Array) -> Any:
-    """What the environment's own ``step`` takes for an action (F,): an int, or an array."""
+    """Convert an action (F,) for the environment's own ``step``: to an int, or an array."""
     if isinstance(space, BoxAction):
         return np.asarray(action, dtype=np.float32)
     numbers = np.asarray(action, dtype=np.int64)
@@ -77,9 +77,9 @@ def native_action(space: Action, action: Array) -> Any:
 
 
 def wrapped(spec: EnvironmentSpec, coordinates: Array) -> Array:
-    """Coordinates (C,) with angles in [-pi, pi) and bounded ones within their bounds.
+    """Wrap angles of coordinates (C,) to [-pi, pi), and clip bounded coordinates to their bounds.
 
-    Environments that keep a float32 state overshoot their own bounds by a rounding error.
+    Environments with a float32 state exceed their own bounds by a rounding error.
     """
     out = np.array(coordinates, dtype=np.float64)
     for i, coordinate in enumerate(spec.coordinates):

@@ -1,4 +1,4 @@
-"""An original environment in its own process: one that raises or hangs costs a query, not the worker."""
+"""An original environment in its own process, so that an error or a hang costs a query and not the worker."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from surrogym_shared.spec import EnvironmentSpec
 
 START_LIMIT = 120.0  # seconds; importing a simulator may take long
 PARENTS_BUSINESS = (signal.SIGINT, getattr(signal, "SIGHUP", signal.SIGINT))
-CLOSE_LIMIT = 2.0  # beyond what a step may take
+CLOSE_LIMIT = 2.0  # seconds, in addition to the limit of a step
 
 
 class IsolatedEnvironment:
-    """An environment whose steps run in a child process, each within a time limit; so does a reset.
+    """An environment whose steps and resets run in a child process, each within a time limit.
 
-    After a step that hung or a process that died, the next step starts a fresh environment. On every other way out, of
-    this process as well, the step under way is finished and the environment closed.
+    After a step that hung, or a process that died, the next step starts a new environment. In all other cases,
+    including the end of this process, the running step is finished and the environment is closed.
 
     Args:
-        factory: makes the environment in the child; it has to pickle (a module's function, a ``partial``).
-        step_limit: seconds one step may take.
+        factory: makes the environment in the child; it must pickle (a module's function, a ``partial``).
+        step_limit: seconds that one step may take.
 
     Raises (from any method):
         UnknownEnvironment: the factory failed.
-        StepFailed: the environment raised, hung or died; the message says which.
+        StepFailed: the environment raised an error, hung or died; the message says which.
     """
 
     def __init__(self, factory: Factory, step_limit: float = 30.0) -> None:
@@ -62,7 +62,7 @@ class IsolatedEnvironment:
         return step
 
     def close(self) -> None:
-        """Let the environment finish its step and close; one that doesn't in time, or Ctrl-C, has it killed."""
+        """Let the environment finish its step and close. If that takes too long, or at Ctrl-C, it is killed."""
         try:
             if self._pipe is not None and self._process is not None and self._process.is_alive():
                 with suppress(StepFailed):
@@ -134,7 +134,7 @@ class IsolatedEnvironment:
 
 
 def _await_answer(pipe: Connection, number: int, limit: float) -> tuple[bool, Any] | None:
-    """The answer (ok, value) to one request, None after ``limit`` seconds; answers to earlier ones are passed over."""
+    """The answer (ok, value) to one request; None after ``limit`` seconds. Answers to earlier requests are skipped."""
     deadline = time.monotonic() + limit
     while pipe.poll(max(0.0, deadline - time.monotonic())):
         answered, ok, value = pipe.recv()
@@ -144,7 +144,7 @@ def _await_answer(pipe: Connection, number: int, limit: float) -> tuple[bool, An
 
 
 class _Ending:
-    """Ends the child on SIGTERM, but not in the middle of a step."""
+    """End of the child on SIGTERM, but not in the middle of a step."""
 
     def __init__(self) -> None:
         self._working = self._ending = False
@@ -166,7 +166,7 @@ class _Ending:
 
 
 def _serve(pipe: Connection, factory: Factory, step_limit: float) -> None:
-    """The child: one answer (ok, value) for the start, then one for every request."""
+    """Main function of the child: one answer (ok, value) for the start, then one for every request."""
     for number in PARENTS_BUSINESS:
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_exit_after_parent, args=(step_limit + CLOSE_LIMIT,), daemon=True).start()
@@ -190,7 +190,7 @@ def _serve(pipe: Connection, factory: Factory, step_limit: float) -> None:
 
 
 def _serve_one(pipe: Connection, environment: Environment, working: _Ending) -> str:
-    """Answer one request; gives its method back."""
+    """Answer one request, and return its method."""
     number, method, arguments = pipe.recv()
     with working:
         pipe.send((number, *_answer(environment, method, arguments)))
@@ -206,7 +206,7 @@ def _answer(environment: Environment, method: str, arguments: tuple[Any, ...]) -
 
 
 def _exit_after_parent(seconds: float) -> None:
-    """When the parent has ended, give the environment some time to close."""
+    """Exit some time after the parent has ended, so that the environment can close."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])

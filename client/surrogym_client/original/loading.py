@@ -1,4 +1,4 @@
-"""From a name to an original environment: one that an adapter opens, or ``package.module:factory`` for one's own."""
+"""Load an original environment by name: an adapter's, or a user's by ``package.module:factory``."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def make(
         name: a Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL``, or ``package.module:factory``.
         spec: a specification that replaces the adapter's own; most names have none until ``describe`` writes one.
         preset, budget, initial, target, acquisition, seed: choices of the design; None keeps the specification's.
-        bins: offer a continuous action to policies as so many discrete values a dimension.
-        teleport: False asks for rollouts from resets, as if no state could be set.
+        bins: number of discrete values that replace each dimension of a continuous action for policies.
+        teleport: False uses rollouts from resets, as if the state could not be set.
         max_rollout: the longest of them.
 
     Raises:
@@ -65,12 +65,13 @@ def make(
 
 
 def is_own(name: str) -> bool:
-    """Whether a name is ``package.module:factory``, and of no adapter."""
+    """Whether a name is ``package.module:factory``, and not an adapter's."""
     return ":" in name and adapter_of(name) is None
 
 
 def is_known(name: str) -> bool:
-    """Whether a server's word is enough for this name: an adapter knows it, and it can open nothing of one's own."""
+    """Whether a name from a server may be opened without further consent: an adapter knows it, and it runs no user's
+    code."""
     import gymnasium
 
     entry = gymnasium.registry.get(name)
@@ -79,12 +80,12 @@ def is_known(name: str) -> bool:
 
 
 def has_specification(name: str) -> bool:
-    """Whether an environment brings its own specification: a built-in one, or that of its class."""
+    """Whether an environment has its own specification, built in or from its class."""
     return name in TASKS or name in SPECIFICATIONS or adapter_of(name) is None
 
 
 def specification(name: str) -> EnvironmentSpec:
-    """The built-in specification of a name.
+    """Return the built-in specification of a name.
 
     Raises:
         UnknownEnvironment: there is none.
@@ -105,7 +106,7 @@ def specification(name: str) -> EnvironmentSpec:
 
 
 def own_time_limit(name: str) -> int:
-    """The time limit of a known name in steps, as its own registration has it; ``LONGEST_EPISODE`` without one."""
+    """Time limit of a known name in steps, from its registration; ``LONGEST_EPISODE`` if it has none."""
     import gymnasium
 
     if name in gymnasium.registry:
@@ -122,10 +123,10 @@ def with_choices(
     teleport: bool = True,
     max_rollout: int | None = None,
 ) -> EnvironmentSpec:
-    """The specification with some choices of its design replaced, and what ``make`` calls its others, checked again.
+    """Replace choices of a specification's design, and other options of ``make``, and validate the result.
 
     Raises:
-        ValueError: they contradict it.
+        ValueError: they contradict the specification.
     """
     fields = spec.model_dump()
     fields["design"].update(design)
@@ -141,7 +142,7 @@ def with_choices(
 
 
 def load_factory(name: str) -> Any:
-    """The factory ``package.module:attribute``; the working directory is searched too."""
+    """Import the factory ``package.module:attribute``. The working directory is searched too."""
     module_name, _, attribute = name.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
@@ -167,7 +168,7 @@ def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str)
 
 
 class _Respecified:
-    """One's own environment whose specification was replaced on the command line."""
+    """A user's environment whose specification was replaced on the command line."""
 
     def __init__(self, environment: object, spec: EnvironmentSpec) -> None:
         self._spec = spec
@@ -181,7 +182,7 @@ class _Respecified:
 
 def _own(made: Any, spec: EnvironmentSpec | None, choose: Choose) -> Environment:
     if not callable(getattr(made, "spec", None)):
-        return answering(made)  # says what it lacks
+        return answering(made)  # its error says what is missing
     own = made.spec()
     given = choose(spec or own)
     return answering(made if given == own else _Respecified(made, given))

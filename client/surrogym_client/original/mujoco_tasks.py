@@ -1,4 +1,4 @@
-"""Specifications of the MuJoCo environments whose observation and termination terms can express."""
+"""Specifications of the MuJoCo environments whose observation and termination can be expressed by terms."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from surrogym_shared.spec import (
 
 
 def inverted_pendulum() -> EnvironmentSpec:
-    """InvertedPendulum-v5. The ends of the rail terminate here: what lies beyond is not worth learning."""
+    """InvertedPendulum-v5. Episodes also terminate at the ends of the rail, beyond which nothing is worth learning."""
     sampling = {
         "slider": Uniform(low=-0.95, high=0.95),
         "hinge": Uniform(low=-0.2, high=0.2),
@@ -41,7 +41,7 @@ def inverted_pendulum() -> EnvironmentSpec:
 
 
 def inverted_double_pendulum() -> EnvironmentSpec:
-    """InvertedDoublePendulum-v5. The constraint force it shows is 0 except at the rail's ends: termination."""
+    """InvertedDoublePendulum-v5. Its constraint force is 0 except at the rail's ends, where episodes terminate."""
     sampling = {
         "slider": Uniform(low=-0.9, high=0.9),
         "hinge": Uniform(low=-0.5, high=0.5),

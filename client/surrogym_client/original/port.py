@@ -1,4 +1,4 @@
-"""The original environment where a surrogate would be, an oracle for comparisons: every step is real, and counted."""
+"""The original environment in place of a surrogate, as an oracle for comparisons. Every step is real, and counted."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from surrogym_shared.wire import (
     SubmittedOccupancy,
 )
 
-SEEDS = (2**20, 2**31)  # of resets: far from those of evaluations
+SEEDS = (2**20, 2**31)  # of resets; far from those of evaluations
 
 
 class OriginalPort:
@@ -41,19 +41,19 @@ class OriginalPort:
     """
 
     def __init__(self, spec: EnvironmentSpec, open_episode: Callable[[], Episode]) -> None:
-        self.steps = 0  # real ones, over all sessions
+        self.steps = 0  # real steps, over all sessions
         self._spec = spec
         self._open_episode = open_episode
-        self._parallel = True  # until the first instance says otherwise
+        self._parallel = True  # until the first instance declares otherwise
         self._sessions: dict[str, list[_Lane]] = {}
         self._names = count()
 
     def spec(self) -> EnvironmentSpec:
-        """The specification it was made with."""
+        """The specification that it was made with."""
         return self._spec
 
     def open(self, request: OpenSession) -> SessionView:
-        """Open N episodes; what concerns models alone (variant, penalty, ...) has no meaning here.
+        """Open N episodes. Options that concern models only (variant, penalty, ...) are ignored.
 
         Raises:
             ValueError: another autoreset mode than same_step.
@@ -114,7 +114,7 @@ class OriginalPort:
         mask: Bools | None = None,
         deviations: bool = False,  # noqa: ARG002  nothing is predicted here
     ) -> StepResult:
-        """One real step of all lanes, or those of the mask (N,); lanes that end begin again."""
+        """Take one real step in all lanes, or in those of the mask (N,). Lanes that end are reset."""
         lanes = self._lanes(session)
         reward, terminated, truncated = np.zeros(len(lanes)), *np.zeros((2, len(lanes)), dtype=np.bool_)
         final: dict[int, Array] = {}
@@ -145,7 +145,7 @@ class OriginalPort:
         return [self.step(session, action) for action in actions]
 
     def submit_occupancy(self, session: str, checkpoint: str) -> SubmittedOccupancy:
-        """Nothing is stored: no design here weighs queries."""
+        """Ignored, because there is no design here that could use occupancies."""
         self._lanes(session)
         return SubmittedOccupancy(checkpoint=checkpoint, states=0)
 
@@ -168,7 +168,7 @@ class OriginalPort:
 
 
 class _Lane:
-    """One lane. Its environment is made when it is needed: many lanes are only ever looked at."""
+    """One lane. Its environment is made on first use, because many lanes are never stepped."""
 
     def __init__(
         self,
@@ -183,7 +183,7 @@ class _Lane:
         self._start_box = start_box
         self._limit = limit
         self._episode: Episode | None = None
-        self._placed: Array | None = None  # where the next step begins, if not where the last one ended
+        self._placed: Array | None = None  # where the next step begins, if not at the end of the last one
         self._length = 0
         self.observation = np.zeros(len(spec.observation))
         self.seed(seed)
@@ -197,7 +197,7 @@ class _Lane:
         return self._length >= self._limit
 
     def begin(self) -> None:
-        """Start an episode: anywhere in the sampling range, or where the environment starts."""
+        """Start an episode, anywhere in the sampling range or at the environment's own start."""
         self._length, self._placed = 0, None
         if self._rng.random() < self._start_box:
             self._placed = draw(self._spec, self._rng, wide=True)

@@ -1,5 +1,5 @@
-"""What the sampler needs of an original environment: its specification, and real steps: one from anywhere, or, where
-no state can be set, several from a reset.
+"""Interface between the sampler and an original environment: its specification and real steps. A step starts from any
+state, or, if the state can't be set, follows others after a reset.
 
 Shapes: C coordinates, F action entries, D observation entries.
 """
@@ -17,12 +17,12 @@ from surrogym_shared.spec import EnvironmentSpec
 
 Array = NDArray[np.float64]
 
-LONGEST_EPISODE = 1_000  # steps, where nothing sets a time limit
+LONGEST_EPISODE = 1_000  # steps, if there is no time limit
 
 
 @dataclass(frozen=True)
 class RealStep:
-    """One real step. ``coordinates`` and ``action`` are what was achieved, not what was asked for."""
+    """One real step. ``coordinates`` and ``action`` are the achieved values, not the requested ones."""
 
     coordinates: ArrayLike  # (C,)
     action: ArrayLike  # (F,)
@@ -57,11 +57,11 @@ class OriginalEnvironment(Protocol):
     """
 
     def spec(self) -> EnvironmentSpec:
-        """What is known of the environment before the first query."""
+        """Return the specification, known before the first query."""
         ...
 
     def step_from(self, coordinates: Array, action: Array) -> RealStep:
-        """Set the environment to coordinates (C,), apply action (F,), and report what happened."""
+        """Set the environment to coordinates (C,), apply action (F,), and return the real step."""
         ...
 
     def close(self) -> None:

@@ -1,6 +1,6 @@
 """Simulators by name: any Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL`` or ``pcgym:FILE.json``.
 
-Each adapter opens a simulator; what it needs is an extra of its own, imported when a name asks for it.
+Each adapter opens one kind of simulator. Its packages are an optional extra, imported when a name needs them.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ GYMNASIUM_ID = re.compile(r"(?:[A-Za-z_][\w.]*:)?[\w./-]+-v\d+")  # package:Id-v
 
 
 class Adapter(NamedTuple):
-    """Where an adapter is, the names that it opens, and those that may also come from a server: the packages' own."""
+    """Location of an adapter, the names that it opens, and the names that it opens for a server too: those of its
+    packages."""
 
     module: str
     names: re.Pattern[str]
     trusted: re.Pattern[str]
-    extra: str  # that brings what it imports
+    extra: str  # that installs the packages that it imports
 
 
 NEVER = re.compile(r"(?!)")
@@ -44,12 +45,13 @@ ADAPTERS = (
 
 
 def adapter_of(name: str) -> Adapter | None:
-    """The adapter that opens a name; None for ``package.module:factory`` and what is no name of an environment."""
+    """The adapter that opens a name; None for ``package.module:factory`` and for other texts."""
     return next((adapter for adapter in ADAPTERS if adapter.names.fullmatch(name)), None)
 
 
 def is_trusted(name: str) -> bool:
-    """Whether a server's word is enough for a name: it can open nothing but what a known package brings."""
+    """Whether a name from a server may be opened without further consent: it can only open environments of known
+    packages."""
     return any(adapter.trusted.fullmatch(name) for adapter in ADAPTERS)
 
 
@@ -57,7 +59,7 @@ def open_simulator(name: str) -> Simulator:
     """Open the simulator of a name.
 
     Raises:
-        UnknownEnvironment: no adapter knows the name, its package is not installed, or it can't be used.
+        UnknownEnvironment: no adapter knows the name, its package is not installed, or the simulator can't be used.
     """
     adapter = adapter_of(name)
     if adapter is None:

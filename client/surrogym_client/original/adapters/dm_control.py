@@ -22,7 +22,7 @@ def open_simulator(name: str) -> Simulator:
     """Open a task.
 
     Raises:
-        UnknownEnvironment: no such task, or the installed MuJoCo does not suit dm_control.
+        UnknownEnvironment: there is no such task, or dm_control does not work with the installed MuJoCo.
         ImportError: dm_control is not installed.
     """
     os.environ.setdefault("MUJOCO_GL", "disable")  # no pictures are made here, and a machine may have no display
@@ -30,7 +30,7 @@ def open_simulator(name: str) -> Simulator:
         from dm_control import suite
     except ImportError:
         raise
-    except Exception as error:  # dm_control 1.0.50 raises an AttributeError of its own beside MuJoCo 4
+    except Exception as error:  # dm_control 1.0.50 raises an AttributeError with MuJoCo 4
         raise UnknownEnvironment(
             f"dm_control does not work with the installed version of MuJoCo ({type(error).__name__}: {error}): "
             "pip install 'surrogym[dm-control]' in a separate Python environment"
@@ -50,7 +50,7 @@ def _tasks_of(tasks: Any, domain: str) -> str:
 
 
 class ControlSuite(OfParts):
-    """One task. A step is that of ``control.Environment``, without its count of steps."""
+    """One task. A step is that of ``control.Environment``, without its counter of steps."""
 
     def __init__(self, name: str, env: Any) -> None:
         self._name, self._env = name, env
@@ -60,7 +60,7 @@ class ControlSuite(OfParts):
         self._substeps = round(env.control_timestep() / self._physics.timestep())
         bounds = env.action_spec()
         self.action = BoxAction(low=tuple(map(float, bounds.minimum)), high=tuple(map(float, bounds.maximum)))
-        limit = float(env._step_limit)  # no public name
+        limit = float(env._step_limit)  # there is no public name
         self.time_limit = round(limit) if np.isfinite(limit) else None
 
     def reset(self, seed: int | None) -> Array:

@@ -1,4 +1,5 @@
-"""Gymnasium environments by id. The state is MuJoCo's, or an attribute ``state``; what has neither can only be reset.
+"""Gymnasium environments by id. The state is MuJoCo's, or an attribute ``state``. An environment with neither can only
+be reset.
 
 The goal of a goal environment (Gymnasium-Robotics) is a part of the state, in its attribute ``goal``.
 """
@@ -37,13 +38,13 @@ def open_simulator(name: str) -> Simulator:
             f"{name} shows {env.observation_space}, a symbol out of several: expected numbers that change gradually"
         )
     limit = env.spec.max_episode_steps
-    wrapped = getattr(env.spec, "additional_wrappers", ())  # these may change what is shown and paid
+    wrapped = getattr(env.spec, "additional_wrappers", ())  # these may change observations and rewards
     simulator = None if wrapped else settable(name, env.unwrapped, limit)
     return simulator or ResetOnly(name, env, limit)
 
 
 def settable(name: str, env: Any, limit: int | None = None) -> GymnasiumSimulator | None:
-    """An unwrapped environment that can be set to a state; None where its state can't be read."""
+    """The unwrapped environment if it can be set to a state; None if its state can't be read."""
     if hasattr(env, "model") and hasattr(env, "data"):
         return GymnasiumSimulator(name, env, _mujoco(env), env.model, env.data, limit=limit)
     if holds_numbers(env, "state"):
@@ -52,7 +53,7 @@ def settable(name: str, env: Any, limit: int | None = None) -> GymnasiumSimulato
 
 
 def make(name: str) -> Any:
-    """The environment after a first reset.
+    """Make the environment, and reset it once.
 
     Raises:
         UnknownEnvironment: it can't be made.
@@ -80,7 +81,7 @@ def _way_out(name: str) -> str:
 
 
 class _Gymnasium(Simulator):
-    """Resets and steps of a Gymnasium environment; the latest observation is kept."""
+    """Resets and steps of a Gymnasium environment. It keeps the latest observation."""
 
     def __init__(self, name: str, env: Any, limit: int | None) -> None:
         self._name, self._env = name, env
@@ -101,7 +102,7 @@ class _Gymnasium(Simulator):
 
 
 class GymnasiumSimulator(_Gymnasium, OfParts):
-    """One that can be set to a state; without wrappers, so without a time limit of its own."""
+    """A Gymnasium environment that can be set to a state. It has no wrappers, so no time limit of its own."""
 
     def __init__(
         self,
@@ -126,7 +127,8 @@ class GymnasiumSimulator(_Gymnasium, OfParts):
 
 
 class ResetOnly(_Gymnasium):
-    """One whose state can't be read: what it shows is taken for its state, and it can only be reset."""
+    """A Gymnasium environment whose state can't be read. Its observation is used as the state, and it can only be
+    reset."""
 
     settable = False
     shows = False

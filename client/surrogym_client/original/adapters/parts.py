@@ -1,4 +1,4 @@
-"""A simulator whose state is made of parts."""
+"""Simulators whose state consists of parts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from surrogym_shared.spec.actions import Action
 
 
 class OfParts(Simulator):
-    """The part that is written last comes first: what it derives, MuJoCo's kinematics, reads the others."""
+    """A simulator with a state of parts. The first part is written last, because MuJoCo's kinematics depend on the
+    others."""
 
     def __init__(self, parts: Sequence[StatePart], model: Any = None, data: Any = None) -> None:
         self._parts = tuple(parts)
@@ -45,7 +46,7 @@ class OfParts(Simulator):
 
 
 def action_of(name: str, space: Any) -> Action:
-    """The action of a Gymnasium space.
+    """Convert the action space of Gymnasium to a specification's action.
 
     Raises:
         UnknownEnvironment: a space, or bounds, that no specification can express.
@@ -64,10 +65,10 @@ def action_of(name: str, space: Any) -> Action:
 
 
 def flat(name: str, observation: Any) -> Array:
-    """An observation as one row of numbers (D,); the entries of a dictionary in the order of their names.
+    """An observation as one row of numbers (D,). Entries of a dictionary are in the order of their names.
 
     Raises:
-        UnknownEnvironment: it holds an image, or something that is no number.
+        UnknownEnvironment: it contains an image, or a value that is not a number.
     """
     entries = [observation[key] for key in sorted(observation)] if isinstance(observation, dict) else [observation]
     arrays = [np.asarray(entry) for entry in entries]

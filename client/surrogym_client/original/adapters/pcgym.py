@@ -1,7 +1,7 @@
 """Process control by pc-gym: ``pcgym:cstr``, its documented stirred tank, or ``pcgym:FILE.json`` with its parameters.
 
-The state is the attribute ``state``. Setpoints and disturbances follow a schedule in an episode; where a state is set,
-they stay as they are set.
+The state is the attribute ``state``. Setpoints and disturbances follow a schedule in an episode. After a state is set,
+they keep the values that were set.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def open_simulator(name: str) -> Simulator:
     """Open a process.
 
     Raises:
-        UnknownEnvironment: no such parameters, or ones that can't be used here.
+        UnknownEnvironment: the parameters don't exist, or can't be used here.
         ImportError: pc-gym is not installed.
     """
     parameters = parameters_of(name.partition(":")[2])
@@ -56,10 +56,10 @@ def open_simulator(name: str) -> Simulator:
 
 
 def parameters_of(which: str) -> dict[str, Any]:
-    """What ``pcgym.make_env`` takes, of ``cstr`` or of a JSON file.
+    """Parameters for ``pcgym.make_env``, of ``cstr`` or from a JSON file.
 
     Raises:
-        UnknownEnvironment: neither, or the file asks for what can't be used here.
+        UnknownEnvironment: neither of them, or the file has parameters that can't be used here.
     """
     given = STIRRED_TANK if which == "cstr" else _read(which)
     for key, why in REFUSED.items():
@@ -95,7 +95,7 @@ def _read(which: str) -> dict[str, Any]:
 
 
 class Process(OfParts):
-    """One process. Its observation is its state in the units of the process."""
+    """One process. Its observation is its state, in the units of the process."""
 
     def __init__(self, name: str, env: Any) -> None:
         self._name, self._env = name, env
@@ -106,7 +106,7 @@ class Process(OfParts):
         self.time_limit = int(env.N) - 1  # its episodes end one step before their number of samples
 
     def reset(self, seed: int | None) -> Array:
-        del seed  # nothing is drawn
+        del seed  # a reset draws no random numbers
         self._env.SP, disturbances = self._schedule
         if disturbances:
             self._env.disturbances = disturbances

@@ -1,6 +1,6 @@
-"""A specification for a simulator that nobody has described yet, from a few episodes whose steps are counted.
+"""Draft a specification of an undescribed simulator from a few episodes, whose steps are counted.
 
-The steps show ranges, limits and coordinates. The file asks in plain words for everything that steps can't show.
+The steps show ranges, limits and coordinates. The file asks a person for everything that steps can't show.
 """
 
 from surrogym_client.original.describing.description import Description, describe

@@ -1,4 +1,4 @@
-"""What was found of a simulator, as a specification; and what a person has to say."""
+"""Convert findings about a simulator to a specification, with questions to a person."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ from surrogym_shared.spec import (
     limits,
 )
 
-FASTER = 1.5  # times the largest speed that was seen: what a policy may reach
-MARGIN = 0.25  # of the range that was seen, on each side
-MOSTLY = 0.5  # of all steps that were paid the same: such a reward is met by luck
-PLACES = 300  # where an observation is read, without a step
-UNKNOWN_SPEED = 1.0  # of what never moved, in the simulator's unit
-UNKNOWN_LIMIT = 200  # steps of an episode where the simulator says nothing
+FASTER = 1.5  # times the largest observed speed: what a policy may reach
+MARGIN = 0.25  # of the observed range, on each side
+MOSTLY = 0.5  # of all steps with the same reward; then other rewards are met only by luck
+PLACES = 300  # at which an observation is read, without a step
+UNKNOWN_SPEED = 1.0  # of a variable that never moved, in the simulator's unit
+UNKNOWN_LIMIT = 200  # steps of an episode if the simulator has no limit
 
 
 @dataclass(frozen=True)
 class Description:
-    """A specification, and where it comes from."""
+    """A specification, with its source."""
 
     spec: EnvironmentSpec
     found: tuple[str, ...]
@@ -67,11 +67,11 @@ class Description:
 
 
 def describe(name: str, steps: int = STEPS, seed: int = 0) -> Description:
-    """Find out what can be found of an environment that an adapter opens.
+    """Describe an environment that an adapter opens.
 
     Args:
         name: a Gymnasium id, ``dm_control:DOMAIN-TASK`` or ``pcgym:MODEL``.
-        steps: real steps of the episodes; some more check what was found.
+        steps: real steps of the episodes. Some more steps check the findings.
         seed: of the random actions.
 
     Raises:
@@ -105,7 +105,7 @@ class _Draft:
             )
 
     def spec(self, rng: np.random.Generator) -> EnvironmentSpec:
-        """The specification, its observation in terms of the coordinates."""
+        """The specification, with the observation in terms of the coordinates."""
         variables = [self._simulator.variables[i] for i in self._kept]
         coordinates = tuple(self._coordinate(i) for i in self._kept)
         frame = EnvironmentSpec(
@@ -123,7 +123,7 @@ class _Draft:
         return EnvironmentSpec.model_validate({**frame.model_dump(), "observation": observation})
 
     def found(self, spec: EnvironmentSpec, steps: int) -> tuple[str, ...]:
-        """What was found, in plain words."""
+        """Findings, one sentence each."""
         probed, kept = self._probed, set(spec.coordinate_names)
         still = [v.name for v in self._simulator.variables if v.name not in kept | probed.shifts]
         kinds = {kind: [c.name for c in spec.coordinates if c.kind == kind] for kind in ("angle", "constant")}
@@ -149,7 +149,7 @@ class _Draft:
         return tuple(lines)
 
     def asked(self, spec: EnvironmentSpec) -> tuple[str, ...]:
-        """What a person has to say, in plain words."""
+        """Questions to a person, one sentence each."""
         guessed = [
             c.name
             for i, c in zip(self._kept, spec.coordinates, strict=True)
@@ -205,7 +205,7 @@ class _Draft:
 
     @property
     def _unmoved(self) -> list[str]:
-        """Joints that no random action moved, and that something may move: each reset put them elsewhere."""
+        """Joints that no random action moved although they can move: each reset gave them another position."""
         moved = (self._seen.states != self._seen.next_states).any(0)
         differs = np.ptp(self._seen.starts, axis=0) > 0
         return [
@@ -215,7 +215,7 @@ class _Draft:
         ]
 
     def _is_constant(self, index: int) -> bool:
-        """Whether a variable stays through every episode, and differs between them."""
+        """Whether a variable is constant in every episode, and differs between episodes."""
         variable, seen = self._simulator.variables[index], self._seen
         if variable.motion in ("slide", "turn", "speed"):
             return False
@@ -249,7 +249,7 @@ class _Draft:
         return low - margin, high + margin
 
     def _start(self, index: int, coordinate: Coordinate) -> Uniform | Fixed:
-        """The range of starts, widened, because the range of n uniform draws is on average too narrow."""
+        """The range of starts, widened, because the range of n uniform draws is too narrow on average."""
         if coordinate.kind == "constant" and self._simulator.variables[index].limited:
             return Uniform(low=limits(coordinate.sampling)[0], high=limits(coordinate.sampling)[1])
         starts = self._seen.starts[:, index]
@@ -283,7 +283,7 @@ class _Draft:
         return list(shown.values())
 
     def _observed(self, frame: EnvironmentSpec, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Coordinates (n, C) and what the simulator shows there (n, D)."""
+        """Coordinates (n, C) and the simulator's observations there (n, D)."""
         simulator = self._simulator
         if not (simulator.shows and self._probed.settable):
             return self._seen.next_states[:, self._kept], self._seen.observations
@@ -298,7 +298,7 @@ class _Draft:
 
 
 def _raw(term: Term) -> set[str]:
-    """The coordinates that a term reads as they are; such a term jumps where an angle wraps."""
+    """The coordinates that a term reads directly. Such a term jumps where an angle wraps."""
     return {name for part in term.parts if part.function == "linear" for name in part.weights}
 
 

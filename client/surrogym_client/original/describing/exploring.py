@@ -16,15 +16,15 @@ from surrogym_shared.spec import BoxAction, DiscreteAction
 from surrogym_shared.spec.actions import Action
 
 STEPS = 400
-EPISODES = 4  # that share the steps, where none ends before
+EPISODES = 4  # that share the steps if none ends early
 RESETS = 32  # for the range of starts
 LONGEST_HOLD = 10  # steps in a row under one action
-PLACES_TRIED = 20  # for a start where nothing touches
+PLACES_TRIED = 20  # attempts to find a start without contacts
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What was seen.
+    """Data of the explored episodes.
 
     Attributes:
         starts: (R, V) after resets.
@@ -48,7 +48,7 @@ class Seen:
 
     @property
     def ended_at_once(self) -> NDArray[np.bool_]:
-        """Which steps (n,) ended an episode of one step: it began where none can be."""
+        """Which steps (n,) ended an episode of one step, because it began in an impossible state."""
         first = np.append(True, self.episodes[1:] != self.episodes[:-1])
         last = np.append(self.episodes[1:] != self.episodes[:-1], True)
         ended: NDArray[np.bool_] = first & last & self.terminated
@@ -64,7 +64,7 @@ class Counted:
         self.resets = 0
 
     def reset(self, seed: int) -> Array:
-        """Begin an episode; the state (V,)."""
+        """Begin an episode. Returns the state (V,)."""
         self.resets += 1
         self.simulator.reset(seed)
         return self.simulator.read()
@@ -75,14 +75,14 @@ class Counted:
         return self.simulator.step(action)
 
     def step_from(self, state: Array, action: Array) -> tuple[Array, Taken]:
-        """Set the state (V,) and take a step; where it led, and what it gave."""
+        """Set the state (V,) and take a step. Returns the next state and the step's results."""
         self.simulator.write(state)
         taken = self.step(action)
         return self.simulator.read(), taken
 
 
 def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
-    """Take random steps: half of the episodes from resets, the others from positions anywhere within limits."""
+    """Take random steps: half of the episodes start from resets, the others from random positions within limits."""
     simulator = counted.simulator
     starts = np.stack([counted.reset(seed) for seed in range(RESETS)])
     rows: list[tuple[Array, Array, Array, float, bool, Array, int]] = []
@@ -104,7 +104,7 @@ def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
 
 
 def _anywhere(simulator: Simulator, state: Array, rng: np.random.Generator) -> Array:
-    """Positions anywhere within their limits, where nothing touches; without such a place the state as it is."""
+    """Random positions within their limits, without contacts. If there are none, the state stays unchanged."""
     for _ in range(PLACES_TRIED):
         placed = state.copy()
         for i, variable in enumerate(simulator.variables):

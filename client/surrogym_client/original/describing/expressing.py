@@ -1,4 +1,4 @@
-"""Observation entries as sums of terms: found by least squares on 1, q, sin and cos of turning coordinates.
+"""Express observation entries as sums of terms, by least squares on 1, q, and sin and cos of turning coordinates.
 
 Shapes: n places, C coordinates, D observation entries.
 """
@@ -16,20 +16,20 @@ from surrogym_shared.terms import evaluate
 
 TOLERANCE = 1e-7  # of an entry's own size
 FEW_TURNS = 4  # with at most this many turning coordinates, sums of three of them are tried as well
-CLIPPED = 0.02  # share of places at a limit that speaks for one
+CLIPPED = 0.02  # share of places at a limit that indicates a clipped entry
 
 
 def express(
     frame: EnvironmentSpec, turning: Sequence[str], coordinates: Array, observed: Array
 ) -> list[ObservationEntry | None]:
-    """The entries of an observation as terms of the coordinates; None for one that never changes, or can't be
-    expressed.
+    """Express the entries of an observation as terms of the coordinates. The result has None for an entry that never
+    changes, or that can't be expressed.
 
     Args:
-        frame: a specification whose coordinates count, and nothing else.
+        frame: a specification, of which only the coordinates are used.
         turning: names of coordinates that enter by their sine and cosine.
         coordinates: (n, C) places.
-        observed: (n, D) what is shown there.
+        observed: (n, D) observations there.
     """
     basis = _basis(frame, turning)
     design = np.stack([evaluate(frame, term, coordinates) for term in basis], axis=1)
@@ -47,7 +47,7 @@ def express(
 
 
 def shown_by_itself(name: str, *, angle: bool) -> list[ObservationEntry]:
-    """A coordinate as it is; an angle by its cosine and sine."""
+    """Terms that show a coordinate directly; an angle by its cosine and sine."""
     if not angle:
         return [ObservationEntry(name=name, term=Term.linear(**{name: 1.0}))]
     pairs = (("cos", Term.cos(**{name: 1.0})), ("sin", Term.sin(**{name: 1.0})))
@@ -74,7 +74,7 @@ def _sum(basis: Sequence[Term], weights: Array) -> Term | None:
 
 
 def _clip_of(frame: EnvironmentSpec, coordinates: Array, entry: Array) -> Term | None:
-    """The coordinate that an entry shows up to limits, or None."""
+    """The coordinate that an entry shows, clipped to limits, or None."""
     low, high = float(entry.min()), float(entry.max())
     for index, name in enumerate(frame.coordinate_names):
         if np.allclose(np.clip(coordinates[:, index], low, high), entry, atol=TOLERANCE):
@@ -84,7 +84,7 @@ def _clip_of(frame: EnvironmentSpec, coordinates: Array, entry: Array) -> Term |
 
 
 def _name_of(term: Term) -> str | None:
-    """The name of an entry that shows one coordinate, or its sine or cosine, as it is."""
+    """Name of an entry that shows one coordinate, or its sine or cosine, directly."""
     if len(term.parts) != 1 or len(term.parts[0].weights) != 1 or term.parts[0].coefficient != 1.0:
         return None
     (name,) = term.parts[0].weights

@@ -1,4 +1,4 @@
-"""Steps that are taken again, from states that were set: whether that is exact, and what makes no difference.
+"""Steps repeated from states that were set: whether this is exact, and which shifts change nothing.
 
 Shapes: V variables of the state.
 """
@@ -12,16 +12,16 @@ import numpy as np
 from surrogym_client.original.describing.exploring import RESETS, Counted, Seen
 from surrogym_client.original.protocol import Array
 
-PLACES = 4  # at which each question is asked
-EXACT = 1e-6  # of what a variable moved in all
-SETTABLE = 1e-3  # of the same: the largest error of a state that counts as set
-FEW = 3.0  # times the noise of some steps: what that of one may be
-FARTHEST = 3.0  # that a position is shifted
+PLACES = 4  # number of states for each question
+EXACT = 1e-6  # of a variable's observed range
+SETTABLE = 1e-3  # of the same range: the largest error of a state that can be set
+FEW = 3.0  # factor for noise that was estimated from few steps
+FARTHEST = 3.0  # largest shift of a position
 
 
 @dataclass(frozen=True)
 class Probed:
-    """What repeated steps said; errors are shares of what was seen of each variable, the largest of all.
+    """Results of repeated steps. Errors are shares of each variable's observed range, the largest of all variables.
 
     Attributes:
         set_error: between a step of an episode and the same step from a state that was set.
@@ -39,18 +39,19 @@ class Probed:
 
     @property
     def noisy(self) -> bool:
-        """Whether the environment is random: equal episodes differ, and not only steps from states that were set."""
+        """Whether the environment is random: equal episodes differ, not only steps from states that were set."""
         return self.replay_error > EXACT
 
     @property
     def settable(self) -> bool:
-        """Whether a state that was set is the state. What two equal episodes don't explain was remembered."""
+        """Whether the state can be set completely. An error that two equal episodes don't explain means
+        hidden memory."""
         noise = FEW * max(self.replay_error, self.repeat_error) if self.noisy else 0.0
         return self.set_error <= max(SETTABLE, noise)
 
 
 def probe(counted: Counted, seen: Seen, rng: np.random.Generator) -> Probed:
-    """Take some of the steps again."""
+    """Repeat some of the steps."""
     simulator, scale = counted.simulator, _scale(seen)
     at = np.unique(np.linspace(0, len(seen.states) - 1, PLACES + 1).astype(int)[1:])
     taken = [(seen.states[i], seen.actions[i], seen.next_states[i], float(seen.rewards[i])) for i in at]
@@ -92,7 +93,7 @@ def probe(counted: Counted, seen: Seen, rng: np.random.Generator) -> Probed:
 
 
 def _replayed(counted: Counted, seen: Seen, scale: Array) -> float:
-    """Begin the first episode again, with its seed and actions."""
+    """Repeat the first episode, with its seed and actions."""
     counted.reset(RESETS)
     rows = np.flatnonzero(seen.episodes == 0)[:PLACES]
     errors = []
@@ -104,7 +105,7 @@ def _replayed(counted: Counted, seen: Seen, scale: Array) -> float:
 
 
 def _scale(seen: Seen) -> Array:
-    """What each variable (V,) moved in all, and the reward behind them."""
+    """Observed range of each variable (V,), followed by that of the reward."""
     moved = np.append(np.ptp(np.concatenate([seen.states, seen.next_states]), axis=0), np.ptp(seen.rewards))
     return np.where(moved > 0, moved, 1.0)
 
