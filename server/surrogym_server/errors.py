@@ -38,11 +38,11 @@ from __future__ import annotations
 
 
 class SurrogymError(Exception):
-    """Base of everything the server raises on purpose. ``str(error)`` is one sentence for a person."""
+    """Base of all errors that the server raises on purpose. ``str(error)`` is one sentence for a person."""
 
 
 class InvalidInput(SurrogymError):
-    """What the caller sent can't be used; nothing was changed."""
+    """The content of a request can't be used; nothing was changed."""
 
 
 class InvalidSpec(InvalidInput):
@@ -54,7 +54,7 @@ class TooLarge(InvalidInput):
 
 
 class NotThere(SurrogymError):
-    """Something named in the request does not exist."""
+    """A thing that the request names does not exist."""
 
 
 class UnknownSurrogate(NotThere):
@@ -70,7 +70,7 @@ class UnknownModel(NotThere):
 
 
 class UnknownPolicy(NotThere):
-    """No policy of this version or alias, or it lacks the file or evaluation that was asked for."""
+    """No policy with this version or alias, or it lacks the requested file or evaluation."""
 
 
 class UnknownJob(NotThere):
@@ -121,7 +121,7 @@ class NotReset(Conflict):
 
 
 class NoModel(Conflict):
-    """Nothing has been fitted yet."""
+    """No model has been fitted yet."""
 
 
 class Refused(SurrogymError):
@@ -137,15 +137,15 @@ class Forbidden(Refused):
 
 
 class BeyondBudget(Refused):
-    """More real steps than the budget has left; who may raise it can."""
+    """More real steps than the budget has left; a caller with role admin may raise it."""
 
 
 class Unavailable(SurrogymError):
-    """Can't be served now; nothing was changed; try again later."""
+    """The request can't be served now; nothing was changed; try again later."""
 
 
 class Damaged(Unavailable):
-    """What is stored can't be read as it was written; trying again helps only after a copy was restored."""
+    """Stored data differ from what was written. Trying again helps only after a copy was restored."""
 
 
 class Overloaded(Unavailable):
@@ -153,20 +153,21 @@ class Overloaded(Unavailable):
 
 
 class DeadlineExceeded(Unavailable):
-    """The answer would come after the deadline of the request; nothing was computed."""
+    """The answer would come after the request's deadline; nothing was computed."""
 
 
 class NotInstalled(SurrogymError):
-    """What is stored needs a plug-in that this server lacks; nothing was changed; reading works without it."""
+    """Stored data need a plug-in that is not installed. Nothing was changed, and reading works without it."""
 
 
 class PluginFailed(SurrogymError):
-    """An acquisition or a family of models raised, or gave back what breaks its laws; says which, and what."""
+    """An acquisition or a family of models raised an error or broke its laws. The message names it."""
 
 
 class ChoiceFailed(PluginFailed):
-    """An acquisition did: the model could be fitted, and its next queries could not be chosen."""
+    """An acquisition raised an error or broke its laws. The model was fitted, but its next queries could not
+    be chosen."""
 
 
 class NumericalFailure(SurrogymError):
-    """A covariance matrix that no jitter repairs."""
+    """A covariance matrix that no jitter makes positive definite."""

@@ -1,11 +1,11 @@
-"""Policy search by gradients straight through the model, for those who run beside the server.
+"""Policy search by gradients through the model, on the machine of the server.
 
-The paper's Autograd remark: the return of an imagined episode is a differentiable function of the policy's
-parameters, mean increments and mean rewards of the processes (AUR-D), one after the other. Episodes are cut after a
-horizon, because gradients through an unstable system grow with its length, and no lane may outweigh the others. Noise
-before the last tanh, fading out, smooths the return: without it Pendulum ended in a local optimum in three of four
-runs. A step that ends an episode ends the sum; when episodes end has no gradient, so a task that is all about when
-(MountainCarContinuous, InvertedPendulum) is none for this search.
+The paper's Autograd remark: the return of an imagined episode is a differentiable function of the policy's parameters,
+by the mean increments and mean rewards of the processes (AUR-D), step after step. Episodes are cut after a horizon,
+because gradients through an unstable system grow with its length, and no lane may outweigh the others. Decaying noise
+before the last tanh smooths the return: without it Pendulum ended in a local optimum in three of four runs. A step that
+ends an episode ends the sum. The time of an ending has no gradient, so the search is unsuitable for tasks that are
+about this time (MountainCarContinuous, InvertedPendulum).
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from surrogym_server.virtual import LaneState, VirtualSettings, create, reset
 from surrogym_shared.network import Network
 from surrogym_shared.spec import BoxAction
 
-SHORTEST_HORIZON, LONGEST_HORIZON = 50, 100  # between them, a third of the time limit
-LONGEST_EPISODE = 1_000  # where the specification has no time limit
+SHORTEST_HORIZON, LONGEST_HORIZON = 50, 100  # bounds for a third of the time limit
+LONGEST_EPISODE = 1_000  # if the specification has no time limit
 START_BOX = 0.5  # share of episodes that start anywhere in the sampling range
 CHECKS = 12
 CHECK_LANES = 64
 LARGEST_LANE = 2.0  # of the median lane's gradient, at every step backwards
-NOISE = 1.0  # first deviation of the noise before the last tanh
-FIRST_SPREAD = 0.5  # deviation of the first parameters
-LAST_RATE = 0.05  # share of the learning rate that is left at the end
+NOISE = 1.0  # initial deviation of the noise before the last tanh
+FIRST_SPREAD = 0.5  # deviation of the initial parameters
+LAST_RATE = 0.05  # final share of the learning rate
 
 
 @dataclass(frozen=True)
 class GradientSettings:
-    """``horizon`` None is a third of the time limit, between 50 and 100 steps."""
+    """Settings of the search. ``horizon`` None is a third of the time limit, between 50 and 100 steps."""
 
     updates: int = 200
     lanes: int = 128
@@ -60,7 +60,7 @@ class Optimised:
     policy: Network
     imagined_return: float
     virtual_steps: int
-    whole: bool = True  # False where Ctrl-C ended the search
+    whole: bool = True  # False if Ctrl-C ended the search
 
 
 def optimise(
@@ -68,7 +68,7 @@ def optimise(
     settings: GradientSettings | None = None,
     progress: Callable[[Update], None] | None = None,
 ) -> Optimised:
-    """Climb the gradient of the imagined return; gives the policy whose imagined return was best.
+    """Climb the gradient of the imagined return. Returns the policy with the best imagined return.
 
     Args:
         surrogate: with continuous actions.
@@ -77,8 +77,8 @@ def optimise(
 
     Raises:
         KeyboardInterrupt: Ctrl-C came before the first check; later it ends the search with the best policy so far.
-        InvalidInput: the policy's actions are discrete, or the model's family can't be differentiated; or the return
-            does not depend on the actions anywhere, as where every step alive pays the same.
+        InvalidInput: the policy's actions are discrete, or the model's family can't be differentiated, or the return
+            does not depend on the actions, for example because every step before the end has the same reward.
 
     Examples:
         >>> optimise(LocalSurrogate.load("spec.json", "model.safetensors")).policy.save(Path("policy.zip"))
@@ -103,7 +103,7 @@ def optimise(
 
 
 class _Search:
-    """Parameters of a ``Network`` as one vector, Adam, and the lanes whose starts are drawn anew for each update."""
+    """Parameters of a ``Network`` as one vector, Adam, and the lanes, whose starts are drawn again for each update."""
 
     def __init__(self, surrogate: LocalSurrogate, settings: GradientSettings) -> None:
         self._spec, self._model, self._settings = surrogate.spec(), surrogate.model, settings
@@ -129,12 +129,12 @@ class _Search:
         self.virtual_steps = 0
 
     def policy(self) -> Network:
-        """The policy as it is now."""
+        """The present policy."""
         vector = self._vector.detach().numpy().copy()
         return Network.of(self._spec, self._mean.numpy(), self._deviation.numpy(), self._settings.units, vector)
 
     def update(self) -> None:
-        """One step up the gradient of the mean return of episodes from new starts."""
+        """Take one step along the gradient of the mean return of episodes from new starts."""
         self._lanes, _ = reset(self._model.definition, self._training, self._lanes)
         returns = self._returns(self._lanes.q, self._horizon)
         if not returns.requires_grad:
@@ -144,14 +144,14 @@ class _Search:
         gradient = self._vector.grad
         assert gradient is not None
         if not bool(gradient.isfinite().all()):
-            gradient.zero_()  # these starts lead where the model is too steep; others follow
+            gradient.zero_()  # the model is too steep after these starts; the next update has others
         torch.nn.utils.clip_grad_norm_([self._vector], self._settings.largest_norm)
         self._adam.step()
         self._rate.step()
 
     @torch.no_grad()
     def imagined_return(self) -> float:
-        """Mean return of whole episodes from the same declared starts at every check."""
+        """Mean return of whole episodes, from the same declared starts at every check."""
         return float(self._returns(self._check_lanes.q, self._limit).mean())
 
     def _returns(self, q: Tensor, steps: int) -> Tensor:
@@ -169,7 +169,7 @@ class _Search:
         return returns
 
     def _act(self, q: Tensor) -> Tensor:
-        """What ``Network`` does, in torch: q (N, C) to actions (N, F)."""
+        """Act like ``Network``, in torch: q (N, C) to actions (N, F)."""
         d, units, size = len(self._mean), self._settings.units, self._spec.action.size
         hidden, bias, output, output_bias = torch.split(self._vector, [d * units, units, units * size, size])
         x = (self._model.definition.observe(q) - self._mean) / self._deviation
@@ -181,7 +181,7 @@ class _Search:
 
     @property
     def _noise(self) -> float:
-        """Deviation of what is added before the last tanh: it smooths the return, and fades like the learning rate."""
+        """Deviation of the noise before the last tanh. It decays like the learning rate."""
         return NOISE * float(self._rate.get_last_lr()[0]) / self._settings.learning_rate
 
     @property
@@ -197,9 +197,9 @@ class _Search:
 
 
 def _evened(gradient: Tensor) -> Tensor:
-    """The gradient (N, C) of what is still to come, where no lane outweighs the others.
+    """Limit the gradient (N, C) of the later steps, so that no lane outweighs the others.
 
-    Backwards through an unstable stretch a lane's gradient grows with every step, and would soon be the only one.
+    Backwards through an unstable stretch, a lane's gradient grows with every step, and would soon dominate.
     """
     size = gradient.norm(dim=1, keepdim=True)
     evened: Tensor = gradient * (LARGEST_LANE * size.median() / size.clamp_min(1e-300)).clamp_max(1.0)

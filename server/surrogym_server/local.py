@@ -1,4 +1,4 @@
-"""LocalSurrogate: a surrogate stepped in this process, for those who have the [server] extra. No server, no FastAPI."""
+"""LocalSurrogate: a surrogate stepped in this process, without a server. It needs the extra [server]."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class LocalSurrogate:
 
     @classmethod
     def load(cls, spec: str | Path, model: str | Path) -> Self:
-        """Read a specification (JSON) and a model (safetensors) as the server exports them.
+        """Read a specification (JSON) and a model (safetensors) that the server exported.
 
         Raises:
             OSError: a file that can't be read.
@@ -58,7 +58,7 @@ class LocalSurrogate:
 
     @classmethod
     def from_bytes(cls, spec: EnvironmentSpec, model: bytes) -> Self:
-        """A surrogate of a specification and a model's file. Raises ``InvalidInput``: no model of it."""
+        """A surrogate from a specification and a model's file. Raises ``InvalidInput`` if the model does not fit."""
         return cls(spec, from_bytes(stored_definition(spec), model))
 
     @classmethod
@@ -67,8 +67,8 @@ class LocalSurrogate:
 
         Raises:
             OSError: the file can't be read.
-            NotASurrogateFile: it is none.
-            InvalidInput: its model is none of its specification.
+            NotASurrogateFile: it is not a surrogate's file.
+            InvalidInput: its model does not fit its specification.
         """
         file = SurrogateFile.load(path)
         return cls.from_bytes(file.spec, file.model)
@@ -78,7 +78,7 @@ class LocalSurrogate:
 
     @property
     def model(self) -> DynamicsModel:
-        """What the steps are computed with."""
+        """The model that computes the steps."""
         return self._model
 
     def open(self, request: OpenSession) -> SessionView:
@@ -130,11 +130,12 @@ class LocalSurrogate:
         return outcome
 
     def submit_occupancy(self, session: str, checkpoint: str) -> SubmittedOccupancy:
-        """There is no design here to weigh; says how many states there are, and keeps none."""
+        """Return the number of visited states. They are not kept, because there is no design here that could
+        use them."""
         return SubmittedOccupancy(checkpoint=checkpoint, states=len(self.visited(session)))
 
     def visited(self, session: str) -> NDArray[np.float64]:
-        """The states that a session opened with occupancy visited, (v, C)."""
+        """The states that a session with occupancy visited, (v, C)."""
         return visited_states(self._get(session))
 
     def close(self, session: str) -> None:
@@ -152,7 +153,7 @@ class LocalSurrogate:
 
 
 class _OneModel:
-    """The models of a surrogate that has one."""
+    """The models of a surrogate with a single model."""
 
     def __init__(self, model: DynamicsModel) -> None:
         self._model = model
@@ -167,4 +168,4 @@ class _OneModel:
 
 
 def _always() -> None:
-    """Rollouts go on to their end."""
+    """Let rollouts continue to their end."""

@@ -12,7 +12,7 @@ LogFormat = Literal["text", "json"]
 REQUEST_ID: ContextVar[str | None] = ContextVar("request_id", default=None)
 
 
-# A path or a name may hold a line break, and what it wrote behind that would look like a line of ours.
+# A path or a name may contain a line break, and the text after it could imitate a line of this log.
 _ESCAPES = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160), 0x2028, 0x2029)}
 
 

@@ -1,4 +1,4 @@
-"""Families that the specification chooses from by name and settings, and that installed packages may add to."""
+"""Registries of classes that a specification chooses by name and settings. Installed packages may add classes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from surrogym_server.errors import InvalidSpec, SurrogymError
 from surrogym_shared import plugins
 
 T = TypeVar("T")
-TYPES: dict[Any, tuple[str, tuple[type, ...]]] = {  # of settings, in words, and what a specification gives for them
+TYPES: dict[Any, tuple[str, tuple[type, ...]]] = {  # of settings: in words, and the types in a specification
     float: ("a number", (int, float)),
     int: ("a whole number", (int,)),
     bool: ("true or false", (bool,)),
@@ -29,10 +29,10 @@ class Choice:
 
 
 class Registry(plugins.Registry[T]):
-    """Classes by name, and members made of them. Nothing is loaded because of what a request holds beside a name."""
+    """Classes by name, and members made of them. Apart from the name, nothing in a request decides what is loaded."""
 
     def lack(self, choice: Choice) -> str | None:
-        """What this machine lacks for a choice that was once made, to go on after "it needs"; None: nothing."""
+        """Describe what this machine lacks for a stored choice, to follow "it needs"; None if nothing."""
         what = f"the {self.noun} {choice.name!r}"
         try:
             self.name_of(choice.name)
@@ -48,10 +48,10 @@ class Registry(plugins.Registry[T]):
         return None
 
     def get(self, name: str) -> type[T]:
-        """The class of a name.
+        """Return the class with a name.
 
         Raises:
-            InvalidSpec: there is none, or its package is broken; says which names there are.
+            InvalidSpec: there is none, or its package is broken; the message lists the known names.
         """
         try:
             return super().get(name)
@@ -59,10 +59,10 @@ class Registry(plugins.Registry[T]):
             raise InvalidSpec(str(error)) from None
 
     def make(self, choice: Choice) -> T:
-        """The member of a name, with its settings: the fields of a frozen dataclass.
+        """Make the member with a name and its settings, which are the fields of a frozen dataclass.
 
         Raises:
-            InvalidSpec: an unknown name, or settings that it does not have or take.
+            InvalidSpec: an unknown name, an unknown setting, or an invalid value.
         """
         kind, settings = self.get(choice.name), dict(choice.settings)
         with guarded(f"{self.kind} {choice.name}", InvalidSpec):
@@ -72,12 +72,12 @@ class Registry(plugins.Registry[T]):
 
 @contextmanager
 def guarded(what: str, failure: type[SurrogymError], *, interrupts: bool = False) -> Iterator[None]:
-    """Run code that may be another package's: whatever it raises becomes a ``failure`` that begins with ``what``; what
-    is raised on purpose stays what it is.
+    """Run code that may belong to another package. Every error becomes a ``failure`` whose message begins with
+    ``what``, except errors that the server raises on purpose.
 
-    A ``ValueError`` is how this code refuses a specification, so that its message says all where ``failure`` is
-    ``InvalidSpec``; the type of anything else is told. ``KeyboardInterrupt`` goes on, as while a package is loaded,
-    unless ``interrupts``: in a server's requests, where a person's Ctrl-C comes in another way.
+    This code refuses a specification by a ``ValueError``, so with ``InvalidSpec`` the message of a ``ValueError`` is
+    enough; for other errors the type is added. ``KeyboardInterrupt`` passes, for example while a package is loaded,
+    unless ``interrupts`` is set: in a server's requests, where a person's Ctrl-C arrives differently.
     """
     try:
         yield
@@ -90,18 +90,20 @@ def guarded(what: str, failure: type[SurrogymError], *, interrupts: bool = False
 
 
 def failed(what: str, failure: type[SurrogymError], error: BaseException) -> SurrogymError:
-    """What ``guarded`` raises."""
+    """The error that ``guarded`` raises."""
     refused = isinstance(error, ValueError) and failure is InvalidSpec
     return failure(f"{what}: {plugins.one_line(error, typed=not refused)}")
 
 
 def in_one_line(error: BaseException) -> str:
-    """What went wrong, for a person: the message of what the server raises on purpose, the type before any other's."""
+    """Describe an error in one line: the message of an error of this package, or the type and message of
+    another one."""
     return plugins.one_line(error, typed=not isinstance(error, SurrogymError))
 
 
 def _check_settings(kind: type, settings: dict[str, float | bool | str]) -> None:
-    """Raises ``ValueError``: one that the class does not have, one that is missing, or one of another type."""
+    """Check settings against the fields of a class. Raises ``ValueError`` for an unknown, missing or wrongly
+    typed one."""
     fields = [field for field in dataclasses.fields(kind) if field.init] if dataclasses.is_dataclass(kind) else []
     names = ", ".join(field.name for field in fields)
     if unknown := sorted(set(settings) - {field.name for field in fields}):
@@ -118,7 +120,7 @@ def _check_settings(kind: type, settings: dict[str, float | bool | str]) -> None
 
 
 def _types(kind: type) -> dict[str, Any]:
-    """Types of the fields of a class; none where it names what only a type checker imports."""
+    """Types of the fields of a class; empty if they name types that only a type checker imports."""
     try:
         return get_type_hints(kind)
     except Exception:

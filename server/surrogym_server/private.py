@@ -1,4 +1,4 @@
-"""Files of the server that hold secrets: new ones are private, and those that others may read are named at start."""
+"""Files with secrets: new ones are made private, and a warning at start names those that others can read."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ logger = logging.getLogger(__name__)
 
 
 def keep_private(settings: Settings) -> None:
-    """Make a new SQLite file readable for its owner alone, and warn of every secret file that others may read.
+    """Make a new SQLite file readable for its owner alone, and warn of every secret file that others can read.
 
-    SQLite gives the files beside it (``-wal``, ``-shm``) the same mode. A database that is there keeps its own.
+    SQLite gives the files beside it (``-wal``, ``-shm``) the same mode. An existing database keeps its mode.
     """
     database = _sqlite_file(settings.database_url)
     if database is not None:
-        with suppress(OSError):  # opening it says what is wrong, and an existing one stays as it is
+        with suppress(OSError):  # opening it raises the error, and an existing file stays unchanged
             database.parent.mkdir(parents=True, exist_ok=True)
             os.close(os.open(database, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     for path in (database, settings.token_file, settings.tls_key):

@@ -1,8 +1,8 @@
 """Elementary functions of whole arrays, in forms that the compiler turns into vector instructions.
 
-Each reduces its argument by a multiple k of log 2 or pi / 2, with k from the low bits of x / step + 1.5 2^52, and takes
-a polynomial of what is left. Errors are below 2 units in the last place; the scalar functions of the C library, which
-compiled code would call for each entry, take five to ten times as long.
+Each reduces its argument by a multiple k of log 2 or pi / 2, with k from the low bits of x / step + 1.5 2^52, and
+evaluates a polynomial of the rest. Errors are below 2 units in the last place. The scalar functions of the C library,
+which compiled code would call for each entry, take five to ten times as long.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from surrogym_shared.compiled.jit import compiled, summing
 
 Floats = NDArray[np.float64]
 
-ROUNDING = 1.5 * 2.0**52  # added to a number below 2^51, leaves it rounded in the low bits
+ROUNDING = 1.5 * 2.0**52  # added to a number below 2^51, it leaves the rounded number in the low bits
 PER_LOG2 = 1.4426950408889634
 LOG2_HIGH, LOG2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
-LEAST_EXPONENT = -708.0  # e to it is the smallest normal number
+LEAST_EXPONENT = -708.0  # e to this power is the smallest normal number
 PER_RIGHT_ANGLE = 0.63661977236758134
 # pi / 2 in three parts, of which the first two have 33 bits, so that their products with k are exact
 RIGHT_ANGLE = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
-LARGEST_ANGLE = 1e5  # beyond, the C library reduces the argument
+LARGEST_ANGLE = 1e5  # for larger angles, the C library reduces the argument
 
 
 def _keep_bits(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -47,7 +47,7 @@ float_of: Any = intrinsic(_float_of)  # of 64 bits
 
 @compiled
 def exponential(x: Floats) -> None:
-    """e^x in the place of x (n,), for x <= 709; below -708 it is about 1e-308."""
+    """Replace x (n,) by e^x, for x <= 709; below -708 it is about 1e-308."""
     for i in range(x.size):
         v = x[i] if x[i] > LEAST_EXPONENT else LEAST_EXPONENT
         t = v * PER_LOG2 + ROUNDING
@@ -70,7 +70,7 @@ def exponential(x: Floats) -> None:
 
 @compiled
 def sine_and_cosine(x: Floats, sine: Floats, cosine: Floats) -> None:
-    """sin x and cos x of x (n,), into arrays of the same size."""
+    """Write sin x and cos x of x (n,) to arrays of the same size."""
     large = False
     for i in range(x.size):
         large |= not abs(x[i]) < LARGEST_ANGLE
@@ -104,7 +104,7 @@ def sine_and_cosine(x: Floats, sine: Floats, cosine: Floats) -> None:
 
 @compiled
 def wrapped(angle: float) -> float:
-    """The angle in [-pi, pi), as ``environment.definition.wrap`` gives it."""
+    """Wrap an angle to [-pi, pi), like ``environment.definition.wrap``."""
     turned = angle + math.pi
     if not 0.0 <= turned < 2 * math.pi:
         turned %= 2 * math.pi

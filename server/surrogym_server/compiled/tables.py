@@ -1,4 +1,4 @@
-"""Many matrices in one array, so that a compiled function takes two arguments for all that it reads."""
+"""Many matrices in one array, so that a compiled function takes only two arguments for all its data."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ Tables = tuple[Floats, Ints]  # numbers (K,), and begin, rows and columns of eac
 
 
 class TablesBuilder:
-    """Collects matrices. A vector is a matrix of one row; whole numbers are kept as float64."""
+    """Collects matrices. A vector is a matrix of one row. Whole numbers are stored as float64."""
 
     def __init__(self) -> None:
         self._matrices: list[NDArray[Any]] = []
 
     def add(self, *matrices: ArrayLike) -> int:
-        """Put matrices one after the other; gives the place of the first."""
+        """Append matrices, and return the place of the first."""
         first = len(self._matrices)
         self._matrices += [np.atleast_2d(np.asarray(matrix, dtype=np.float64)) for matrix in matrices]
         return first
 
     def reserve(self) -> int:
-        """A place that ``fill`` fills later."""
+        """Reserve a place that ``fill`` fills later."""
         return self.add(np.zeros((1, 0)))
 
     def fill(self, place: int, matrix: ArrayLike) -> None:
@@ -44,6 +44,6 @@ class TablesBuilder:
 
 @compiled
 def matrix(numbers: Floats, places: Ints, place: int) -> Floats:
-    """The matrix at a place, (rows, columns), not copied."""
+    """The matrix at a place, (rows, columns), as a view."""
     begin, rows, columns = places[place, 0], places[place, 1], places[place, 2]
     return numbers[begin : begin + rows * columns].reshape((rows, columns))

@@ -1,4 +1,4 @@
-"""Wire <-> core, in pairs."""
+"""Conversion between wire models and objects of the core, in pairs of functions."""
 
 from surrogym_server.convert.definitions import default_budget, definition_from_spec, stored_definition
 from surrogym_server.convert.jobs import claimed_job, job_detail, job_list, job_progress, job_result, job_view

@@ -1,4 +1,4 @@
-"""Specification to definition."""
+"""Conversion of a specification to a definition."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from surrogym_shared import spec as wire
 PENALTY = {"default": 0.0, "paper": 3.0}  # k of eq. 14
 MONTE_CARLO = 1024
 HYPERCUBE_TRIES = 50
-LONGEST_ROLLOUT = 200  # where the specification names none
+LONGEST_ROLLOUT = 200  # if the specification has none
 
 
 def definition_from_spec(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
-    """The core's view of a specification for a new design, every default of its preset resolved.
+    """Convert the specification of a new design, with every default of its preset resolved.
 
     Raises:
-        InvalidSpec: the preset can't represent this environment, or an acquisition or a family of models
-            that is not installed, does not take its settings, or does not fit this environment.
+        InvalidSpec: the preset can't represent this environment, or an acquisition or a family of models is not
+            installed, does not take its settings, or does not fit this environment.
     """
     definition = stored_definition(spec)
     learner_of(definition.learning.model)
@@ -34,8 +34,7 @@ def definition_from_spec(spec: wire.EnvironmentSpec) -> core.EnvironmentDefiniti
 
 
 def stored_definition(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
-    """The core's view of a specification that was once taken: what it names need not be installed any more, and only
-    who uses it will miss it.
+    """Convert a stored specification. Its plug-ins need not be installed any more; only their use would fail.
 
     Raises:
         InvalidSpec: the preset can't represent this environment.
@@ -67,9 +66,11 @@ def stored_definition(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
 
 
 def default_budget(spec: wire.EnvironmentSpec) -> int:
-    """Real steps the design may take where the specification names none: ten per dimension for the default preset,
-    twenty where it can only reset and act; three times the initial design for the paper's (it took 125 and 120 in all
-    after 40 and 50)."""
+    """Default for the design's real steps.
+
+    In preset default ten for each dimension, or twenty if the environment can't be set to a state. In preset paper
+    three times the initial design (the paper needed 125 and 120 in all after 40 and 50).
+    """
     if spec.design.budget is not None:
         return spec.design.budget
     initial = _design(spec).initial
@@ -110,7 +111,8 @@ def _learning(spec: wire.EnvironmentSpec) -> core.LearningDefinition:
 
 
 def _model(design: wire.Design) -> Choice:
-    """The family of models. What the preset says of Gaussian processes holds unless the specification overrides it."""
+    """The family of models. The preset chooses the settings of Gaussian processes that the specification
+    leaves open."""
     choice, paper = _choice(design.model, GAUSSIAN_PROCESS), design.preset == "paper"
     if choice.name == GAUSSIAN_PROCESS:
         kernel = "squared_exponential" if paper else "composite"

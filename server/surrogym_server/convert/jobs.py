@@ -8,7 +8,7 @@ from surrogym_server.convert.stored import read_stored
 from surrogym_server.storage.jobs import JobProgress, JobRecord, JobResult, LeasedJob
 from surrogym_shared import wire
 
-JOB = "a job"  # in the error where it is damaged
+JOB = "a job"  # name in the error if it is damaged
 
 
 def claimed_job(job: LeasedJob | None, lease_seconds: float) -> wire.ClaimedJob:
@@ -34,7 +34,7 @@ def job_view(record: JobRecord) -> wire.JobView:
 
 
 def job_detail(record: JobRecord) -> wire.JobDetail:
-    """With the curve so far."""
+    """A job with its curve so far."""
     return read_stored(wire.JobDetail, JOB, {**_fields(record), "curve": record.curve})
 
 

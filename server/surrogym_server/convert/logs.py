@@ -1,4 +1,4 @@
-"""Logs: text to checked rows, checked rows to samples and replies."""
+"""Conversion of logs: from text to checked rows, and from checked rows to samples and replies."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WHERE = "the log"
 
 
 def drafted_log(body: wire.DraftLog) -> ReadLog:
-    """A log with the specification that is drafted from it. Raises ``InvalidInput``: it can't be used."""
+    """A log with a specification drafted from it. Raises ``InvalidInput`` if it can't be used."""
     try:
         table, roles = _table(body)
         return draft_log(table, roles, body.environment, body.budget)

@@ -1,4 +1,4 @@
-"""Arrays out of rows, rows out of arrays."""
+"""Conversion between arrays and nested lists."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from surrogym_server.errors import InvalidInput
 
 
 def numbers(what: str, rows: Sequence[Any]) -> NDArray[np.float64]:
-    """Nested lists as an array.
+    """Convert nested lists to an array.
 
     Raises:
         InvalidInput: rows of different lengths.

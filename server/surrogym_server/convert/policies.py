@@ -1,4 +1,4 @@
-"""Policies: requests to records, records to replies."""
+"""Conversion of policies: requests to records, and records to replies."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from surrogym_server.storage.policies import EvaluationRecord, PolicyFile, Polic
 from surrogym_server.storage.records import JSON
 from surrogym_shared import wire
 
-CARD = "the card of a policy"  # in the error where it is damaged
+CARD = "the card of a policy"  # name in the error if it is damaged
 
 
 def new_policy(body: wire.AddPolicy) -> tuple[JSON, list[JSON], PolicyFile]:
-    """Card, curve and announced file."""
+    """Card, curve and announced file of a request."""
     curve = [point.model_dump(mode="json") for point in body.curve]
     return body.card.model_dump(mode="json"), curve, policy_file(body.file)
 
@@ -49,7 +49,7 @@ def pushed_policy(record: PolicyRecord, *, created: bool) -> wire.PushedPolicy:
 
 
 def policy_detail(record: PolicyRecord) -> wire.PolicyDetail:
-    """With the settings and the curve of its training."""
+    """A policy with the settings and the curve of its training."""
     card = _card(record)
     curve = [read_stored(wire.CurvePoint, "the curve of a training", point) for point in record.curve]
     of_training = {name: getattr(card, name) for name in ("seed", "seconds", "settings", "versions")}
@@ -63,7 +63,7 @@ def evaluation_view(policy: PolicyRecord, record: EvaluationRecord) -> wire.Eval
 def evaluation_detail(
     policy: PolicyRecord, record: EvaluationRecord, episodewise: JSON | None, missing: str | None, *, traces: bool
 ) -> wire.EvaluationDetail:
-    """``episodewise`` is None where it is ``missing``."""
+    """An evaluation with its episodes. ``episodewise`` is None if they are ``missing``."""
     there = episodewise or {"returns": [], "lengths": [], "success": None, "traces": []}
     fields = {**_evaluation(record, _card(policy)), **there, "missing": missing}
     if not traces:

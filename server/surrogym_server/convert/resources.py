@@ -1,4 +1,4 @@
-"""Surrogates, queries, samples, models and events: records to replies."""
+"""Conversion of surrogates, queries, samples, models and events: records to replies."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from surrogym_server.virtual.single_step import PointPrediction
 from surrogym_shared import spec as wire
 from surrogym_shared import wire as replies
 
-FIDELITY = "the fidelity of a model"  # in the error where it is damaged
+FIDELITY = "the fidelity of a model"  # name in the error if it is damaged
 
 
 def surrogate_list(listed: Sequence[Listed], limit: int) -> replies.SurrogateList:
-    """A page of ``limit`` surrogates; another one follows where more are ``listed``."""
+    """A page of ``limit`` surrogates. There is a next page if more are ``listed``."""
     page, more = listed[:limit], len(listed) > limit
     surrogates = [_summary_fields(one) for one in page]
     return replies.SurrogateList.model_validate(

@@ -1,4 +1,4 @@
-"""Sessions: requests to openings, answers to replies and frames."""
+"""Conversion of sessions: requests to openings, and answers to replies and frames."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def session_view(session: SessionInfo, idle_seconds: float, replay: int = 0) -> 
 
 
 def session_coordinates(coordinates: Array) -> replies.SessionCoordinates:
-    """Of coordinates (N, C)."""
+    """The reply with coordinates (N, C)."""
     return replies.SessionCoordinates(coordinates=coordinates.tolist())
 
 
@@ -114,7 +114,7 @@ def lane_mask(mask: list[bool] | None) -> NDArray[np.bool_] | None:
 
 
 def reset_reply(reply: Reply) -> dict[str, Any]:
-    """The fields of ``ResetReply``, unchecked: this and ``step_reply`` are on the path of every step."""
+    """The fields of ``ResetReply``, not validated, because this and ``step_reply`` are on the path of every step."""
     assert isinstance(reply.outcome, ResetResult)
     result = reply.outcome
     return {
@@ -131,14 +131,14 @@ def step_reply(reply: Reply) -> dict[str, Any]:
 
 
 def rollout_steps(reply: Reply) -> Iterator[dict[str, Any]]:
-    """The fields of the steps of ``RolloutReply``, one by one; they all carry the one seq of the request."""
+    """The fields of the steps of ``RolloutReply``, one by one. They all have the seq of the request."""
     assert not isinstance(reply.outcome, ResetResult)
     steps = reply.outcome.steps() if isinstance(reply.outcome, PolicyRollout) else reply.outcome
     return (_step_fields(reply.seq, step) for step in steps)
 
 
 def rollout_actions(reply: Reply) -> dict[str, Any]:
-    """The fields of ``RolloutReply`` that say what a policy did; none where no policy acted."""
+    """The fields of ``RolloutReply`` about a policy's actions; none without a policy."""
     if not isinstance(reply.outcome, PolicyRollout):
         return {}
     log = reply.outcome.log_probability
@@ -146,13 +146,13 @@ def rollout_actions(reply: Reply) -> dict[str, Any]:
 
 
 def policy_run(request: replies.RolloutSession) -> PolicyRun:
-    """Raises ``InvalidInput``: arrays that don't fit together."""
+    """Read a policy's run from arrays. Raises ``InvalidInput`` if they don't fit together."""
     assert request.policy is not None
     assert request.steps is not None
     given, dtype = request.policy, np.dtype(request.policy.precision)
 
     def array(name: str, rows: Any) -> NDArray[Any]:
-        with np.errstate(over="ignore"):  # what float32 can't hold becomes infinite, and is refused as such
+        with np.errstate(over="ignore"):  # values too large for float32 become infinite, and are refused as such
             return numbers(name, rows).astype(dtype)
 
     try:
@@ -170,13 +170,13 @@ def policy_run(request: replies.RolloutSession) -> PolicyRun:
 
 
 def framed_policy_run(request: frames.PolicyRequest, shape: frames.Shape) -> PolicyRun:
-    """Raises ``FrameError``."""
+    """Read a policy's run from a frame. Raises ``FrameError``."""
     policy, until = frames.policy_of(request, shape), frames.until_of(request, shape)
     return PolicyRun(policy, request.steps, frames.noise_of(request), until)
 
 
 def session_shape(session: SessionInfo) -> frames.Shape:
-    """What a session's frames leave out."""
+    """The numbers of a session that its frames omit."""
     definition = session.definition
     return frames.Shape(
         lanes=session.settings.num_envs,

@@ -1,4 +1,4 @@
-"""Reads stored documents with the models that the wire checks requests with."""
+"""Reading of stored documents with the wire's models."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ M = TypeVar("M", bound=BaseModel)
 
 
 def read_stored(model: type[M], what: str, stored: dict[str, Any]) -> M:
-    """A document as an instance of its model.
+    """Read a document as an instance of its model.
 
     Args:
-        model: what it was written from.
-        what: its name in the error, with its article.
-        stored: what the database holds.
+        model: the model that it was written from.
+        what: its name in the error, with an article.
+        stored: the document in the database.
 
     Raises:
-        Damaged: it is no such document; names the field.
+        Damaged: the document does not fit the model; names the field.
     """
     try:
         return model.model_validate(stored)

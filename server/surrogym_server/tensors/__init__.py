@@ -1,4 +1,4 @@
-"""Tensors, whatever they hold: where they live, what is cached, rows in blocks, and the order of memory."""
+"""Tensors in general: their device, caching, blocks of rows, and order in memory."""
 
 from surrogym_server.tensors.blocks import in_blocks
 from surrogym_server.tensors.cached import cached

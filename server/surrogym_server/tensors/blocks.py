@@ -1,4 +1,4 @@
-"""Rows in blocks, so that what is held at once stays in the cache and memory is bounded at any batch size."""
+"""Computation in blocks of rows, so that data stay in the cache and memory is bounded at any batch size."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def in_blocks(rows: int, function: Callable[..., tuple[Tensor, ...]], *tensors: Tensor | None) -> tuple[Tensor, ...]:
-    """``function`` of the tensors (m, ...), at most ``rows`` rows at a time, its results joined.
+    """Apply ``function`` to the tensors (m, ...), at most ``rows`` rows at a time, and join its results.
 
     A tensor that is None is None in every block.
     """

@@ -1,4 +1,4 @@
-"""Tensors that are made once and used for ever, whoever asks first."""
+"""Tensors that are computed once and cached."""
 
 from __future__ import annotations
 
@@ -12,6 +12,5 @@ T = TypeVar("T")
 
 
 def cached(make: Callable[[Any], T]) -> cached_property[T]:
-    """``cached_property`` for tensors. A step runs in torch's inference mode, whose tensors no gradient may go through;
-    what a step happens to make first must serve a later gradient all the same."""
+    """``cached_property`` for tensors, computed outside inference mode, so that autograd can use them later."""
     return cached_property(torch.inference_mode(False)(make))

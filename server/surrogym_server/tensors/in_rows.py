@@ -1,4 +1,4 @@
-"""Tensors in the order of memory that stored ones have."""
+"""Tensors with the order in memory of stored ones."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from torch import Tensor
 
 
 def in_rows(tensor: Tensor) -> Tensor:
-    """A copy that lies in rows, without a gradient. What LAPACK returns lies in columns, and even the stride of a
-    dimension of one entry changes the last bits of a product: a fresh model would differ from a loaded one."""
+    """A copy in row order, without a gradient.
+
+    LAPACK returns columns, and even the stride of a dimension of size one changes the last bits of a product. So a new
+    model would differ from a loaded one.
+    """
     return tensor.detach().clone(memory_format=torch.contiguous_format)

@@ -1,4 +1,4 @@
-"""Values on a device: where arrays live is said once, when they are placed there; what computes follows its inputs."""
+"""Values moved to a device. Arrays are placed on a device once; computations follow their inputs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CPU = torch.device("cpu")
 def to_device(value: T, device: torch.device) -> T:
     """The same value with every tensor on a device, through frozen dataclasses, tuples and mappings.
 
-    A ``torch.device`` among the fields becomes this one: it says where what is derived later is made.
+    A ``torch.device`` among the fields is replaced too: it is the device of values that are derived later.
     """
     result: Any = value
     match value:

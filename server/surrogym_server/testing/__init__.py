@@ -1,4 +1,4 @@
-"""Laws of the ports as plain functions, for whoever writes an implementation; a broken law raises AssertionError.
+"""Laws of the ports as plain functions, for authors of implementations. A broken law raises ``AssertionError``.
 
 Examples:
     >>> import pytest

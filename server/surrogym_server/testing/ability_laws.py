@@ -1,4 +1,4 @@
-"""Laws of what only some families can do; a family without an ability keeps its laws by not having it."""
+"""Laws of the abilities. A family without an ability passes its laws trivially."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ DRAWS = 400
 
 
 def _draws(case: ModelCase) -> list[FunctionDraws]:
-    """What draws functions of the model, of one optimum of its hyperparameters and of uncertain ones."""
+    """Objects that draw functions of the model: with the optimal hyperparameters, and with uncertain ones."""
     plain, uncertain = offers(case.model, FunctionDraws), offers(case.model, UncertainHyperparameters)
     found = [] if plain is None else [plain]
     return found if uncertain is None else [*found, uncertain.uncertain_functions]
 
 
 def a_drawn_function_is_one_function(case: ModelCase) -> None:
-    """The same weights at the same point give the same step, whatever rows they stand in."""
+    """The same weights at the same point give the same step, whatever other rows are in the batch."""
     for able in _draws(case):
         noise = case.noise(3, able.path_size)
         paths = able.draw(noise)
@@ -56,7 +56,7 @@ def drawn_functions_scatter_as_the_deviations_say(case: ModelCase) -> None:
 
 
 def a_drawn_function_may_have_columns_beyond_its_own(case: ModelCase) -> None:
-    """Those of a session whose lanes follow models of several sizes."""
+    """Functions may have more columns, as in a session whose lanes follow models of several sizes."""
     for able in _draws(case):
         paths = able.draw(case.noise(2, able.path_size))
         wider = torch.cat([paths, torch.zeros(2, 3, dtype=torch.float64)], 1)

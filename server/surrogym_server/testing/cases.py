@@ -1,4 +1,4 @@
-"""Small environments with known equations, on which the laws of a family of models are checked."""
+"""Small environments with known equations, for checks of the laws of a family of models."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ VARIATIONS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class ModelCase:
-    """One environment, what a family learns of it, and where it is asked."""
+    """One environment, what a family learns of it, and the points at which it is tested."""
 
     name: str
     definition: EnvironmentDefinition
@@ -94,7 +94,7 @@ class ModelCase:
 
 
 def model_cases(family: str, settings: Mapping[str, float | bool | str] | None = None) -> tuple[ModelCase, ...]:
-    """The environments, learned by a family of this name and settings."""
+    """The environments, to be learned by a family with this name and settings."""
     design = {"model": {"name": family, "settings": dict(settings or {})}, "monte_carlo": 64, "initial": SAMPLES}
     return tuple(
         ModelCase(name, definition_from_spec(EnvironmentSpec.model_validate(PENDULUM | changes | {"design": design})))
@@ -103,12 +103,13 @@ def model_cases(family: str, settings: Mapping[str, float | bool | str] | None =
 
 
 def close(one: torch.Tensor, other: torch.Tensor) -> bool:
-    """Whether two tensors are equal but for rounding."""
+    """Whether two tensors are equal except for rounding."""
     return torch.allclose(one, other, rtol=1e-7, atol=1e-9)
 
 
 def _real_steps(case: ModelCase, count: int, seed: int) -> Samples:
-    """Steps from anywhere in the sampling range: a pendulum that is pushed, and pays by its angle and the push."""
+    """Steps from anywhere in the sampling range of a pushed pendulum, whose reward depends on its angle and
+    the push."""
     q, u = random_points(case.definition, count, np.random.default_rng(seed))
     angle, speed = q.unbind(-1)
     push = u[:, 0] - 1 if case.definition.action.nvec else u[:, 0]

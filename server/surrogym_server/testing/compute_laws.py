@@ -1,4 +1,4 @@
-"""Laws that whatever computes rounds of designs keeps; see the docstrings of ``engine.port``."""
+"""Laws of every ``Compute``; see the docstrings of ``engine.port``."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ Function = Callable[[DesignJob], DesignResult]
 
 @dataclass(frozen=True)
 class ComputeCase:
-    """Something that computes, made with the function that does a job, and a job of a real design.
+    """A ``Compute``, made with the function that does a job, and a job of a real design.
 
-    The functions are found by their names where they are called, in whatever process.
+    The functions are found by name in the process that calls them.
     """
 
     make: Callable[[Function], Compute]
     job: DesignJob
-    folder: Path  # an empty one that jobs can write to
+    folder: Path  # an empty folder to which jobs can write
 
     def asked(self, **state: Any) -> DesignJob:
-        """A job for the functions of this file, which read its state alone."""
+        """A job for the functions of this file, which only read its state."""
         return replace(self.job, state=state)
 
 
@@ -53,7 +53,7 @@ async def a_result_is_that_of_the_job_bit_for_bit(case: ComputeCase) -> None:
 
 
 async def jobs_at_once_do_not_wait_for_each_other(case: ComputeCase) -> None:
-    """Each waits until it has heard of the other."""
+    """Each job waits for a sign of the other."""
     first, second = (str(case.folder / name) for name in ("first", "second"))
     compute = case.make(_meet)
     try:

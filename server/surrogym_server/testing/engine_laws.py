@@ -1,4 +1,4 @@
-"""Laws that every engine of sessions keeps; see the docstrings of ``engine.port``."""
+"""Laws of every engine of sessions; see the docstrings of ``engine.port``."""
 
 from __future__ import annotations
 
@@ -35,8 +35,7 @@ E = TypeVar("E", bound=SurrogymError)
 
 @dataclass(frozen=True)
 class EngineCase:
-    """An engine that has been started, and one surrogate that it can open, with one continuous action and a model of
-    version 1."""
+    """A started engine, and one surrogate that it can open, with one continuous action and a model of version 1."""
 
     engine: SessionEngine
     surrogate: str
@@ -64,11 +63,11 @@ class EngineCase:
         return low + share * (high - low)
 
     def steps(self, session: str, count: int = STEPS) -> list[Advance]:
-        """As many steps, after the reset."""
+        """A number of steps after the reset."""
         return [Step(session, number + 2, self.action(number)) for number in range(count)]
 
     def policy(self, session: str, seq: int) -> PolicySteps:
-        """Steps in which a random policy acts, with noise."""
+        """Steps in which a random policy acts with noise."""
         observation, rng = len(self.definition.observation_names), np.random.default_rng(0)
         layer = Layer(rng.normal(size=(observation, 1)), np.zeros(1))
         policy = ActingPolicy(np.zeros(observation), np.ones(observation), (layer,), log_deviations=np.zeros(1))
@@ -289,7 +288,7 @@ LAWS_OF_ENGINES: tuple[Law, ...] = (
 
 
 async def _refused(kind: type[E], asked: Awaitable[object]) -> E:
-    """The error of this class that a request raises, which has to pickle."""
+    """Return the error of this class that a request raises; it must pickle."""
     caught: E | None = None
     try:
         await asked

@@ -1,4 +1,4 @@
-"""Laws that every family of models keeps; see the docstrings of ``models.port``."""
+"""Laws of every family of models; see the docstrings of ``models.port``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from surrogym_server.tensors import CPU
 from surrogym_server.testing.cases import ModelCase, close
 from surrogym_server.virtual import VirtualSettings, create, reset, step
 
-GUESS = 0.5  # of the deviation of the targets: a family that learns does better
+GUESS = 0.5  # of the deviation of the targets: the error of a family that learns is smaller
 RESERVED = "samples."
 NONSENSE: tuple[Any, ...] = ("nonsense", [], None, math.inf)
 
@@ -82,7 +82,7 @@ def next_states_are_where_the_environment_can_be(case: ModelCase) -> None:
 
 
 def a_draw_is_the_mean_and_noise_times_the_deviation(case: ModelCase) -> None:
-    """Of the speed: what the angle reads of a predicted speed is that of the draw."""
+    """For the speed: the angle, which depends on the predicted speed, uses the draw of the speed."""
     q, u, noise = case.points.q, case.points.u, case.noise(len(case.points), 2)
     made = case.model.transition(q, u, noise=noise, deviations=True)
     assert made.deviation is not None
@@ -154,7 +154,7 @@ def stored_arrays_are_float64_and_keep_off_reserved_names(case: ModelCase) -> No
 
 
 def a_damaged_file_is_refused_in_words(case: ModelCase) -> None:
-    """Without the checksum, so that the codec itself looks."""
+    """The file has no checksum, so that the codec itself has to find the damage."""
     data = to_bytes(case.model)
     header = json.loads(json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"][METADATA])
     del header["checksum"]
