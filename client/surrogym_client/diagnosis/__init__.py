@@ -1,1 +1,1 @@
-"""Whether an installation is in order, and whether a server keeps the protocol."""
+"""Checks of an installation, and of a server's conformance to the protocol."""

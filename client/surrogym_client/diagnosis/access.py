@@ -1,5 +1,5 @@
-"""Checks of an environment before it is used: states are set and read back, steps and resets are repeated,
-and a step from a state that was set is held against the same step of an episode. Every real step is counted.
+"""Checks of an environment before it is used. States are set and read back, steps and resets are repeated, and a step
+from a set state is compared with the same step of an episode. Every real step is counted.
 
 Shapes: C coordinates, F action entries.
 """
@@ -17,25 +17,25 @@ from surrogym_client.original.isolated import IsolatedEnvironment
 from surrogym_client.original.protocol import Array, RealStep
 from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 
-PLACES = 3  # states that are set, and steps of an episode
-EXACT = 1e-6  # of a range: rounding
-CLOSE = 1e-2  # of a range: the largest error with which a state counts as set
-FEW = 3.0  # times the noise of some steps: what that of one may be
+PLACES = 3  # number of states that are set, and of steps of an episode
+EXACT = 1e-6  # of a range; a smaller error is rounding
+CLOSE = 1e-2  # of a range: the largest error of a state that can be set
+FEW = 3.0  # factor for noise that was estimated from few steps
 
 
 @dataclass(frozen=True)
 class Access:
-    """What repeated steps and resets said. Errors are shares of the sampling ranges, the largest of all; None where the
-    environment has no methods for it.
+    """Results of repeated steps and resets. Errors are shares of the sampling ranges, the largest of all. None if the
+    environment lacks the methods.
 
     Attributes:
-        steps: real ones, taken.
-        resets: taken.
-        set_error: between the coordinates that were asked and those that were read back.
+        steps: number of real steps.
+        resets: number of resets.
+        set_error: between the requested coordinates and those that were read back.
         repeat_error: between two steps from one state.
         reset_error: between two resets with one seed.
         replay_error: between two episodes from one seed under the same actions.
-        memory_error: between a step of an episode and that step from its state, set anew.
+        memory_error: between a step of an episode and the same step after its state was set.
     """
 
     steps: int
@@ -48,12 +48,12 @@ class Access:
 
     @property
     def noise(self) -> float:
-        """The error of equal steps; 0 where none were compared."""
+        """The error between equal steps; 0 if none were compared."""
         return max(self.repeat_error or 0.0, self.replay_error or 0.0)
 
     @property
     def can_set(self) -> bool:
-        """Whether a state that was set is the state."""
+        """Whether the state can be set completely."""
         if self.set_error is None or self.set_error > CLOSE:
             return False
         random = self.replay_error is None or self.replay_error > EXACT
@@ -62,15 +62,15 @@ class Access:
 
     @property
     def mode(self) -> str:
-        """How it should be used."""
+        """The recommended mode."""
         return "set any state" if self.can_set else "reset only (--no-teleport)"
 
 
 def examine(environment: IsolatedEnvironment, spec: EnvironmentSpec) -> Access:
-    """Take some real steps again.
+    """Take some real steps twice.
 
     Raises:
-        StepFailed: a step failed that is no matter of the mode.
+        StepFailed: a step failed for a reason that does not depend on the mode.
     """
     looking = _Looking(environment, spec)
     if spec.query == "step":
@@ -80,7 +80,7 @@ def examine(environment: IsolatedEnvironment, spec: EnvironmentSpec) -> Access:
 
 
 class _Looking:
-    """The looks at one environment."""
+    """The checks of one environment."""
 
     def __init__(self, environment: IsolatedEnvironment, spec: EnvironmentSpec) -> None:
         self._environment, self._spec = environment, spec
@@ -90,11 +90,11 @@ class _Looking:
         self._errors: dict[str, float] = {}
 
     def access(self) -> Access:
-        """What was found."""
+        """The results."""
         return Access(self._steps, self._resets, **self._errors)
 
     def set_states(self) -> None:
-        """Set states and read them back; step twice from each."""
+        """Set states and read them back. Take two steps from each."""
         for _ in range(PLACES):
             q, u = draw(self._spec, self._rng, wide=True), self._action()
             first, again = self._step_from(q, u), self._step_from(q, u)
@@ -102,14 +102,14 @@ class _Looking:
             self._note("repeat_error", self._between([first], [again]))
 
     def begin_again(self) -> None:
-        """Reset twice with one seed and act alike; then set the last step's state and take it again."""
+        """Reset twice with one seed and take the same actions. Then set the last step's state and repeat the step."""
         actions = [self._action() for _ in range(PLACES)]
         try:
             starts, episodes = zip(*(self._episode(actions) for _ in range(2)), strict=True)
         except StepFailed:
             if self._spec.query == "rollout":
                 raise
-            return  # it has no resets
+            return  # it has no reset
         self._note("reset_error", self._apart(starts[0], starts[1]))
         self._note("replay_error", self._between(*episodes))
         inside = [step for step in episodes[1] if self._is_inside(step)]
@@ -140,7 +140,7 @@ class _Looking:
         return bool(((at >= ends[:, 0]) & (at <= ends[:, 1])).all())
 
     def _between(self, ones: Sequence[RealStep], others: Sequence[RealStep]) -> float:
-        """The largest difference of where steps led; of the rewards where these lead to the same place."""
+        """The largest difference between the results of steps; that of the rewards if the states are equal."""
         if len(ones) != len(others):
             return 1.0  # one episode ended earlier
         apart = [self._apart(a.next_coordinates, b.next_coordinates) for a, b in zip(ones, others, strict=True)]

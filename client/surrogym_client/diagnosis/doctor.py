@@ -1,4 +1,4 @@
-"""What stands between a person and a first step: one finding for each thing that has to be in place."""
+"""Checks for a first step: one finding for each thing that has to be in order."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.wire import PROTOCOL, StepQuery
 
 ROUND_TRIPS = 20
-OF_THE_SERVER = {  # registries by the group of their entry points; they are there where a server can run
+OF_THE_SERVER = {  # registries by the group of their entry points; they exist if a server can run here
     "surrogym.acquisitions": "surrogym_server.sampling.acquisition:ACQUISITIONS",
     "surrogym.models": "surrogym_server.models.registry:MODELS",
 }
@@ -39,7 +39,7 @@ OF_THE_SERVER = {  # registries by the group of their entry points; they are the
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at. ``way_out`` says what to do about a problem; None where there is none."""
+    """One checked thing. ``way_out`` says what to do about a problem; None if there is none."""
 
     name: str
     said: str
@@ -47,7 +47,7 @@ class Finding:
 
 
 def installation() -> Iterator[Finding]:
-    """Python, and the packages that this program was started with."""
+    """Python, and the packages of this program."""
     yield Finding("python", f"{platform.python_version()} on {platform.system()} {platform.machine()}")
     packages = ", ".join(f"{name} {number}" for name, number in versions().items() if name != "python")
     lacking = [extra for extra, modules in EXTRAS.items() if not all(find_spec(module) for module in modules)]
@@ -60,19 +60,20 @@ def installation() -> Iterator[Finding]:
 
 
 def _registries() -> Iterator[Registry[Any]]:
-    """What packages of this machine may add to. The server's load torch, so only those that a package adds to."""
+    """Registries to which packages may add. The server's load torch, so they are listed only with such a package."""
     yield SEARCHES
     for group, place in OF_THE_SERVER.items():
         module, _, name = place.partition(":")
         if entry_points(group=group):
-            with suppress(ImportError):  # no server can run on this machine, so nothing here would use the package
+            with suppress(ImportError):  # no server can run on this machine, so nothing would use the package
                 yield getattr(import_module(module), name)
 
 
 def service(api: Api) -> Iterator[Finding]:
-    """The server: whether it answers, is ready, speaks this protocol, and lets this token in; and how far away it is.
+    """The server: whether it answers, is ready, speaks this protocol, and accepts this token; and the time of a round
+    trip.
 
-    What depends on a finding with a problem is left out.
+    Findings that depend on a failed one are left out.
     """
     try:
         health = api.health()
@@ -95,7 +96,7 @@ def service(api: Api) -> Iterator[Finding]:
 
 def environment(factory: Factory, step_limit: float) -> Iterator[Finding]:
     """The original environment: whether it can be made, takes a step, and can be set to a state. The steps are real,
-    and in no ledger."""
+    but they don't enter a ledger."""
     try:
         with IsolatedEnvironment(factory, step_limit) as original:
             spec = original.spec()
@@ -110,7 +111,7 @@ def environment(factory: Factory, step_limit: float) -> Iterator[Finding]:
 
 
 def _access_of(original: IsolatedEnvironment, spec: EnvironmentSpec) -> Iterator[Finding]:
-    """How exact the environment is, and how it should be used."""
+    """Exactness of the environment, and the recommended mode."""
     try:
         access = examine(original, spec)
     except StepFailed as error:
@@ -163,7 +164,7 @@ def _timed(api: Api) -> float:
 
 
 def _one_step(original: IsolatedEnvironment, spec: EnvironmentSpec) -> Finding:
-    """A step from anywhere in the sampling range; from a reset where no state can be set."""
+    """A step from anywhere in the sampling range, or from a reset if the state can't be set."""
     start, action = draw(spec, np.random.default_rng(0), wide=True), _middle(spec)
     begun = time.perf_counter()
     try:
@@ -180,7 +181,7 @@ def _one_step(original: IsolatedEnvironment, spec: EnvironmentSpec) -> Finding:
 
 
 def _check(step: RealStep, start: Array, action: Array) -> None:
-    """Raises ``StepFailed`` for a step that no sampler could hand in."""
+    """Raise ``StepFailed`` for a step that a sampler could not submit."""
     query = StepQuery(
         id=1,
         number=0,
@@ -195,7 +196,7 @@ def _check(step: RealStep, start: Array, action: Array) -> None:
 
 
 def _middle(spec: EnvironmentSpec) -> Array:
-    """The action (F,) in the middle of the bounds; of discrete ones the first."""
+    """The action (F,) in the middle of the bounds; the first of discrete ones."""
     if isinstance(spec.action, BoxAction):
         middle: Array = (np.array(spec.action.low) + np.array(spec.action.high)) / 2
         return middle

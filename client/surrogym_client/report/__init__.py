@@ -1,1 +1,1 @@
-"""What a server knows of a surrogate, as one page that needs nothing else."""
+"""A report on a surrogate, as one self-contained page."""

@@ -1,4 +1,4 @@
-"""Where a log has been: every pair of its states and actions, in cells.
+"""Coverage of a log: every pair of its states and actions, in cells.
 
 Shapes: n steps, K columns (states, then actions).
 """
@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 
 CELLS = 10  # along a side
-MOST_COLUMNS = 8  # in a picture that can still be read
+MOST_COLUMNS = 8  # largest number that keeps a picture readable
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """How often a log was in each cell of each pair of columns.
+    """How often a log visited each cell of each pair of columns.
 
     Attributes:
         names: of the columns, (K,).
@@ -35,7 +35,7 @@ class Coverage:
     counts: dict[tuple[int, int], NDArray[np.int64]]
 
     def share(self, pair: tuple[int, int]) -> float:
-        """Which share of a pair's cells the log has been in."""
+        """The share of a pair's cells that the log has visited."""
         return float((self.counts[pair] > 0).mean())
 
     @property
@@ -73,7 +73,7 @@ def _counted(values: Array, ends: Array) -> NDArray[np.int64]:
 
 
 def columns_shown(names: Sequence[str]) -> list[int]:
-    """The columns that a picture has room for: the first, and the actions behind them."""
+    """The columns that fit into a picture: the first coordinates, followed by the actions."""
     count = len(names)
     actions = [i for i, name in enumerate(names) if name.startswith("action")]
     states = [i for i in range(count) if i not in actions][: max(MOST_COLUMNS - len(actions), 1)]

@@ -1,6 +1,6 @@
-"""The first part of the report, for whoever decides: cost, result, prediction, doubts, and what to do next.
+"""The first part of the report, for decisions: cost, result, prediction, doubts, and what to do next.
 
-Each section says what is missing where something is, and shows the rest.
+A section with missing data says what is missing, and shows the rest.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def decision(known: Known, cuts: Sequence[Cut]) -> str:
 
 
 def _in_short(known: Known) -> str:
-    """The answer in at most four sentences."""
+    """The result in at most four sentences."""
     view, real = known.view, known.real
     if known.policy is None:
         said = f"There is a model of {view.name} from {steps(view.ledger.total)}, and no controller yet."
@@ -164,7 +164,7 @@ def _from_one_start(known: Known, real: EvaluationDetail, others: Sequence[Evalu
 
 
 def _prediction(known: Known) -> str:
-    """Imagined beside real."""
+    """Comparison of imagined and real returns."""
     policy, real = known.policy, known.real
     promise = None if policy is None else policy.promise
     title = "Was it predicted?"
@@ -212,7 +212,7 @@ def _unsure(known: Known, cuts: Sequence[Cut]) -> str:
 
 
 def _of_allowed(output: OutputFidelity) -> str:
-    """The typical error as a share of the one that is allowed."""
+    """The typical error as a share of the tolerance."""
     error = output.leave_one_out_error
     if error is None:
         return "-"
@@ -229,7 +229,7 @@ def _ends(interval: Interval | None) -> tuple[float | None, float | None]:
 
 
 def number(value: float) -> str:
-    """A return as people read it: large ones without decimals, small ones with three digits."""
+    """A return in readable form: large ones without decimals, small ones with three digits."""
     size = abs(value)
     return f"{value:,.0f}" if size >= 1_000 else f"{value:.1f}" if size >= 10 else f"{value:.3g}"
 
@@ -241,7 +241,7 @@ def mean(evaluation: EvaluationView) -> str:
 
 
 def successes(evaluation: EvaluationView) -> str:
-    """How many episodes succeeded, with the interval of the share."""
+    """Number of successful episodes, with the interval of the share."""
     assert evaluation.success_rate is not None
     count, interval = round(evaluation.success_rate * evaluation.episodes), evaluation.success_interval
     about = f" ({share(interval.low)} to {share(interval.high)})" if interval else ""
@@ -249,7 +249,7 @@ def successes(evaluation: EvaluationView) -> str:
 
 
 def share(value: float) -> str:
-    """A share as percent, never rounded to a hundred that it is not."""
+    """A share as percent. It is never rounded up to 100."""
     if value >= 1:
         return "100 %"
     percent = 100 * value

@@ -1,11 +1,11 @@
-"""What nobody has tested, and the next steps that follow, in plain sentences. Each follows from what is stored."""
+"""What was not tested, and the next steps, in plain sentences. Each sentence follows from stored data."""
 
 from __future__ import annotations
 
 from surrogym_client.report.known import PREFERRED, Known
 from surrogym_client.surrogates.advice import advice
 
-FEW = 30  # episodes: fewer say little of an average
+FEW = 30  # episodes; fewer give an unreliable average
 
 
 def untested(known: Known) -> list[str]:
@@ -35,7 +35,7 @@ def untested(known: Known) -> list[str]:
 
 
 def next_steps(known: Known) -> list[str]:
-    """What is worth doing, the most urgent first."""
+    """Recommended next steps, the most urgent first."""
     view, policy, real = known.view, known.policy, known.real
     name = view.name
     if policy is None:

@@ -1,5 +1,5 @@
-"""Figures of real episodes, and of predictions beside measurements. Lines differ by their strokes, so that a reader
-distinguishes them in black and white."""
+"""Figures of real episodes, and of predictions with measurements. Lines have different strokes, so that they can be
+distinguished in black and white."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def draw_episodes(spec: EnvironmentSpec, shown: Sequence[tuple[str, EpisodeTrace
 
 
 def draw_ranges(ranges: Sequence[Range], label: str) -> Figure:
-    """Numbers with their intervals under each other, on one axis."""
+    """Draw numbers with their intervals below each other, on one axis."""
     figure = Figure(figsize=(1.5 * WIDTH, 0.55 * len(ranges) + 0.9), layout="constrained")
     axes = figure.add_subplot()
     places = list(range(len(ranges)))[::-1]
@@ -79,7 +79,7 @@ def draw_ranges(ranges: Sequence[Range], label: str) -> Figure:
 
 
 def _unbroken(coordinate: Coordinate, values: Array) -> Array:
-    """An angle without the line across the picture where it jumps from pi to -pi: a value after a jump is not drawn."""
+    """An angle without the vertical line where it jumps from pi to -pi: the value after a jump is not drawn."""
     if coordinate.kind != "angle":
         return values
     shown = values.copy()

@@ -1,4 +1,4 @@
-"""Figures of a surrogate: how sure each model was, where the latest is not, and where the real steps began."""
+"""Figures of a surrogate: the certainty of each model, the uncertainty of the latest, and the starts of real steps."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from surrogym_shared.wire import ModelView, OutputFidelity, SampleView, Surrogat
 COLOURS = {"logged": "#8c8c8c", "initial": "#4c72b0", "adaptive": "#dd8452", "manual": "#55a868", "audit": "#c44e52"}
 WIDTH = 6.0  # inches
 SMALLEST = 1e-9  # of what is drawn on a logarithmic axis
-DECADES = 6  # of the index: what lies further below its highest value is nothing
+DECADES = 6  # of the index: smaller shares of its highest value are not drawn
 LOG_10 = math.log(10)
 
 
@@ -47,13 +47,13 @@ def draw_fidelity(models: Sequence[ModelView], target: float) -> Figure:
 
 
 def _in_tolerances(output: OutputFidelity) -> float:
-    """Leave-one-out error; NaN, which is not drawn, where the family of models can't tell."""
+    """Leave-one-out error; NaN, which is not drawn, if the family of models can't compute it."""
     error = output.leave_one_out_error
     return math.nan if error is None else max(error / output.tolerance, SMALLEST)
 
 
 def draw_samples(view: SurrogateView, samples: Sequence[SampleView]) -> Figure:
-    """Where the real steps began, two coordinates a picture."""
+    """Draw where the real steps began, two coordinates in each picture."""
     coordinates, shown = view.spec.coordinates, pairs(view.spec)
     figure = Figure(figsize=(WIDTH, 0.8 * WIDTH * len(shown)), layout="constrained")
     for n, (i, j) in enumerate(shown):
@@ -72,7 +72,7 @@ def draw_samples(view: SurrogateView, samples: Sequence[SampleView]) -> Figure:
 
 
 def draw_coverage(coverage: Coverage) -> Figure:
-    """How often a log was in each cell of two columns; where it never was is white."""
+    """Draw how often a log visited each cell of two columns; unvisited cells are white."""
     shown = columns_shown(coverage.names)
     figure = Figure(figsize=(WIDTH, WIDTH), layout="constrained")
     grid = figure.subplots(len(shown) - 1, len(shown) - 1, squeeze=False)

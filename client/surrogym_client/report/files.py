@@ -1,4 +1,4 @@
-"""The report as a file: HTML, or PDF where Chromium is."""
+"""The report as a file: HTML, or PDF if Chromium is installed."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class NoPdf(SurrogymClientError):
 
 
 def write(out: Path, page: str) -> int:
-    """Write a page as the ending of the file says; gives the size in bytes.
+    """Write a page in the format of the file's ending. Returns the size in bytes.
 
     Raises:
-        NoPdf: Chromium is not here, or it failed; nothing was written.
+        NoPdf: Chromium is not installed, or it failed; nothing was written.
     """
     if out.suffix.lower() == ".pdf":
         content = as_pdf(page)

@@ -1,4 +1,5 @@
-"""HTML that loads nothing: pictures are inside, the one style sheet is known by its hash, there is no script."""
+"""HTML that loads nothing: pictures are embedded, the one style sheet is allowed by its hash, and there is no
+script."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ pre { overflow-x: auto; font-size: 0.85em; }
 
 
 def document(title: str, body: str) -> str:
-    """HTML that loads nothing: pictures are inside, the one style sheet is known by its hash, there is no script."""
+    """Build a page that loads nothing: pictures are embedded, the style sheet is allowed by its hash, and there is no
+    script."""
     digest = base64.b64encode(hashlib.sha256(STYLE.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'"
     return (

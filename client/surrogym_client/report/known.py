@@ -1,4 +1,4 @@
-"""What a report is written from: all that a server knows of a surrogate and of one of its policies."""
+"""The data of a report: everything that a server knows of a surrogate and of one of its policies."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class Known:
         view: the surrogate.
         models: all fits, oldest first.
         samples: all real steps.
-        server: where it is, and of which version.
-        policy: the one that the report is about; None: there is none.
+        server: its address and version.
+        policy: the policy of the report; None if there is none.
         real: its newest real episodes from the declared starts.
         without: real episodes without the policy, from the same starts.
         reference: real episodes of a reference controller, from the same starts.
@@ -51,7 +51,7 @@ class Known:
 
 
 def collect(api: Api, name: str, which: str | None = None) -> Known:
-    """Everything for a report; what can't be read is named in it.
+    """Collect the data of a report. It names data that can't be read.
 
     Args:
         api: the server.
@@ -78,7 +78,7 @@ def collect(api: Api, name: str, which: str | None = None) -> Known:
 
 
 def cuts_of(api: Api, known: Known) -> tuple[list[Cut], str]:
-    """What the latest model says over two coordinates, and why it says nothing where it can't."""
+    """The latest model's maps over two coordinates, or the reason why there are none."""
     try:
         return cuts(known.view, partial(api.query_uncertainty, known.view.name)), ""
     except NotInstalled as error:
@@ -86,7 +86,7 @@ def cuts_of(api: Api, known: Known) -> tuple[list[Cut], str]:
 
 
 def chosen_real(policy: PolicyView) -> EvaluationView | None:
-    """The newest evaluation of the policy from the declared starts; where there is none, from others."""
+    """The newest evaluation of the policy from the declared starts, or else from other starts."""
     own = [one for one in policy.evaluations if one.controller == "policy"]
     return next((one for one in reversed(own) if one.declared), own[-1] if own else None)
 
@@ -119,7 +119,7 @@ def _policy(api: Api, name: str, which: str | None) -> PolicyDetail | None:
             return api.policies.get(name, wanted)
         except UnknownPolicy:
             continue
-        except SurrogymClientError as error:  # a server of before: it keeps no policies
+        except SurrogymClientError as error:  # an older server, which keeps no policies
             if getattr(getattr(error, "problem", None), "status", None) != 404:
                 raise
             return None

@@ -1,5 +1,5 @@
-"""What a model says over two coordinates, the others and the action in the middle of their ranges: as the server's page
-shows it, without its sliders.
+"""Maps of a model over two coordinates, with the others and the action in the middle of their ranges, like the server's
+page without its sliders.
 
 Shapes: S cells along a side.
 """
@@ -23,7 +23,7 @@ SIDE = 33
 
 @dataclass(frozen=True)
 class Cut:
-    """Over coordinates ``across`` and ``up``, by their numbers; the largest over the outputs."""
+    """A map over coordinates ``across`` and ``up``, given by their numbers; the largest value over the outputs."""
 
     across: int
     up: int
@@ -33,13 +33,13 @@ class Cut:
 
 
 def pairs(spec: EnvironmentSpec) -> list[tuple[int, int]]:
-    """Numbers of coordinates to show together: each once, the last with itself where it is left over."""
+    """Numbers of coordinates to show together: each once. If one is left over, it is paired with itself."""
     last = len(spec.coordinates) - 1
     return [(i, min(i + 1, last)) for i in range(0, last + 1, 2)]
 
 
 def cuts(view: SurrogateView, ask: Ask) -> list[Cut]:
-    """One for each pair of coordinates; none without a model."""
+    """A map for each pair of coordinates; none without a model."""
     if view.fidelity is None:
         return []
     tolerances = np.array([output.tolerance for output in view.fidelity.outputs])
@@ -62,7 +62,7 @@ def _cut(spec: EnvironmentSpec, across: int, up: int, tolerances: Array, ask: As
 
 
 def _middle(spec: EnvironmentSpec) -> Array:
-    """An action (F,): the middle of a box, the first of choices."""
+    """An action (F,): the middle of a box, or the first of the choices."""
     action = spec.action
     if not isinstance(action, BoxAction):
         return np.zeros(action.size)

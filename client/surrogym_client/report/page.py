@@ -1,4 +1,4 @@
-"""The page: figures as pictures inside it, tables, and a policy that lets it load nothing."""
+"""The page of the report: embedded pictures, tables, and a content security policy that lets it load nothing."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ LEDGER = ("initial", "adaptive", "manual", "total", "audit", "logged", "evaluati
 
 
 def page(known: Known, cuts: Sequence[Cut] = ()) -> str:
-    """The whole page of a surrogate, HTML in one file: first for whoever decides, then for whoever works.
+    """The whole page of a surrogate, HTML in one file: first the part for decisions, then the details.
 
     Args:
         known: what the server knows of the surrogate and of one of its policies.
-        cuts: what the latest model says over two coordinates.
+        cuts: the latest model's maps over two coordinates.
     """
     view, now = known.view, datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     packages = ", ".join(f"{name} {number}" for name, number in versions().items())
@@ -67,7 +67,7 @@ def _details(known: Known, cuts: Sequence[Cut]) -> list[str]:
 
 
 def _covered(view: SurrogateView, samples: Sequence[SampleView]) -> str:
-    """Where the log has been; nothing without logged steps."""
+    """The coverage of the log; nothing without logged steps."""
     logged = [sample for sample in samples if sample.purpose == "logged"]
     if not logged:
         return ""

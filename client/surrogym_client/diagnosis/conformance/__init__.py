@@ -1,4 +1,4 @@
-"""What any server of this protocol must do, checked from outside: one small surrogate is made, used and deleted."""
+"""Checks of a server of this protocol from outside. One small surrogate is created, used and deleted."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Check = Callable[[Target], None]
 
 @dataclass(frozen=True)
 class Outcome:
-    """One check. ``failure`` says what was expected and what came; None where it passed."""
+    """One check. ``failure`` says what was expected and what came; None if the check passed."""
 
     name: str
     failure: str | None
@@ -25,8 +25,8 @@ def conformance(url: str | None, token: str | None, surrogate: str) -> Iterator[
 
     Args:
         url: the server's address; default ``SURROGYM_URL``, then http://127.0.0.1:8000.
-        token: of the role admin, where the server has tokens.
-        surrogate: name that is free on the server; the surrogate is deleted at the end.
+        token: of the role admin, if the server has tokens.
+        surrogate: an unused name on the server; the surrogate is deleted at the end.
 
     Raises:
         SurrogymClientError: the name is taken, or the surrogate gets no model, so that nothing can be checked.

@@ -1,4 +1,4 @@
-"""Leases, late answers and idempotency keys; checked before there is a model."""
+"""Checks of leases, late answers and idempotency keys, before there is a model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sessions: seq, seeds, autoreset, spaces, ends of episodes, errors and transports."""
+"""Checks of sessions: seq, seeds, autoreset, spaces, ends of episodes, errors and transports."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from surrogym_client.transport.http_surrogate import HttpSurrogate, Transport
 from surrogym_shared.wire import OpenSession
 
 BACK = [[-1.0], [-1.0]]
-ON_AND_BACK = [[1.0], [-1.0]]  # the first lane terminates, the second goes on
+ON_AND_BACK = [[1.0], [-1.0]]  # the first lane terminates, the second does not
 ROLLED = 5  # steps, more than an episode has
 
 

@@ -1,4 +1,4 @@
-"""The server under test, with a surrogate that a handful of exact samples teach."""
+"""The server under test, with a surrogate that learns from a handful of exact samples."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Mismatch(Exception):
 
 
 def expect(what: str, expected: object, came: object) -> None:
-    """Compare.
+    """Compare two values.
 
     Raises:
         Mismatch: they differ.
@@ -50,7 +50,7 @@ def expect(what: str, expected: object, came: object) -> None:
 
 
 class Target:
-    """Requests by hand, for replies are judged as they come; ``api`` for what is a mere means."""
+    """Plain requests, because the raw replies are checked. ``api`` serves the steps that are not checked."""
 
     def __init__(self, url: str | None, token: str | None, surrogate: str) -> None:
         self.surrogate = surrogate
@@ -80,11 +80,11 @@ class Target:
             raise Mismatch(f"{path}: expected a reply, got {failure!r}") from failure
 
     def post_text(self, path: str, body: str) -> httpx.Response:
-        """POST what may be no JSON."""
+        """POST a text that may not be JSON."""
         return self._http.post(f"/v1/{path}", content=body, headers={"Content-Type": "application/json"})
 
     def refused(self, what: str, reply: httpx.Response, status: int, code: str) -> dict[str, Any]:
-        """The problem body of a reply that must be refused."""
+        """The problem body of a request that must be refused."""
         expect(f"status of {what}", status, reply.status_code)
         expect(f"media type of {what}", "application/problem+json", reply.headers.get("content-type"))
         problem: dict[str, Any] = reply.json()
@@ -92,21 +92,21 @@ class Target:
         return problem
 
     def open(self, **options: object) -> str:
-        """A new session of two lanes; its id."""
+        """Open a session of two lanes, and return its id."""
         reply = self.post(f"surrogates/{self.surrogate}/sessions", {"num_envs": 2, "seed": 7, **options})
         expect("status of opening", True, reply.is_success)
         session: str = reply.json()["id"]
         return session
 
     def act(self, session: str, what: str, **body: object) -> dict[str, Any]:
-        """Reset or step that must succeed."""
+        """A reset or step that must succeed."""
         reply = self.post(f"sessions/{session}/{what}", body)
         expect(f"status of {what}", 200, reply.status_code)
         answer: dict[str, Any] = reply.json()
         return answer
 
     def claim(self, lease_seconds: float = 60.0) -> wire.StepQuery:
-        """One query, which must be there."""
+        """Claim one query, which must exist."""
         claimed = self.api.claim(self.surrogate, "conformance", lease_seconds=lease_seconds, wait_seconds=5.0)
         expect("number of claimed queries", 1, len(claimed.queries))
         query = claimed.queries[0]
@@ -117,7 +117,7 @@ class Target:
         """Answer all queries until a model is served.
 
         Raises:
-            SurrogymClientError: there is none in time.
+            SurrogymClientError: there is no model in time.
         """
         deadline = time.monotonic() + LEARNING_SECONDS
         while self.api.surrogate(self.surrogate).model_version is None:
