@@ -1,1 +1,2 @@
-"""Whole runs from cold: what ``surrogym demo`` and ``surrogym reproduce`` share is here, the rest in a room of each."""
+"""Whole runs from the beginning: the shared parts of ``surrogym demo`` and ``surrogym reproduce``, and a room
+for each."""

@@ -1,8 +1,8 @@
-"""The arms of a comparison: how the same budget of real steps is spent, and on which model.
+"""The arms of a comparison: ways to spend the same budget of real steps, and kinds of models.
 
 The default may stop before its budget is spent, also without symmetry or with other starts. Every other arm that learns
-a surrogate spends exactly that budget, and learns for as many virtual steps, so that a comparison can only be in its
-favour. Imports nothing but the standard library.
+a surrogate spends exactly that budget, and learns for as many virtual steps, so that a comparison can only favour it.
+Imports only the standard library.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ PAPERS_SHARE = 3  # the paper's initial designs were 40 of 125 and 50 of 120 ste
 class Arm:
     """One way to spend a budget.
 
-    ``closed_loop``: queries where policies have been, between trainings; without it the whole budget is the design's,
+    ``closed_loop``: queries near the visited states, between trainings; without it the design spends the whole budget
     before training. ``start_box``: share of virtual episodes that start anywhere in the range. ``original``: no
-    surrogate at all, the policy search runs in the original environment.
+    surrogate; the policy search runs in the original environment.
     """
 
     words: str
     preset: Literal["default", "paper"] = "default"
     acquisition: Acquisition | None = None
     closed_loop: bool = False
-    start_box: float | None = None  # None: a training's own
+    start_box: float | None = None  # None: the default of a training
     original: bool = False
     symmetry: Literal["auto", "none"] = "auto"
 
@@ -48,7 +48,7 @@ class Arm:
         return chosen
 
     def fields(self) -> dict[str, Any]:
-        """What distinguishes the arm, JSON-able: a choice that only another arm makes is not among it."""
+        """The fields that define the arm, JSON-able, without choices that only another arm makes."""
         plain = asdict(Arm(self.words))
         return {name: value for name, value in asdict(self).items() if value != plain[name]}
 

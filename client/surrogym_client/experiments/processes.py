@@ -1,4 +1,5 @@
-"""Child processes that never outlive the demo: each in a group of its own, ended together, watching their parent."""
+"""Child processes that never outlive the demo: each in its own process group, stopped together, and watching their
+parent."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ LOOK_SECONDS = 0.05
 
 
 class RunFailed(SurrogymClientError):
-    """A process of a run ended badly or did not start, or there is no place for the run."""
+    """A process of a run failed or did not start, or the run folder can't be used."""
 
 
 @dataclass(frozen=True)
@@ -34,19 +35,19 @@ class Child:
     log: Path
 
     def check(self) -> None:
-        """Raises RunFailed if the process has ended badly."""
+        """Raise ``RunFailed`` if the process has failed."""
         code = self.process.poll()
         if code:
             raise RunFailed(f"the {self.name} ended with exit code {code}: {self.last_words()} (log: {self.log})")
 
     def last_words(self) -> str:
-        """The last line it has written."""
+        """The last line that it has written."""
         lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         return lines[-1] if lines else "no output"
 
 
 class Children:
-    """The processes of one run. Leaving the context ends them all, whatever the reason."""
+    """The processes of one run. Leaving the context stops them all, for any reason."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -69,7 +70,7 @@ class Children:
         return child
 
     def check(self) -> None:
-        """Raises RunFailed if any of them has ended badly."""
+        """Raise ``RunFailed`` if any of them has failed."""
         for child in self._children:
             child.check()
 
@@ -79,7 +80,8 @@ class Children:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Ask every group to end, newest first, so that nobody loses the server it talks to; then make sure."""
+        """Ask every group to stop, newest first, so that none loses its server. Then make sure that all have
+        stopped."""
         for child in reversed(self._children):
             _signal(child, signal.SIGTERM)
         deadline = time.monotonic() + STOPPING_SECONDS
@@ -92,10 +94,10 @@ class Children:
 
 
 def await_file(child: Child, path: Path) -> str:
-    """What a child writes into a file once it is ready.
+    """Wait for a file that a child writes when it is ready, and return its content.
 
     Raises:
-        RunFailed: it ended instead, or took too long.
+        RunFailed: the child ended instead, or took too long.
     """
     deadline = time.monotonic() + STARTING_SECONDS
     while not path.exists():
@@ -106,7 +108,7 @@ def await_file(child: Child, path: Path) -> str:
 
 
 def _signal(child: Child, number: signal.Signals) -> None:
-    """Signal the child's whole group, which may be there after the child itself has ended."""
+    """Signal the child's whole group, which may still exist after the child itself has ended."""
     with suppress(ProcessLookupError, PermissionError):
         os.killpg(child.process.pid, number)
 

@@ -1,4 +1,4 @@
-"""What one run is asked to do, and the specification that follows from it."""
+"""Settings of one run, and the specification that follows from them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from surrogym_shared.spec import EnvironmentSpec
 
 @dataclass(frozen=True)
 class DemoSettings:
-    """None takes the task's own."""
+    """Settings of a demo. None takes the task's own."""
 
     task: str = "pendulum"
     seed: int = 0
@@ -75,7 +75,7 @@ class DemoSettings:
         return make(self.demo_task.environment).spec()
 
     def asked(self) -> dict[str, Any]:
-        """All that a result depends on and that is known before the run, but the seed; JSON-able."""
+        """Everything that a result depends on and that is known before the run, without the seed; JSON-able."""
         spec = self.spec().model_dump(mode="json")
         spec["design"].pop("seed")
         names = ["task", "real_steps", "virtual_steps", "prolong", "episodes"]

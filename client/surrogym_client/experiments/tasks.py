@@ -1,6 +1,6 @@
-"""The tasks of the demo: environment, real steps that may be spent, and what counts as solved.
+"""The tasks of the demo: environment, budget of real steps, and criterion of success.
 
-Everything else is derived from the specification. Imports nothing, so that a command line can name them.
+Everything else is derived from the specification. Imports nothing, so that a command line can list them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Starts:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What 100 episodes gave."""
+    """Results of 100 episodes."""
 
     mean: float
     lowest: float
@@ -32,7 +32,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Target:
-    """What one run has to reach; every criterion that is given, from below or at it."""
+    """Criteria for one run. Every given value must be reached."""
 
     words: str
     mean: float | None = None
@@ -48,7 +48,7 @@ class Target:
 
 @dataclass(frozen=True)
 class DemoTask:
-    """What a demo solves, and the real steps it may spend."""
+    """A task of a demo, and its budget of real steps."""
 
     environment: str
     budget: int
@@ -104,10 +104,10 @@ EVERY_TASK = TASKS | UNSEEN
 
 
 def design_budget(budget: int) -> int:
-    """What the design may spend before the first policy: two fifths, and not too few to begin with."""
+    """Real steps of the design before the first policy: two fifths, with a minimum."""
     return min(budget, max(MIN_DESIGN, 2 * budget // 5))
 
 
 def queries_a_round(budget: int) -> int:
-    """What each round of the closed loop may spend; 0 where the design has taken it all."""
+    """Real steps of each round of the closed loop; 0 if the design has taken all."""
     return (budget - design_budget(budget)) // ROUNDS

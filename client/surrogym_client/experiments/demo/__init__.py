@@ -1,1 +1,1 @@
-"""The demo: three processes that talk over HTTP, and what a person sees of them."""
+"""The demo: three processes that communicate over HTTP, and the output for a person."""

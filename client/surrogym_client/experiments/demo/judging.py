@@ -1,5 +1,5 @@
-"""What a policy is worth: episodes in the original environment, from its own starts and, where the task has others,
-from those as well."""
+"""Evaluation of a policy in the original environment, from its own starts and, if the task has others, from those as
+well."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COMPARED = 20  # starts that are run without the policy as well
 
 @dataclass(frozen=True)
 class Part:
-    """Real episodes from some starts, and who acted in them."""
+    """Real episodes from some starts, and the controller that acted in them."""
 
     controller: Controller
     settings: EvaluationSettings
@@ -33,8 +33,8 @@ class Part:
 
 @dataclass(frozen=True)
 class Judgement:
-    """``also`` is from the task's other starts, None if it has none; ``without`` is without the policy, from the first
-    of the declared starts."""
+    """Results of an evaluation. ``also`` is from the task's other starts, None without any. ``without`` is without the
+    policy, from the first of the declared starts, None if starts are not drawn."""
 
     real: Part
     also: Part | None
@@ -46,9 +46,10 @@ class Judgement:
         return [part for part in (self.real, self.also, self.without) if part is not None]
 
     @property
-    def results(self) -> tuple[Evaluation, Evaluation | None, Evaluation]:
-        """Of the policy, of the other starts, and without the policy."""
-        return self.real.result, None if self.also is None else self.also.result, self.without.result
+    def results(self) -> tuple[Evaluation, Evaluation | None, Evaluation | None]:
+        """The results of the policy, of the other starts, and without the policy."""
+        also, without = (None if part is None else part.result for part in (self.also, self.without))
+        return self.real.result, also, without
 
     @property
     def steps(self) -> int:

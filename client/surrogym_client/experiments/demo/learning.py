@@ -32,12 +32,13 @@ from surrogym_shared.wire import SurrogateView
 LEDGER = ("initial", "adaptive", "total", "unresolved", "audit")
 PATIENCE_SECONDS = 3_600.0
 REPORT = "report.html"  # in the run folder
-LOOK_SECONDS = 1.0  # a look costs the server a little of what the trainer wants
+LOOK_SECONDS = 1.0  # each poll costs the server a little of the trainer's time
 
 
 @dataclass(frozen=True)
 class Learned:
-    """A policy, and what it took. ``confidence_index``, ``fidelity`` and ``phase`` are of the surrogate, if any."""
+    """A policy, with the steps and time of its training. ``confidence_index``, ``fidelity`` and ``phase`` are of the
+    surrogate, if any."""
 
     policy: Path
     real_queries: dict[str, int]  # initial, adaptive, total of these, unresolved, and of audits
@@ -60,7 +61,8 @@ class SurrogateRun:
             self._api = Api(self._serve(), token="", retries=Retries(seconds=10.0))
 
     def learn(self) -> Learned:
-        """Design and train. In the closed loop the trainer comes early: it imports while the design goes on."""
+        """Run the design and the training. In the closed loop the trainer starts early, so that it imports during the
+        design."""
         self._employ_sampler()
         early = self._employ_trainer() if self._settings.way.closed_loop else None
         with self._timed("design"):
@@ -79,8 +81,8 @@ class SurrogateRun:
         )
 
     def keep(self, judgement: Judgement) -> None:
-        """Enter the evaluation into the ledger, store its episodes with the policy; write specification, samples and,
-        unless unwanted, pictures."""
+        """Enter the evaluation into the ledger, store its episodes with the policy, and write specification, samples
+        and, unless unwanted, pictures."""
         name = self._settings.task
         self._api.report_steps(name, judgement.steps, episodes=judgement.episodes, note="demo")
         compared = min(part.settings.episodes for part in judgement.parts)
@@ -125,7 +127,7 @@ class SurrogateRun:
         say(f"live server, with a page to look at: {self._api.url}  (run folder: {self._folder})", quiet=self._quiet)
         self._api.create_surrogate(self._settings.task, self._settings.spec())
         named = self._settings.demo_task.environment
-        own = ["--env", named] if ":" in named else []  # a server's word is not taken for a module
+        own = ["--env", named] if ":" in named else []  # the sampler does not import a module that only a server names
         self._children.start("sampler", "surrogym_client", ["sample", *self._common, *own])
 
     def _employ_trainer(self) -> Child:
@@ -159,7 +161,7 @@ class SurrogateRun:
                 self._spend_the_rest(view, look)
 
     def _spend_the_rest(self, view: SurrogateView, look: Callable[[SurrogateView], None]) -> None:
-        """Ask on, one query after the other, where a design was ready before its budget was spent."""
+        """Add queries one by one if the design was ready before its budget was spent."""
         name, budget, before = self._settings.task, self._settings.real_steps, -1
         while before < view.ledger.total < budget:
             before = view.ledger.total
@@ -195,7 +197,7 @@ class SurrogateRun:
 
 
 def read_curve(path: Path) -> list[dict[str, Any]]:
-    """The trainer's progress so far; a line that is being written is left for the next look."""
+    """The trainer's progress so far. An unfinished line is left for the next call."""
     if not path.exists():
         return []
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
@@ -210,7 +212,7 @@ def later_imports(settings: DemoSettings) -> tuple[str, ...]:
 
 
 def _warm_up(modules: Sequence[str]) -> None:
-    """Import while there is nothing to do but wait."""
-    with suppress(ImportError):  # told by whoever needs it
+    """Import modules while the program waits."""
+    with suppress(ImportError):  # the code that needs it reports the error
         for module in modules:
             import_module(module)

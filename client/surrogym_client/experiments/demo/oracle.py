@@ -1,4 +1,4 @@
-"""The oracle: the policy search that serves the surrogate, with the original environment in its place."""
+"""The oracle: the surrogate's policy search, run in the original environment."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from surrogym_shared.terminal import progress
 
 
 class OriginalRun:
-    """The default training in the original environment: its steps are real ones, those of its checks too."""
+    """The default training in the original environment. Its steps are real, including those of its checks."""
 
     def __init__(self, settings: DemoSettings, folder: Path, *, quiet: bool) -> None:
         self._settings = settings
@@ -50,7 +50,7 @@ class OriginalRun:
         return Learned(self._policy, steps, {"train": result.seconds})
 
     def keep(self, judgement: Judgement) -> None:
-        """There is no ledger, and nothing was designed."""
+        """Nothing to store: there is no ledger and no design."""
 
     def linger(self) -> None:
-        """Nothing runs."""
+        """Nothing to leave running."""

@@ -1,4 +1,4 @@
-"""Pictures of one run: where the samples fall, how training went, what the real episodes gave."""
+"""Pictures of one run: the samples, the training, and the real episodes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def draw_learning(curve: Sequence[dict[str, Any]]) -> Figure:
 
 
 def draw_returns(result: Evaluation) -> Figure:
-    """How the real returns spread."""
+    """Draw the distribution of the real returns."""
     figure, axes = _one("real return of an episode", "episodes", f"{len(result.returns)} real episodes")
     axes.hist(result.returns, bins=20)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
@@ -47,7 +47,8 @@ def draw_returns(result: Evaluation) -> Figure:
 
 
 def draw_rollout(spec: EnvironmentSpec, result: Evaluation) -> Figure:
-    """The real episode of the median return: coordinates, and the action. Half of all episodes went better."""
+    """Draw the real episode of the median return: coordinates, and the action. Half of all episodes had a higher
+    return."""
     at = result.ranked()["median"]
     trace = result.traces[at]
     actions = trace.action.shape[1]

@@ -1,4 +1,4 @@
-"""What a demo found out: as JSON for programs, as a table for people."""
+"""Results of a demo: as JSON for programs, as a table for people."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def _without(metrics: dict[str, Any]) -> tuple[str, str]:
 
 
 def _promise(metrics: dict[str, Any]) -> list[tuple[str, str]]:
-    """What the policy was handed over with; nothing where it was learned in the original environment."""
+    """The promise at the handover; empty if the policy was learned in the original environment."""
     promise, audit = metrics["promise"], metrics["audit"]
     if promise is None:
         return []
@@ -144,7 +144,7 @@ def _share(value: float | None) -> str:
 
 
 def _number(value: float | None) -> str:
-    """A return as people read it: small ones keep their digits."""
+    """A return in readable form: small ones keep their digits."""
     if value is None:
         return "-"
     return f"{value:.1f}" if abs(value) >= 10 else f"{value:.3g}"

@@ -23,15 +23,15 @@ class Run(Protocol):
     """One way to a policy."""
 
     def learn(self) -> Learned:
-        """Learn a policy, and say what that took."""
+        """Learn a policy. Returns it with its costs."""
         ...
 
     def keep(self, judgement: Judgement) -> None:
-        """Enter what the evaluation took, and put what there is to see into the run folder."""
+        """Enter the steps of the evaluation, and write pictures and data into the run folder."""
         ...
 
     def linger(self) -> None:
-        """Leave running what a person may want to look at, until Ctrl-C."""
+        """Keep the server running until Ctrl-C, so that a person can look at its page."""
         ...
 
 
@@ -42,10 +42,10 @@ def run_demo(
     *,
     quiet: bool = False,
 ) -> None:
-    """Run the whole loop, then ``tell`` the metrics, which also lie in the run folder, and where that is.
+    """Run the whole loop. Then call ``tell`` with the metrics, which are also in the run folder, and with this folder.
 
     Raises:
-        RunFailed: the folder is not empty, or a process ended badly; says which, its last words and its log.
+        RunFailed: the folder is not empty, or a process failed; the message has its last words and its log.
         SurrogymClientError: the server refused, or the design failed.
     """
     started, code = time.monotonic(), commit()
@@ -91,7 +91,7 @@ def _empty_folder(folder: Path) -> Path:
 
 
 def _what_stays(folder: Path) -> str:
-    """What there is to go on with after an interruption."""
+    """Name the results that are kept after an interruption."""
     database, policy = _database(folder), folder / "policy.zip"
     kept = [f"the real samples (surrogym serve --database {database})"] if database.exists() else []
     kept += [f"the policy so far ({policy})"] if policy.exists() else []

@@ -1,1 +1,1 @@
-"""Evidence: what the documentation claims, made again from real runs."""
+"""Evidence for the claims of the documentation, reproduced by real runs."""

@@ -1,4 +1,4 @@
-"""Cells: one demo each, in processes of their own, several at once; a cell whose row is there is not run again."""
+"""Cells: one demo each, in separate processes, several at once. A cell that has a row already is not run again."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from surrogym_client.experiments.settings import DemoSettings, fingerprint
 from surrogym_client.experiments.tasks import EVERY_TASK
 from surrogym_client.runtime.versions import commit, machine
 
-COMPARED = ("pendulum", "cartpole", "mountaincar", "swingup")  # tasks that a study runs every arm on
+COMPARED = ("pendulum", "cartpole", "mountaincar", "swingup")  # tasks on which a study runs every arm
 EVERY_SEED = ("latin_hypercube", "paper")  # arms that it runs with as many seeds as the default
 LOOK_SECONDS = 0.2
 ENDING_SECONDS = 30.0  # a demo ends its own processes first
@@ -45,7 +45,7 @@ class Cell:
 
     @property
     def arguments(self) -> tuple[str, ...]:
-        """Of ``surrogym demo``."""
+        """The arguments of ``surrogym demo``."""
         s = self.settings
         given = {"--seed": s.seed, "--arm": s.arm, "--budget": s.budget, "--steps": s.steps, "--episodes": s.episodes}
         given |= {"--algorithm": s.algorithm}
@@ -54,13 +54,13 @@ class Cell:
 
     @property
     def key(self) -> Key:
-        """That of its row."""
+        """The key of its row."""
         s = self.settings
         return s.task, s.arm, s.real_steps, s.seed
 
     @property
     def specification(self) -> str:
-        """Hash of what is asked, without the seed."""
+        """Hash of the settings, without the seed."""
         return _specification(replace(self.settings, seed=0))
 
 
@@ -69,7 +69,7 @@ Command = Callable[[Cell, Path], list[str]]
 
 @dataclass(frozen=True)
 class Progress:
-    """What is known while cells run; ``left_seconds`` is a guess, None before the first cell is done."""
+    """Progress while cells run. ``left_seconds`` is an estimate, None before the first cell has ended."""
 
     done: int
     of: int
@@ -88,10 +88,10 @@ def cells(
     episodes: int = 100,
     algorithm: str | None = None,
 ) -> Iterator[Cell]:
-    """Every combination; a seed of everything comes before the next seed of anything.
+    """Every combination of tasks, arms and shares with one seed, then with the next.
 
     Args:
-        tasks, arms, seeds: what to combine.
+        tasks, arms, seeds: values to combine.
         shares: of each task's budget of real steps.
         steps: virtual steps; None takes the task's.
         episodes: of each evaluation.
@@ -103,8 +103,8 @@ def cells(
 
 
 def study(tasks: Sequence[str], seeds: Sequence[int], **chosen: Any) -> Iterator[Cell]:
-    """The efficiency study of the documentation: the default on every task; on those that are ``COMPARED`` a hypercube
-    and the paper's preset as well, and the other arms on the first half of the seeds. ``chosen`` as for ``cells``."""
+    """The efficiency study of the documentation: the default on every task, a hypercube and the paper's preset on the
+    tasks of ``COMPARED``, and there the other arms with the first half of the seeds. ``chosen`` as for ``cells``."""
     compared = [task for task in tasks if task in COMPARED]
     others = [arm for arm in ARMS if arm not in ("default", *EVERY_SEED)]
     for place, seed in enumerate(seeds):
@@ -113,7 +113,7 @@ def study(tasks: Sequence[str], seeds: Sequence[int], **chosen: Any) -> Iterator
 
 
 def done_already(cell: Cell, rows: Iterable[Row]) -> bool:
-    """Whether a row answers a cell: the same cell, asked for the same, and not ended badly."""
+    """Whether a row is the result of a cell with the same settings, and the run did not fail."""
     return any(row.key == cell.key and row.specification == cell.specification and not row.error for row in rows)
 
 
@@ -131,18 +131,18 @@ def run_cells(
     tell: Callable[[Progress], None],
     command: Command = demo_command,
 ) -> list[Row]:
-    """Run cells, several at once; ``rows.csv`` in the folder is written after each.
+    """Run cells, several at once. ``rows.csv`` in the folder is written after each.
 
     Args:
-        todo: what to run.
-        rows: what is there already.
+        todo: cells to run.
+        rows: existing rows.
         folder: of rows, logs and run folders.
         jobs: cells at once.
-        tell: called with every look.
+        tell: called at every poll.
         command: runs a cell into a run folder, where it leaves ``metrics.json``.
 
     Returns:
-        All rows, old and new. A run that ended badly has one too, with its error.
+        All rows, old and new. A failed run has a row too, with its error.
     """
     folder.mkdir(parents=True, exist_ok=True)
     known, waiting, running = list(rows), list(todo), list[Job]()
@@ -168,7 +168,7 @@ def run_cells(
 
 
 class Job:
-    """A cell that runs."""
+    """A running cell."""
 
     def __init__(self, cell: Cell, folder: Path, command: Command) -> None:
         self.cell = cell
@@ -191,7 +191,7 @@ class Job:
         return self._process.poll() is not None
 
     def row(self) -> Row:
-        """What the run gave."""
+        """The row of the run."""
         if self._process.returncode == 0:
             return row_of(json.loads(self._metrics.read_text(encoding="utf-8")))
         said = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines() or ["no output"]
@@ -205,7 +205,7 @@ class Job:
         )
 
     def end(self) -> None:
-        """Ask it to end; it ends its own processes."""
+        """Ask it to stop. It stops its own processes."""
         self._process.terminate()
 
     def wait(self) -> None:

@@ -36,7 +36,7 @@ def update(page: Path, rows: Sequence[Row], pictures: Path) -> None:
 
 
 def section(name: str, rows: Sequence[Row], folder: str) -> str:
-    """What belongs between the marks ``name``; ``folder`` of the pictures is seen from the page."""
+    """The content between the marks ``name``. ``folder`` of the pictures is relative to the page."""
     if not rows:
         return ""
     if name == "headline":
@@ -46,7 +46,7 @@ def section(name: str, rows: Sequence[Row], folder: str) -> str:
 
 
 def present_sections(page: Path) -> dict[str, str]:
-    """What stands between each pair of marks of a page, by name. Raises ``NoSuchPlace`` where it has none."""
+    """The present content between each pair of marks of a page, by name. Raises ``NoSuchPlace`` if there are none."""
     text, found = page.read_text(encoding="utf-8"), {}
     for name in PARTS:
         begin, end = marks(name)

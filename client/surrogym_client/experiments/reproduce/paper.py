@@ -1,7 +1,7 @@
-"""The paper's section 5, made again: designs, policies and real episodes as stages that can be resumed.
+"""The experiments of the paper's section 5: designs, policies and real episodes, as stages that can be resumed.
 
-A cell is one design with one seed. Its stages lie in a folder of their own, and a stage that is there is not run again;
-the server's database keeps the real steps of a design that was interrupted.
+A cell is one design with one seed. Its stages are in a folder of their own, and a stage with a result is not run again.
+The server's database keeps the real steps of an interrupted design.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ Row = dict[str, Any]
 
 
 def run_cells(todo: Sequence[Cell], folder: Path, say: Say) -> list[Row]:
-    """What every cell gave, one after the other; stages that are there are read. Tables and figures of all seeds that
-    are complete are written after each.
+    """Run the cells one after the other, and return their results. Finished stages are read. After each cell, tables
+    and figures of all seeds that are complete are written.
 
     Raises:
         RunFailed: the server did not start.
@@ -65,7 +65,7 @@ def run_cells(todo: Sequence[Cell], folder: Path, say: Say) -> list[Row]:
 
 
 def tables(rows: Sequence[Row]) -> dict[str, list[tuple[str, ...]]]:
-    """The paper's numbers beside ours, by task."""
+    """Tables that compare the paper's numbers with ours, by task."""
     return {task: table(rows, task) for task in dict.fromkeys(row["task"] for row in rows)}
 
 
@@ -91,7 +91,7 @@ def _run(cell: Cell, folder: Path, api: Api, tell: Say) -> None:
 
 
 def _stage(done: Path, run: Callable[[], Row]) -> None:
-    """Run a stage unless its result is there; the result appears whole or not at all."""
+    """Run a stage unless its result exists. The result is written whole or not at all."""
     if done.exists():
         return
     result, draft = run(), done.with_suffix(".part")
@@ -100,7 +100,7 @@ def _stage(done: Path, run: Callable[[], Row]) -> None:
 
 
 def _design(cell: Cell, api: Api, tell: Say) -> Row:
-    """Answer the queries of the design, then hold some of its models against unseen real steps."""
+    """Answer the queries of the design. Then compare some of its models with unseen real steps."""
     spec = cell.spec
     budget = api.create_surrogate(cell.name, spec).budget
     environment = make(spec.environment, spec=spec)
@@ -159,7 +159,7 @@ def _episodes(cell: Cell, api: Api, place: Path, tell: Say) -> Row:
 
 @contextmanager
 def _server(folder: Path) -> Iterator[Api]:
-    """A server of its own on the folder's database; it ends with the context."""
+    """A server on the folder's database, which stops with the context."""
     ready = folder / "server.url"
     ready.unlink(missing_ok=True)
     options = ["--port", "0", "--database", str(folder / "surrogym.db"), "--ready-file", str(ready)]
@@ -170,7 +170,7 @@ def _server(folder: Path) -> Iterator[Api]:
 
 
 def _places(cell: Cell, folder: Path) -> tuple[Path, Path]:
-    """Where a cell's design lies, and what its policy gave."""
+    """The folder of a cell's design, and the results of its policy."""
     design = folder / "cells" / cell.name
     return design, design / cell.policy_name
 

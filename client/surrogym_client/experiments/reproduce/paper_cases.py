@@ -1,4 +1,5 @@
-"""What section 5 of the paper does: its two tasks, the designs compared, and the variations a policy has to stand."""
+"""The experiments of the paper's section 5: its two tasks, the compared designs, and the variations for its
+policies."""
 
 from __future__ import annotations
 
@@ -114,12 +115,12 @@ ARMS = {
 
 @dataclass(frozen=True)
 class Scale:
-    """How much is done: everything, or hardly anything to see that it works."""
+    """Size of the experiments: complete, or minimal to check that everything works."""
 
-    steps: int | None = None  # virtual steps of a training; None takes what the specification suggests
+    steps: int | None = None  # virtual steps of a training; None takes the specification's
     shrink: int = 1  # real steps and episodes are divided by this
-    unseen: int = 400  # real steps that models are held against
-    versions: int = 16  # of the models of a design, that are held against them
+    unseen: int = 400  # real steps with which models are compared
+    versions: int = 16  # number of a design's models that are compared with them
 
 
 WHOLE, QUICK = Scale(), Scale(steps=2_048, shrink=10, unseen=20, versions=3)
@@ -127,7 +128,7 @@ WHOLE, QUICK = Scale(), Scale(steps=2_048, shrink=10, unseen=20, versions=3)
 
 @dataclass(frozen=True)
 class Cell:
-    """One design, the policy learned from it, and what that is worth in the original environment."""
+    """One design, the policy learned from it, and the policy's results in the original environment."""
 
     task: str
     arm: str
@@ -147,7 +148,7 @@ class Cell:
 
     @property
     def episodes_name(self) -> str:
-        """The same for what the policy has to stand."""
+        """The same for the variations of its episodes."""
         return f"episodes-{_hash([_plain(v) for v in self.variations])}"
 
     @property
@@ -160,7 +161,7 @@ class Cell:
 
     @property
     def spec(self) -> EnvironmentSpec:
-        """What the surrogate is registered with."""
+        """The specification of the surrogate."""
         task, arm, shrink = self.paper_task, ARMS[self.arm], self.scale.shrink
         paper = arm.preset == "paper"
         budget = max(6, (task.budget if paper else task.default_budget) // shrink)
@@ -170,7 +171,7 @@ class Cell:
 
     @property
     def variations(self) -> tuple[Variation, ...]:
-        """What the policy has to stand, in as many episodes as the scale allows."""
+        """The variations for the policy, with the number of episodes of the scale."""
         return tuple(_fewer(v, self.scale.shrink) for v in self.paper_task.variations)
 
 

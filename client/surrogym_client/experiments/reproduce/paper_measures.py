@@ -1,4 +1,4 @@
-"""What is measured: confidence and error of every model of a design, and real episodes under varied conditions."""
+"""Measurements: confidence and error of every model of a design, and real episodes under varied conditions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PENALTY = 3.0  # k of eq. 14
 
 
 class BiasedEpisode(GymnasiumEpisode):
-    """An episode that starts as a variation says, in a system whose physics are off."""
+    """An episode that starts as a variation says, with changed physical quantities."""
 
     def __init__(self, spec: EnvironmentSpec, variation: Variation) -> None:
         super().__init__(spec)
@@ -78,7 +78,7 @@ def run_variation(predict: Predict, spec: EnvironmentSpec, variation: Variation)
 
 
 def _starts(spec: EnvironmentSpec, variation: Variation, first_seed: int) -> list[list[float]]:
-    """Where the episodes began, for those that begin anywhere under nominal physics."""
+    """Starts of the episodes that start anywhere under nominal physics."""
     if variation.start != ANYWHERE or variation.physics:
         return []
     seeds = range(first_seed, first_seed + variation.episodes)
@@ -90,7 +90,7 @@ def _trace(trace: Trace) -> dict[str, Any]:
 
 
 class Unseen:
-    """Real steps from anywhere that no design has seen, to hold models against."""
+    """Real steps from anywhere that no design has seen, to test models."""
 
     def __init__(self, spec: EnvironmentSpec, count: int) -> None:
         self._spec = spec

@@ -1,4 +1,4 @@
-"""The paper's figures 5 to 15, drawn from what the cells gave. Single runs are those of the first seed."""
+"""The paper's figures 5 to 15, drawn from the results of the cells. Single runs are those of the first seed."""
 
 from __future__ import annotations
 

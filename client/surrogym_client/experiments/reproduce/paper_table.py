@@ -1,4 +1,4 @@
-"""The paper's numbers beside ours: preset ``paper``, and the default with a tenth of the real steps."""
+"""The paper's numbers with ours: preset ``paper``, and the default with a tenth of the real steps."""
 
 from __future__ import annotations
 

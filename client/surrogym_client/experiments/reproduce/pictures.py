@@ -20,7 +20,7 @@ from surrogym_client.experiments.reproduce.table import Group, column, grouped, 
 OF_ARMS = ("#dd8452", "#da8bc3", "#64b5cd", "#4c72b0", "#55a868", "#8172b3", "#937860", "#c9a66b", "#555555")
 COLOURS = dict(zip(ARMS, OF_ARMS, strict=True))
 SIZE = (6.0, 3.6)  # inches
-BESIDE = 0.05  # dots of single seeds stand so far from their arm, as a share of its real steps
+BESIDE = 0.05  # distance of the dots of single seeds from their arm, as a share of its real steps
 
 
 def draw_tasks(folder: Path, rows: Sequence[Row]) -> list[Path]:
@@ -35,7 +35,7 @@ def draw_tasks(folder: Path, rows: Sequence[Row]) -> list[Path]:
 
 
 def draw_task(task: str, groups: dict[Group, list[Row]]) -> Figure:
-    """Each arm where its median of real steps is: interquartile mean with interval, and beside it every seed."""
+    """Draw each arm at its median of real steps: interquartile mean with interval, and every seed next to it."""
     figure = Figure(figsize=SIZE, layout="constrained")
     axes = figure.add_subplot()
     named: set[str] = set()

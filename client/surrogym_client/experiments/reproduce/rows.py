@@ -1,4 +1,4 @@
-"""Rows: what one run gave, one line of a CSV file. Rows of several sittings and machines merge."""
+"""Rows: the result of one run each, as a line of a CSV file. Rows of several runs and machines can be merged."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Key = tuple[str, str, int, int]
 
 
 class UnusableRows(SurrogymClientError):
-    """A file of rows can't be read; says which line and why."""
+    """A file of rows can't be read; the message names the line and the reason."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Tables of an efficiency study, as Markdown: every cell that was run counts, also one that ended badly."""
+"""Tables of an efficiency study, as Markdown. Every run counts, also a failed one."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ HEADING = (
     *("task", "arm", "seeds", "real steps", "real return", "worst seed", "worst episode"),
     *("success", "other starts", "imagined", "target reached", "virtual steps", "seconds"),
 )
-FEW = 3  # seeds; fewer have no interval worth the name
-CONTRASTS = (  # what a pair of arms tells, at the same budget
+FEW = 3  # seeds; fewer give no useful interval
+CONTRASTS = (  # what a pair of arms shows, at the same budget
     ("adaptive queries", "no_loop", "latin_hypercube"),
     ("adaptive queries, in the paper's representation", "paper", "paper_hypercube"),
     ("default's or paper's preset, on a hypercube", "latin_hypercube", "paper_hypercube"),
@@ -34,7 +34,7 @@ CONTRASTS = (  # what a pair of arms tells, at the same budget
     ("the whole of it", "default", "paper"),
     ("surrogate or original", "default", "oracle"),
 )
-WITHOUT_ROUNDS = {  # what the same pairs tell where the design has the whole budget: did a run stop early, or none
+WITHOUT_ROUNDS = {  # what the same pairs show if the design has the whole budget: whether an early stop matters
     "closed loop": ("an early stop", None),
     "adaptive queries and closed loop": ("adaptive queries and an early stop", "adaptive queries"),
 }
@@ -48,7 +48,7 @@ training: median. Seconds: median (largest). A bootstrap of five seeds is narrow
 
 
 def report(rows: Sequence[Row]) -> str:
-    """The headline, the main table, the questions that pairs of arms answer, and where the rows come from."""
+    """The headline, the main table, the questions that pairs of arms answer, and the origin of the rows."""
     parts = [headline(rows), summary(rows), NOTES]
     if pairs := contrasts(rows):
         parts += [
@@ -150,7 +150,7 @@ def _line(group: Group, rows: Sequence[Row]) -> Sequence[str]:
 
 
 def _asked(question: str, budget: int, rows: Sequence[Row]) -> str | None:
-    """What a pair tells where a budget leaves no rounds; None where both of its arms are the same design."""
+    """What a pair shows if a budget leaves no rounds; None if both arms are then the same design."""
     if queries_a_round(budget) or question not in WITHOUT_ROUNDS:
         return question
     early, whole = WITHOUT_ROUNDS[question]
@@ -158,7 +158,7 @@ def _asked(question: str, budget: int, rows: Sequence[Row]) -> str | None:
 
 
 def _origin(rows: Sequence[Row]) -> str:
-    """Commits and machines; and a warning where rows that are compared were not made alike."""
+    """Commits and machines, with a warning if the compared rows differ in these."""
     lines = [f"Commits: {_listed(rows, 'commit')}. Machines: {_listed(rows, 'machine')}."]
     for (task, arm, budget), of in grouped(rows).items():
         for name, plural in (("configuration", "configurations"), ("commit", "commits")):
