@@ -97,7 +97,7 @@ def test_a_stop_lets_long_polls_end_and_running_steps_finish(restarting: Restart
     restarting.start()
 
 
-def test_a_crash_truncates_the_episodes_and_training_goes_on(restarting: RestartingServer):
+def test_a_crash_truncates_the_episodes_and_training_continues(restarting: RestartingServer):
     envs = vec_env(restarting)
     envs.reset()
     last, *_ = envs.step(actions(1)[0])

@@ -57,7 +57,7 @@ def test_markdown_fits_and_keeps_every_word(width):
     assert "\n\nA sentence that is broken where" in fitted(MARKDOWN, 80).replace("was\n", "was ")
 
 
-def test_markdown_stays_what_it_is_in_a_file():
+def test_markdown_is_unchanged_in_a_file():
     assert fitted(MARKDOWN, ENDLESS) == MARKDOWN
 
 

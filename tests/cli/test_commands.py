@@ -44,7 +44,7 @@ def pendulum(on_server, name):
     return name
 
 
-def test_register_tells_what_is_next(on_server, name):
+def test_register_names_the_next_command(on_server, name):
     said = on_server("register", "CartPole-v1", "--name", name)
     assert said.code == 0
     assert said.out == (
@@ -71,7 +71,7 @@ def test_tolerances_are_given_at_registration_and_changed_later(on_server, name)
         assert words in said.err
 
 
-def test_print_spec_asks_no_server_and_gives_what_register_takes(surrogym, on_server, name, tmp_path):
+def test_print_spec_needs_no_server_and_register_accepts_its_output(surrogym, on_server, name, tmp_path):
     said = surrogym("register", "Pendulum-v1", "--seed", "5", "--bins", "3", "--print-spec")
     assert said.code == 0
     assert said.json["design"]["seed"] == 5
@@ -118,7 +118,7 @@ def test_a_surrogate_leaves_and_enters_as_one_file(surrogym, pendulum_server, na
     )
 
 
-def test_what_has_no_model_can_not_leave(on_server, pendulum):
+def test_a_surrogate_without_a_model_can_not_be_exported(on_server, pendulum):
     said = on_server("export", pendulum, "--out", "pendulum.surrogate")
     assert (said.code, said.out) == (1, "")
     assert "has no model yet" in said.err

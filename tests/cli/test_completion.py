@@ -41,7 +41,7 @@ def test_commands_and_names_of_surrogates_are_completed(pendulum_server):
     assert complete("surrogym train xyz", pendulum_server.url) == []
 
 
-def test_without_a_server_nothing_is_offered_and_nothing_is_said():
+def test_without_a_server_there_is_no_offer_and_no_message():
     started = time.monotonic()
     assert complete("surrogym export pend", "http://127.0.0.1:9") == []
     assert time.monotonic() - started < QUICK + 10  # the start of Python on a busy machine included

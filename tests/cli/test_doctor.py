@@ -82,7 +82,7 @@ def test_one_thing_out_of_place_does_not_hide_the_others(surrogym, monkeypatch, 
     assert way_out in lines(said)[broken][1]
 
 
-def test_the_role_of_a_token_is_told(surrogym):
+def test_the_role_of_a_token_is_returned(surrogym):
     alive = reply(wire.Health(version="0.1.0").model_dump_json())
     access = reply(wire.Access(role="sample", tokens=True).model_dump_json())
     with scripted_server(alive, reply('{"status": "ready", "storage": "ok"}'), access, alive) as server:

@@ -40,7 +40,7 @@ def test_a_server_that_is_not_there(surrogym, quickly, arguments):
     assert "start one with surrogym serve" in said
 
 
-def test_an_address_that_is_none(surrogym):
+def test_an_invalid_address_is_refused(surrogym):
     assert "expected a server address" in refused(surrogym("status", "--server", "pendulum"))
 
 

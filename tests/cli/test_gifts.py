@@ -82,7 +82,7 @@ def test_a_server_that_a_person_names_gets_the_real_steps_and_the_token(surrogym
 
 
 @pytest.mark.parametrize("name", ["..", "a/b", "", "a b", "pendulum/../other", "pendulum\n"])
-def test_a_card_with_a_name_that_none_can_have_is_refused(surrogym, tmp_path, name):
+def test_a_card_with_an_invalid_name_is_refused(surrogym, tmp_path, name):
     network(tmp_path, surrogate=name)
     ended = surrogym(*EVALUATE)
     assert ended.code == 1

@@ -24,7 +24,7 @@ def test_what_is_not_known_is_refused(surrogym, option, words):
     assert words in said.err
 
 
-def test_what_is_done_is_not_run_again(surrogym, tmp_path):
+def test_finished_stages_are_not_run_again(surrogym, tmp_path):
     row = Row(**{**vars(ROW), "specification": Cell(DemoSettings("pendulum")).specification})
     write_rows(tmp_path / "out" / "rows.csv", [row])
     said = surrogym("reproduce", "efficiency", "--tasks=pendulum", "--seeds=1", "--out=out", "--json")

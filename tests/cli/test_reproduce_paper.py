@@ -61,7 +61,7 @@ def test_a_full_command_stays_the_full_torque():
     assert abs(episode._env.last_u + 2.0) > 1e-3
 
 
-def test_what_follows_from_a_mass_follows():
+def test_quantities_derived_from_a_mass_follow_its_change():
     variation = Variation("any", 1, None, ("masspole",), 0.5)
     episode = BiasedEpisode(make("CartPole-v1").spec(), variation)
     episode.reset(3)

@@ -81,11 +81,11 @@ def test_a_script_reads_one_document_and_nothing_else(surrogym, pendulum_server:
 @pytest.mark.parametrize(
     ("line", "shown"), [("report pendulum", "report: done"), ("export pendulum -o s.csv", "export: done")]
 )
-def test_what_may_take_seconds_says_how_far_it_is(surrogym, pendulum_server: ServerProcess, line, shown) -> None:
+def test_a_long_operation_shows_its_progress(surrogym, pendulum_server: ServerProcess, line, shown) -> None:
     assert shown in surrogym(*line.split(), "--server", pendulum_server.url).err
 
 
-def test_a_wait_says_what_for(surrogym, pendulum_server: ServerProcess, monkeypatch) -> None:
+def test_a_wait_names_its_reason(surrogym, pendulum_server: ServerProcess, monkeypatch) -> None:
     monkeypatch.setattr("surrogym_shared.terminal.FIRST_SECONDS", 0.05)
     server = ("--server", pendulum_server.url)
     said = surrogym("sample", "nowhere", "--wait", "0.5", *server)

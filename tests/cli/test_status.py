@@ -74,7 +74,7 @@ def test_watching_shows_changes_alone_and_ends_cleanly(on_server, server_process
     assert on_server("status", name, "--watch", "--quiet").out == f"{name} paused\n"
 
 
-def test_a_server_that_goes_away_is_told_and_looked_for(surrogym, looks, monkeypatch):
+def test_a_lost_server_is_reported_and_polled(surrogym, looks, monkeypatch):
     monkeypatch.setattr("surrogym_client.cli.options.QUICK", 0.0)
     looks(3)
     with scripted_server(EMPTY, lost_reply, EMPTY) as server:

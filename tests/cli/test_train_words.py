@@ -30,16 +30,16 @@ def test_the_closed_loop_says_how_well_the_policys_region_is_known():
     assert words_of(vars(now)) == "100 of 512 virtual steps, confidence index 0.9000 where the policy went"
 
 
-def test_a_training_that_still_got_better_says_how_it_goes_on():
+def test_a_training_that_still_improves_shows_how_to_continue():
     words = words_of_result(replace(RESULT, gaining=True))
     assert "; it still improved at the end, and --start-from p.zip continues it; next: surrogym evaluate" in words
 
 
-def test_networks_that_were_given_up_are_told():
+def test_replaced_networks_are_reported():
     assert "; 1 network replaced because of slow learning; next" in words_of_result(replace(RESULT, networks=2))
     assert "; 2 networks replaced because of slow learning; next" in words_of_result(replace(RESULT, networks=3))
 
 
-def test_after_an_interruption_the_closed_loop_is_asked_for_again():
+def test_the_advice_after_an_interruption_keeps_the_closed_loop():
     words = words_of_interruption(RESULT, "cart --improve 5 --rounds 3")
     assert words.endswith("to continue: surrogym train cart --improve 5 --rounds 3 --start-from p.zip --out p.zip")

@@ -71,7 +71,7 @@ def test_what_is_left_out_is_the_specifications(port: SurrogatePort):
     port.close(view.id)
 
 
-def test_a_seed_that_is_not_given_is_drawn_and_told(port: SurrogatePort):
+def test_a_missing_seed_is_drawn_and_returned(port: SurrogatePort):
     views = [port.open(OpenSession()) for _ in range(2)]
     assert views[0].seed != views[1].seed
     starts = [port.reset(view.id).observation for view in views]
@@ -114,7 +114,7 @@ def test_results_have_the_shapes_and_types_of_the_port(port: SurrogatePort, open
     assert result.reward.dtype == np.float64
 
 
-def test_deviations_come_only_when_asked_for_and_change_nothing(port: SurrogatePort, opened: Opened):
+def test_deviations_are_returned_only_on_request_without_other_effects(port: SurrogatePort, opened: Opened):
     plain, asked = opened(), opened()
     assert_same(port.reset(plain), port.reset(asked))
     for action in actions(3):
@@ -177,7 +177,7 @@ def test_the_same_requests_give_the_same_replies(port: SurrogatePort, opened: Op
             assert_same(port.step(first, action), port.step(second, action))
 
 
-def test_an_unseeded_reset_goes_on_to_the_next_episode(port: SurrogatePort, opened: Opened):
+def test_an_unseeded_reset_begins_the_next_episode(port: SurrogatePort, opened: Opened):
     session = opened()
     episodes = []
     for _ in range(2):
@@ -381,7 +381,7 @@ def test_a_closed_session_is_gone_and_closing_it_again_harmless(port: SurrogateP
 # Occupancy
 
 
-def test_visited_states_are_collected_when_asked_for(port: SurrogatePort, opened: Opened, harness):
+def test_visited_states_are_collected_on_request(port: SurrogatePort, opened: Opened, harness):
     session = opened(occupancy=True)
     with pytest.raises(harness.errors.NotReset):
         port.submit_occupancy(session, "too early")

@@ -125,7 +125,7 @@ def test_tab_reaches_everything_that_can_be_operated_and_jumps_land_in_their_par
     expect(page.get_by_label("queries to show")).to_be_focused()
 
 
-def test_the_queue_says_who_holds_a_query_and_for_how_long(url: str, open_page: Open):
+def test_the_queue_shows_the_holder_and_end_of_each_lease(url: str, open_page: Open):
     with Api(url) as api:
         api.create_surrogate("leased", pendulum())
         _, failed = api.claim("leased", "arm-7", max_queries=2, lease_seconds=600).queries

@@ -86,13 +86,13 @@ def test_rendering_is_refused():
         RemoteEnv(ExactPendulum(), render_mode="human")
 
 
-def test_deviation_comes_when_asked_for():
+def test_deviation_is_returned_on_request():
     env = RemoteEnv(ExactPendulum(), deviations=True)
     env.reset(seed=0)
     assert env.step(ACTION)[-1]["deviation"].shape == (3,)
 
 
-def test_it_pickles_and_goes_on_where_it_was():
+def test_it_pickles_and_continues():
     env = RemoteEnv(ExactPendulum())
     env.reset(seed=1)
     again = pickle.loads(pickle.dumps(env))

@@ -140,7 +140,7 @@ def test_a_loss_found_by_a_partial_reset_ends_the_other_lanes_at_the_next_step(
     np.testing.assert_array_equal(reasons[f"_{LOST}"], ~mask)
 
 
-def test_a_loss_found_by_a_full_reset_is_told(port: ExactPendulum):
+def test_a_lost_session_found_by_a_full_reset_is_reported(port: ExactPendulum):
     env = RemoteEnv(port)
     first, _ = env.reset(seed=1)
     port.lose()

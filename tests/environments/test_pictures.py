@@ -141,7 +141,7 @@ def test_an_environment_of_ones_own_draws_itself(own: None) -> None:
         (BLIND, "line:Line", "got none for 'x'"),
     ],
 )
-def test_what_can_not_be_shown_is_refused_in_words(own: None, spec, original, message) -> None:
+def test_an_impossible_picture_is_refused_with_a_reason(own: None, spec, original, message) -> None:
     with pytest.raises(NotRenderable, match=message):
         Pictures(spec, original)
 
@@ -187,7 +187,7 @@ def test_rendering_before_a_reset_is_refused() -> None:
             env.render()
 
 
-def test_what_can_not_be_rendered_opens_no_session() -> None:
+def test_an_impossible_rendering_opens_no_session() -> None:
     for kind in (RemoteEnv, RemoteVectorEnv):
         with pytest.raises(ValueError, match="expected render_mode None or rgb_array for a surrogate, got 'human'"):
             kind(port := ExactPendulum(), render_mode="human")

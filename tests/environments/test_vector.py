@@ -64,7 +64,7 @@ def test_disabled_autoreset_refuses_to_step_a_finished_lane():
         remote.step(actions(1)[0])
 
 
-def test_a_seed_list_may_leave_lanes_to_go_on_unseeded():
+def test_a_list_of_seeds_may_omit_lanes():
     remote, reference = both(AutoresetMode.NEXT_STEP)
     for seeds in (SEEDS, [None, 9, None, 10], [None] * 4):
         assert_same(remote.reset(seed=seeds), reference.reset(seed=seeds))
@@ -88,7 +88,7 @@ def test_a_list_of_seeds_has_one_a_lane():
             envs.reset(seed=[1, 2])
 
 
-def test_an_int_seed_repeats_and_an_unseeded_reset_goes_on():
+def test_an_int_seed_repeats_and_an_unseeded_reset_continues():
     remote, _ = both(AutoresetMode.NEXT_STEP)
     first, second = remote.reset(seed=0)[0], remote.reset()[0]
     assert_same(remote.reset(seed=0)[0], first)
@@ -98,7 +98,7 @@ def test_an_int_seed_repeats_and_an_unseeded_reset_goes_on():
 
 
 @pytest.mark.parametrize("mode", ["same_step", "SameStep", AutoresetMode.SAME_STEP])
-def test_the_autoreset_mode_is_told_as_gymnasiums_enum(mode: object):
+def test_the_autoreset_mode_is_gymnasiums_enum(mode: object):
     envs = RemoteVectorEnv(ExactPendulum(), 2, autoreset_mode=mode)
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
 
@@ -138,7 +138,7 @@ def test_a_bad_mask_is_refused_as_gymnasium_refuses_it(mask: object, error: type
             envs.reset(options={"reset_mask": mask})
 
 
-def test_deviations_come_when_asked_for():
+def test_deviations_are_returned_on_request():
     envs = RemoteVectorEnv(ExactPendulum(), 2, deviations=True)
     envs.reset(seed=0)
     infos = envs.step(np.zeros((2, 1), dtype=np.float32))[-1]
@@ -146,7 +146,7 @@ def test_deviations_come_when_asked_for():
     assert infos["_deviation"].all()
 
 
-def test_it_keeps_nothing_of_what_it_gave_away():
+def test_it_shares_no_memory_with_returned_arrays():
     envs, untouched = both(AutoresetMode.NEXT_STEP)
     untouched.reset(seed=SEEDS)
     envs.reset(seed=SEEDS)[0][:] = np.nan
@@ -156,7 +156,7 @@ def test_it_keeps_nothing_of_what_it_gave_away():
         observation[:] = np.nan
 
 
-def test_it_pickles_and_goes_on_where_it_was():
+def test_it_pickles_and_continues():
     envs, reference = both(AutoresetMode.NEXT_STEP)
     envs.reset(seed=SEEDS)
     reference.reset(seed=SEEDS)

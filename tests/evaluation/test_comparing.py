@@ -58,7 +58,7 @@ def test_a_wrong_step_is_found_with_its_episode_state_and_output() -> None:
     assert Differing(found, 10_000).as_json()["steps"][0]["seed"] == 10_001
 
 
-def test_a_model_that_is_right_is_said_to_be() -> None:
+def test_a_correct_model_has_no_disagreements() -> None:
     found = held(episodes(2, 10), np.zeros((20, 2)))
     assert Differing(found, 0).in_words(SPEC) == [
         "none of 20 real steps differs from the model by more than the model's uncertainty"

@@ -185,7 +185,7 @@ def test_scaled_starts_are_declared_ones_spread_about_their_middle():
         EvaluationSettings(wide=True, start_scale=2.0)
 
 
-def test_an_interruption_tells_the_real_steps_that_were_taken():
+def test_an_interruption_reports_the_real_steps_taken():
     def interrupt(share, _):
         if share >= 3 / 200:
             raise KeyboardInterrupt

@@ -66,7 +66,7 @@ def test_a_function_gets_one_observation_at_a_time(controllers: str) -> None:
         assert trace.action[:, 0] == pytest.approx(np.clip(-trace.coordinates[:-1, 1], -2, 2), abs=1e-5)
 
 
-def test_what_is_no_controller_is_refused_before_a_real_step(controllers: str, tmp_path: Path) -> None:
+def test_an_invalid_controller_is_refused_before_a_real_step(controllers: str, tmp_path: Path) -> None:
     with pytest.raises(PolicyMisfit, match=r"expected actions of shape \(1, 1\)"):
         evaluate(load_reference(f"{controllers}:wrong"), opened, EvaluationSettings(episodes=1))
     with pytest.raises(UnknownEnvironment, match="absent"):

@@ -80,7 +80,7 @@ def test_a_study_has_the_default_everywhere_and_the_arms_on_four_tasks():
     assert {(cell.settings.seed, cell.settings.steps) for cell in some} == {(3, 9)}
 
 
-def test_what_is_asked_has_a_hash_that_the_seed_does_not_change():
+def test_the_hash_of_settings_does_not_depend_on_the_seed():
     plain = Cell(DemoSettings("pendulum"))
     assert plain.specification == Cell(DemoSettings("pendulum", seed=7, pictures=False)).specification
     changes = ({"arm": "variance"}, {"steps": 9}, {"budget": 7}, {"episodes": 3}, {"task": "cartpole"})

@@ -49,7 +49,7 @@ def test_a_file_from_before_promises_is_read(tmp_path):
         ((",yes,", ",maybe,"), "line 2: expected yes or no, got 'maybe'"),
     ],
 )
-def test_a_file_that_is_none_of_ours_is_refused(tmp_path, change, words):
+def test_a_foreign_file_is_refused(tmp_path, change, words):
     path = tmp_path / "rows.csv"
     write_rows(path, [ROW])
     path.write_text(path.read_text().replace(*change, 1))

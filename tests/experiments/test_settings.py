@@ -42,7 +42,7 @@ def test_a_training_is_prolonged_unless_its_steps_are_chosen_or_real_or_the_pape
     assert not DemoSettings("acrobot", steps=1_750_000).prolong
 
 
-def test_arms_differ_in_what_they_say():
+def test_arms_differ_in_their_specifications():
     designs = {name: DemoSettings("acrobot", arm=name).spec().design for name in ARMS}
     assert designs["variance"].acquisition == "variance"
     assert designs["latin_hypercube"].acquisition == designs["paper_hypercube"].acquisition == "latin_hypercube"
@@ -50,7 +50,7 @@ def test_arms_differ_in_what_they_say():
     assert designs["no_loop"].acquisition is designs["default"].acquisition is None
 
 
-def test_an_arm_is_told_by_what_it_alone_chooses():
+def test_an_arm_is_identified_by_its_own_choices():
     assert ARMS["declared_starts"].fields() == {"closed_loop": True, "start_box": 0}
     assert ARMS["no_loop"].fields() == {}
     assert len({str(arm.fields()) for arm in ARMS.values()}) == len(ARMS)

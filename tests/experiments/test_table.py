@@ -67,7 +67,7 @@ def test_pairs_of_arms_answer_questions_with_an_interval():
     assert text.index("| pendulum | no_loop |") < text.index("| pendulum | latin_hypercube |")
 
 
-def test_an_arm_that_closes_no_loop_is_not_said_to():
+def test_an_arm_without_a_closed_loop_is_described_so():
     """A budget of 14 is all the design's, one of 60 leaves queries for three rounds."""
     asked = [*DEFAULT, *[replace(row, arm="no_loop") for row in DEFAULT]]
     assert line(report(asked), "pendulum", "an early stop", "default, no_loop")
@@ -78,7 +78,7 @@ def test_an_arm_that_closes_no_loop_is_not_said_to():
     assert line(report(with_rounds), "swingup", "closed loop", "default, no_loop")
 
 
-def test_rows_that_were_not_made_alike_are_told():
+def test_rows_with_different_origins_cause_a_warning():
     assert "configurations" not in report(DEFAULT)
     assert "of 2 commits" not in report(DEFAULT)
     assert "pendulum, default, budget 14: rows of 2 commits" in report([*DEFAULT, replace(ROW, seed=9, commit="d")])

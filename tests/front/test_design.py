@@ -52,7 +52,7 @@ def test_pendulum_is_known_after_a_few_real_steps():
     assert {query.purpose for query in asked} == {"initial", "adaptive"}
 
 
-def test_it_asks_what_the_server_asks(server_process: ServerProcess):
+def test_its_queries_equal_those_of_a_server(server_process: ServerProcess):
     design = surrogym.Design(small())
     asked = run(design)
     with surrogym.Client(server_process.url) as client:
@@ -215,7 +215,7 @@ def test_a_query_may_come_back_from_another_process():
     copied.give_up(second)
 
 
-def test_what_is_no_specification_is_refused():
+def test_an_invalid_specification_is_refused():
     with pytest.raises(InvalidInput, match="spec: expected an EnvironmentSpec, got dict"):
         surrogym.Design({})  # type: ignore[arg-type]
 
@@ -236,7 +236,7 @@ def test_numbers_of_numpy_are_numbers():
         (1, [[1e308, 0.0]], "visited: expected '.*' within"),
     ],
 )
-def test_asking_for_more_in_a_way_that_can_not_be_changes_nothing(steps: Any, visited: Any, said: str):
+def test_an_impossible_request_for_more_queries_changes_nothing(steps: Any, visited: Any, said: str):
     design = surrogym.Design(pendulum(), budget=20)
     before = (design._extra, design._visited)
     with pytest.raises(InvalidInput, match=said):
@@ -244,7 +244,7 @@ def test_asking_for_more_in_a_way_that_can_not_be_changes_nothing(steps: Any, vi
     assert (design._extra, design._visited) == before
 
 
-def test_more_can_be_asked_for_within_the_budget_where_a_policy_goes():
+def test_queries_near_visited_states_can_be_added_within_the_budget():
     design = surrogym.Design(pendulum(), budget=20)
     before = len(run(design))
     design.improve(2, np.zeros((50, 2)))
@@ -264,7 +264,7 @@ def test_the_model_is_an_environment(done: surrogym.Design):
         surrogym.make(surrogym.Design(small()))
 
 
-def test_it_is_saved_and_goes_on(done: surrogym.Design, tmp_path: Path):
+def test_it_is_saved_and_continues(done: surrogym.Design, tmp_path: Path):
     done.save(tmp_path / "pendulum.surrogate", "pendulum")
     assert SurrogateFile.load(tmp_path / "pendulum.surrogate").name == "pendulum"
     assert surrogym.make(tmp_path / "pendulum.surrogate").reset(seed=0)[0].shape == (3,)
@@ -345,6 +345,6 @@ def test_where_no_state_can_be_set_it_asks_for_rollouts():
     assert design.steps == 1
 
 
-def test_a_budget_that_is_none_is_refused():
+def test_an_invalid_budget_is_refused():
     with pytest.raises(InvalidInput, match="budget: expected a whole number from 2 to 100000, got 1"):
         surrogym.Design(pendulum(), budget=1)

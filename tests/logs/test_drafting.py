@@ -71,13 +71,13 @@ def test_an_angle_from_0_to_a_full_turn_is_wrapped(tmp_path: Path):
     assert log.steps.q.max() < math.pi
 
 
-def test_what_never_changes_is_left_out_and_said(tmp_path: Path):
+def test_constant_columns_are_left_out_and_reported(tmp_path: Path):
     log = drafted(tmp_path, **rows(p=np.full(50, 3.0), next_p=np.full(50, 3.0)))
     assert log.spec.coordinate_names == ("x",)
     assert "p: always 3, left out" in log.notes
 
 
-def test_what_never_moves_in_an_episode_is_a_constant(tmp_path: Path):
+def test_a_state_that_never_moves_within_episodes_is_constant(tmp_path: Path):
     goal = np.repeat(RNG.uniform(-1, 1, 5), 10)
     log = drafted(tmp_path, **rows(goal=goal, next_goal=goal))
     assert {c.name: c.kind for c in log.spec.coordinates} == {"x": "linear", "goal": "constant"}

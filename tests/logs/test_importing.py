@@ -68,7 +68,7 @@ def test_an_interrupted_import_is_taken_up(
         assert wait_for_model(api, name, 120).samples == ROWS
 
 
-def test_a_log_that_has_grown_brings_what_is_new(server_process: ServerProcess, tmp_path: Path, name: str):
+def test_a_grown_log_adds_only_its_new_steps(server_process: ServerProcess, tmp_path: Path, name: str):
     whole = reactor.log(runs=3, length=20)
     early = reactor.Log(whole.heading, whole.rows[:40]).write(tmp_path / "early.csv")
     late = whole.write(tmp_path / "late.csv")
@@ -87,7 +87,7 @@ def test_a_surrogate_of_a_log_moves_as_a_file(server_process: ServerProcess, log
     assert (after.spec, after.model_version) == (before.spec, 1)
 
 
-def test_a_real_environment_goes_on_from_its_log(server_process: ServerProcess, log: Path, name: str):
+def test_a_real_environment_continues_from_its_log(server_process: ServerProcess, log: Path, name: str):
     spec = reactor.example().Reactor().spec()
     with Api(server_process.url) as api:
         before = api.create_surrogate(name, spec)
@@ -164,7 +164,7 @@ def test_wrong_options_of_a_log_are_refused(
     assert says in capsys.readouterr().err
 
 
-def test_a_server_that_is_away_is_said_before_anything_is_lost(log: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_unreachable_server_is_reported_before_any_loss(log: Path, monkeypatch: pytest.MonkeyPatch):
     from surrogym_client.transport.connection import Retries
 
     monkeypatch.setattr("surrogym_client.logs.importing.Api", lambda *given: Api(*given, retries=Retries(seconds=0)))

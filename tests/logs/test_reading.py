@@ -121,7 +121,7 @@ def test_a_lost_row_leaves_no_step_across_its_gap(tmp_path: Path):
     assert log.steps.row.tolist() == [0, 1, 2, 3, 6, 7, 8], "4 has no next state, 5 no state, 9 is the end"
 
 
-def test_a_bad_action_spoils_its_own_step_alone(tmp_path: Path):
+def test_a_bad_action_fails_only_its_own_step(tmp_path: Path):
     whole = reactor.log(runs=1, length=10).without("next_concentration", "next_temperature")
     log = read(whole.at(5, "action_coolant", "nan").write(tmp_path / "log.csv"), next={})
     assert log.steps.row.tolist() == [0, 1, 2, 3, 4, 6, 7, 8]
@@ -224,7 +224,7 @@ def test_a_mapping_may_be_toml_or_json(tmp_path: Path):
         (b"a,action\nx,y\n", "expected two usable steps at least, got 0"),
     ],
 )
-def test_what_is_no_log_is_refused_in_a_sentence(tmp_path: Path, content: bytes, says: str):
+def test_an_invalid_log_is_refused_in_a_sentence(tmp_path: Path, content: bytes, says: str):
     path = tmp_path / "log"
     path.write_bytes(content)
     with pytest.raises(UnusableLog, match=says):

@@ -21,7 +21,7 @@ def said(path: Path, text: str) -> str:
     return str(refused.value)
 
 
-def test_the_most_frequent_reason_is_said_with_its_line(tmp_path: Path):
+def test_the_most_frequent_reason_is_named_with_its_line(tmp_path: Path):
     rows = ["0.1,", "0.2,x", "0.3,y", "0.4,z"]
     words = said(tmp_path / "log.csv", "\n".join(["level,action", *rows]) + "\n")
     assert words.startswith("expected two usable steps at least, got 0 of 4 rows; ")

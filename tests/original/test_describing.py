@@ -80,7 +80,7 @@ def test_the_described_observation_is_the_environments_own() -> None:
 
 
 @installed("mujoco")
-def test_what_terms_can_not_express_is_replaced_by_coordinates() -> None:
+def test_entries_that_terms_can_not_express_are_replaced_by_coordinates() -> None:
     found = describe("Pusher-v5", STEPS)
     assert any("no sums of 1, q, sin and cos" in line for line in found.found)
     shown = {name for entry in found.spec.observation for part in entry.term.parts for name in part.weights}
@@ -89,7 +89,7 @@ def test_what_terms_can_not_express_is_replaced_by_coordinates() -> None:
 
 
 @installed("mujoco")
-def test_steps_that_ended_an_episode_make_termination_learned_and_asked_for() -> None:
+def test_terminating_steps_make_termination_learned_and_a_question() -> None:
     found = describe("Hopper-v5", STEPS)
     assert found.spec.termination == "learned"
     assert any(line.startswith("termination:") for line in found.asked)
@@ -113,18 +113,18 @@ def test_every_step_is_counted(registered: Register) -> None:
     assert describe(name, 50).steps == len(taken) > 50
 
 
-def test_an_environment_that_remembers_what_can_not_be_set_can_only_be_reset(registered: Register) -> None:
+def test_an_environment_with_hidden_memory_can_only_be_reset(registered: Register) -> None:
     found = describe(registered("Worn-v0", wear=0.01), 60)
     assert found.spec.query == "rollout"
     assert any("has memory that can't be set" in line for line in found.found)
 
 
-def test_a_state_that_can_not_be_read_is_what_is_shown(registered: Register) -> None:
+def test_the_observation_replaces_an_unreadable_state(registered: Register) -> None:
     found = describe(registered("Hidden-v0", attribute="_hidden"), 60)
     assert (found.spec.query, found.spec.coordinate_names) == ("rollout", ("o0", "o1"))
 
 
-def test_a_reward_that_is_mostly_the_same_is_asked_for(registered: Register) -> None:
+def test_a_mostly_constant_reward_becomes_a_question(registered: Register) -> None:
     def step(self, action):
         shown, reward, *rest = Spiral.step(self, action)
         return shown, float(reward > -0.01), *rest

@@ -59,7 +59,7 @@ def test_a_step_runs_in_another_process(moody):
     assert int(step(moody, 0).reward) != os.getpid()
 
 
-def test_one_that_raises_is_reported_and_goes_on(moody):
+def test_a_raised_error_fails_its_step_and_the_child_continues(moody):
     child = step(moody, 0).reward
     with pytest.raises(StepFailed, match="RuntimeError: the motor is hot"):
         step(moody, 1)
@@ -75,7 +75,7 @@ def test_one_that_hangs_or_dies_is_replaced(moody, mood, error):
     assert int(step(moody, 0).reward) != child
 
 
-def test_a_factory_that_fails_says_why():
+def test_the_error_of_a_failing_factory_is_shown():
     with IsolatedEnvironment(broken) as environment, pytest.raises(UnknownEnvironment, match="no robot at"):
         environment.spec()
 
@@ -163,7 +163,7 @@ class Numbered(Moody):
         return RealStep(coordinates, action, coordinates, reward=float(self.steps))
 
 
-def test_the_answer_to_an_interrupted_step_is_nobody_elses():
+def test_the_answer_to_an_interrupted_step_reaches_no_other_request():
     with IsolatedEnvironment(Numbered) as environment:
         environment.spec()
         threading.Timer(0.3, lambda: os.kill(os.getpid(), signal.SIGINT)).start()

@@ -102,7 +102,7 @@ def test_in_a_process_of_its_own_one_that_fails_in_the_middle_begins_anew(factor
         environment.act(LEFT)
 
 
-def test_a_name_that_is_no_module_is_told_without_where_in_surrogym_that_was_noticed():
+def test_an_unknown_module_is_named_without_surrogyms_traceback():
     environment = IsolatedEnvironment(partial(original.make, "nomod:F"))
     with pytest.raises(UnknownEnvironment) as told:
         environment.spec()

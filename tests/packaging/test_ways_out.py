@@ -16,7 +16,7 @@ PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text
 
 
 @pytest.mark.parametrize("extra", ["server", "train", "export", "render", "mujoco"])
-def test_a_missing_package_of_an_extra_is_said_with_the_extra(extra: str):
+def test_a_missing_package_is_named_with_its_extra(extra: str):
     modules: dict[str, set[str]] = {}
     for module, names in packages_distributions().items():
         for name in names:

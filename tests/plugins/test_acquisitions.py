@@ -61,7 +61,7 @@ def test_the_design_asks_by_an_installed_acquisition(plugin_server: ServerProces
         ("variance", {"width": 1.0}, "expected no settings, got 'width'"),
     ],
 )
-def test_what_is_not_installed_or_set_wrong_is_refused(
+def test_missing_packages_and_wrong_settings_are_refused(
     plugin_server: ServerProcess, name: str, settings: dict[str, object], said: str
 ):
     spec = pendulum().model_dump(mode="json")

@@ -92,7 +92,7 @@ def test_a_file_of_one_family_is_not_taken_by_a_surrogate_of_another(plugin_serv
         ("bayesian_linear", {"ridge": -1.0}, "expected a positive ridge, got -1.0"),
     ],
 )
-def test_what_is_not_installed_or_set_wrong_is_refused(
+def test_missing_packages_and_wrong_settings_are_refused(
     plugin_server: ServerProcess, name: str, settings: dict[str, float], said: str
 ):
     spec = designed(ModelChoice(name=name, settings=settings)).model_dump(mode="json")

@@ -125,7 +125,7 @@ def surrogym(left: ServerProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     ],
     ids=" ".join,
 )
-def test_what_is_stored_is_read_written_out_and_paused(
+def test_commands_that_need_no_model_work_without_the_plug_in(
     surrogym: Callable[..., Result], words: tuple[str, ...], name: str
 ):
     done = surrogym(words[0], name, *words[1:])
@@ -137,7 +137,7 @@ def refusal(reply: httpx.Response) -> tuple[int, str, str]:
     return reply.status_code, reply.json()["code"], reply.json()["detail"]
 
 
-def test_what_needs_the_family_is_refused_and_says_what_the_server_lacks(left: ServerProcess):
+def test_requests_that_need_a_missing_family_are_refused(left: ServerProcess):
     at = f"{left.url}/v1/surrogates/lin"
     points = {"coordinates": [[1.0, 2.0]], "action": [[0.5]]}
     model = httpx.get(f"{at}/models/1?format=safetensors", timeout=60).raise_for_status().content
@@ -158,7 +158,7 @@ def test_a_model_serves_without_the_acquisition(left: ServerProcess):
     assert opened.status_code == 201
 
 
-def test_the_log_names_who_lacks_what_from_the_start(left: ServerProcess):
+def test_the_log_names_missing_packages_at_the_start(left: ServerProcess):
     assert LIN in left.log
     assert FOC in left.log
 
@@ -195,7 +195,7 @@ def test_it_can_be_deleted(left: ServerProcess, surrogym: Callable[..., Result])
     assert httpx.get(f"{left.url}/v1/surrogates/lin", timeout=60).status_code == 404
 
 
-def test_installed_again_the_design_goes_on(left: ServerProcess, packages: Path, tmp_path: Path):
+def test_the_design_continues_after_reinstallation(left: ServerProcess, packages: Path, tmp_path: Path):
     """The way out that the status names: install, restart, resume."""
     left.stop()
     shutil.copy(left.folder / "surrogym.db", tmp_path / "surrogym.db")

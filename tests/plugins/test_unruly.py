@@ -67,7 +67,7 @@ def fitted(server: ServerProcess, name: str) -> dict[str, Any]:
         ("nan", "the fit failed: the model family 'unruly': next coordinates: expected finite numbers, got nan"),
     ],
 )
-def test_a_fit_that_breaks_anything_fails_alone(server: ServerProcess, mode: str, said: str):
+def test_a_failing_fit_affects_no_other(server: ServerProcess, mode: str, said: str):
     status = fitted(server, taught(server, mode))
     assert (status["phase"], status["error"]) == ("failed", said)
 

@@ -118,7 +118,7 @@ def test_a_file_whose_actions_differ_is_not_kept(tmp_path: Path, monkeypatch):
     assert not (tmp_path / "policy.pt2").exists()
 
 
-def test_what_can_not_be_exported_is_refused_in_words(tmp_path: Path):
+def test_an_export_that_is_impossible_is_refused_with_a_reason(tmp_path: Path):
     policy = saved(tmp_path, "DQN")
     with pytest.raises(NotExportable, match=r"ending in \.onnx or \.pt2, got '\.txt'"):
         export_policy(policy, tmp_path / "policy.txt", "DQN")

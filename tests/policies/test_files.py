@@ -146,7 +146,7 @@ def test_an_algorithm_learns_on_as_the_one_that_was_unpickled(tmp_path: Path, ca
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "fastppo"])
-def test_what_train_saves_is_read_without_unpickling(tmp_path: Path, no_unpickling, algorithm: str):
+def test_policies_of_train_are_read_without_unpickling(tmp_path: Path, no_unpickling, algorithm: str):
     port, policy = ExactPendulum(), tmp_path / "policy"
     small = {"algorithm": algorithm, "total_steps": 256, "num_envs": 4, "hyperparameters": {"n_steps": 16}}
     train(port, policy, TrainSettings(**small))
@@ -208,7 +208,7 @@ def test_a_gift_among_the_weights_stays_pickled(tmp_path: Path, mark: Path, trus
     assert not mark.exists()
 
 
-def test_a_schedule_that_nothing_describes_is_needed_for_learning_alone(tmp_path: Path):
+def test_an_unknown_schedule_matters_only_for_learning(tmp_path: Path):
     learner = stable_baselines3.PPO(
         PaperPolicy, Idle(TORQUES), n_steps=8, batch_size=8, learning_rate=LinearSchedule(1, 0, 1), device="cpu"
     )
@@ -324,7 +324,7 @@ def test_variables_that_would_overwrite_the_policy_are_refused(tmp_path: Path):
 
 
 @pytest.mark.parametrize("missing", ["data", "policy.pth"])
-def test_a_file_that_lacks_something_says_what(tmp_path: Path, missing: str):
+def test_an_incomplete_file_is_refused_with_the_missing_part(tmp_path: Path, missing: str):
     policy = saved(tmp_path, "PPO, continuous")
     entries = read_entries(policy, LIMIT)
     del entries[missing]
@@ -342,7 +342,7 @@ def test_a_policy_of_another_make_is_not_described():
     assert described.objects()["action_space"] == TORQUES
 
 
-def test_an_address_from_a_card_is_none_that_connects(tmp_path: Path):
+def test_an_address_from_a_card_is_never_connected_to(tmp_path: Path):
     policy = tmp_path / "policy.zip"
     policy.touch()
     card = PolicyCard(server=NotedAddress("http://127.0.0.1:9"))

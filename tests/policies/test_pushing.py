@@ -54,7 +54,7 @@ def evaluation(key: str) -> wire.AddEvaluation:
     return wire.AddEvaluation(first_seed=1, returns=[-1.0, -2.0], lengths=[3, 4], idempotency_key=key)
 
 
-def test_what_a_server_that_is_away_did_not_get_is_sent_later(api: Api, away: Api, policy: Path):
+def test_results_are_sent_later_if_the_server_is_unreachable(api: Api, away: Api, policy: Path):
     pushing.keep(policy, evaluation("a"))
     pushing.keep(policy, evaluation("b"))
     with pytest.raises(ServerUnreachable):

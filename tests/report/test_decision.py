@@ -98,7 +98,7 @@ def told(known: Known) -> Parts:
     return {"": text[0], **dict(zip(text[1::2], text[2::2], strict=True))}
 
 
-def test_a_tested_policy_is_told_whole(modelled: Known):
+def test_the_report_of_a_tested_policy_is_complete(modelled: Known):
     parts = told(replace(modelled, policy=policy(), real=evaluation(), without=without()))
     assert parts[""] == (
         "In 100 real episodes the controller earned -143.2 (-160.0 to -127.0) on average. 97 of 100 (92 % to 99.0 %) "
@@ -131,7 +131,7 @@ def test_a_reference_controller_stands_beside_the_policy(modelled: Known):
     assert "A controller of reference" not in parts["What was not tested"]
 
 
-def test_a_broken_promise_is_said_first_of_what_to_do(modelled: Known):
+def test_a_broken_promise_comes_first_in_the_next_steps(modelled: Known):
     worse = evaluation(mean=-250.0, promise_kept=False)
     parts = told(replace(modelled, policy=policy(evaluations=[worse]), real=worse))
     assert "worse than predicted, by 80.2 beyond" in parts["Was it predicted?"]

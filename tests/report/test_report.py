@@ -108,7 +108,7 @@ def test_the_same_figure_is_the_same_text(known: Both) -> None:
     assert svg(draw_fidelity(known[0].models, 0.999)) == svg(draw_fidelity(known[0].models, 0.999))
 
 
-def test_a_map_says_what_the_server_says_of_its_points(known: Both, pendulum_server: ServerProcess) -> None:
+def test_a_map_equals_the_servers_answers_at_its_points(known: Both, pendulum_server: ServerProcess) -> None:
     (cut,) = known[-1]
     tolerances = np.array([output.tolerance for output in known[0].models[-1].fidelity.outputs])
     with Api(pendulum_server.url) as api:
@@ -118,7 +118,7 @@ def test_a_map_says_what_the_server_says_of_its_points(known: Both, pendulum_ser
     assert cut.log_index[0, -1] == pytest.approx(max(corner.log_uncertainty_index[0]))
 
 
-def test_what_strangers_wrote_stays_text(known: Both) -> None:
+def test_foreign_text_stays_text(known: Both) -> None:
     hostile = "</td><script>alert(1)</script>"
     model = known[0].models[0].model_copy(update={"description": {"outputs": [{"name": hostile, hostile: [hostile]}]}})
     view = known[0].view.model_copy(update={"error": hostile, "environment": hostile})

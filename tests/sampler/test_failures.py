@@ -42,7 +42,7 @@ def test_a_machine_that_is_off_ends_the_sampler_before_every_query_is_set_aside(
     assert (report.answered, report.failed) == (6, 0)
 
 
-def test_a_design_that_failed_by_a_fault_of_the_machine_goes_on_when_it_is_resumed(api, line, monkeypatch):
+def test_a_design_that_a_machine_failed_continues_when_resumed(api, line, monkeypatch):
     """Somebody started the sampler again and again beside the broken machine."""
     monkeypatch.setattr(limits, "FIRST_DELAY", 0.01)
     machine = Switched()

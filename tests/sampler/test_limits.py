@@ -103,7 +103,7 @@ def test_a_query_beyond_the_environment_is_given_back_unbegun(server_process, li
     assert re.fullmatch(why, error)
 
 
-def test_queries_that_are_refused_again_and_again_are_told_once(server_process, line):
+def test_repeatedly_refused_queries_are_reported_once(server_process, line):
     told = []
     with Forged(server_process.url, lambda query: query.model_copy(update={"action": [math.nan]})) as api:
         settings = SamplerSettings(batch=2, wait_seconds=5.0, time_limit=1.5)

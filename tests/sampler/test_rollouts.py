@@ -103,7 +103,7 @@ def test_a_failure_at_the_first_step_fails_the_query(api, asked):
     assert "the rail is blocked" in api.queries(asked)[-1].error
 
 
-def test_stop_in_the_middle_hands_in_what_was_done(api, asked):
+def test_a_stopped_rollout_submits_its_finished_steps(api, asked):
     class Stops(Rail):
         def step(self, action):
             sampler.stop()
@@ -113,7 +113,7 @@ def test_stop_in_the_middle_hands_in_what_was_done(api, asked):
     assert (sampler.run().steps, api.surrogate(asked).ledger.manual) == (1, 1)
 
 
-def test_an_interrupt_in_the_middle_hands_in_what_was_done(api, asked):
+def test_an_interrupted_rollout_submits_its_finished_steps(api, asked):
     class Interrupted(Rail):
         def step(self, action):
             if action[0] > 0:
@@ -168,7 +168,7 @@ def _until(happened):
         time.sleep(0.05)
 
 
-def test_the_server_refuses_a_trajectory_that_jumps_or_goes_on_after_an_end(api, asked):
+def test_a_trajectory_with_a_jump_or_steps_after_an_end_is_refused(api, asked):
     [query] = api.claim(asked, "worker", max_queries=1).queries
     values = {"query_id": query.id, "lease_token": query.lease_token, "action": LEFT, "reward": 0.0}
 
@@ -208,7 +208,7 @@ def test_starts_differ_between_attempts_queries_and_designs_and_are_the_same_aga
     assert reset_seed(queries[0], 0) == reset_seed(queries[0].model_copy(update={"lease_token": "other"}), 0)
 
 
-def test_the_same_design_takes_the_same_steps_whatever_else_the_server_was_asked(api):
+def test_a_design_does_not_depend_on_other_requests(api):
     taken = []
     for number in range(2):
         name = f"rail-{uuid.uuid4().hex[:8]}"

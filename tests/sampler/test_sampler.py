@@ -101,7 +101,7 @@ def test_a_server_that_is_away_keeps_no_stopped_worker_waiting(server_process, l
     assert (report.answered, errors) == (0, [])
 
 
-def test_a_real_step_that_can_not_be_handed_in_is_told(server_process, line, monkeypatch):
+def test_a_real_step_that_can_not_be_submitted_is_reported(server_process, line, monkeypatch):
     monkeypatch.setattr("surrogym_client.sampler.worker.LAST_SECONDS", 0.2)
     with Away(server_process.url, "add_samples") as api:
         reports, [error] = stopped(api, line)
@@ -124,7 +124,7 @@ def test_an_environment_that_raises_fails_the_query_with_its_error(api, line):
     assert all("there is a wall on the left" in error for error in errors)
 
 
-def test_an_environment_that_hangs_is_killed_and_the_worker_goes_on(api, line):
+def test_a_hanging_environment_is_killed_and_the_worker_continues(api, line):
     settings = SamplerSettings(name="worker", batch=6, max_queries=6, wait_seconds=5.0)
     with IsolatedEnvironment(HangsLeft, step_limit=0.5) as environment:
         report = Sampler(api, line, environment, settings).run()
@@ -201,7 +201,7 @@ def test_a_factory_that_fails_ends_the_worker_at_once(api, line):
     assert api.surrogate(line).queries.leased == 0
 
 
-def test_an_unknown_surrogate_and_a_missing_server_are_told(server_process):
+def test_an_unknown_surrogate_and_a_missing_server_are_reported(server_process):
     with Api(server_process.url) as api, pytest.raises(UnknownSurrogate):
         Sampler(api, "nobody", Line()).run()
     with Api("http://127.0.0.1:9", retries=Retries(seconds=0)) as api, pytest.raises(ServerUnreachable):

@@ -109,7 +109,7 @@ NOT_FINITE = ["NaN", "Infinity", "-Infinity", "1e999"]
 
 
 @pytest.mark.parametrize("number", [*NOT_FINITE, "[]", '"1"', "1e300"])
-def test_numbers_that_are_none_of_an_action(client: httpx.Client, session: str, number: str):
+def test_invalid_action_numbers_are_refused(client: httpx.Client, session: str, number: str):
     reply = client.post(f"/v1/sessions/{session}/step", content=f'{{"action": [[{number}]]}}')
     assert reply.status_code in (415, 422)
     content = {"content-type": "application/json"}
@@ -189,7 +189,7 @@ def test_connections_and_bodies_beyond_the_limit_are_refused(narrow: ServerProce
     assert httpx.post(narrow.url + PATH, content=body, headers=content).status_code == 422, "there is room again"
 
 
-def test_what_is_no_http_is_refused_in_words(server: ServerProcess):
+def test_a_request_other_than_http_is_refused_with_a_reason(server: ServerProcess):
     with connected(server.url) as attacker:
         attacker.sendall(b"\x16\x03\x01 hello\r\n\r\n")
         reply = read_all(attacker)
@@ -201,7 +201,7 @@ SLOW = [head(PATH)[:30], head(PATH, "content-length: 100", "", "") + b'{"sampler
 
 
 @pytest.mark.parametrize("begun", SLOW, ids=["head", "body"])
-def test_slow_senders_are_told_so_and_others_are_served(
+def test_slow_senders_are_refused_and_others_are_served(
     server: ServerProcess, client: httpx.Client, session: str, begun: bytes
 ):
     """Fifty requests that come a byte a second."""
@@ -294,7 +294,7 @@ def test_a_stream_is_opened_by_get_alone(server: ServerProcess):
         assert b"expected GET to open a stream" in read_all(attacker)
 
 
-def test_many_who_only_look_are_refused_and_others_are_served(server: ServerProcess, client: httpx.Client):
+def test_many_readers_are_refused_while_others_are_served(server: ServerProcess, client: httpx.Client):
     body = {"coordinates": [0.1, 0.0], "actions": [[0.5]] * 100, "draws": 8}
     with ThreadPoolExecutor(50) as pool, httpx.Client(base_url=server.url, timeout=120) as lookers:
         asked = [pool.submit(lookers.post, "/v1/surrogates/pendulum/imagine", json=body) for _ in range(50)]
@@ -306,7 +306,7 @@ def test_many_who_only_look_are_refused_and_others_are_served(server: ServerProc
     refused(beyond, Code.TOO_MANY_REQUESTS, "at most 34 predictions at work or waiting")
 
 
-def test_a_body_that_nobody_asked_for_is_ignored(server: ServerProcess, client: httpx.Client):
+def test_an_unexpected_body_is_ignored(server: ServerProcess, client: httpx.Client):
     for path in ("/v1/surrogates", "/healthz"):
         assert client.request("GET", path, content=b"x" * 100).status_code == 200
     with client.stream("GET", "/v1/events", content=b"x" * 10) as events:

@@ -116,9 +116,7 @@ def test_a_missing_table_is_an_error_that_names_it_and_the_server_is_not_ready(
     assert "Traceback" not in server.log
 
 
-def test_a_flipped_bit_in_a_model_is_told_and_the_version_before_it_is_used(
-    server: ServerProcess, client: httpx.Client
-):
+def test_the_version_before_replaces_a_model_with_a_flipped_bit(server: ServerProcess, client: httpx.Client):
     view = client.get(f"/v1/surrogates/{NAME}").json()
     newest, said = view["model_version"], {"coordinates": [[0.3, -0.2]], "action": [[0.7]]}
     flip(server.folder / "surrogym.db", "models", "blob")

@@ -43,7 +43,7 @@ def test_steps_of_the_model_are_differentiable(surrogate):
     assert torch.autograd.gradcheck(returned, q, atol=1e-4)
 
 
-def test_gradients_go_through_what_a_step_has_made_first(surrogate):
+def test_gradients_pass_through_tensors_that_a_step_has_cached(surrogate):
     fresh = local(surrogate.spec())
     session = fresh.open(OpenSession(num_envs=2, seed=0)).id
     fresh.reset(session)
@@ -79,7 +79,7 @@ def test_the_same_seed_finds_the_same_policy(surrogate):
     assert not np.array_equal(found(0), found(1))
 
 
-def test_checks_and_steps_are_told(surrogate):
+def test_checks_and_steps_are_reported(surrogate):
     seen = []
     found = optimise(surrogate, SMALL, seen.append)
     assert [update.number for update in seen] == list(range(1, 13))

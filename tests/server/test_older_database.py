@@ -49,7 +49,7 @@ def test_all_of_it_is_there(url: str):
     np.testing.assert_allclose(said.reward, TOLD["prediction"]["reward"], rtol=1e-9)
 
 
-def test_its_session_goes_on(url: str):
+def test_its_session_continues(url: str):
     with httpx.Client(base_url=url) as client:
         for action, observation in zip(TOLD["actions"][STEPPED:], TOLD["observations"][STEPPED:], strict=True):
             reply = client.post(f"/v1/sessions/{TOLD['session']}/step", json={"action": action}).raise_for_status()
@@ -64,7 +64,7 @@ def test_its_specification_is_the_same_one_though_specifications_have_grown(url:
             api.create_surrogate(NAME, spec.model_copy(update={"time_limit": 3}))
 
 
-def test_its_design_goes_on(url: str):
+def test_its_design_continues(url: str):
     with httpx.Client(base_url=url, timeout=60) as client:
         before = len(TOLD["samples"])
         pendulum.finish(client, NAME)  # the three by hand

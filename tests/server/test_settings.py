@@ -67,7 +67,7 @@ def test_tokens_come_with_roles(tmp_path: Path):
         ({"SURROGYM_LOG_LEVEL": "loud"}, "setting log_level: .*'info'"),
     ],
 )
-def test_what_cannot_be_used_is_named(environment: dict[str, str], message: str):
+def test_an_invalid_setting_is_named(environment: dict[str, str], message: str):
     with pytest.raises(InvalidInput, match=message):
         read_settings(environment)
 

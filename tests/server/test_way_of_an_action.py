@@ -38,7 +38,7 @@ def model(pendulum_definition: EnvironmentDefinition, pendulum_samples: Samples)
 
 
 @pytest.mark.skipif(not compiled.available(), reason="without numba steps take the way of torch")
-def test_an_action_passes_few_files_and_none_twice(tmp_path: Path, model: bytes):
+def test_an_action_passes_few_files_and_each_once(tmp_path: Path, model: bytes):
     ways = asyncio.run(watched(tmp_path, model))
     for transport, way in ways.items():
         begin = next(i for i, file in enumerate(way.files) if file.startswith("surrogym_server/api/stepping/"))

@@ -102,7 +102,7 @@ def test_compression_that_can_not_be_bounded_is_refused(kind: int):
 
 
 @pytest.mark.parametrize("content", [b"", b"no zip", deflated("a", bytes(100))[:-30]], ids=["empty", "text", "cut"])
-def test_what_is_no_zip_is_refused(content: bytes):
+def test_an_invalid_zip_is_refused(content: bytes):
     with pytest.raises(ValueError, match="expected a zip file, got content"):
         read_entries(content, MEBIBYTE)
 

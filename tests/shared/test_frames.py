@@ -117,7 +117,7 @@ def test_a_policy_comes_back_bit_for_bit(policy: ActingPolicy, noise: NoiseKey |
 
 
 @given(data=st.data(), shape=SHAPES)
-def test_what_a_policy_did_comes_back_bit_for_bit(data: st.DataObject, shape: Shape):
+def test_a_policys_actions_are_returned_bit_for_bit(data: st.DataObject, shape: Shape):
     trusted = data.draw(st.booleans())
     drawn = data.draw(st.lists(step_results(shape), min_size=1, max_size=3))
     steps = [replace(one, deviation=None, untrusted=one.terminated if trusted else None) for one in drawn]
@@ -137,7 +137,7 @@ def test_any_layout_of_an_array_is_sent_in_row_order():
     np.testing.assert_array_equal(frames.action_of(request, Shape(2, 1, 3, 1)), action)
 
 
-def test_what_a_caller_gets_is_his_own():
+def test_result_arrays_are_writable_and_aligned():
     reply = frames.read_reply(frames.encode(frames.step_reply(1, example())))
     assert isinstance(reply, frames.StepReply)
     result = frames.step_result(reply.step, SMALL)
@@ -280,7 +280,7 @@ def test_every_cut_of_a_frame_is_an_error(read: Callable[[bytes], None], content
         (of_policy(noise=frames.Noise(-1, 0)), "expected a frame"),
     ],
 )
-def test_a_request_that_does_not_fit_the_session_says_how(request_frame: frames.Request, message: str):
+def test_the_refusal_of_a_misfitting_request_says_why(request_frame: frames.Request, message: str):
     with pytest.raises(FrameError, match=message):
         read_whole_request(frames.encode(request_frame))
 

@@ -39,7 +39,7 @@ def test_whole_frames_come_out_of_any_chunks(sent: list[tuple[Opcode, bytes]], c
     assert [frame for frame, _ in found] == written
 
 
-def test_what_is_too_long_is_given_back_as_it_came():
+def test_a_message_that_is_too_long_is_returned_unchanged():
     splitter, announced = FrameSplitter(max_bytes=100), header(101, MASKED)
     assert splitter.split(announced[:1]) == []
     assert splitter.split(announced[1:]) == [(announced, None)]

@@ -125,5 +125,5 @@ def test_an_output_that_never_varied_is_to_be_declared() -> None:
 
 
 @pytest.mark.parametrize("phase", ["ready", "sampling", "from_log"])
-def test_a_design_that_goes_on_or_is_ready_needs_no_advice(phase: str) -> None:
+def test_a_running_or_ready_design_gets_no_advice(phase: str) -> None:
     assert advice(view(output("x", 0.7), phase=phase), []) == ""

@@ -35,13 +35,13 @@ def owned(guarded: ServerProcess) -> str:
     return name
 
 
-def test_rounds_that_the_budget_holds_are_said(guarded: ServerProcess, owned: str) -> None:
+def test_rounds_within_the_budget_are_announced(guarded: ServerProcess, owned: str) -> None:
     with Api(guarded.url, TOKENS["train"]) as api:
         words = words_of_rounds(api, owned, queries=4, rounds=2)
     assert words == f"up to 8 more real steps (2 rounds of 4); the budget of {owned!r} has 8 of 12 real steps left"
 
 
-def test_rounds_beyond_the_budget_are_for_those_who_may_raise_it(guarded: ServerProcess, owned: str) -> None:
+def test_rounds_beyond_the_budget_need_the_right_to_raise_it(guarded: ServerProcess, owned: str) -> None:
     with Api(guarded.url, TOKENS["train"]) as api, pytest.raises(BudgetTooSmall, match=rf"{owned} --budget 13\b"):
         words_of_rounds(api, owned, queries=3, rounds=3)
     with Api(guarded.url, TOKENS["admin"]) as api:

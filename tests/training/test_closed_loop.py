@@ -70,7 +70,7 @@ def sampling(url: str, name: str, spec: EnvironmentSpec) -> Iterator[None]:
     [(1e-9, 4, 4 + 2 * 3, 2), (1e3, 4, 4, 1), (1e3, 8, 6, 0)],
     ids=["unsure", "known where it goes", "ready"],
 )
-def test_rounds_go_on_until_the_policys_region_is_known_or_the_design_is_ready(
+def test_rounds_end_when_the_visited_region_is_known_or_design_ready(
     own_server: ServerProcess,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -150,7 +150,7 @@ def test_a_policy_that_explores_by_state_visits_each_lanes_own_way_and_the_same_
     assert np.array_equal(actions, again(same))
 
 
-def test_rounds_share_the_steps_that_were_asked_for() -> None:
+def test_rounds_share_the_requested_steps() -> None:
     assert shares(TrainSettings(total_steps=1_750), rounds=3) == (1_750, 250), "the last has four rounds' steps"
     assert shares(TrainSettings(total_steps=1_900), rounds=9) == (1_900, 100), "many rounds leave it half and more"
     assert shares(TrainSettings("PPO"), rounds=3) == (1_000_000, 150_000)

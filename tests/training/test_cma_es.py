@@ -72,7 +72,7 @@ def test_it_learns_to_balance_and_evaluation_reads_the_file(tmp_path: Path):
     assert returns.mean() > 50
 
 
-def test_it_goes_on_from_a_network(surrogate, tmp_path: Path):
+def test_it_continues_from_a_network(surrogate, tmp_path: Path):
     first = train(surrogate, tmp_path / "first.zip", small(total_steps=3_000))
     second = train(surrogate, tmp_path / "second.zip", small(start_from=first.path, seed=1, total_steps=320))
     assert second.path.exists()

@@ -103,7 +103,7 @@ def test_advantages_are_those_of_a_rollout_buffer():
     )
 
 
-def test_a_session_that_is_lost_cuts_its_episodes_and_collecting_goes_on(surrogate):
+def test_a_lost_session_cuts_its_episodes_and_collecting_continues(surrogate):
     """One step of the rollout ends them where they stood; the others are taken in a new session."""
     spec, lanes = surrogate.spec(), 6
     learner = Learner(spec, np.zeros(3), np.ones(3), (8,), np.random.default_rng(0))
@@ -160,7 +160,7 @@ def test_it_learns(tmp_path: Path):
     assert train(port, tmp_path / "policy.zip", settings).imagined_return > 80
 
 
-def test_what_it_saves_acts_with_and_without_noise(surrogate, tmp_path: Path):
+def test_its_saved_policy_acts_with_and_without_noise(surrogate, tmp_path: Path):
     settings = TrainSettings(algorithm="fastppo", total_steps=512, num_envs=16, hyperparameters=SMALL)
     path = train(surrogate, tmp_path / "policy.zip", settings).path
     observations = np.random.default_rng(0).normal(size=(2_000, 3)).astype(np.float32)
@@ -170,7 +170,7 @@ def test_what_it_saves_acts_with_and_without_noise(surrogate, tmp_path: Path):
     assert np.abs(first).max() <= 2
 
 
-def test_it_goes_on_from_what_it_saved(surrogate, tmp_path: Path):
+def test_it_continues_from_a_saved_policy(surrogate, tmp_path: Path):
     """Parameters and the moments of Adam; a policy alone is refused."""
     settings = TrainSettings(algorithm="fastppo", total_steps=512, num_envs=16, hyperparameters=SMALL, prolong=False)
     first = train(surrogate, tmp_path / "first.zip", settings).path

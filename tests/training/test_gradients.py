@@ -72,7 +72,7 @@ def test_it_finds_the_policy_of_optimise_with_the_servers_model(pendulum_server:
         ({"prolong": True}, "GRADIENT trains for a fixed number of steps"),
     ],
 )
-def test_what_has_no_meaning_for_gradients_is_refused(
+def test_options_without_meaning_for_gradients_are_refused(
     pendulum_server: ServerProcess, tmp_path: Path, settings: dict[str, object], said: str
 ):
     with (

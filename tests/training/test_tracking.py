@@ -70,7 +70,7 @@ def test_a_tracker_that_is_not_installed_stops_the_training_before_it_begins(
     assert not (tmp_path / "policy.zip").exists()
 
 
-def test_cmaes_says_that_it_logs_to_no_tracker(surrogate: LocalSurrogate, tmp_path: Path) -> None:
+def test_cmaes_refuses_a_tracker(surrogate: LocalSurrogate, tmp_path: Path) -> None:
     settings = TrainSettings(algorithm="cmaes", tracker="mlflow")
     with pytest.raises(ValueError, match="expected none, or another algorithm, got mlflow"):
         train(surrogate, tmp_path / "policy.zip", settings)

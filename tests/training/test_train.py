@@ -79,7 +79,7 @@ def test_the_same_seed_gives_the_same_policy(surrogate, tmp_path: Path):
     assert not np.array_equal(one, weights(1, "c.zip"))
 
 
-def test_training_goes_on_from_a_saved_policy(surrogate, tmp_path: Path):
+def test_training_continues_from_a_saved_policy(surrogate, tmp_path: Path):
     first, second = tmp_path / "first.zip", tmp_path / "second.zip"
     before = train(surrogate, first, small(total_steps=128))
     after = train(surrogate, second, small(total_steps=128, start_from=first))
@@ -91,7 +91,7 @@ def test_training_goes_on_from_a_saved_policy(surrogate, tmp_path: Path):
     assert distance(one, two) < 0.3 * distance(one, fresh)
 
 
-def test_what_is_asked_for_goes_over_what_the_policy_was_saved_with(surrogate, tmp_path: Path):
+def test_given_settings_override_those_saved_with_the_policy(surrogate, tmp_path: Path):
     first, second = tmp_path / "first.zip", tmp_path / "second.zip"
     train(surrogate, first, small(total_steps=128))
     asked = SMALL | {"learning_rate": 1e-5, "n_steps": 32, "ent_coef": 0.01}
@@ -101,7 +101,7 @@ def test_what_is_asked_for_goes_over_what_the_policy_was_saved_with(surrogate, t
     assert {name: result.settings[name] for name in asked} == asked
 
 
-def test_what_a_policy_does_not_go_with_is_told(surrogate, tmp_path: Path):
+def test_the_misfit_of_a_policy_is_named(surrogate, tmp_path: Path):
     first = tmp_path / "first.zip"
     train(surrogate, first, small(total_steps=128))
     for changes in ({"n_steps": "many"}, {"device": "moon"}):
@@ -222,7 +222,7 @@ def test_dqn_takes_one_discrete_action_and_sac_none(tmp_path: Path):
         ({"total_steps": MAX_STEPS + 1}, f"expected 1 to {MAX_STEPS}, got {MAX_STEPS + 1}"),
     ],
 )
-def test_what_can_not_be_trained_is_refused(surrogate, tmp_path: Path, settings, complaint):
+def test_an_impossible_training_is_refused(surrogate, tmp_path: Path, settings, complaint):
     with pytest.raises(ValueError, match=complaint):
         train(surrogate, tmp_path / "policy.zip", small(**settings))
     assert not list(tmp_path.iterdir())
@@ -269,7 +269,7 @@ def idle(**settings) -> TrainSettings:
     return small(**{"total_steps": 2_000, "hyperparameters": IDLE, "session": {"time_limit": 4}} | settings)
 
 
-def test_a_network_that_learns_nothing_is_given_up_for_another(surrogate, tmp_path: Path, made):
+def test_a_network_that_learns_too_slowly_is_replaced(surrogate, tmp_path: Path, made):
     result = train(surrogate, tmp_path / "policy.zip", idle())
     seeds = {settings.seed for settings in made}
     assert 2 <= result.networks == len(made) == len(seeds) <= 4, "at most one for each quarter of the steps"

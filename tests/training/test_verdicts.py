@@ -34,5 +34,5 @@ def test_training_is_over_once_three_checks_earn_the_most_there_is():
         pytest.param(-1_200.0, [-1.0], [-150.0] * 5, id="a plateau"),
     ],
 )
-def test_training_goes_on_while_more_may_be_earned(untrained: float, earned: list[float], checks: list[float]):
+def test_training_continues_while_more_may_be_earned(untrained: float, earned: list[float], checks: list[float]):
     assert not after(untrained, earned, checks).saturated

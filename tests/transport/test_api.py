@@ -48,7 +48,7 @@ def sample(number: int) -> wire.SampleView:
     )
 
 
-def test_samples_are_handed_in_again_under_the_same_key_after_a_lost_reply():
+def test_samples_are_resent_with_their_key_after_a_lost_reply():
     added = said(wire.AddedSamples(sample_ids=[1], duplicates=1, ledger=wire.Ledger(manual=1, total=1)))
     with api_of(lost_reply, added, added) as (api, server):
         api.add_samples("pendulum", "me", [SAMPLE])
@@ -73,7 +73,7 @@ def test_all_pages_of_samples_are_read():
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "a/b", "a%2Fb", "../sessions", "a b", "a?b", "a#b", "a\n", "x" * 65])
-def test_a_name_that_none_can_have_reaches_no_server(name: str):
+def test_an_invalid_name_is_refused_without_a_request(name: str):
     with api_of(reply("{}")) as (api, server):
         remote = HttpSurrogate(server.url, name)
         calls = [
@@ -144,7 +144,7 @@ def test_all_pages_of_surrogates_are_read():
     assert [request.path for request in server.received] == ["/v1/surrogates?after=0", "/v1/surrogates?after=7"]
 
 
-def test_a_broken_stream_of_events_goes_on_after_the_last_one():
+def test_a_broken_stream_of_events_continues_after_the_last_event():
     first = reply(": connected\n\n" + event(1) + event(2), content_type="text/event-stream")
     second = reply(": connected\n\n" + event(3), content_type="text/event-stream")
     gone = problem(Code.UNKNOWN_SURROGATE)

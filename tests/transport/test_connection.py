@@ -33,14 +33,14 @@ def test_a_failed_request_is_sent_again_unchanged(failure):
     assert [r.body for r in server.received] == [BODY] * 3
 
 
-def test_what_must_not_be_repeated_is_not_sent_again_after_a_lost_reply():
+def test_unrepeatable_requests_are_not_sent_again_after_a_lost_reply():
     with scripted_server(lost_reply) as server, Connection(server.url, retries=QUICK) as connection:
         with pytest.raises(errors.ServerUnreachable, match="was lost"):
             connection.send("POST", "/x", BODY, repeatable=False)
         assert len(server.received) == 1
 
 
-def test_what_must_not_be_repeated_is_sent_again_when_the_server_refused_it():
+def test_unrepeatable_requests_are_sent_again_after_a_refusal():
     script = [problem(Code.UNAVAILABLE), reply("done")]
     with scripted_server(*script) as server, Connection(server.url, retries=QUICK) as connection:
         assert connection.send("POST", "/x", BODY, repeatable=False) == b"done"
@@ -54,7 +54,7 @@ def test_a_late_reply_never_answers_a_later_request():
         assert connection.send("POST", "/x", b"2") == b"third"
 
 
-def test_a_time_out_is_told_from_a_dead_server():
+def test_a_time_out_differs_from_a_dead_server():
     with (
         scripted_server(reply("late", delay=0.3)) as server,
         Connection(server.url, retries=NEVER) as connection,
@@ -116,7 +116,7 @@ def test_a_gateway_without_a_server_behind_it_is_waited_for():
 
 
 @pytest.mark.parametrize("url", ["pendulum", "ftp://host", "http://", "http://host:port", "host:8000"])
-def test_what_is_no_address_is_refused(url: str):
+def test_an_invalid_server_address_is_refused(url: str):
     with pytest.raises(errors.ServerUnreachable, match=r"expected a server address like http://127.0.0.1:8000, got"):
         Connection(url)
 

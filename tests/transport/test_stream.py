@@ -99,7 +99,7 @@ def test_a_late_reply_finds_nobody():
         assert len(seen) == 2
 
 
-def test_a_cut_stream_is_told_and_the_next_message_connects_anew():
+def test_a_cut_stream_raises_and_the_next_message_reconnects():
     def once(connection: ServerConnection) -> None:
         connection.send(connection.recv())
 
@@ -120,7 +120,7 @@ def test_a_message_that_is_too_large_is_no_lost_connection():
         opened.exchange(b"x" * 2000, 30)
 
 
-def test_a_server_that_closes_in_the_middle_of_a_message_has_said_why():
+def test_a_server_that_closes_within_a_message_gives_the_reason():
     def refuse(handler: BaseHTTPRequestHandler) -> None:
         upgrade(handler)
         handler.rfile.read(2)
@@ -146,7 +146,7 @@ def test_a_server_that_closes_in_the_middle_of_a_message_has_said_why():
         lost_reply,
     ],
 )
-def test_what_knows_no_stream_is_told_from_a_refusal(answer):
+def test_a_missing_stream_differs_from_a_refused_one(answer):
     with scripted_server(answer) as server, stream(server.url) as opened, pytest.raises(StreamUnavailable):
         opened.exchange(b"", 30)
 

@@ -49,7 +49,7 @@ def test_it_is_a_surrogate_port():
     assert isinstance(HttpSurrogate(None, "pendulum"), SurrogatePort)
 
 
-def test_a_lost_reply_is_asked_for_again_under_the_same_seq():
+def test_a_lost_reply_is_requested_again_with_the_same_seq():
     with scripted_server(session_view(), lost_reply, step(1), step(2)) as server, surrogate(server) as port:
         session = port.open(wire.OpenSession(num_envs=2)).id
         port.step(session, ACTION)
@@ -67,7 +67,7 @@ def test_a_refused_step_leaves_the_seq_as_it_was():
         assert [body["seq"] for body in bodies(server)[1:]] == [1, 1]
 
 
-def test_what_it_sends_is_what_the_wire_accepts():
+def test_the_wire_accepts_what_it_sends():
     reset = reply(wire.ResetReply(seq=1, observation=[[0, 0]] * 2, model_version=[1, 1]).model_dump_json())
     rollout = reply(wire.RolloutReply(seq=3, steps=[step_reply(3)] * 2).model_dump_json())
     with scripted_server(session_view(), reset, step(2), rollout) as server, surrogate(server) as port:
@@ -108,7 +108,7 @@ def test_a_reply_becomes_arrays():
         (np.array([["left"], ["right"]]), r"expected an array of numbers, got dtype <U5"),
     ],
 )
-def test_what_json_cannot_carry_is_refused_before_it_is_sent(action: np.ndarray, message: str):
+def test_values_without_a_json_form_are_refused_before_sending(action: np.ndarray, message: str):
     with scripted_server(session_view()) as server, surrogate(server) as port:
         port.open(wire.OpenSession(num_envs=2))
         with pytest.raises(errors.InvalidInput, match=message):
@@ -116,7 +116,7 @@ def test_what_json_cannot_carry_is_refused_before_it_is_sent(action: np.ndarray,
         assert len(server.received) == 1
 
 
-def test_another_client_goes_on_with_a_session_it_did_not_open():
+def test_another_client_continues_a_session_it_did_not_open():
     with scripted_server(session_view(seq=41), step(42)) as server, surrogate(server) as port:
         port.step("abc", ACTION)
         assert bodies_of_posts(server)[0]["seq"] == 42
@@ -126,7 +126,7 @@ def bodies_of_posts(server: ScriptedServer) -> list[dict[str, object]]:
     return [json.loads(received.body) for received in server.received if received.method == "POST"]
 
 
-def test_a_pickled_client_goes_on_with_the_session():
+def test_a_pickled_client_continues_its_session():
     with scripted_server(session_view(), step(1), step(2)) as server, surrogate(server) as port:
         port.open(wire.OpenSession(num_envs=2))
         port.step("abc", ACTION)

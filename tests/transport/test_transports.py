@@ -185,7 +185,7 @@ def test_an_answer_to_another_request_is_refused():
         (ACTION, np.ones(3, dtype=bool), r"mask: expected 2 entries, got shape \(3,\)"),
     ],
 )
-def test_what_a_frame_would_hide_is_refused_before_it_is_sent(action, mask, message: str):
+def test_values_that_a_frame_would_hide_are_refused_before_sending(action, mask, message: str):
     with scripted_server(session_view()) as server, HttpSurrogate(server.url, "pendulum", transport="binary") as port:
         port.open(wire.OpenSession(num_envs=2))
         with pytest.raises(errors.InvalidInput, match=message):
@@ -215,7 +215,7 @@ def test_by_itself_it_takes_the_stream(pendulum_server):
         port.close(session)
 
 
-def test_no_stream_is_asked_for_through_a_proxy(monkeypatch: pytest.MonkeyPatch):
+def test_no_stream_is_opened_through_a_proxy(monkeypatch: pytest.MonkeyPatch):
     for name in ("http_proxy", "HTTP_PROXY", "no_proxy", "NO_PROXY"):
         monkeypatch.delenv(name, raising=False)
     assert not Connection("http://far.example").proxied

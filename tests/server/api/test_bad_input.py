@@ -117,7 +117,7 @@ def crossed(field: str, value: Any) -> dict[str, Any]:
         ("termination", [[{"term": ONE, "relation": ">", "value": 0}]] * 17, "at most 16 items"),
     ],
 )
-def test_a_spec_that_contradicts_itself(client: httpx.Client, name: str, field: str, value: Any, said: str):
+def test_a_contradictory_specification_is_refused(client: httpx.Client, name: str, field: str, value: Any, said: str):
     reply = post(client, "/v1/surrogates", {"name": name, "spec": crossed(field, value)})
     problem = refused(reply, Code.INVALID_SPEC, said)
     assert problem.model_extra is not None
@@ -144,7 +144,7 @@ def test_a_second_spec_under_the_same_name(client: httpx.Client, fresh: str):
 
 
 @pytest.mark.parametrize("bad", ["", "a/b", "-x", "x" * 65, "ä"])
-def test_a_name_that_is_none(client: httpx.Client, bad: str):
+def test_an_invalid_name_is_refused(client: httpx.Client, bad: str):
     refused(post(client, "/v1/surrogates", {"name": bad, "spec": pendulum.spec()}), Code.INVALID_REQUEST, "name")
 
 
@@ -173,7 +173,7 @@ def sample(**changes: Any) -> dict[str, Any]:
         ({"query_id": 1}, "query_id and lease_token together"),
     ],
 )
-def test_a_sample_that_cannot_be_used(client: httpx.Client, fresh: str, changes: dict[str, Any], said: str):
+def test_an_unusable_sample_is_refused(client: httpx.Client, fresh: str, changes: dict[str, Any], said: str):
     body = {"sampler": "s", "idempotency_key": "k", "samples": [sample(), sample(**changes)][::-1]}
     refused(post(client, f"/v1/surrogates/{fresh}/add_sample", body), Code.INVALID_REQUEST, said)
     assert client.get(f"/v1/surrogates/{fresh}/samples").json()["samples"] == []
@@ -221,7 +221,7 @@ def test_the_same_key_with_another_body(client: httpx.Client, fresh: str):
         ({"coordinates": [], "action": []}, "at least 1 item"),
     ],
 )
-def test_a_query_by_hand_that_cannot_be_asked(client: httpx.Client, fresh: str, body: Any, said: str):
+def test_an_impossible_manual_query_is_refused(client: httpx.Client, fresh: str, body: Any, said: str):
     refused(post(client, f"/v1/surrogates/{fresh}/queries", body), Code.INVALID_REQUEST, said)
     assert len(client.get(f"/v1/surrogates/{fresh}/queries").json()["queries"]) == pendulum.INITIAL
 
@@ -229,7 +229,7 @@ def test_a_query_by_hand_that_cannot_be_asked(client: httpx.Client, fresh: str, 
 # Models
 
 
-def test_points_that_are_none(client: httpx.Client, taught: str):
+def test_invalid_points_are_refused(client: httpx.Client, taught: str):
     for path in ("predict", "query_uncertainty"):
         body = {"coordinates": [[0, 0]], "action": [[5]]}
         refused(post(client, f"/v1/surrogates/{taught}/{path}", body), Code.INVALID_REQUEST, "[-2, 2], got 5")
@@ -251,7 +251,7 @@ def test_a_file_that_is_no_model(client: httpx.Client, taught: str, content: byt
     assert client.get(f"/v1/surrogates/{taught}/models").json() == before
 
 
-def test_occupancy_that_nobody_submitted(client: httpx.Client, taught: str):
+def test_an_unknown_occupancy_is_refused(client: httpx.Client, taught: str):
     body = {"queries": 1, "checkpoint": "never"}
     refused(post(client, f"/v1/surrogates/{taught}/improve", body), Code.INVALID_REQUEST, "'never'")
 
@@ -276,7 +276,7 @@ def test_occupancy_that_nobody_submitted(client: httpx.Client, taught: str):
         ({"action": [[0.0], [0.0]], "seq": 0}, "greater than or equal to 1, got 0"),
     ],
 )
-def test_a_step_that_cannot_be_made(client: httpx.Client, session: str, body: Any, said: str):
+def test_an_impossible_step_is_refused(client: httpx.Client, session: str, body: Any, said: str):
     post(client, f"/v1/sessions/{session}/reset", {"seq": 1}).raise_for_status()
     reply = post(client, f"/v1/sessions/{session}/step", {"seq": 2, **body})
     refused(reply, Code.INVALID_REQUEST, said)
@@ -293,7 +293,7 @@ def test_a_step_that_cannot_be_made(client: httpx.Client, session: str, body: An
         ({"mask": [True]}, "mask: expected 2 entries, got 1"),
     ],
 )
-def test_a_reset_that_cannot_be_made(client: httpx.Client, session: str, body: Any, said: str):
+def test_an_impossible_reset_is_refused(client: httpx.Client, session: str, body: Any, said: str):
     refused(post(client, f"/v1/sessions/{session}/reset", body), Code.INVALID_REQUEST, said)
     assert client.get(f"/v1/sessions/{session}").json()["seq"] == 0
 

@@ -26,7 +26,7 @@ def test_events_tell_the_story_of_a_surrogate(client: httpx.Client, fresh: str):
     assert [event.id for event in events] == sorted({event.id for event in events})
 
 
-def test_a_reader_goes_on_where_it_left_off(client: httpx.Client, fresh: str):
+def test_a_reader_continues_after_its_last_event(client: httpx.Client, fresh: str):
     first, second = read(client, fresh, 2, **{"last-event-id": "0"})
     assert read(client, fresh, 1, **{"last-event-id": str(first.id)}) == [second]
 
@@ -50,7 +50,7 @@ def test_the_stream_of_a_deleted_surrogate_ends(client: httpx.Client, fresh: str
         assert not [line for line in lines if line.startswith("data: ")]
 
 
-def test_one_stream_tells_of_changes_to_any_surrogate(client: httpx.Client, fresh: str):
+def test_one_stream_reports_changes_of_any_surrogate(client: httpx.Client, fresh: str):
     with client.stream("GET", "/v1/events") as stream:
         lines = stream.iter_lines()
         assert next(lines).startswith(":")

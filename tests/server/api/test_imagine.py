@@ -43,7 +43,7 @@ def test_the_same_seed_draws_the_same_functions(client: httpx.Client, taught: st
         ({"actions": [[0.0, 0.0]]}, "expected shape (1, 1)"),
     ],
 )
-def test_what_cannot_be_imagined_is_refused(client: httpx.Client, taught: str, body: dict[str, Any], says: str):
+def test_invalid_episodes_are_refused(client: httpx.Client, taught: str, body: dict[str, Any], says: str):
     reply = imagine(client, taught, **body)
     assert reply.status_code == 422
     assert says in reply.text

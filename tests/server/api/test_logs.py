@@ -81,7 +81,7 @@ def test_a_draft_equals_that_of_the_command(client: httpx.Client, tmp_path):
         ({"text": "x" * 6 * 1024 * 1024}, 413, "at most 5242880 bytes"),
     ],
 )
-def test_what_is_no_log_is_refused_with_what_was_expected(
+def test_an_invalid_log_is_refused_with_the_expected_form(
     client: httpx.Client, fresh: str, body: dict[str, object], status: int, expected: str
 ):
     refused = client.post(f"/v1/surrogates/{fresh}/logs", json=body)

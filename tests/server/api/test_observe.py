@@ -104,7 +104,7 @@ def test_a_refused_stream_is_a_request_and_no_error_of_the_server(tmp_path: Path
     assert "ERROR" not in server.log
 
 
-def test_logs_are_objects_when_asked_and_name_the_request(tmp_path: Path):
+def test_logs_are_json_on_request_and_name_the_request(tmp_path: Path):
     with running_server(tmp_path, "--log-format", "json") as server:
         httpx.get(f"{server.url}/v1/surrogates/nowhere", headers={"x-request-id": "find-me"})
         server.stop()

@@ -42,6 +42,6 @@ def test_what_a_description_says_is_text():
     assert "<script" not in page(openapi)
 
 
-def test_a_refused_method_is_told_all_methods_of_its_path(client: httpx.Client):
+def test_the_refusal_of_a_method_lists_the_allowed_methods(client: httpx.Client):
     assert client.put("/v1/surrogates/any").headers["allow"] == "DELETE, GET, PATCH"
     assert client.post("/").headers["allow"] == "GET"

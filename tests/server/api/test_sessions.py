@@ -177,7 +177,7 @@ def test_no_occupancy_without_asking_for_it(client: httpx.Client, session: str, 
     assert send(client, asked, "occupancy", checkpoint="c").json()["code"] == "not_reset"
 
 
-def test_coordinates_of_the_lanes_are_what_observations_show(client: httpx.Client, session: str):
+def test_coordinates_of_lanes_match_observations(client: httpx.Client, session: str):
     observation = send(client, session, "reset", seed=3).json()["observation"]
     coordinates = client.get(f"/v1/sessions/{session}/coordinates").json()["coordinates"]
     angles, speeds = np.array(coordinates).T

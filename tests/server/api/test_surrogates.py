@@ -173,7 +173,7 @@ def test_queries_set_aside_never_stick_the_design(client: httpx.Client, fresh: s
     assert [query["error"] for query in aside] == ["the motor did not answer"]
 
 
-def test_a_design_without_any_answer_fails_openly_and_goes_on_by_hand(client: httpx.Client, fresh: str):
+def test_a_design_without_answers_fails_and_continues_after_manual_samples(client: httpx.Client, fresh: str):
     while view(client, fresh).phase == "collecting":
         for query in pendulum.claim(client, fresh)["queries"]:
             body = {"lease_token": query["lease_token"], "error": "no power"}

@@ -41,7 +41,7 @@ def test_a_policy_and_its_card_are_written(tmp_path: Path):
 
 
 @pytest.mark.parametrize("missing", [True, False], ids=["no file", "discrete"])
-def test_what_can_not_be_optimised_is_one_sentence(tmp_path: Path, missing: bool):
+def test_an_impossible_optimisation_is_refused_in_one_sentence(tmp_path: Path, missing: bool):
     if not missing:
         export(tmp_path, cartpole())
     said = optimise(tmp_path)

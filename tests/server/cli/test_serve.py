@@ -62,7 +62,7 @@ def test_a_taken_port_is_one_sentence(server_process: Any, tmp_path: Path):
         pytest.param([], {"SURROGYM_DEVICE": "cuda"}, "setting device: expected cpu, got cuda", marks=WITHOUT_CUDA),
     ],
 )
-def test_what_cannot_be_served(options: list[str], environment: dict[str, str], said: str):
+def test_invalid_settings_are_refused_at_start(options: list[str], environment: dict[str, str], said: str):
     assert said in refused(serve(*options, **environment))
 
 

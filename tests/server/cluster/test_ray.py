@@ -233,7 +233,7 @@ def walked(port: HttpSurrogate, actions: NDArray[np.float64], kills: dict[int, s
         ({"max_lanes": 5}, "which have max_lanes"),
     ],
 )
-def test_what_can_not_serve_a_cluster_is_one_sentence(
+def test_an_unsuitable_cluster_is_refused_in_one_sentence(
     settings: Settings, engine: SessionEngine, storage: Storage, options: dict[str, object], said: str
 ):
     with pytest.raises(InvalidInput, match=said) as refused:

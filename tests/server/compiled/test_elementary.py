@@ -40,7 +40,7 @@ def test_sine_and_cosine_are_exact_for_small_and_large_angles(largest: float):
     np.testing.assert_allclose(cosine, np.cos(x), rtol=0, atol=ULPS)
 
 
-def test_an_angle_that_is_no_number_stays_none():
+def test_an_angle_that_is_nan_stays_nan():
     x, sine, cosine = np.array([np.nan, 1.0]), np.empty(2), np.empty(2)
     njit(elementary.sine_and_cosine.py_func)(x, sine, cosine)
     assert np.isnan(sine[0])

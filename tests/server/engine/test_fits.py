@@ -67,7 +67,7 @@ RAISED = {
 }
 
 
-def test_what_a_job_raises_comes_here_as_words_and_ends_nothing(started: Started):
+def test_a_jobs_error_arrives_as_text_and_ends_nothing(started: Started):
     """Not as the exception: one could end who receives it, and another can't be sent. One process does all."""
     fits = started(jobs.refuse)
     process = run(fits, answer=True).data_hash

@@ -64,7 +64,7 @@ def test_the_least_recently_used_is_dropped(cache: ModelCache, store: Store):
     assert store.loaded == [(A, 1), (A, 2), (A, 3), (A, 2)]
 
 
-def test_what_is_published_is_the_newest_and_loaded_already(cache: ModelCache, store: Store):
+def test_the_published_version_is_the_newest_and_already_loaded(cache: ModelCache, store: Store):
     assert cache.latest(A) == 1
     cache.publish(A, 2)
     assert (cache.latest(A), store.loaded) == (2, [(A, 1), (A, 2)])
@@ -85,7 +85,7 @@ def test_a_deleted_surrogate_begins_again(cache: ModelCache, store: Store):
     assert store.loaded == [(A, 1)]
 
 
-def test_what_another_server_stores_is_seen(cache: ModelCache, store: Store):
+def test_data_stored_by_another_server_are_seen(cache: ModelCache, store: Store):
     assert cache.latest(A) == 1
     store.newest[A] = 2
     assert (cache.latest(A), cache.refresh(A), cache.latest(A)) == (1, 2, 2), "when it is asked for"
@@ -122,7 +122,7 @@ def test_a_known_latest_that_is_found_damaged_is_known_no_longer(cache: ModelCac
     assert cache.latest(A) == 1
 
 
-def test_a_newest_that_is_damaged_and_not_set_aside_is_told(cache: ModelCache, store: Store):
+def test_a_damaged_newest_model_that_was_not_set_aside_raises(cache: ModelCache, store: Store):
     store.damaged = {1}
     with pytest.raises(Damaged, match="model 1"):
         cache.latest(A)

@@ -86,7 +86,7 @@ def test_only_stepped_lanes_count_as_visits(opened: Open, fitted: Fitted):
 
 @pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize("variant", ["deterministic", "probabilistic", "pathwise"])
-def test_what_was_saved_goes_on_bit_for_bit(
+def test_a_restored_session_continues_bit_for_bit(
     opened: Open, fitted: Fitted, definition: EnvironmentDefinition, variant: str, compiled: bool
 ):
     chosen = {"variant": variant, "particles": 8, "trust": 2.0, "process_noise": True, "compiled": compiled}
@@ -194,7 +194,7 @@ def test_only_the_next_seq_and_a_repeat_of_the_last_are_taken(opened: Open):
         assert refusal.value.expected == 2
 
 
-def test_a_digest_tells_requests_apart():
+def test_different_requests_have_different_digests():
     action = np.array([[0.5], [1.0]])
     requests = [
         ("step", action, None, False),

@@ -77,7 +77,7 @@ def test_a_repeat_while_the_first_runs_waits_for_its_answer(live: LiveSessions, 
     assert (slow.begun, live.get("s").seq) == (1, 1)
 
 
-def test_another_session_and_the_loop_go_on_meanwhile(live: LiveSessions, opened: Open):
+def test_another_session_and_the_event_loop_continue_meanwhile(live: LiveSessions, opened: Open):
     slow = Slow()
     live.add(opened("slow"))
     live.add(opened("quick"))
@@ -244,7 +244,7 @@ def test_requests_beyond_the_queue_are_refused(live: LiveSessions, opened: Open)
     asyncio.run(run())
 
 
-def test_what_would_be_late_is_refused_before_it_is_computed(live: LiveSessions, opened: Open, clock: Clock):
+def test_a_request_that_would_be_late_is_never_begun(live: LiveSessions, opened: Open, clock: Clock):
     slow = Slow()
     live.add(opened("known"))
     live.add(opened("waiting"))

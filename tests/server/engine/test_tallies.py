@@ -62,7 +62,7 @@ def test_the_steps_of_a_policy_count_as_single_steps():
     assert several.read(None) == one.read(None)  # type: ignore[arg-type]
 
 
-def test_a_reset_drops_what_did_not_end():
+def test_a_reset_drops_unfinished_episodes():
     tally = Tally(Clock())
     tally.stepped(answer(2, result([1, 10], [False, False])))
     tally.reset(np.array([True, False]))

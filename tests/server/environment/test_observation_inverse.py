@@ -52,7 +52,7 @@ def reacher(*observed: ObservationEntry) -> EnvironmentSpec:
     )
 
 
-def test_a_clip_that_cuts_nothing_off_is_no_obstacle():
+def test_a_clip_without_effect_is_accepted():
     clipped = ObservationEntry(name="o", term=Term.linear(joint=1).clipped(-4, 4))
     inverse = ObservationInverse.of(definition_from_spec(reacher(clipped)))
     assert inverse.sources == ((0, (0,)),)

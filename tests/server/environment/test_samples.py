@@ -34,7 +34,7 @@ def test_samples_that_end_at_a_bound_are_saturated(pendulum_definition, mountain
     assert saturated(mountain_car_definition, ends).tolist() == [True, True, False]
 
 
-def test_the_digest_tells_samples_apart():
+def test_different_samples_have_different_digests():
     one = samples([[0.0, 1.0]], [[0.0, 1.0]])
     same, other = samples([[0.0, 1.0]], [[0.0, 1.0]]), samples([[0.0, 1.0]], [[0.0, 1.0 + 1e-15]])
     assert one.digest == same.digest

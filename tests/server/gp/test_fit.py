@@ -65,7 +65,7 @@ def test_without_priors_the_objective_is_scikit_learns_evidence(rng, linear):
     assert -(value - constant) == pytest.approx(reference.log_marginal_likelihood_value_, rel=1e-6)
 
 
-def test_what_cannot_be_factored_is_a_wall(rng):
+def test_a_covariance_that_cannot_be_factored_has_a_huge_cost(rng):
     x, y = draw(rng, 10, [1.0], 1e-2)
     objective = _Objective(x, y, FitOptions(linear=False), None)
     theta = np.array([40.0, 40.0, -80.0])  # all points alike, far outside the bounds

@@ -71,7 +71,7 @@ def test_without_noise_a_draw_is_the_mean(posterior, at):
     assert paths.residual(at, weights).abs().max() == 0
 
 
-def test_a_draw_is_one_function_whatever_is_asked_beside_it(posterior, at, rng):
+def test_a_draw_is_one_function_in_any_batch(posterior, at, rng):
     paths = Pathwise(posterior)
     weights = paths.draw(torch.from_numpy(rng.standard_normal((len(at), paths.size))))
     together = paths.residual(at, weights)

@@ -85,7 +85,7 @@ def test_jitter_escalates_by_tens_only_as_far_as_needed():
     assert factorise(torch.eye(3, dtype=torch.float64))[1] == 0
 
 
-def test_what_no_jitter_repairs_is_a_numerical_failure():
+def test_a_matrix_that_no_jitter_repairs_is_a_numerical_failure():
     hopeless = torch.diag(torch.tensor([1.0, -2 * MAX_JITTER], dtype=torch.float64))
     with pytest.raises(NumericalFailure, match="covariance of 2 points"):
         factorise(hopeless)

@@ -56,7 +56,7 @@ def test_what_is_predicted_has_the_parity(reflected, rng):
     torch.testing.assert_close(same, latent, rtol=1e-8, atol=1e-10)
 
 
-def test_an_odd_process_is_sure_of_nothing_at_the_mirror(rng):
+def test_an_odd_process_is_certainly_zero_at_the_mirror(rng):
     hyper = Hyperparameters(torch.ones(2, dtype=torch.float64), 1.0, 0.5, 0.5, 1e-4, Reflection(SIGNS, -1))
     at = points(rng, 7) * torch.tensor([0.0, 1.0], dtype=torch.float64)
     mean, latent = condition(hyper, points(rng, 3), torch.ones(3, dtype=torch.float64)).mean_and_variance(at)

@@ -48,7 +48,7 @@ def test_every_output_is_its_posterior(outputs, at, monkeypatch, device, toleran
         torch.testing.assert_close(deviation[:, output.column], output.scale * variance.sqrt(), rtol=1e-7, atol=1e-9)
 
 
-def test_deviations_that_are_not_asked_for_are_zero(outputs, at):
+def test_deviations_that_were_not_requested_are_zero(outputs, at):
     compiled = Serving.of(outputs, COLUMNS, WIDTH)
     _, some = compiled.mean_and_deviation(at, [1])
     _, every = compiled.mean_and_deviation(at, range(COLUMNS))

@@ -22,7 +22,7 @@ def test_a_subset_is_all_points_or_one_from_each_stretch(points: int):
     assert torch.equal(rows, spread(points, 30))
 
 
-def test_a_subset_sees_every_phase_of_what_repeats():
+def test_a_subset_samples_every_phase_of_a_periodic_sequence():
     assert len((spread(3_000, 150) % 20).unique()) > 10
 
 
@@ -45,7 +45,7 @@ def test_hyperparameters_refined_from_a_few_points_predict_as_those_of_all():
     assert float((refined.mean(at) - truth).std()) < 0.03
 
 
-def test_what_few_points_took_for_noise_more_points_resolve():
+def test_more_points_resolve_what_few_explain_as_noise():
     """From where few points end, the search ends in noise; the second start finds the wave."""
     x = torch.linspace(-1.7, 1.7, 200, dtype=torch.float64)[:, None]
     y, found = torch.sin(6 * x[:, 0]), np.array([0.7, 0.0, -10.0, 0.0])  # as theta: the last is log sigma_n^2

@@ -45,7 +45,7 @@ def job(**changes: object) -> DesignJob:
         ("infinite", ": expected a description that can be written as JSON, got ValueError: "),
     ],
 )
-def test_a_model_that_is_none_fails_its_fit_in_one_sentence(monkeypatch: pytest.MonkeyPatch, mode: str, said: str):
+def test_an_invalid_model_fails_its_fit_in_one_sentence(monkeypatch: pytest.MonkeyPatch, mode: str, said: str):
     monkeypatch.setattr(guard, "learner_of", lambda _: unruly.Unruly(mode))
     with pytest.raises(PluginFailed, match=f"^the model family 'gaussian_process'{said}"):
         run_design_job(job())
@@ -57,7 +57,7 @@ def test_ctrl_c_in_a_fit_of_ones_own_process_stays_ctrl_c(monkeypatch: pytest.Mo
         run_design_job(job())
 
 
-def test_a_prediction_of_a_wrong_shape_is_named_when_it_is_asked_for(monkeypatch: pytest.MonkeyPatch):
+def test_a_prediction_of_a_wrong_shape_raises_on_use(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(guard, "learner_of", lambda _: unruly.Unruly())
     made = job()
     samples = [torch.from_numpy(a) for a in (made.coordinates, made.action, made.next_coordinates, made.reward)]

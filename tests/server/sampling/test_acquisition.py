@@ -57,7 +57,7 @@ def test_variance_looks_at_the_deviation_alone(model, candidates):
     )
 
 
-def test_integrated_variance_prefers_what_is_good_for_many_points(model, candidates):
+def test_integrated_variance_prefers_queries_that_inform_many_points(model, candidates):
     """A candidate far from the reference, and from its mirror image, lowers nothing there, however uncertain it is."""
     here = (candidates.points.q[:, 1].abs() > 4).double()
     only_here = replace(candidates, weights=here / here.sum())
@@ -68,7 +68,7 @@ def test_integrated_variance_prefers_what_is_good_for_many_points(model, candida
 
 
 @pytest.mark.parametrize("criterion", CRITERIA)
-def test_a_batch_is_what_one_after_the_other_would_have_been(model, candidates, criterion):
+def test_a_batch_equals_its_points_one_by_one(model, candidates, criterion):
     """Choosing three at once is choosing one three times, with those before assumed."""
     points, nothing = candidates.points, candidates.points[:0]
     model = by(model, criterion)
@@ -80,7 +80,7 @@ def test_a_batch_is_what_one_after_the_other_would_have_been(model, candidates, 
     assert len(set(batch)) == 3
 
 
-def test_what_was_asked_is_not_asked_again(model, candidates):
+def test_earlier_queries_are_not_chosen_again(model, candidates):
     points = candidates.points
     all_but_two = points[: len(points) - 2]
     assert set(choose(model, candidates, all_but_two, points[:0], [0, 1, 2, 0, 1], TOLERANCES)) == {58, 59}
@@ -95,7 +95,7 @@ def test_the_first_of_a_batch_is_taken_from_the_reserved(model, candidates):
     assert len(batch) == 3
 
 
-def test_an_output_that_never_varied_is_tried_far_from_what_was_asked(model, candidates):
+def test_a_constant_output_is_queried_far_from_earlier_queries(model, candidates):
     """It has no deviation to choose by, and only something unlike the samples could prove it wrong."""
     constant = replace(model, reward=replace(model.reward, posterior=None))
     taken = candidates.points[:30]

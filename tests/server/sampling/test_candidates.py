@@ -61,7 +61,7 @@ def test_without_visited_states_a_query_should_be_good_anywhere(model, points, r
     torch.testing.assert_close(made.weights, torch.full((60,), 1 / 60, dtype=torch.float64))
 
 
-def test_visited_states_outside_the_sampling_range_are_never_asked_for(model, points, unseen, rng):
+def test_visited_states_outside_the_sampling_range_are_never_queried(model, points, unseen, rng):
     visited, away = unseen.q[:7], torch.tensor([[0.0, 8.5], [3.0, -400.0]], dtype=torch.float64)
     made = candidates_of(model, Points(*points), torch.cat([away, visited]), rng)
     assert float(made.points.q[:, 1].abs().max()) <= 8

@@ -122,7 +122,7 @@ def test_pending_queries_count_against_the_budget(definition, few, unseen):
     assert chosen == [2, 1, 0, 0]
 
 
-def test_pending_queries_are_not_asked_again(definition, few):
+def test_pending_queries_are_not_chosen_again(definition, few):
     asked = advance(definition, few, NEVER, request())
     pending = Samples(asked.q, asked.u, asked.q, few.reward[:0], few.terminated[:0])
     again = advance(definition, few, NEVER, request(pending=pending))
@@ -140,7 +140,7 @@ def test_one_round_asks_once_for_each_unsure_output_and_never_twice_the_same(def
     assert not near(definition, asked, Points(few.q, few.u)).any()
 
 
-def test_sure_outputs_are_not_asked_for(definition, few):
+def test_certain_outputs_get_no_queries(definition, few):
     generous = DesignState(1, (1e3, 1e3, 1e-12))
     assert len(advance(definition, few, generous, request()).q) == 1
 
@@ -162,7 +162,7 @@ def test_extra_queries_are_chosen_whatever_the_verdict(definition, few, unseen, 
     assert len(made.q) == 5
 
 
-def test_what_ending_pays_is_asked_for_first():
+def test_the_reward_of_an_ending_is_queried_first():
     spec = cartpole()
     definition = definition_from_spec(spec)
     steps = random_steps(spec, 60, seed=0)
@@ -334,7 +334,7 @@ def test_queries_go_where_policies_went(acquisition):
     assert int((anywhere < 1).sum()) == 0
 
 
-def test_a_design_that_has_ended_asks_nothing_because_of_an_audit(definition, few):
+def test_an_ended_design_adds_no_queries_after_an_audit(definition, few):
     first = advance(definition, few, DesignState(), request(budget=len(few)))
     assert first.verdict == "over_budget"
     state = DesignState.from_json(first.state.to_json())

@@ -26,7 +26,7 @@ def part(samples: Samples, chosen: torch.Tensor) -> Samples:
     return Samples(*(getattr(samples, name)[chosen] for name in samples.__dataclass_fields__))
 
 
-def test_before_any_end_was_seen_the_farthest_points_are_asked(steps):
+def test_before_any_seen_ending_the_farthest_points_are_queried(steps):
     near = part(steps, steps.q_next.abs().amax(1) < 1)
     assert not bool(near.terminated.any())
     model = learn(definition_from_spec(LEARNED), near).model
@@ -36,7 +36,7 @@ def test_before_any_end_was_seen_the_farthest_points_are_asked(steps):
     assert ending(model, near, Points(0 * steps.q, steps.u)) is None
 
 
-def test_a_boundary_in_doubt_is_asked_for(steps):
+def test_an_uncertain_boundary_is_queried(steps):
     some = part(steps, torch.arange(len(steps)) % 2 == 0)
     assert bool(some.terminated.any())
     model = learn(definition_from_spec(LEARNED), some).model
@@ -51,7 +51,7 @@ def test_a_declared_end_is_never_in_doubt(steps):
     assert float(in_doubt(model, steps.q_next).max()) == 0
 
 
-def test_a_rewards_edge_in_doubt_is_asked_for():
+def test_an_uncertain_edge_of_the_reward_is_queried():
     seen = drifting(lambda q, _: (q[:, 0] > 0.5).double(), 12)
     model = learn(definition_from_spec(plane()), seen).model
     (jump,) = model.jumps

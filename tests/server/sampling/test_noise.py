@@ -79,7 +79,7 @@ def test_one_repeat_comes_first_and_more_only_where_it_differs(model: ClaimsNois
     assert to_repeat(model, samples(model, again=ENOUGH, noise=0.2), TOLERANCES) is None
 
 
-def test_noise_below_the_tolerance_is_nobodys_concern(model: ClaimsNoise):
+def test_noise_below_the_tolerance_is_ignored(model: ClaimsNoise):
     quiet = replace(model, noise=(0.005, 0.0, 0.0))
     assert to_repeat(quiet, samples(model, again=0), TOLERANCES) is None
     assert established_noise(quiet, samples(model, again=9, noise=0.005), TOLERANCES).tolist() == [0, 0, 0]

@@ -33,7 +33,7 @@ def looked_for(samples, tolerance: float = 0.01) -> Points | None:
     return highest(model, samples, POINTS, tolerance, np.random.default_rng(0))
 
 
-def test_place_that_pays_is_asked_for_before_it_was_met():
+def test_a_hidden_peak_is_queried_before_it_was_reached():
     samples = drifting(bump, 12)
     assert float(samples.reward.max()) < 0.01
     found = looked_for(samples)
@@ -42,7 +42,7 @@ def test_place_that_pays_is_asked_for_before_it_was_met():
     assert float((arrives - PLACE).norm()) < 0.02
 
 
-def test_no_step_is_asked_for_from_where_episodes_have_ended():
+def test_no_query_starts_in_a_terminated_state():
     """A reward that is highest behind the line at which episodes end."""
     right = Inequality(term=Term.linear(x=1), relation=">", value=0.1)
     definition = definition_from_spec(plane().model_copy(update={"termination": ((right,),)}))
@@ -55,7 +55,7 @@ def test_no_step_is_asked_for_from_where_episodes_have_ended():
     assert not bool(definition.terminated(found.q).any())
 
 
-def test_nothing_is_asked_for_once_the_place_was_met():
+def test_nothing_is_queried_once_the_peak_was_reached():
     samples = drifting(bump, 12)
     q, u = PLACE[None], torch.zeros(1, 1, dtype=torch.float64)
     met = replace(
@@ -77,7 +77,7 @@ def constant(value: float) -> Samples:
     return drifting(lambda q, _: torch.full((len(q),), value, dtype=torch.float64), 12)
 
 
-def test_while_nothing_was_paid_the_farthest_place_is_asked_for():
+def test_without_any_reward_the_farthest_place_is_queried():
     samples = constant(0.0)
     found = looked_for(samples)
     assert found is not None

@@ -96,7 +96,7 @@ def test_starts_are_the_declared_ones_and_stratified(swinging: EnvironmentDefini
     assert bool((starts[:, 1].abs() <= 1).all())
 
 
-def test_a_predicted_path_goes_on_where_it_was(model: GaussianProcessModel):
+def test_a_predicted_path_continues_from_its_last_state(model: GaussianProcessModel):
     actions = torch.from_numpy(random_sequences(model.definition, 5, 7, rng()))
     paths = predict_paths(model, start_points(model.definition, 5, rng()), actions)
     torch.testing.assert_close(paths.q[:, 1:], paths.q_next[:, :-1])

@@ -21,7 +21,7 @@ def frozen(samples, before=None):
     return frozen_tolerances(DEFINITION, samples, before or Usual())
 
 
-def test_tolerance_of_what_met_nothing_is_taken_again_when_something_is_paid():
+def test_a_tolerance_without_rewards_is_recomputed_at_the_first_reward():
     first = frozen(NOTHING_MET)
     assert first.tolerances[-1] < 1e-100
     second = frozen(PAID, first)

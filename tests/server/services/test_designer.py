@@ -136,7 +136,7 @@ def test_the_job_has_what_the_design_knows(answered: Storage, designer, runner: 
     np.testing.assert_array_equal(job.occupancy, np.ones((3, 2)))
 
 
-def test_a_budget_lowered_after_somebody_asked_holds_all_the_same(answered: Storage, designer, runner: Runner):
+def test_a_budget_lowered_after_a_request_for_queries_holds(answered: Storage, designer, runner: Runner):
     """What was promised within the old budget is not asked beyond the new one."""
     answered.designs.improve(NAME, 2)
     answered.surrogates.change(NAME, budget=pendulum.INITIAL + 1)
@@ -145,7 +145,7 @@ def test_a_budget_lowered_after_somebody_asked_holds_all_the_same(answered: Stor
     assert len(answered.queries.list(NAME)) <= pendulum.INITIAL + 1
 
 
-def test_occupancy_steers_nothing_unless_it_was_asked_for(answered: Storage, designer, runner: Runner):
+def test_occupancy_has_no_effect_unless_requested(answered: Storage, designer, runner: Runner):
     answered.occupancy.put(NAME, "visited", np.ones((3, 2)))
     fit_all(designer)
     assert runner.jobs[0].occupancy is None
@@ -165,7 +165,7 @@ def test_a_fit_that_fails_says_why_and_is_tried_again_with_new_samples(answered:
     assert (answered.surrogates.get(NAME).phase, answered.surrogates.get(NAME).error) == ("sampling", None)
 
 
-def test_an_error_nobody_thought_of_fails_the_design_and_not_the_designer(answered: Storage, designer, runner: Runner):
+def test_an_unexpected_error_fails_the_design_but_not_the_designer(answered: Storage, designer, runner: Runner):
     runner.function = refuse(ZeroDivisionError("surprise"))
     fit_all(designer)
     assert answered.surrogates.get(NAME).error == "the fit failed: ZeroDivisionError: surprise"
@@ -283,7 +283,7 @@ def test_a_fit_whose_surrogate_is_deleted_is_ended(answered: Storage, designer, 
 
 
 @pytest.mark.usefixtures("watchful")
-def test_a_fit_that_takes_long_is_told_and_passed(answered: Storage, designer, runner: Runner, caplog):
+def test_a_long_fit_is_logged_and_passed_by_others(answered: Storage, designer, runner: Runner, caplog):
     teach_another(answered, budget=29)
     runner.hang_at_budget = pendulum.BUDGET
 

@@ -22,7 +22,7 @@ def test_a_notice_before_the_wait_is_remembered():
     asyncio.run(run())
 
 
-def test_only_those_who_listen_are_woken():
+def test_only_listeners_are_woken():
     async def run() -> list[bool]:
         notices = Notices()
         with notices.listen("a") as a, notices.listen("b") as b, notices.listen() as everything:
@@ -83,7 +83,7 @@ class Told(Announcements):
         pass
 
 
-def test_what_another_server_announces_wakes_and_is_not_announced_again():
+def test_an_announcement_of_another_server_wakes_without_an_echo():
     async def run() -> None:
         told = Told()
         notices = Notices(told)

@@ -45,7 +45,7 @@ def lost_at_commit(storage: Storage, monkeypatch: pytest.MonkeyPatch, operation:
     monkeypatch.setattr(storage.policies, operation, broken)
 
 
-def test_file_whose_commit_nobody_heard_of_is_there(storage: Storage, monkeypatch: pytest.MonkeyPatch):
+def test_a_file_with_a_lost_acknowledgement_is_stored(storage: Storage, monkeypatch: pytest.MonkeyPatch):
     policies, file = service(storage)
     with monkeypatch.context() as patched:
         lost_at_commit(storage, patched, "attach")
@@ -54,7 +54,7 @@ def test_file_whose_commit_nobody_heard_of_is_there(storage: Storage, monkeypatc
     assert policies.file(NAME, "1", "gif") == (1, GIF)
 
 
-def test_episodes_whose_commit_nobody_heard_of_are_there_once(storage: Storage, monkeypatch: pytest.MonkeyPatch):
+def test_episodes_with_a_lost_acknowledgement_are_stored_once(storage: Storage, monkeypatch: pytest.MonkeyPatch):
     policies, _ = service(storage)
     with monkeypatch.context() as patched:
         lost_at_commit(storage, patched, "evaluate")

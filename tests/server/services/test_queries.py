@@ -51,7 +51,7 @@ def test_without_waiting_nothing_is_an_answer(emptied: Storage, definitions: Def
     assert asyncio.run(run()).queries == []
 
 
-def test_a_query_that_comes_wakes_who_waits(emptied: Storage, definitions: Definitions):
+def test_a_new_query_wakes_a_waiting_claim(emptied: Storage, definitions: Definitions):
     async def run() -> tuple[Claim, float]:
         service = QueryService(emptied, definitions, Notices())
         return await waiting_claim(service, lambda: service.add(NAME, np.zeros((1, 2)), np.zeros((1, 1)), None))
@@ -61,7 +61,7 @@ def test_a_query_that_comes_wakes_who_waits(emptied: Storage, definitions: Defin
     assert seconds < PATIENCE / 2
 
 
-def test_the_end_of_the_design_wakes_who_waits(emptied: Storage, definitions: Definitions):
+def test_the_end_of_the_design_wakes_waiting_claims(emptied: Storage, definitions: Definitions):
     async def run() -> tuple[Claim, float]:
         notices = Notices()
 
@@ -76,7 +76,7 @@ def test_the_end_of_the_design_wakes_who_waits(emptied: Storage, definitions: De
     assert seconds < PATIENCE / 2
 
 
-def test_the_end_of_the_server_wakes_who_waits(emptied: Storage, definitions: Definitions):
+def test_the_end_of_the_server_wakes_waiting_claims(emptied: Storage, definitions: Definitions):
     async def run() -> tuple[Claim, float]:
         notices = Notices()
         return await waiting_claim(QueryService(emptied, definitions, notices), notices.close)
@@ -84,7 +84,7 @@ def test_the_end_of_the_server_wakes_who_waits(emptied: Storage, definitions: De
     assert asyncio.run(run())[1] < PATIENCE / 2
 
 
-def test_two_who_wait_share_what_comes(emptied: Storage, definitions: Definitions):
+def test_two_waiting_samplers_share_new_queries(emptied: Storage, definitions: Definitions):
     async def run() -> list[Claim]:
         service = QueryService(emptied, definitions, Notices())
         claims = [asyncio.create_task(service.claim(NAME, f"tester {i}", 1, 60, PATIENCE)) for i in range(2)]

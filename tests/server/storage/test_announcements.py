@@ -48,7 +48,7 @@ def until_they_listen(storage: Storage, count: int) -> None:
     raise AssertionError("they never listened")
 
 
-def test_nobody_hears_of_a_sqlite_file_and_nothing_is_lost(tmp_path) -> None:
+def test_sqlite_servers_get_no_announcements_and_lose_nothing(tmp_path) -> None:
     storage, heard = open_storage(f"sqlite:///{tmp_path}/surrogym.db"), []
     storage.announcements.listen(heard.append)
     storage.announcements.announce("a")

@@ -96,7 +96,7 @@ def test_the_right_to_fit_of_a_dead_server_passes_on_though_the_clock_was_set_ba
     assert storage.designs.commit(heir, design()) == 1
 
 
-def test_a_fit_that_goes_on_while_the_clock_is_set_back_counts(
+def test_a_fit_during_which_the_clock_is_set_back_counts(
     storage: Storage,
     make: Callable[..., str],
     answer_all: Callable[[str], None],

@@ -105,7 +105,7 @@ def all_read(storage: Storage) -> Iterator[SurrogymError]:
 @pytest.mark.parametrize("url", ["sqlite"], indirect=True)
 @pytest.mark.parametrize("flips", [1, 10, 60])
 @pytest.mark.parametrize("seed", range(5))
-def test_flipped_bytes_are_told_in_one_sentence(url: str, file: Path, flips: int, seed: int) -> None:
+def test_flipped_bytes_are_reported_in_one_sentence(url: str, file: Path, flips: int, seed: int) -> None:
     content = bytearray(file.read_bytes())
     random = np.random.default_rng(seed)
     for place in random.integers(len(content), size=flips):
@@ -208,7 +208,7 @@ def flip(url: str, version: int) -> None:
         connection.execute(sa.update(models).where(own).values(blob=bytes(blob)))
 
 
-def test_a_model_that_is_not_what_was_stored_is_refused(url: str, full: Storage) -> None:
+def test_a_model_changed_in_storage_is_refused(url: str, full: Storage) -> None:
     assert full.models.blob(NAME, 1) == b"\0model"
     flip(url, 1)
     for version in (1, None):
@@ -245,7 +245,7 @@ def test_a_fit_is_due_when_a_model_is_set_aside(
         storage.models.get(name)
 
 
-def test_models_from_before_get_the_checksum_of_what_they_are(url: str, full: Storage) -> None:
+def test_older_models_get_the_checksum_of_their_present_content(url: str, full: Storage) -> None:
     full.close()
     with closing(connect(url)) as database, database.write() as connection:
         downgrade(connection, "0004")

@@ -96,7 +96,7 @@ def test_a_commit_stores_model_state_phase_and_queries_together(
     assert storage.designs.due() == []
 
 
-def test_rounds_go_on_until_no_queries_come(
+def test_rounds_continue_until_there_are_no_more_queries(
     storage: Storage, due: str, design: Callable[..., NewDesign], answer_all: Callable[[str], None]
 ) -> None:
     assert storage.designs.commit(begun(storage, due), design(queries=1)) == 1
@@ -107,7 +107,7 @@ def test_rounds_go_on_until_no_queries_come(
     assert (storage.ledger.read(due).initial, storage.ledger.read(due).adaptive) == (3, 1)
 
 
-def test_what_comes_in_during_a_fit_makes_the_next_one_due(
+def test_samples_during_a_fit_make_the_next_one_due(
     storage: Storage, due: str, design: Callable[..., NewDesign], by_hand: Callable[..., NewSample]
 ) -> None:
     lease = begun(storage, due)
@@ -154,7 +154,7 @@ ASKED_ANEW = ({"tolerances": {"theta": 0.5}}, {"target": 0.9}, {"budget": 3})
 
 
 @pytest.mark.parametrize("change", ASKED_ANEW)
-def test_what_was_chosen_by_what_was_asked_before_is_withdrawn_unless_it_is_begun(
+def test_queries_for_an_older_target_are_withdrawn_unless_begun(
     storage: Storage, due: str, design: Callable[..., NewDesign], change: dict[str, Any]
 ) -> None:
     """A tolerance typed wrong costs no real step; a step that may have been taken stays in the ledger."""
@@ -171,7 +171,7 @@ def test_what_was_chosen_by_what_was_asked_before_is_withdrawn_unless_it_is_begu
 
 
 @pytest.mark.parametrize(("change", "again"), [({"tolerances": {"theta": 0.5}}, 2), ({"budget": 7}, 0)])
-def test_what_somebody_asked_for_is_asked_for_again_unless_there_is_less_to_spend(
+def test_requested_queries_are_chosen_again_unless_the_budget_is_smaller(
     storage: Storage, due: str, design: Callable[..., NewDesign], change: dict[str, Any], again: int
 ) -> None:
     storage.designs.commit(begun(storage, due), design(phase="ready"))
@@ -194,7 +194,7 @@ def test_a_smaller_budget_leaves_as_many_initial_queries_as_it_holds(
     assert [query.id for query in storage.queries.list(name)] == first
 
 
-def test_what_nobody_has_begun_does_not_keep_a_change_waiting(
+def test_queries_without_a_lease_do_not_delay_a_change(
     storage: Storage, due: str, design: Callable[..., NewDesign]
 ) -> None:
     storage.designs.commit(begun(storage, due), design(queries=2))
@@ -203,7 +203,7 @@ def test_what_nobody_has_begun_does_not_keep_a_change_waiting(
 
 
 @pytest.mark.parametrize("change", ASKED_ANEW)
-def test_a_fit_that_runs_while_something_else_is_asked_is_made_again(
+def test_a_fit_overtaken_by_a_change_is_repeated(
     storage: Storage, due: str, design: Callable[..., NewDesign], change: dict[str, Any]
 ) -> None:
     lease = begun(storage, due)
@@ -220,7 +220,7 @@ def test_a_paused_design_is_not_fitted(storage: Storage, due: str) -> None:
     assert storage.designs.begin(due, "me", LONG) is None
 
 
-def test_the_design_goes_on_without_queries_that_were_set_aside(
+def test_the_design_continues_without_queries_that_were_set_aside(
     storage: Storage, due: str, design: Callable[..., NewDesign]
 ) -> None:
     storage.designs.commit(begun(storage, due), design(queries=1))
@@ -254,7 +254,7 @@ def test_a_budget_that_is_large_enough_stays(storage: Storage, due: str) -> None
     assert (granted.record.budget, granted.raised) == (30, 0)
 
 
-def test_who_may_not_raise_the_budget_gets_what_it_has_left(storage: Storage, due: str) -> None:
+def test_without_the_right_to_raise_the_budget_its_rest_is_granted(storage: Storage, due: str) -> None:
     """The budget is the owner's: steps taken, queries open or set aside, and what was promised before all count."""
     storage.queries.enqueue(due, np.zeros((2, 2)), np.zeros((2, 1)))
     for _ in range(MAX_ATTEMPTS):
@@ -272,7 +272,7 @@ def test_who_may_not_raise_the_budget_gets_what_it_has_left(storage: Storage, du
     assert storage.designs.left(due) == 0
 
 
-def test_many_who_ask_at_once_get_no_more_than_the_budget_has_left(storage: Storage, due: str) -> None:
+def test_simultaneous_requests_get_at_most_the_budget_left(storage: Storage, due: str) -> None:
     def ask(_: int) -> int:
         try:
             return storage.designs.improve(due, 4).record.extra_queries

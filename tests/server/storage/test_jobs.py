@@ -117,7 +117,7 @@ def test_an_evaluation_is_never_run_again_by_itself(storage: Storage, make: Make
 
 
 @pytest.mark.parametrize("new", [TRAIN, EVALUATE])
-def test_a_worker_whose_server_was_away_for_long_goes_on(
+def test_a_worker_continues_after_a_long_absence_of_its_server(
     storage: Storage, make: Make, until: Until, new: NewJob
 ) -> None:
     name = make()

@@ -72,7 +72,7 @@ def test_no_fit_is_due_before_the_log_is_complete(storage: Storage, make: Make, 
     assert storage.designs.due() == [name]
 
 
-def test_a_complete_log_that_was_there_makes_nothing_due(
+def test_a_repeated_complete_log_makes_no_fit_due(
     storage: Storage, make: Make, by_hand: Sample, design: Callable[..., NewDesign]
 ) -> None:
     name = make(queries=0)
@@ -95,7 +95,7 @@ def test_a_logged_sample_of_a_query_is_refused_by_its_index(
     assert storage.samples.count(name) == 0
 
 
-def test_only_queries_that_nobody_began_are_withdrawn(storage: Storage, make: Make, answer: Sample) -> None:
+def test_only_queries_without_a_lease_are_withdrawn(storage: Storage, make: Make, answer: Sample) -> None:
     name = make(queries=4)
     ids = [query.id for query in storage.queries.list(name)]
     answered, failed = storage.queries.claim(name, "a", 2, SECONDS)

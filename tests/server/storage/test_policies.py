@@ -139,7 +139,7 @@ def test_beyond_the_count_the_oldest_without_an_alias_goes(
         pushed(storage, name, b"four")
 
 
-def test_what_belongs_to_a_deleted_surrogate_is_an_orphan(storage: Storage, make: Make) -> None:
+def test_files_of_a_deleted_surrogate_are_orphans(storage: Storage, make: Make) -> None:
     name = make()
     version, _ = pushed(storage, name, b"one")
     evaluated(storage, name, version, "a")

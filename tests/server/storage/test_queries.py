@@ -134,7 +134,7 @@ def test_a_query_whose_leases_all_run_out_is_set_aside(
     assert storage.ledger.read(name) == LedgerRecord(unresolved=MAX_ATTEMPTS, failed=0)
 
 
-def test_resuming_asks_what_was_set_aside_again(storage: Storage, make: Callable[..., str]) -> None:
+def test_resuming_requeues_queries_that_were_set_aside(storage: Storage, make: Callable[..., str]) -> None:
     """With all attempts, of which giving back unbegun is none, and as often as somebody resumes."""
     name = make(queries=1)
 
@@ -207,7 +207,7 @@ def test_an_answered_query_can_neither_fail_nor_be_renewed(
     assert storage.queries.get(name, leased.id).status == "answered"
 
 
-def test_foreign_tokens_and_unknown_queries_are_told_apart(storage: Storage, make: Callable[..., str]) -> None:
+def test_foreign_tokens_and_unknown_queries_raise_different_errors(storage: Storage, make: Callable[..., str]) -> None:
     name, other = make(name="one"), make(name="two")
     mine, neighbour = storage.queries.claim(name, "a", 2, LONG)
     [foreign] = storage.queries.claim(other, "a", 1, LONG)

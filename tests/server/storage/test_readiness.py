@@ -76,7 +76,7 @@ def test_a_file_that_another_program_keeps_is_not_ready_and_nobody_waits_long_fo
     storage.close()
 
 
-def test_many_who_ask_at_once_cause_one_write(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_simultaneous_checks_cause_one_write(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(readiness, "FRESH_SECONDS", 3600.0)
     writes: list[None] = []
     write = readiness.Readiness._write

@@ -232,7 +232,9 @@ def test_arrays_hold_all_samples_in_order_and_exactly(
     assert got.terminated.tolist() == (rows[:, 5] > 0).tolist()
 
 
-def test_pages_go_on_after_an_id(storage: Storage, make: Callable[..., str], by_hand: Callable[..., NewSample]) -> None:
+def test_pages_continue_after_an_id(
+    storage: Storage, make: Callable[..., str], by_hand: Callable[..., NewSample]
+) -> None:
     name = make(queries=0)
     other = make(queries=0, name="other")
     storage.samples.add(other, "a", [by_hand()])

@@ -171,7 +171,7 @@ def test_deviations_of_many_points_are_left_to_torch(monkeypatch):
     assert in_fastest_form(VirtualSettings(LANES), model).compiled == compiled.available()
 
 
-def test_a_model_of_a_log_steps_by_torch_which_knows_what_is_paid_outside():
+def test_a_log_model_steps_by_torch_for_the_outside_reward():
     slow = pendulum().model_dump() | {"outside_reward": -7.0}
     slow["coordinates"][1]["sampling"] = {"kind": "uniform", "low": -1.0, "high": 1.0}
     spec = EnvironmentSpec.model_validate(slow)

@@ -183,7 +183,7 @@ def test_stepping_leaves_the_old_lanes_as_they_were(cartpole_model, started):
         np.testing.assert_array_equal(array, before[name])
 
 
-def test_lanes_survive_as_arrays_and_go_on_alike(pendulum_model, started):
+def test_lanes_restored_from_arrays_continue_alike(pendulum_model, started):
     settings, lanes = started(pendulum_model, 3, variant="probabilistic", particles=4)
     stored = {name: array.copy() for name, array in lanes.to_arrays().items()}
     loaded = LaneState.from_arrays(stored)

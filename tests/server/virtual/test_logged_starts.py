@@ -40,7 +40,7 @@ def test_a_share_of_them_still_starts_anywhere(of_a_log, started):
     assert 100 < elsewhere < 200
 
 
-def test_leaving_the_range_ends_the_episode_and_pays_what_it_lacks(of_a_log, started):
+def test_leaving_the_range_ends_an_episode_and_pays_missing_steps(of_a_log, started):
     settings, lanes = started(of_a_log, 2, time_limit=10)
     lanes = replace(lanes, q=torch.tensor([[1.5, 3.9], [0.0, 0.0]], dtype=torch.float64), elapsed=lanes.elapsed + 4)
     _, moved = step(of_a_log, settings, lanes, STILL)
@@ -50,7 +50,7 @@ def test_leaving_the_range_ends_the_episode_and_pays_what_it_lacks(of_a_log, sta
     assert not moved.truncated.any()
 
 
-def test_leaving_what_is_trusted_pays_as_well(of_a_log, started):
+def test_leaving_the_trusted_range_pays_too(of_a_log, started):
     unsure = replace(of_a_log, deviation=0.5)
     settings, lanes = started(unsure, 2, time_limit=10, trust=0.4)
     _, moved = step(unsure, settings, lanes, STILL)

@@ -72,7 +72,7 @@ def test_the_noise_of_a_lane_is_the_same_whatever_the_number_of_lanes(lanes):
     assert torch.equal(uniform_noise(lanes, Purpose.START, 6)[3:4], uniform_noise(alone, Purpose.START, 6))
 
 
-def test_more_particles_go_on_where_fewer_ended(lanes):
+def test_noise_of_more_particles_extends_that_of_fewer(lanes):
     few, many = (normal_noise(lanes, Purpose.TRANSITION, count, 3) for count in (4, 9))
     assert torch.equal(many[:, :4], few)
 

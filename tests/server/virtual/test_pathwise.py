@@ -54,7 +54,7 @@ def test_a_place_answers_alike_throughout_an_episode(model, started):
     assert not np.allclose(elsewhere, first)
 
 
-def test_lanes_share_so_many_functions_from_starts_of_their_own(model, started):
+def test_lanes_share_functions_from_different_starts(model, started):
     settings, lanes = started(model, 6, variant="pathwise", functions=2)
     assert len(np.unique(lanes.q.numpy(), axis=0)) == 6
     _, there = moved(model, settings, lanes, 2.0, -6.0)

@@ -40,7 +40,7 @@ def test_a_list_of_seeds_makes_every_lane_the_first_of_its_own(definition):
         np.testing.assert_array_equal(listed[lane], starts(definition, 1, seed=seed)[0][0])
 
 
-def test_without_a_seed_each_lane_goes_on_to_its_next_episode(definition):
+def test_without_a_seed_each_lane_begins_its_next_episode(definition):
     first = starts(definition, 2, seed=7, episodes=3)
     assert len(np.unique(first[:, :, 0])) == 6
     np.testing.assert_array_equal(first, starts(definition, 2, seed=7, episodes=3))
@@ -62,7 +62,7 @@ def test_a_mask_keeps_the_others_as_they_are(definition):
     assert lanes.episode.tolist() == [0, 0, 0]
 
 
-def test_a_mask_that_names_nobody_changes_nothing(definition):
+def test_an_empty_mask_changes_nothing(definition):
     settings = VirtualSettings(2)
     fresh = create(definition, settings, 0)
     lanes, _ = reset(definition, settings, fresh, mask=np.zeros(2, dtype=bool))

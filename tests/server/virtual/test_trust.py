@@ -44,7 +44,7 @@ def test_the_range_is_in_units_of_the_samples_deviation(unsure, started):
     assert transition.untrusted.tolist() == [False, False, True]
 
 
-def test_without_a_range_nobody_is_told_of_one(unsure, started):
+def test_a_session_without_a_trusted_range_reports_none(unsure, started):
     _, transition = stepped(unsure, started, [0.1, 0.8, -2.0])
     assert transition.untrusted is None
     assert not transition.truncated.any()

@@ -113,7 +113,7 @@ def test_seeds_of_each_lane_are_the_same_over_every_transport(client: httpx.Clie
     np.testing.assert_array_equal(frames.reset_result(framed, SHAPE).observation, np.float32(again["observation"]))
 
 
-def test_a_refused_request_is_a_problem_frame_and_the_stream_goes_on(stream: ClientConnection):
+def test_the_stream_continues_after_the_problem_frame_of_a_refusal(stream: ClientConnection):
     exchange = over_stream(stream)
     refused = exchange(frames.step_request(1, ACTION, None, False))
     assert isinstance(refused, frames.ProblemReply)
@@ -165,7 +165,7 @@ def test_a_frame_belongs_to_its_route(client: httpx.Client, session: str):
     assert (reply.status_code, reply.json()["detail"]) == (422, "expected a StepRequest, got a ResetRequest")
 
 
-def test_a_form_there_is_none_of_is_refused(client: httpx.Client, session: str):
+def test_an_unknown_form_is_refused(client: httpx.Client, session: str):
     reply = client.post(f"/v1/sessions/{session}/step", content=b"1", headers={"content-type": "text/csv"})
     assert reply.json()["code"] == "unsupported_media_type"
     assert "application/json or application/vnd.msgpack, got text/csv" in reply.json()["detail"]

@@ -92,7 +92,7 @@ def test_the_papers_representation_moves_the_observation():
     assert float(off[:, 1].square().mean().sqrt()) < 0.5 * float(steps.q_next[:, 1].std())
 
 
-def test_what_never_varied_is_constant_and_certain():
+def test_an_output_that_never_varied_is_constant_and_certain():
     made = ensemble(cartpole())
     steps = random_steps(cartpole(), 5, seed=9)
     moved = made.transition(steps.q, steps.u, reward_deviation=True)

@@ -38,7 +38,7 @@ def test_a_reward_of_the_cosine_is_given_cos_and_sin(pendulum_definition):
 
 @pytest.mark.parametrize("task", [pendulum, cartpole])
 @pytest.mark.parametrize("seed", range(2))
-def test_a_body_that_is_its_own_mirror_image_is_found_to_be_so(task, seed):
+def test_the_symmetry_of_a_body_is_found(task, seed):
     model = learn(definition_from_spec(task()), random_steps(task(), 12, seed=seed)).model
     assert {output.feature_map.parity for output in model.transitions} == {"odd"}
     assert all(output.centre == 0 for output in model.transitions)
@@ -106,7 +106,7 @@ def test_a_constant_output_has_no_process_and_no_deviation(cartpole_model):
     assert deviation.tolist() == [0.0] * 3
 
 
-def test_an_ending_pays_what_it_paid_beyond_the_reward_process(cartpole_definition):
+def test_an_ending_adds_its_terminal_reward(cartpole_definition):
     steps = random_steps(cartpole(), 60, seed=0)
     assert bool(steps.terminated.any())
     assert bool((~steps.terminated).any())

@@ -45,7 +45,7 @@ def test_cartpole_ends_where_its_pole_has_fallen(model):
     assert float((model.termination_probability(unseen.q_next) > 0.5).double().mean()) > 0
 
 
-def test_where_no_threshold_tells_a_classifier_does():
+def test_a_classifier_separates_states_that_no_threshold_can():
     spec, steps = ACROBOT, random_steps(ACROBOT, 150, seed=1)
     region = learn_termination(OutputLearner(definition_from_spec(spec), Settings(), {}, {}), steps)
     assert isinstance(region.forms[0][1], Classifier)
@@ -63,7 +63,7 @@ def test_nothing_ends_before_anything_was_seen_to(model):
     assert bool(always.terminated(steps.q).all())
 
 
-def test_points_beyond_what_was_seen_are_unexplored(model):
+def test_points_beyond_the_seen_states_are_unexplored(model):
     seen = torch.tensor([[0.0, 0, 0, 0], [1, 1, 1, 1]], dtype=torch.float64)
     at = torch.tensor([[0.5, 0.5, 0.5, 0.5], [1.25, 0.5, 0.5, 0.5], [-0.5, 1.5, 0.5, 9]], dtype=torch.float64)
     assert unexplored(model.definition, seen, at).tolist() == [0, 0.25, 2]

@@ -76,7 +76,7 @@ def test_the_boundary_lies_midway_in_its_gap(plane):
     assert Thresholds(plane, rules).probability(at).tolist() == pytest.approx([0, 0.25, 0.5, 1])
 
 
-def test_axes_that_explain_the_same_samples_are_rivals_until_one_tells_them_apart(plane):
+def test_axes_compete_until_a_sample_distinguishes_them(plane):
     q = torch.tensor([[0.0, 0.0], [-0.8, -0.8], [0.2, -0.8], [-0.8, 0.2], [0.8, 0.8]], dtype=torch.float64)
     ended = torch.arange(5) == 4
     (form, _), *_ = thresholds(plane, q, ended)
