@@ -116,7 +116,7 @@ def _result(known: Known) -> str:
 
 
 def _beside(known: Known) -> str:
-    """Controlled beside uncontrolled, and beside a reference controller."""
+    """Comparison of the controller with no controller, and with a reference controller."""
     real, title = known.real, "With and without the controller"
     if real is None:
         return section(title, paragraph("There is nothing to compare yet."))

@@ -191,7 +191,7 @@ class _Objective:
         matrix = np.zeros((self.n, self.n))
         matrix.ravel()[self.places] = k
         matrix.flat[:: self.n + 1] += noise
-        if (solved := self._solve(matrix)) is None:  # float64 can't factor it: infinite cost for the line search
+        if (solved := self._solve(matrix)) is None:  # float64 can't factor it: a very large cost stops the line search
             return 1e10, np.zeros_like(theta)
         inverse, weights, log_root = solved
         product = weights.take(self.rows) * weights.take(self.columns)
