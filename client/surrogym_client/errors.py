@@ -1,4 +1,4 @@
-"""What can go wrong between a client and the service.
+"""Errors between a client and the service.
 
 SurrogymClientError
 ├── ServerUnreachable       no answer within the retry budget; the last request may have been carried out

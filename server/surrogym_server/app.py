@@ -83,21 +83,21 @@ A sampler claims queries and adds samples; a trainer opens a session and steps i
 
 @dataclass(frozen=True)
 class DesignPort:
-    """What does the design's work; tests put a cheaper one in its place."""
+    """Factory of the design's fits; tests replace it by a cheaper one."""
 
     plan: Plan = initial_queries
     run: Callable[[DesignJob], DesignResult] = run_design_job
 
 
 class State(TypedDict):
-    """What every request carries."""
+    """State of the app for every request."""
 
     services: Services
 
 
 @dataclass(frozen=True)
 class _Process:
-    """What a server process has beside its services."""
+    """Objects of a server process besides its services."""
 
     storage: Storage
     definitions: Definitions

@@ -22,7 +22,7 @@ Compare = Literal["zero", "random"]
 
 @dataclass(frozen=True)
 class Beside:
-    """What runs from the same starts as the policy."""
+    """A controller that runs from the same starts as the policy."""
 
     compare: Annotated[
         Compare | None,

@@ -43,7 +43,7 @@ def differ_from(
 
 @dataclass(frozen=True)
 class Differing:
-    """Where reality and the model disagree, for episodes whose reset seeds begin at ``first_seed``."""
+    """Steps at which reality and the model disagree, for episodes whose reset seeds begin at ``first_seed``."""
 
     found: Disagreements
     first_seed: int

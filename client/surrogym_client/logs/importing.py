@@ -29,15 +29,7 @@ Mapping_ = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Imported:
-    """What an import came to.
-
-    Attributes:
-        log: the log, with its specification and the rows that were set aside.
-        surrogate: where its steps went; None where nothing was sent.
-        sent: usable steps.
-        duplicates: of them were there before.
-        rejected_file: where the rows are that were set aside; None where there is none.
-    """
+    """Result of an import."""
 
     log: ReadLog
     surrogate: str | None = None

@@ -20,12 +20,7 @@ SURROGATE = ".surrogate"
 
 
 def format_of(path: Path) -> Format:
-    """What a log is, or that it is a surrogate's own file.
-
-    Raises:
-        OSError: there is no such file, and no Minari data set of this name.
-        UnusableLog: it is a folder, and no Minari data set.
-    """
+    """The format of a log, or that of a surrogate's file."""
     if path.suffix == SURROGATE:
         return "surrogate"
     if path.is_dir():

@@ -1,4 +1,4 @@
-"""What can go wrong beside the original environment.
+"""Errors of the original environment.
 
 OriginalError
 ├── UnknownEnvironment      nothing can be made of this name, or no specification can express it

@@ -99,7 +99,7 @@ class ResettableEnvironment(Protocol):
     """
 
     def spec(self) -> EnvironmentSpec:
-        """What is known of the environment before the first query."""
+        """Return the specification, known before the first query."""
         ...
 
     def reset(self, *, seed: int | None = None) -> tuple[Any, dict[str, Any]]:
@@ -121,10 +121,10 @@ class ResettableEnvironment(Protocol):
 
 @runtime_checkable
 class RolloutEnvironment(Protocol):
-    """What answers a rollout query: ``FromReset`` makes one of a ``ResettableEnvironment``."""
+    """Environment that answers rollout queries: ``FromReset`` makes one of a ``ResettableEnvironment``."""
 
     def spec(self) -> EnvironmentSpec:
-        """What is known of the environment before the first query."""
+        """Return the specification, known before the first query."""
         ...
 
     def begin(self, seed: int | None = None) -> Array:

@@ -26,14 +26,7 @@ DRAWN_WITH = {"gymnasium.envs.classic_control.": ("pygame", "render"), "gymnasiu
 
 @runtime_checkable
 class Drawable(Protocol):
-    """What an environment of one's own needs to be shown: one method beside its others.
-
-    Examples:
-        >>> def picture(self, coordinates):
-        ...     frame = np.full((100, 200, 3), 255, dtype=np.uint8)
-        ...     frame[45:55, int(100 + 80 * coordinates[0])] = 0
-        ...     return frame
-    """
+    """The additional method of a user's environment that can be rendered."""
 
     def picture(self, coordinates: Array) -> Picture:
         """The state at coordinates (C,)."""

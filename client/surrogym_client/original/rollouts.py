@@ -86,11 +86,7 @@ def _only_resets(environment: object) -> TypeGuard[ResettableEnvironment]:
 
 
 def answering(environment: object) -> Environment:
-    """What answers the kind of query that an environment's specification declares.
-
-    Raises:
-        UnknownEnvironment: it lacks the methods for it.
-    """
+    """Adapt an environment to the kind of query that its specification declares."""
     if _only_resets(environment):
         environment = FromReset(environment)
     if not isinstance(environment, (OriginalEnvironment, RolloutEnvironment)):

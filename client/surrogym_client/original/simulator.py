@@ -1,7 +1,4 @@
-"""What an adapter gives of a simulator, and the original environment that it makes with a specification.
-
-Shapes: V variables of the state, C coordinates, D entries of the simulator's own observation, F action entries.
-"""
+"""The interface of an adapter to a simulator, and the original environment made from it with a specification."""
 
 from __future__ import annotations
 
@@ -48,7 +45,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Taken:
-    """What one step of a simulator gave; ``observation`` is its own, (D,)."""
+    """Results of one step of a simulator; ``observation`` is its own, (D,)."""
 
     observation: Array
     reward: float
@@ -183,7 +180,7 @@ class Simulated:
         )
 
     def coordinates(self) -> Array:
-        """Where the simulator stands, (C,)."""
+        """Present coordinates of the simulator, (C,)."""
         return wrapped(self._spec, self.simulator.read()[self._columns])
 
     def close(self) -> None:

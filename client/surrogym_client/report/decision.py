@@ -128,7 +128,7 @@ def _beside(known: Known) -> str:
 
 
 def _gained(real: EvaluationDetail, other: EvaluationDetail) -> str:
-    """What the controller earned beyond another one from the same starts."""
+    """The gain in return over another controller from the same starts."""
     same = min(real.episodes, other.episodes)
     with_it = sum(real.returns[:same]) / same if real.returns else real.mean
     gain = with_it - (sum(other.returns[:same]) / same if other.returns else other.mean)

@@ -1,4 +1,4 @@
-"""What was not tested, and the next steps, in plain sentences. Each sentence follows from stored data."""
+"""Untested points, and the next steps, in plain sentences. Each sentence follows from stored data."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ FEW = 30  # episodes; fewer give an unreliable average
 
 
 def untested(known: Known) -> list[str]:
-    """What the real episodes do not cover."""
+    """Points that the real episodes do not cover."""
     policy, real = known.policy, known.real
     if policy is None:
         return ["Everything: there is no controller yet."]

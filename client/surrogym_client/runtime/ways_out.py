@@ -1,4 +1,4 @@
-"""What a person can do about what is missing."""
+"""Advice for a person about missing things: servers, tokens and packages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What goes into a session engine and what comes out of it: frozen data that pickles, and no callable.
+"""Requests and replies of a session engine: frozen data that pickle, without callables.
 
 Shapes: N lanes, C coordinates, F action entries, T steps.
 """
@@ -21,7 +21,8 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Opening:
-    """What a trainer asks for. A time limit or penalty of None is the surrogate's; a seed of None is drawn."""
+    """A trainer's request for a session. A time limit or penalty of None is the surrogate's; a seed of None
+    is drawn."""
 
     settings: VirtualSettings
     penalty: float | None

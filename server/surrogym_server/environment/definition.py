@@ -75,13 +75,13 @@ class ActionDefinition:
 
 @dataclass(frozen=True)
 class LearningDefinition:
-    """What a model is made of, every default resolved.
+    """Settings of a model, every default resolved.
 
     Attributes:
         model: family of models, by its name in ``models.registry``, and its settings.
         moves: what the transition outputs are increments of; under ``observation`` the coordinates are read back from
-            the observation, as the paper has it.
-        limits_rewards: whether virtual rewards are kept near those of the samples.
+            the observation, as in the paper.
+        limits_rewards: whether virtual rewards are limited by those of the samples.
     """
 
     model: Choice

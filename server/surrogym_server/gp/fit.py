@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FitOptions:
-    """What to fit, and the normal priors on logarithms: (mean, deviation). Inputs and outputs are standardised.
+    """Parts of the kernel, and the normal priors on logarithms: (mean, deviation). Inputs and outputs are standardised.
 
     The length scale's prior grows with sqrt(d), as distances do (Hvarfner et al., ICML 2024).
     """

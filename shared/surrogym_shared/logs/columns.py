@@ -48,18 +48,7 @@ Limits = Annotated[list[float | None], Field(min_length=2, max_length=2)]
 
 @dataclass(frozen=True)
 class Roles:
-    """What the columns of a log are.
-
-    Attributes:
-        state: column of each coordinate, by the coordinate's name, in order.
-        action: column of each action entry, by its name.
-        following: column of the next state, of all coordinates or of none.
-        reward, terminated, truncated, episode, time: columns; None where the log has none.
-        limits: declared ends (low, high) of coordinates and action entries, by name.
-        angles, constants: coordinates declared as such.
-        discrete: whether the action is declared as the number of a discrete one; None leaves it to the data.
-        ignored: columns that are none of these.
-    """
+    """Roles of the columns of a log."""
 
     state: Mapping[str, str]
     action: Mapping[str, str]
@@ -123,11 +112,7 @@ class LogMapping(FailFast):
 
 
 def roles_by_name(names: Sequence[str]) -> Roles:
-    """What the columns are by their names; see the how-to page on logs.
-
-    Raises:
-        UnusableLog: no column is an action, or none a state.
-    """
+    """Find the roles of columns by their names; see the how-to page on logs."""
     single: dict[str, Any] = {role: _first(names, known) for role, known in SINGLE.items()}
     left = [name for name in names if name not in single.values()]
     action = {_part(ACTION.match(name)) or "0": name for name in left if ACTION.match(name)}
@@ -160,12 +145,12 @@ def roles_by_file(path: Path, names: Sequence[str]) -> Roles:
 
 
 def roles_by_map(content: Mapping[str, Any], names: Sequence[str], where: str = "the mapping") -> Roles:
-    """What the columns are by a mapping. Raises ``UnusableLog`` as ``roles_by_file``."""
+    """Find the roles of columns by a mapping. Raises ``UnusableLog`` like ``roles_by_file``."""
     return roles_by_mapping(_mapped(content, where), names, where)
 
 
 def roles_by_mapping(mapped: LogMapping, names: Sequence[str], where: str = "the mapping") -> Roles:
-    """What the columns are by a mapping that was read. Raises ``UnusableLog``: it names a column that the log lacks."""
+    """Find the roles of columns by a parsed mapping. Raises ``UnusableLog`` if it names a missing column."""
     fields: dict[str, Any] = {role: getattr(mapped, role) or None for role in SINGLE}
     state, action = _by_name(mapped.state), _by_name(mapped.action)
     wanted = [*state.values(), *action.values(), *mapped.next.values(), *filter(None, fields.values())]
@@ -247,7 +232,7 @@ def _first(names: Iterable[str], known: Sequence[str]) -> str | None:
 
 
 def _part(match: re.Match[str] | None) -> str:
-    """What the name has beside its prefix or its ending."""
+    """The part of a name without its prefix or its ending."""
     return "" if match is None else next((part for part in match.groups() if part), "")
 
 

@@ -146,7 +146,7 @@ def _stays_at(after: Floats, end: float, ends: tuple[float, float]) -> bool:
 
 
 def _start(coordinate: Coordinate, steps: Transitions, index: int) -> Uniform | Fixed:
-    """Where episodes of the log begin; a log of a single episode begins anywhere that it has been."""
+    """Starts of the log's episodes. If the log is a single episode, any of its states is a start."""
     begins = steps.q[steps.first, index]
     values = begins if len(begins) >= FEW_EPISODES else steps.q[:, index]
     if coordinate.kind == "angle":

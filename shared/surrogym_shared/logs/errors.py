@@ -1,4 +1,4 @@
-"""What can go wrong with a whole log; what is wrong with one row sets that row aside."""
+"""Errors of whole logs. A fault in one row only sets that row aside."""
 
 from __future__ import annotations
 

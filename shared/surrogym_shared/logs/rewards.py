@@ -10,7 +10,7 @@ from surrogym_shared.terms import evaluate, holds
 
 
 def declared_reward(spec: EnvironmentSpec, q: Floats, u: Floats, q_next: Floats, terminated: Bools) -> Floats:
-    """What a declared reward pays for n steps, (n,). Raises TypeError where the reward is learned."""
+    """Declared rewards of n steps, (n,). Raises ``TypeError`` if the reward is learned."""
     reward = spec.reward
     if not isinstance(reward, DeclaredReward):
         raise TypeError(f"expected a declared reward, got a {reward.kind} one")

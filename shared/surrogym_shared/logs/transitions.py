@@ -64,7 +64,7 @@ def transitions_of(rows: Rows) -> Transitions:
     order = [row for row in np.argsort(episode, kind="stable").tolist() if rows.faults.get(row) or row not in rejected]
     out_of_order = _backwards(rows, episode, order, rejected)
     _reject(rejected, out_of_order)
-    order = [row for row in order if row not in out_of_order]  # the row before goes on with the one behind
+    order = [row for row in order if row not in out_of_order]  # the row before continues with the one after
     follower = {a: b for a, b in pairwise(order) if episode[a] == episode[b]}
     if rows.episode is not None:
         _reject(rejected, _going_on(rows, follower, rejected))

@@ -40,7 +40,7 @@ class RejectedRow(Reply):
 
 
 class LogReport(Reply):
-    """What the rows of a log came to."""
+    """Result of reading a log's rows."""
 
     rows: int
     steps: int = Field(description="usable ones")

@@ -50,7 +50,7 @@ class PolicyAudit(BaseModel):
 
 
 class PushedCard(BaseModel):
-    """What a policy was trained for, and how. Unknown fields are dropped."""
+    """Settings and results of a policy's training. Unknown fields are dropped."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
@@ -198,7 +198,7 @@ class PolicyView(Reply):
     imagined_return: float | None
     promise: PolicyPromise | None
     audit: PolicyAudit | None
-    trusted: bool | None = Field(description="None: nobody judged the promise")
+    trusted: bool | None = Field(description="None: nobody checked whether the promise can be trusted")
     reason: str
     differs: str | None = Field(
         description="where the specification that it was made for differs from the surrogate's; None: it does not"

@@ -125,7 +125,7 @@ class WithdrawQueries(Request):
 
 
 class WithdrawnQueries(Reply):
-    withdrawn: int = Field(description="how many were removed: those that were pending and that no sampler had begun")
+    withdrawn: int = Field(description="how many were removed: pending ones that no sampler had begun")
 
 
 class NewSample(Request):

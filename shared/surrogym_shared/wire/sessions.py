@@ -42,8 +42,8 @@ class OpenSession(Request):
     process_noise: bool = Field(default=False, description="the learned noise moves the state")
     trust: Annotated[float, Field(gt=0, le=1_000)] | None = Field(
         default=None,
-        description="an episode ends, truncated, where an output's standard deviation exceeds so many times the "
-        "deviation that output has over the samples; None: nowhere",
+        description="truncate an episode when an output's predicted standard deviation exceeds this factor times the "
+        "output's standard deviation in the samples; None: no limit",
     )
     particles: Annotated[int, Field(ge=1, le=MAX_PARTICLES)] = Field(
         default=1_000, description="of a lane; this and the next three are the probabilistic variant's"
@@ -59,8 +59,8 @@ class OpenSession(Request):
     )
     functions: Annotated[int, Field(ge=1, le=MAX_LANES)] | None = Field(
         default=None,
-        description="variant pathwise: lane i follows function i modulo so many, so that lanes share "
-        "functions from different starts; None: each lane its own",
+        description="variant pathwise: number of functions; lane i follows function i modulo it, so that lanes "
+        "share functions from different starts; None: one function for each lane",
     )
     occupancy: bool = Field(default=False, description="collect visited coordinates, to be submitted at checkpoints")
     idempotency_key: Key | None = None
@@ -131,14 +131,14 @@ class SessionActivity(Reply):
     num_envs: int
     variant: Variant
     model: Literal["latest"] | int
-    model_version: list[int] = Field(description="versions its lanes are under now, without repetition")
+    model_version: list[int] = Field(description="model versions that its lanes use now, each once")
     steps: int = Field(description="of all lanes")
     steps_per_second: float = Field(description="of all lanes, over about the last ten seconds")
     idle_seconds: float = Field(description="since its last step")
     penalty: float = Field(description="k of eq. 14")
     episodes: int = Field(description="that ended")
     returns: list[float] = Field(description="imagined, of the last episodes that ended, oldest first")
-    penalties: list[float] = Field(description="what was taken off each of them for its deviations")
+    penalties: list[float] = Field(description="penalty for deviations that was subtracted from each of them")
 
 
 class SessionList(Reply):

@@ -102,7 +102,9 @@ class SurrogateSummary(Reply):
     budget: int = Field(description="real steps the design may take")
     ledger: Ledger
     queries: QueryCounts
-    samplers: list[str] = Field(default=[], description="names of those that were heard of within the last minute")
+    samplers: list[str] = Field(
+        default=[], description="names of the samplers that sent a request within the last minute"
+    )
     sessions: int = Field(default=0, description="open ones")
     created_at: float = Field(description="seconds since 1970, the server's clock")
 
@@ -110,7 +112,7 @@ class SurrogateSummary(Reply):
 class SurrogateView(SurrogateSummary):
     spec: EnvironmentSpec
     budget_left: int = Field(
-        description="real steps of the budget that are neither taken, nor asked for, nor promised to who asked for more"
+        description="real steps of the budget that are not taken, not queried, and not promised to a request for more"
     )
     tolerances: dict[str, float] = Field(description="set since the surrogate was created, by output, in its own unit")
     outputs: list[str]

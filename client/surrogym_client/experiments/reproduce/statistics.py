@@ -59,7 +59,7 @@ def exact_interval(count: int, of: int) -> tuple[float, float]:
 
 
 def _root(rising: Callable[[float], float]) -> float:
-    """Where a function that rises over [0, 1] is 0, by halving."""
+    """Zero of a function that increases over [0, 1], by bisection."""
     low, high = 0.0, 1.0
     for _ in range(HALVINGS):
         middle = (low + high) / 2

@@ -1,4 +1,4 @@
-"""What the tasks share: a formula, the ranges of its state, and noise of steps or of sensors."""
+"""Shared parts of the tasks: a formula, the ranges of its state, and noise of steps or of sensors."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Machine:
         raise NotImplementedError
 
     def spec(self) -> EnvironmentSpec:
-        """What is known beforehand."""
+        """Return the specification, known before the first query."""
         return EnvironmentSpec(
             environment=type(self).__name__,
             coordinates=tuple(

@@ -170,7 +170,7 @@ class ResetOnly:
         self._q = np.zeros(3)
 
     def spec(self) -> EnvironmentSpec:
-        """What is known beforehand."""
+        """Return the specification, known before the first query."""
         return EnvironmentSpec.model_validate({**self._plate.spec().model_dump(), "query": "rollout"})
 
     def reset(self, *, seed: int | None = None) -> tuple[Array, dict[str, Any]]:

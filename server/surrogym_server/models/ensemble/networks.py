@@ -29,7 +29,7 @@ class Networks:
 
     @property
     def hidden(self) -> tuple[Tensor, ...]:
-        """What is trained by gradients: all but the skip."""
+        """Weights trained by gradients: all except the skip."""
         return (self.first, self.first_bias, self.second, self.second_bias, self.last)
 
     def __call__(self, x: Tensor) -> Tensor:
