@@ -92,7 +92,9 @@ class RayEngine(SessionEngine):
         self._places.pop(session, None)
         with suppress(Unavailable, TimeoutError):  # a host that does not answer now finds the record gone
             async with asyncio.timeout(ANSWERING_SECONDS):
-                await self._reply(_number(holder.owner) if holder else self._place(session), "close", session)
+                host = _number(holder.owner) if holder else self._place(session)
+                if host < len(self._hosts):
+                    await self._reply(host, "close", session)
 
     async def forget(self, surrogate: int) -> None:
         await asyncio.to_thread(self._store.remove_all_of, surrogate)
@@ -157,7 +159,8 @@ class RayEngine(SessionEngine):
             raise error if isinstance(error, UnknownSession) else unknown
         if holder.seconds_left <= 0:
             return self._remember(session, await self._taken(session, asked, holder.machine))
-        if (host := _number(holder.owner)) == asked:
+        host = _number(holder.owner)
+        if host == asked or host >= len(self._hosts):  # of a larger pool that was here before
             raise Unavailable(
                 f"session host {host} has ended, and another one takes session {session!r} in "
                 f"{holder.seconds_left:.1f} s: try again later"

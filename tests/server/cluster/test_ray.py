@@ -5,21 +5,22 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from support.postgresql import running_postgresql
-from support.server import running_server
+from support.postgresql import Postgresql, running_postgresql
+from support.server import ServerProcess, running_server
 from surrogym_client.original import classic
-from surrogym_client.transport import HttpSurrogate
+from surrogym_client.transport import HttpSurrogate, Transport
 from surrogym_server.cluster import pool
 from surrogym_server.cluster.host import Refused
 from surrogym_server.convert import stored_definition
@@ -40,14 +41,19 @@ pytestmark = [pytest.mark.postgresql, pytest.mark.timeout(600), pytest.mark.filt
 
 
 @pytest.fixture(scope="module")
-def database(fill: Callable[[Storage], int]) -> Iterator[str]:
-    """A PostgreSQL with one surrogate that has a model."""
-    with running_postgresql() as postgresql:
-        url = postgresql.new_database()
-        storage = open_storage(url)
-        fill(storage)
-        storage.close()
-        yield url
+def postgresql() -> Iterator[Postgresql]:
+    with running_postgresql() as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def database(postgresql: Postgresql, fill: Callable[[Storage], int]) -> str:
+    """A PostgreSQL database with one surrogate that has a model."""
+    url = postgresql.new_database()
+    storage = open_storage(url)
+    fill(storage)
+    storage.close()
+    return url
 
 
 @pytest.fixture(scope="module")
@@ -114,6 +120,22 @@ def test_a_session_goes_on_at_another_host_when_its_own_died_or_stopped(
         assert [step_of(reply) for reply in (*before, *after)] == [step_of(reply) for reply in expected]
 
     asyncio.run(moved())
+
+
+def test_a_request_that_takes_long_is_waited_for(case: EngineCase, storage: Storage, monkeypatch: pytest.MonkeyPatch):
+    """As long as its host renews the lease, at which the front server looks again and again."""
+    looks, look = [], storage.live_sessions.holder
+    monkeypatch.setattr(storage.live_sessions, "holder", lambda id: (looks.append(id), look(id))[1])
+    monkeypatch.setattr(case.engine, "_patience", 1e-3)
+
+    async def waited() -> None:
+        session = await case.opened()
+        asked = case.policy(session, 2)
+        reply = await case.engine.advance(replace(asked, run=replace(asked.run, steps=500)))
+        assert reply.seq == 2
+        assert looks.count(session) > 2
+
+    asyncio.run(waited())
 
 
 @dataclass(frozen=True)
@@ -190,34 +212,58 @@ def test_any_front_server_goes_on_with_a_session(database: str, address: str, en
             client.close()
 
 
-@pytest.mark.long
-def test_a_client_goes_on_bit_for_bit_while_hosts_are_killed(
-    database: str, address: str, engine: SessionEngine, tmp_path: Path
-):
-    """Over the stream, and by frames over HTTP: the client sends its last requests again by itself."""
+@pytest.fixture
+def server(database: str, address: str, engine: SessionEngine, tmp_path: Path) -> Iterator[ServerProcess]:
+    """A front server."""
     options = ("--database", database, "--engine", "ray", "--ray-address", address)
     environment = {"SURROGYM_RAY_LEASE_SECONDS": str(LEASE), "SURROGYM_RAY_CHECKPOINT_SECONDS": "0.1"}
+    with running_server(tmp_path, *options, **environment) as running:
+        yield running
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("transport", ["stream", "binary"])
+def test_a_client_goes_on_bit_for_bit_while_hosts_are_killed(
+    server: ServerProcess, database: str, storage: Storage, transport: Transport
+):
+    """The client sends its last requests again by itself."""
+
+    def kill_its_host(session: str) -> None:
+        holder = storage.live_sessions.holder(session)
+        assert holder is not None
+        owner = int(holder.owner.partition(" ")[0])
+        [host] = [one for one in asyncio.run(about(database)) if one.number == owner]
+        os.kill(host.pid, signal.SIGKILL)
+
+    with HttpSurrogate(server.url, NAME, transport=transport) as port:
+        undisturbed = walked(port, {})
+        np.testing.assert_array_equal(walked(port, {120: kill_its_host, 250: kill_its_host}), undisturbed)
+
+
+@pytest.mark.long
+def test_a_client_goes_on_bit_for_bit_while_postgresql_crashes(server: ServerProcess, postgresql: Postgresql):
+    """Steps go on until the lease ends, and again when the database is back."""
+
+    def away_for_longer_than_a_lease(_: str) -> None:
+        postgresql.stop()
+        time.sleep(2 * LEASE)
+        threading.Timer(1.0, postgresql.start).start()
+
+    with HttpSurrogate(server.url, NAME) as port:
+        undisturbed = walked(port, {})
+        found = walked(port, {120: lambda _: postgresql.stop(), 140: lambda _: postgresql.start()})
+        np.testing.assert_array_equal(found, undisturbed)
+        np.testing.assert_array_equal(walked(port, {200: away_for_longer_than_a_lease}), undisturbed)
+
+
+def walked(port: HttpSurrogate, disturbances: dict[int, Callable[[str], None]]) -> list[Any]:
+    """Observations of a new session's steps, with what happens before some of them."""
     actions = np.random.default_rng(0).uniform(-2, 2, (400, 2, 1))
-    with running_server(tmp_path, *options, **environment) as server:
-        for transport in ("stream", "binary"):
-            with HttpSurrogate(server.url, NAME, transport=transport) as port:
-                found = [walked(port, actions), walked(port, actions, {120: database, 250: database})]
-            np.testing.assert_array_equal(found[0], found[1])
-
-
-def walked(port: HttpSurrogate, actions: NDArray[np.float64], kills: dict[int, str] | None = None) -> list[Any]:
-    """Observations of a new session's steps; before some of them its host is killed."""
     session = port.open(OpenSession(num_envs=2, seed=0)).id
     observations = [port.reset(session).observation]
     for number, action in enumerate(actions):
-        if database := (kills or {}).get(number):
-            storage = open_storage(database)
-            holder = storage.live_sessions.holder(session)
-            storage.close()
-            assert holder is not None
-            owner = int(holder.owner.partition(" ")[0])
-            [host] = [one for one in asyncio.run(about(database)) if one.number == owner]
-            os.kill(host.pid, signal.SIGKILL)
+        if happens := disturbances.get(number):
+            happens(session)
         observations.append(port.step(session, action).observation)
     port.close(session)
     return observations
