@@ -228,8 +228,9 @@ def _build_process(
         idle_seconds=settings.session_idle_seconds,
         device=torch.device(settings.device),
     )
-    notices = Notices(storage.announcements)
-    return _Process(storage, definitions, models, engine, Fits(design.run, settings.fit_workers), notices, metrics)
+    shared = pool.fits_of(settings, design.run) if settings.engine == "ray" else None
+    fits = shared or Fits(design.run, settings.fit_workers)
+    return _Process(storage, definitions, models, engine, fits, Notices(storage.announcements), metrics)
 
 
 def _build_services(settings: Settings, design: DesignPort, process: _Process) -> Services:

@@ -1,1 +1,1 @@
-"""Sessions in a Ray cluster: a fixed pool of processes, each with a ``LocalEngine``, behind ``SessionEngine``."""
+"""A Ray cluster behind the ports: sessions in a fixed pool of processes, with leases and checkpoints; fits as tasks."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import socket
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from importlib.util import find_spec
 from typing import Any
@@ -12,7 +12,8 @@ from typing import Any
 import sqlalchemy as sa
 
 from surrogym_server.cluster.host import HostInfo, HostSettings, SessionHost, versions
-from surrogym_server.engine.port import SessionEngine
+from surrogym_server.engine.design_job import DesignJob, DesignResult
+from surrogym_server.engine.port import Compute, SessionEngine
 from surrogym_server.errors import InvalidInput, Unavailable
 from surrogym_server.settings import Settings
 from surrogym_server.storage.live_sessions import LiveSessions
@@ -62,6 +63,25 @@ def connect(settings: Settings, store: LiveSessions) -> SessionEngine:
             raise InvalidInput(f"engine ray: expected a cluster of the same versions: {said}") from error
         raise Unavailable(f"engine ray: the cluster can't be used: {said}") from error
     return _of_hosts(HostSettings.of(settings), store)
+
+
+def fits_of(settings: Settings, function: Callable[[DesignJob], DesignResult]) -> Compute | None:
+    """What computes fits in the cluster that ``connect`` has found; None if all its CPUs are taken by session hosts."""
+    import ray
+
+    from surrogym_server.cluster.fits import RayFits
+
+    untyped: Any = ray
+    cpus: float = untyped.cluster_resources().get("CPU", 0.0)
+    if cpus <= settings.ray_hosts:
+        logger.warning(
+            "fits run on this machine: the cluster has %g CPUs, and each of its %d session hosts takes one",
+            cpus,
+            settings.ray_hosts,
+        )
+        return None
+    logger.info("fits run as tasks of the cluster")
+    return RayFits(function)
 
 
 def _knock(address: str) -> None:

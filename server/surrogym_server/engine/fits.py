@@ -26,8 +26,8 @@ Function = Callable[[DesignJob], DesignResult]
 
 
 @dataclass(frozen=True)
-class _Failure:
-    """Error of a job as text, because the exception itself may not pickle, or may end the process that receives it."""
+class Failure:
+    """What a job raised, as words: the exception itself may be one that can't be sent, or that ends who receives it."""
 
     kind: type[PluginFailed]
     said: str
@@ -59,7 +59,7 @@ class Fits(Compute):
             self._busy.append(process)
             whole = False
             try:
-                outcome = await asyncio.wrap_future(process.pool.submit(_done, self._function, job))
+                outcome = await asyncio.wrap_future(process.pool.submit(done, self._function, job))
                 whole = True
             except BrokenProcessPool:
                 continue
@@ -67,8 +67,8 @@ class Fits(Compute):
                 raise PluginFailed(in_one_line(error)) from error
             finally:
                 self._give_back(process, whole)
-            if isinstance(outcome, _Failure):
-                raise _failure(outcome)
+            if isinstance(outcome, Failure):
+                raise error_of(outcome)
             return outcome
         raise Unavailable(
             "the process that fits models died twice on the same job; perhaps the machine has too little memory"
@@ -118,17 +118,18 @@ class _Process:
             self.pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _done(function: Function, job: DesignJob) -> DesignResult | _Failure:
-    """Run the job in the other process. No error leaves it as an exception, not even one that would end a process."""
+def done(function: Function, job: DesignJob) -> DesignResult | Failure:
+    """Do a job, in another process. Whatever it raises is returned, even what would end the process."""
     try:
         return function(job)
     except BaseException as error:
         on_purpose = isinstance(error, SurrogymError) and error.__cause__ is None
         kind = ChoiceFailed if isinstance(error, ChoiceFailed) else PluginFailed
-        return _Failure(kind, in_one_line(error), "" if on_purpose else traceback.format_exc())
+        return Failure(kind, in_one_line(error), "" if on_purpose else traceback.format_exc())
 
 
-def _failure(outcome: _Failure) -> PluginFailed:
+def error_of(outcome: Failure) -> PluginFailed:
+    """The error to raise for a failure, with its details as a note."""
     failure = outcome.kind(outcome.said)
     if outcome.details:
         failure.add_note(outcome.details)

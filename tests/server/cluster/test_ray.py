@@ -17,6 +17,7 @@ import httpx
 import numpy as np
 import pytest
 
+from support import pendulum
 from support.postgresql import Postgresql, running_postgresql
 from support.server import ServerProcess, running_server
 from surrogym_client.original import classic
@@ -60,7 +61,7 @@ def database(postgresql: Postgresql, fill: Callable[[Storage], int]) -> str:
 def address() -> Iterator[str]:
     """Of a Ray cluster that this process begins."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    begun = ray.init(num_cpus=HOSTS, namespace=pool.NAMESPACE, include_dashboard=False, log_to_driver=False)
+    begun = ray.init(num_cpus=HOSTS + 1, namespace=pool.NAMESPACE, include_dashboard=False, log_to_driver=False)
     yield str(begun.address_info["gcs_address"])
     ray.shutdown()
 
@@ -238,6 +239,13 @@ def test_a_client_goes_on_bit_for_bit_while_hosts_are_killed(
     with HttpSurrogate(server.url, NAME, transport=transport) as port:
         undisturbed = walked(port, {})
         np.testing.assert_array_equal(walked(port, {120: kill_its_host, 250: kill_its_host}), undisturbed)
+
+
+@pytest.mark.long
+def test_a_front_server_designs_with_fits_in_the_cluster(server: ServerProcess):
+    with httpx.Client(base_url=server.url, timeout=60) as client:
+        assert pendulum.teach(client, "taught")["model_version"] >= 1
+    assert "fits run as tasks of the cluster" in server.log
 
 
 @pytest.mark.long

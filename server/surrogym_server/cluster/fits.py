@@ -1,0 +1,80 @@
+"""RayFits: each round of a design is a task of a Ray cluster, which runs where a CPU is free."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import platform
+from collections.abc import Awaitable, Mapping
+from contextlib import suppress
+from typing import Any, cast
+
+import ray
+from ray.exceptions import RayError, RayTaskError, TaskCancelledError
+
+from surrogym_server.cluster.host import versions
+from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
+from surrogym_server.engine.fits import Failure, Function, done, error_of
+from surrogym_server.engine.port import Compute
+from surrogym_server.errors import PluginFailed, Unavailable
+from surrogym_server.plugins import in_one_line
+
+logger = logging.getLogger(__name__)
+
+RETRIES = 1  # of a job whose process or machine died
+
+
+class RayFits(Compute):
+    """A task for each job. Ray ends them when this process ends, however it ends.
+
+    Args:
+        function: what does a job.
+    """
+
+    def __init__(self, function: Function = run_design_job) -> None:
+        self._function = function
+        self._running: set[Any] = set()
+        self._task: Any = ray.remote(num_cpus=1, max_retries=RETRIES)(_done_there)
+
+    def start(self) -> None:
+        """Ray starts its processes itself."""
+
+    async def run(self, job: DesignJob) -> DesignResult:
+        asked = self._task.remote(self._function, job, versions())
+        self._running.add(asked)
+        try:
+            outcome = await cast(Awaitable[Any], asked)
+        except RayTaskError as error:  # the result can't be sent
+            raise PluginFailed(in_one_line(error.cause or error)) from error
+        except TaskCancelledError as error:
+            raise Unavailable("the fit was ended: this server stops") from error
+        except RayError as error:
+            raise Unavailable(f"the process or machine of a fit died: {in_one_line(error)}") from error
+        except asyncio.CancelledError:
+            await asyncio.to_thread(_end, asked)
+            raise
+        finally:
+            self._running.discard(asked)
+        if isinstance(outcome, Failure):
+            raise error_of(outcome)
+        return cast(DesignResult, outcome)
+
+    def close(self) -> None:
+        for asked in list(self._running):
+            _end(asked)
+        self._running.clear()
+
+
+def _end(asked: Any) -> None:
+    """End the process of a task."""
+    with suppress(RayError, ValueError):
+        ray.cancel(asked, force=True)
+
+
+def _done_there(function: Function, job: DesignJob, expected: Mapping[str, str]) -> DesignResult | Failure:
+    """In a process of the cluster, perhaps on another machine."""
+    for name, here in versions().items():
+        if here != expected[name]:
+            wrong = f"expected {name} {expected[name]} on every machine of the cluster, got {here} on {platform.node()}"
+            return Failure(PluginFailed, wrong, "")
+    return done(function, job)
