@@ -1,7 +1,5 @@
 """Cells: every combination once, resumed, several at once, ended together, and none lost that ended badly."""
 
-import json
-import sys
 import time
 from collections import Counter
 from dataclasses import replace
@@ -10,34 +8,12 @@ import pytest
 
 from support.commands import parse
 from support.metrics import METRICS
+from support.studies import ignore, stand_in
 from surrogym_client.experiments.arms import ARMS
 from surrogym_client.experiments.reproduce.cells import Cell, cells, demo_command, done_already, run_cells, study
 from surrogym_client.experiments.reproduce.rows import Row, read_rows, row_of
 from surrogym_client.experiments.settings import DemoSettings
 from surrogym_client.experiments.tasks import TASKS
-
-
-def stand_in(seconds=0.0, fails=()):
-    """A command that leaves the metrics of its cell, as a demo does."""
-
-    def command(cell, run):
-        s = cell.settings
-        own = {**METRICS, "task": s.task, "arm": s.arm, "seed": s.seed, "budget": s.real_steps}
-        own["specification"] = cell.specification
-        script = (
-            f"import os, pathlib, sys, time; time.sleep({seconds}); "
-            f"sys.exit('error: no luck') if {s.seed in fails} else None; "
-            f"run = pathlib.Path({str(run)!r}); run.mkdir(parents=True); "
-            f"assert os.environ['OMP_NUM_THREADS'] == '1'; "
-            f"(run / 'metrics.json').write_text({json.dumps(own)!r})"
-        )
-        return [sys.executable, "-c", script]
-
-    return command
-
-
-def ignore(progress):
-    pass
 
 
 def test_every_combination_is_a_cell_and_seeds_come_evenly():

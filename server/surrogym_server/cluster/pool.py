@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import socket
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from importlib.util import find_spec
@@ -17,11 +16,12 @@ from surrogym_server.engine.port import Compute, SessionEngine
 from surrogym_server.errors import InvalidInput, Unavailable
 from surrogym_server.settings import Settings
 from surrogym_server.storage.live_sessions import LiveSessions
+from surrogym_shared.ray_address import require_cluster
 
 logger = logging.getLogger(__name__)
 
 NAMESPACE = "surrogym"
-STARTING_SECONDS, KNOCKING_SECONDS = 180.0, 10.0
+STARTING_SECONDS = 180.0
 
 
 def check(settings: Settings) -> None:
@@ -49,7 +49,10 @@ def connect(settings: Settings, store: LiveSessions) -> SessionEngine:
     check(settings)
     import ray
 
-    _knock(settings.ray_address)
+    try:
+        require_cluster(settings.ray_address)
+    except ValueError as error:
+        raise InvalidInput(f"engine ray: {error}") from error
     quiet: dict[str, Any] = {"log_to_driver": False, "configure_logging": False}
     try:
         ray.init(settings.ray_address, namespace=NAMESPACE, ignore_reinit_error=True, **quiet)
@@ -82,19 +85,6 @@ def fits_of(settings: Settings, function: Callable[[DesignJob], DesignResult]) -
         return None
     logger.info("fits run as tasks of the cluster")
     return RayFits(function)
-
-
-def _knock(address: str) -> None:
-    """Raise ``InvalidInput`` where nobody listens: Ray would try for minutes, and then end this process."""
-    if address == "auto":
-        return
-    host, _, port = address.rpartition(":")
-    if not (host and port.isascii() and port.isdigit()) or "/" in host:
-        raise InvalidInput(f"setting ray_address: expected auto or host:port, got {address!r}")
-    try:
-        socket.create_connection((host, int(port)), KNOCKING_SECONDS).close()
-    except (OSError, OverflowError) as error:
-        raise InvalidInput(f"engine ray: expected a cluster at {address!r}, got none: {error}") from error
 
 
 def _of_hosts(wanted: HostSettings, store: LiveSessions) -> SessionEngine:

@@ -61,7 +61,9 @@ def database(postgresql: Postgresql, fill: Callable[[Storage], int]) -> str:
 def address() -> Iterator[str]:
     """Of a Ray cluster that this process begins."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    begun = ray.init(num_cpus=HOSTS + 1, namespace=pool.NAMESPACE, include_dashboard=False, log_to_driver=False)
+    begun = ray.init(
+        "local", num_cpus=HOSTS + 1, namespace=pool.NAMESPACE, include_dashboard=False, log_to_driver=False
+    )
     yield str(begun.address_info["gcs_address"])
     ray.shutdown()
 

@@ -29,7 +29,7 @@ pytestmark = [pytest.mark.timeout(600), pytest.mark.filterwarnings("ignore::Futu
 @pytest.fixture(scope="module", autouse=True)
 def cluster() -> Iterator[None]:
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    ray.init(num_cpus=2, namespace=pool.NAMESPACE, include_dashboard=False, log_to_driver=False)
+    ray.init("local", num_cpus=2, namespace=pool.NAMESPACE, include_dashboard=False, log_to_driver=False)
     yield
     ray.shutdown()
 

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -65,6 +66,7 @@ class Cell:
 
 
 Command = Callable[[Cell, Path], list[str]]
+Begin = Callable[[Cell, Path, Command], "Run"]
 
 
 @dataclass(frozen=True)
@@ -130,6 +132,7 @@ def run_cells(
     jobs: int,
     tell: Callable[[Progress], None],
     command: Command = demo_command,
+    begin: Begin | None = None,
 ) -> list[Row]:
     """Run cells, several at once. ``rows.csv`` in the folder is written after each.
 
@@ -140,17 +143,18 @@ def run_cells(
         jobs: cells at once.
         tell: called at every poll.
         command: runs a cell into a run folder, where it leaves ``metrics.json``.
+        begin: begins a run; None begins a process of this machine.
 
     Returns:
         All rows, old and new. A failed run has a row too, with its error.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    known, waiting, running = list(rows), list(todo), list[Job]()
+    known, waiting, running = list(rows), list(todo), list[Run]()
     new: list[Row] = []
     try:
         while waiting or running:
             while waiting and len(running) < jobs:
-                running.append(Job(waiting.pop(0), folder, command))
+                running.append((begin or ProcessRun)(waiting.pop(0), folder, command))
             for job in [job for job in running if job.over]:
                 running.remove(job)
                 new.append(job.row())
@@ -167,18 +171,54 @@ def run_cells(
     return known
 
 
-class Job:
-    """A running cell."""
+@dataclass(frozen=True)
+class Places:
+    """Where a cell leaves its run folder and its log."""
+
+    run: Path
+    log: Path
+
+    @classmethod
+    def of(cls, cell: Cell, folder: Path) -> Places:
+        """The places of a cell in the folder of a study, without what an earlier run left there."""
+        places = cls(folder / "runs" / cell.name, folder / "logs" / f"{cell.name}.log")
+        shutil.rmtree(places.run, ignore_errors=True)
+        places.log.parent.mkdir(exist_ok=True)
+        return places
+
+
+class Run(ABC):
+    """A cell that runs."""
+
+    cell: Cell
+
+    @property
+    @abstractmethod
+    def over(self) -> bool:
+        """Whether it has ended, well or not."""
+
+    @abstractmethod
+    def row(self) -> Row:
+        """Return what the run gave, once it is over."""
+
+    @abstractmethod
+    def end(self) -> None:
+        """Ask it to end."""
+
+    @abstractmethod
+    def wait(self) -> None:
+        """Wait for its end for a while, and make sure of it."""
+
+
+class ProcessRun(Run):
+    """A cell that runs in a process of this machine."""
 
     def __init__(self, cell: Cell, folder: Path, command: Command) -> None:
         self.cell = cell
-        run, logs = folder / "runs" / cell.name, folder / "logs"
-        self._metrics, self._log = run / "metrics.json", logs / f"{cell.name}.log"
-        shutil.rmtree(run, ignore_errors=True)
-        logs.mkdir(exist_ok=True)
-        with self._log.open("wb") as log:
+        self._places = Places.of(cell, folder)
+        with self._places.log.open("wb") as log:
             self._process = subprocess.Popen(
-                command(cell, run),
+                command(cell, self._places.run),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -191,18 +231,7 @@ class Job:
         return self._process.poll() is not None
 
     def row(self) -> Row:
-        """The row of the run."""
-        if self._process.returncode == 0:
-            return row_of(json.loads(self._metrics.read_text(encoding="utf-8")))
-        said = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines() or ["no output"]
-        task, arm, budget, seed = self.cell.key
-        return Row(
-            *(task, arm, seed, budget),
-            commit=commit(),
-            specification=self.cell.specification,
-            machine=machine(),
-            error=f"exit code {self._process.returncode}: {said[-1][:300]}",
-        )
+        return row_of_run(self.cell, self._process.returncode, self._places)
 
     def end(self) -> None:
         """Ask it to stop. It stops its own processes."""
@@ -215,8 +244,28 @@ class Job:
         self._process.wait()
 
 
+def row_of_run(cell: Cell, code: int, places: Places) -> Row:
+    """Return the row of a run that ended with an exit code."""
+    if code == 0:
+        return row_of(json.loads((places.run / "metrics.json").read_text(encoding="utf-8")))
+    said = places.log.read_text(encoding="utf-8", errors="replace").strip().splitlines() or ["no output"]
+    return failed(cell, f"exit code {code}: {said[-1][:300]}")
+
+
+def failed(cell: Cell, error: str) -> Row:
+    """Return the row of a run that gave nothing."""
+    task, arm, budget, seed = cell.key
+    return Row(
+        *(task, arm, seed, budget),
+        commit=commit(),
+        specification=cell.specification,
+        machine=machine(),
+        error=error,
+    )
+
+
 def _progress(
-    new: Sequence[Row], todo: Sequence[Cell], running: Sequence[Job], jobs: int, last: Row | None = None
+    new: Sequence[Row], todo: Sequence[Cell], running: Sequence[Run], jobs: int, last: Row | None = None
 ) -> Progress:
     names = tuple(job.cell.name for job in running)
     seconds = {(row.task, row.arm): row.seconds for row in new if row.seconds is not None}
