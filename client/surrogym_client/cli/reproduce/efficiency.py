@@ -11,11 +11,18 @@ import typer
 from surrogym_client.cli.options import AsJson, Quiet, require_known
 
 if TYPE_CHECKING:
-    from surrogym_client.experiments.reproduce.cells import Cell, Progress
+    from surrogym_client.experiments.reproduce.cells import Begin, Cell, Progress
     from surrogym_client.experiments.reproduce.rows import Row
 
 
 STUDY = "study"
+OnRay = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Run in the Ray cluster at ADDRESS (auto or host:port). --jobs is then the number of runs in the cluster.",
+    ),
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -43,6 +50,7 @@ def command(
     algorithm: Annotated[
         str | None, typer.Option(help="Policy search, as in surrogym demo. [default: that command's]")
     ] = None,
+    on_ray: OnRay = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -58,18 +66,29 @@ def command(
 
     Example: surrogym reproduce efficiency --arms study --seeds 10 --jobs 2
 
+    Example: surrogym reproduce efficiency --arms study --seeds 10 --on-ray auto --jobs 64
+
     Example: surrogym reproduce efficiency --tasks pendulum,acrobot --arms default,latin_hypercube --seeds 5
     """
     numbers = range(first_seed, first_seed + seeds)
     chosen = {"shares": _shares(shares), "steps": steps, "episodes": episodes, "algorithm": algorithm}
-    run_study(_wanted(tasks, arms, numbers, chosen), out, jobs, again=again, as_json=as_json, quiet=quiet)
+    run_study(_wanted(tasks, arms, numbers, chosen), out, jobs, on_ray, again=again, as_json=as_json, quiet=quiet)
 
 
-def run_study(wanted: Sequence[Cell], out: Path, jobs: int, *, again: bool, as_json: bool, quiet: bool) -> None:
+def run_study(
+    wanted: Sequence[Cell], out: Path, jobs: int, on_ray: str | None, *, again: bool, as_json: bool, quiet: bool
+) -> None:
     """Run the cells that have no row yet, or all of them if ``again``, and show the table.
+
+    Args:
+        wanted: all cells of the study.
+        out: its folder.
+        jobs: cells at once.
+        on_ray: address of a Ray cluster that runs them; None runs them here.
 
     Raises:
         CommandError: a run failed.
+        RunFailed: there is no such cluster.
     """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.cli.reproduce.table import present
@@ -78,6 +97,7 @@ def run_study(wanted: Sequence[Cell], out: Path, jobs: int, *, again: bool, as_j
     from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_shared.terminal import on_interrupt, progress, say
 
+    begin = _begin_on(on_ray)
     rows = read_rows(out / "rows.csv")
     todo = wanted if again else [cell for cell in wanted if not done_already(cell, rows)]
     say(f"{len(wanted)} runs, {len(wanted) - len(todo)} of them done already", quiet=quiet)
@@ -89,10 +109,19 @@ def run_study(wanted: Sequence[Cell], out: Path, jobs: int, *, again: bool, as_j
             if now.last is not None:
                 say(_outcome(now.last), quiet=quiet)
 
-        rows = run_cells(todo, rows, out, jobs, tell) if todo else rows
+        rows = run_cells(todo, rows, out, jobs, tell, begin=begin) if todo else rows
     present(rows, out, as_json=as_json, quiet=quiet)
     if bad := [row for row in rows if row.error and row.key in {cell.key for cell in wanted}]:
         raise CommandError(f"{len(bad)} runs failed, the first with {bad[0].error}; logs: {out / 'logs'}")
+
+
+def _begin_on(address: str | None) -> Begin | None:
+    if address is None:
+        return None
+    from surrogym_client.experiments.reproduce.on_ray import RayRun, connect
+
+    connect(address)
+    return RayRun
 
 
 def _wanted(tasks: str, arms: str, seeds: Sequence[int], chosen: dict[str, Any]) -> list[Cell]:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from surrogym_client.cli.options import AsJson, Quiet
+from surrogym_client.cli.reproduce.efficiency import OnRay
 
 
 def register(app: typer.Typer) -> None:
@@ -25,6 +26,7 @@ def command(
     out: Annotated[Path, typer.Option(help="Folder for rows, tables, pictures, logs and runs.")] = Path("runs/trust"),
     again: Annotated[bool, typer.Option("--again", help="Repeat runs that have a row already.")] = False,
     episodes: Annotated[int, typer.Option(min=1, help="Number of real episodes of each evaluation.")] = 100,
+    on_ray: OnRay = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -45,4 +47,4 @@ def command(
     named = list(UNSEEN) if tasks == "unseen" else names_of("task", tasks, EVERY_TASK, "unseen")
     numbers = range(first_seed, first_seed + seeds)
     wanted = list(cells(named, ["default"], numbers, episodes=episodes))
-    run_study(wanted, out, jobs, again=again, as_json=as_json, quiet=quiet)
+    run_study(wanted, out, jobs, on_ray, again=again, as_json=as_json, quiet=quiet)
