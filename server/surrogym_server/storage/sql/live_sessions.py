@@ -15,6 +15,7 @@ from surrogym_server.storage.live_sessions import (
     TakenSession,
 )
 from surrogym_server.storage.sql.database import Database, clock, conflict_insert
+from surrogym_server.storage.sql.expiry import has_ended, shorten
 from surrogym_server.storage.sql.tables import live_sessions as live
 from surrogym_server.storage.sql.tables import surrogates
 
@@ -66,7 +67,7 @@ class SqlLiveSessions(LiveSessions):
 
     def take(self, id: str, owner: str, seconds: float) -> TakenSession:
         with self._database.write() as connection:
-            free = (live.c.expires <= clock(connection)) | (live.c.owner == owner)
+            free = has_ended(connection, live, sa.true()) | (live.c.owner == owner)
             taken = sa.update(live).where(live.c.id == id, free)
             values = {"fence": live.c.fence + 1, **_lease(connection, owner, seconds)}
             row = connection.execute(taken.values(values).returning(*live.c)).one_or_none()
@@ -92,10 +93,9 @@ class SqlLiveSessions(LiveSessions):
 
     def sweep(self, seconds: float) -> int:
         with self._database.write() as connection:
-            now = clock(connection)
-            too_long = sa.update(live).where(live.c.expires > now + live.c.seconds)
-            connection.execute(too_long.values(expires=now + live.c.seconds))
-            return connection.execute(sa.delete(live).where(live.c.expires <= now - seconds)).rowcount
+            shorten(connection, live, sa.true())
+            forgotten = sa.delete(live).where(live.c.expires <= clock(connection) - seconds)
+            return connection.execute(forgotten).rowcount
 
 
 def _lease(connection: Connection, owner: str, seconds: float) -> dict[str, object]:
