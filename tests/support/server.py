@@ -73,10 +73,11 @@ def running_server(folder: Path, *options: str, **environment: str) -> Iterator[
 class RestartingServer:
     """A server that can be stopped and started at the same address, on the same database."""
 
-    def __init__(self, folder: Path, *options: str) -> None:
+    def __init__(self, folder: Path, *options: str, **environment: str) -> None:
         self._folder = folder
         self._options = options
-        self._server = start_server(folder, *options)
+        self._environment = environment
+        self._server = start_server(folder, *options, **environment)
         self.url = self._server.url
 
     @property
@@ -88,7 +89,8 @@ class RestartingServer:
         return self._server.log
 
     def start(self) -> None:
-        self._server = start_server(self._folder, *self._options, "--port", self.url.rpartition(":")[2])
+        port = self.url.rpartition(":")[2]
+        self._server = start_server(self._folder, *self._options, "--port", port, **self._environment)
 
     def stop(self, sig: int = signal.SIGTERM) -> int:
         return self._server.stop(sig)
