@@ -14,7 +14,9 @@ from playwright.sync_api import Page, expect
 from support.browser import serious
 from support.policies import store
 from support.server import ServerProcess
-from surrogym_client.original.classic import pendulum
+from surrogym_client.evaluation.evaluator import Evaluation, Trace
+from surrogym_client.evaluation.videos import record
+from surrogym_client.original.classic import cartpole, pendulum
 from surrogym_client.transport import Api
 from surrogym_shared import wire
 
@@ -145,6 +147,33 @@ def test_damaged_episodes_are_named_and_the_rest_is_shown(
     with Api(url) as api:
         api.policies.delete("bare", 1)
     assert [said for said in complaints if "500" not in said] == []
+
+
+def test_a_video_plays_on_the_page_and_a_broken_one_is_named(url: str, open_page: Open, pendulum_server: ServerProcess):
+    plain = cartpole()
+    way = np.zeros((11, 4))
+    way[:, 0] = np.linspace(0, 1, 11)
+    ones = Evaluation(np.ones(1), np.array([10]), None, (Trace(way, np.zeros((10, 1)), np.ones(10)),))
+    with Api(url) as api:
+        video = record(plain, None, ones, "declared starts")
+        api.policies.put_file("better", 1, video.form, video.content)
+        api.policies.put_file("worse", 1, "mp4", b"\0\0\0\x20ftypisom" + bytes(500))
+        page = open_page(f"{url}/#/s/better")
+        page.locator("#policies summary").last.click()
+        shown = page.locator("#policies video, #policies img.video")
+        expect(shown).to_be_visible()
+        if video.form == "mp4":  # Chromium of a distribution may know no H.264
+            page.wait_for_function(
+                "() => document.querySelector('video.video')?.readyState > 0 || !document.querySelector('video.video')"
+            )
+        assert serious(page) == []
+        page = open_page(f"{url}/#/s/worse")
+        page.locator("#policies summary").last.click()
+        expect(page.locator("#policies")).to_contain_text("The video can't be played")
+        expect(page.locator("#policies .episodes canvas")).to_have_count(2)
+        newer = page.locator("#policies summary").first
+        newer.click()
+        expect(page.locator("#policies")).to_contain_text("No video: surrogym evaluate --video")
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,19 @@ def api(server_process: ServerProcess) -> Iterator[Api]:
         opened.delete_surrogate(NAME)
 
 
+def test_a_video_beside_the_policy_is_sent_once_and_a_broken_one_is_named(api: Api, policy: Path):
+    video = policy.with_suffix(".mp4")
+    video.write_bytes(b"\0\0\0\x20ftypisom" + bytes(500))
+    assert pushing.push(api, policy).refused == ""
+    assert api.policies.file(NAME, 1, "mp4") == video.read_bytes()
+    assert pushing.push(api, policy).refused == ""
+    assert [one.form for one in api.policies.get(NAME, 1).files] == ["zip", "mp4"]
+    video.write_bytes(b"no video")
+    again = pushing.push(api, policy)
+    assert "expected an MP4 video" in again.refused
+    assert api.policies.file(NAME, 1, "mp4") != b"no video"
+
+
 @pytest.fixture
 def away() -> Api:
     return Api("http://127.0.0.1:9", retries=Retries(seconds=0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import re
 import shutil
 from dataclasses import replace
@@ -115,6 +116,12 @@ def test_the_report_of_a_tested_policy_is_complete(modelled: Known):
     assert "Another unit of the machine" in parts["What was not tested"]
     assert "not every start succeeded" in parts["What to do next"]
     assert "What could not be read" not in parts
+
+
+def test_a_video_is_inside_the_report(modelled: Known):
+    known = replace(modelled, policy=policy(), real=evaluation(), video=("video/mp4", b"a video"))
+    assert f'src="data:video/mp4;base64,{base64.b64encode(b"a video").decode()}"' in decision(known, [])
+    assert "drawn from their states" in told(known)["What it gives"]
 
 
 def test_a_reference_controller_stands_beside_the_policy(modelled: Known):

@@ -91,7 +91,7 @@ def test_it_loads_nothing_and_its_policy_lets_nothing_load(known: Both) -> None:
     assert "url(" not in style
     policy = next(meta["content"] for meta in read.of("meta") if "http-equiv" in meta)
     digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
-    assert policy == f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'"
+    assert policy == f"default-src 'none'; img-src data:; media-src data:; style-src 'sha256-{digest}'"
 
 
 def test_its_figures_are_whole_pictures_with_words_for_who_can_not_see_them(known: Both) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from surrogym_client.cli.beside import Beside
+from surrogym_client.cli.filming import film
 from surrogym_client.cli.groups import Output, PolicyReading, Service, add
 from surrogym_client.cli.options import SpecFile, read_spec
 from surrogym_client.cli.pushing import push_or_say
@@ -109,6 +110,14 @@ def command(
     where: Where = False,
     surrogate: Ledger = None,
     beside: Beside,
+    video: Annotated[
+        bool,
+        typer.Option(
+            "--video",
+            help="Draw the best, the median and the worst episode into a video beside the policy, which the server "
+            "stores too. The environment must be one that can be drawn. This takes no real step.",
+        ),
+    ] = False,
     push: Annotated[
         bool, typer.Option("--push/--no-push", help="Store the policy and its episodes on the server as well.")
     ] = True,
@@ -134,6 +143,7 @@ def command(
     run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
     reports = _reports(beside.controllers(policy, card, reading, opener), run, enter, settings, policy)
     result = reports[0][1]
+    filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if video else None
     version = None
     if push and ledger is not None:
         _keep(policy, reports, settings, quiet=output.quiet)
@@ -144,6 +154,8 @@ def command(
         found = differ_from(ledger, service.server, token, result, settings.first_seed, quiet=output.quiet)
     judged = {"promise_kept": _kept(promise, result), "version": version, "disagreements": found and found.as_json()}
     summary = {"policy": str(policy), **_settings(settings), **_summary(reports, beside.reference), **judged}
+    if filmed is not None:
+        summary["video"] = str(filmed)
     more = [] if found is None else found.in_words(card.spec)
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
 

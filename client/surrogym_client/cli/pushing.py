@@ -27,5 +27,7 @@ def push_or_say(
             quiet=quiet,
         )
         return None
+    if sent.refused:
+        say(f"the server did not take the video: {sent.refused}", quiet=quiet)
     say(f"stored on the server as {sent.surrogate}@{sent.policy.version}", quiet=quiet)
     return sent.policy.version

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,11 +12,14 @@ from typing import cast, get_args
 
 from pydantic import TypeAdapter, ValidationError
 
+from surrogym_client.errors import InvalidInput
 from surrogym_client.policies.card import PolicyCard, UnusablePolicy, first_fault, read_card
 from surrogym_client.transport import Api
 from surrogym_shared import wire
 
 MAX_WAITING_BYTES = 64 * 1024 * 1024
+MAX_VIDEO_BYTES = 32 * 1024 * 1024  # of a file on the server
+VIDEOS: tuple[wire.PolicyForm, ...] = ("mp4", "gif")
 CURVE_POINTS = 200
 _WAITING = TypeAdapter(list[wire.AddEvaluation])
 
@@ -27,6 +31,7 @@ class Pushed:
     surrogate: str
     policy: wire.PushedPolicy
     evaluations: int
+    refused: str = ""  # why the server did not take the video
 
 
 def thinned(curve: Sequence[wire.CurvePoint]) -> tuple[wire.CurvePoint, ...]:
@@ -46,7 +51,7 @@ def waiting_path(policy: Path) -> Path:
 
 
 def push(api: Api, policy: Path, surrogate: str | None = None) -> Pushed:
-    """Send a policy's file and card, and the evaluations that wait beside it. Repeating it is harmless.
+    """Send a policy's file and card, and the evaluations and the video beside it. Repeating it is harmless.
 
     Args:
         api: the server.
@@ -71,7 +76,26 @@ def push(api: Api, policy: Path, surrogate: str | None = None) -> Pushed:
     for done, evaluation in enumerate(waiting, start=1):
         api.policies.evaluate(name, sent.version, evaluation)
         _write(policy, waiting[done:])
-    return Pushed(name, sent, len(waiting))
+    return Pushed(name, sent, len(waiting), _push_video(api, name, sent, policy))
+
+
+def _push_video(api: Api, name: str, sent: wire.PushedPolicy, policy: Path) -> str:
+    """Send the video beside a policy, unless the server has it; returns why it was refused, if it was."""
+    for form in VIDEOS:
+        path = policy.with_suffix(f".{form}")
+        if not path.is_file():
+            continue
+        if path.stat().st_size > MAX_VIDEO_BYTES:
+            return f"{path} has more than {MAX_VIDEO_BYTES // 2**20} MiB"
+        content = path.read_bytes()
+        digest = hashlib.sha256(content).hexdigest()
+        if any(one.stored and one.digest == digest for one in sent.files):
+            continue
+        try:
+            api.policies.put_file(name, sent.version, form, content)
+        except InvalidInput as error:
+            return f"{path}: {error}"
+    return ""
 
 
 def as_pushed(card: PolicyCard) -> wire.PushedCard:

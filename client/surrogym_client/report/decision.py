@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from surrogym_client.report.doubts import next_steps, untested
 from surrogym_client.report.episodes import Range, draw_episodes, draw_ranges
 from surrogym_client.report.figures import svg
-from surrogym_client.report.html import bullets, paragraph, picture, section, table
+from surrogym_client.report.html import bullets, moving, paragraph, picture, section, table
 from surrogym_client.report.known import Known
 from surrogym_client.report.maps import Cut
 from surrogym_client.surrogates.advice import verdict
@@ -112,7 +112,16 @@ def _result(known: Known) -> str:
         said += paragraph(
             "The best, the median and the worst of these episodes: half of all went at least as well as the median."
         )
-    return section("What it gives", said)
+    return section("What it gives", said + _video(known))
+
+
+def _video(known: Known) -> str:
+    """The video of the best, the median and the worst episode; nothing where there is none."""
+    if known.video is None:
+        return ""
+    alt = "Video: the best, the median and the worst real episode beside each other"
+    words = "The video shows the best, the median and the worst episode beside each other, drawn from their states."
+    return moving(*known.video, alt) + paragraph(words)
 
 
 def _beside(known: Known) -> str:

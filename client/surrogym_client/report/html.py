@@ -20,7 +20,7 @@ p.about, caption, footer { color: var(--soft); }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: 1rem 0; }
 caption { text-align: left; }
 th, td { text-align: left; vertical-align: top; padding: 0.25rem 1rem 0.25rem 0; border-bottom: 1px solid var(--line); }
-img { width: 100%; max-width: 45rem; background: white; border-radius: 0.5rem; display: block; margin: 1rem 0; }
+img, video { width: 100%; max-width: 45rem; background: white; border-radius: 0.5rem; display: block; margin: 1rem 0; }
 pre { overflow-x: auto; font-size: 0.85em; }
 @media print {
   body { max-width: none; margin: 0; color: black; } section { break-inside: avoid; } h1.part { break-before: page; }
@@ -33,7 +33,7 @@ def document(title: str, body: str) -> str:
     """Build a page that loads nothing: pictures are embedded, the style sheet is allowed by its hash, and there is no
     script."""
     digest = base64.b64encode(hashlib.sha256(STYLE.encode()).digest()).decode()
-    policy = f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'"
+    policy = f"default-src 'none'; img-src data:; media-src data:; style-src 'sha256-{digest}'"
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
@@ -58,6 +58,14 @@ def section(title: str, content: str) -> str:
 
 def picture(image: str, alt: str) -> str:
     return f'<img alt="{escape(alt)}" src="data:image/svg+xml;base64,{base64.b64encode(image.encode()).decode()}">'
+
+
+def moving(kind: str, content: bytes, alt: str) -> str:
+    """A video, or an animated picture, inside the page. ``kind`` is its media type."""
+    source = f"data:{kind};base64,{base64.b64encode(content).decode()}"
+    if kind.startswith("image/"):
+        return f'<img alt="{escape(alt)}" src="{source}">'
+    return f'<video controls muted aria-label="{escape(alt)}" src="{source}">This browser plays no {kind}.</video>'
 
 
 def rows(pairs: Iterable[tuple[str, Any]]) -> str:

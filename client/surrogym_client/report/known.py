@@ -15,12 +15,15 @@ from surrogym_shared.wire import (
     EvaluationView,
     ModelView,
     PolicyDetail,
+    PolicyForm,
     PolicyView,
     SampleView,
     SurrogateView,
 )
 
 PREFERRED = "production"
+VIDEOS: dict[PolicyForm, str] = {"mp4": "video/mp4", "gif": "image/gif"}
+MOST_VIDEO_BYTES = 8 * 1024 * 1024  # inside a report
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,7 @@ class Known:
         real: its newest real episodes from the declared starts.
         without: real episodes without the policy, from the same starts.
         reference: real episodes of a reference controller, from the same starts.
+        video: its form and content, as a browser plays it; None: there is none.
         missing: sentences about what could not be read.
     """
 
@@ -47,6 +51,7 @@ class Known:
     real: EvaluationDetail | None = None
     without: EvaluationDetail | None = None
     reference: EvaluationDetail | None = None
+    video: tuple[str, bytes] | None = None
     missing: tuple[str, ...] = ()
 
 
@@ -74,7 +79,31 @@ def collect(api: Api, name: str, which: str | None = None) -> Known:
         if detail is not None and detail.missing:
             missing.append(f"the single episodes of evaluation {detail.id} are missing: {detail.missing}")
         details.append(detail)
-    return Known(view, models, samples, server, policy, details[0], details[1], details[2], tuple(missing))
+    video, lacks = _video(api, name, policy)
+    missing += lacks
+    return Known(view, models, samples, server, policy, details[0], details[1], details[2], video, tuple(missing))
+
+
+def _video(api: Api, name: str, policy: PolicyDetail) -> tuple[tuple[str, bytes] | None, list[str]]:
+    """The video of a policy, and a sentence about each one that could not be read."""
+    missing = []
+    for form, kind in VIDEOS.items():
+        file = next((one for one in policy.files if one.form == form), None)
+        if file is None:
+            continue
+        if not file.stored:
+            missing.append(f"the video ({form}) is missing: it never came, or it made room for newer files")
+        elif file.bytes > MOST_VIDEO_BYTES:
+            missing.append(
+                f"the video has {file.bytes / 1e6:.0f} MB, too much for one page: surrogym policy get "
+                f"{name}@{policy.version} --out video.{form}"
+            )
+        else:
+            try:
+                return (kind, api.policies.file(name, policy.version, form)), missing
+            except SurrogymClientError as error:
+                missing.append(f"the video ({form}) can't be read: {error}")
+    return None, missing
 
 
 def cuts_of(api: Api, known: Known) -> tuple[list[Cut], str]:

@@ -9,7 +9,7 @@ EXTRAS = {  # their packages
     ),
     "train": ("cmaes", "matplotlib", "stable_baselines3", "tensorboard", "torch"),
     "export": ("onnx", "onnxruntime", "onnxscript"),
-    "render": ("moviepy", "pygame"),
+    "render": ("imageio_ffmpeg", "moviepy", "PIL", "pygame"),
     "trackers": ("mlflow", "wandb"),
     "mujoco": ("mujoco", "imageio"),
     "dm-control": ("dm_control",),

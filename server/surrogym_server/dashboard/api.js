@@ -51,10 +51,15 @@ export async function call(method, path, body, signal, patience = PATIENCE_MS) {
   }
 }
 
-/** Saves what a route gives as a file: a link would carry no token. */
-export async function download(path, name) {
+/** The bytes that a route gives: an address in the page would carry no token. */
+export async function bytes(path) {
   const reply = await send(path, { headers: headers() });
-  save(await reply.blob(), name);
+  return reply.blob();
+}
+
+/** Saves what a route gives as a file. */
+export async function download(path, name) {
+  save(await bytes(path), name);
 }
 
 /** Saves bytes that the page has as a file. */

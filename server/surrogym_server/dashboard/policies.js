@@ -7,6 +7,7 @@ import { moment, number, percent } from "/page/format.js";
 import { meanWords, marksOf, sentence } from "/page/judged.js";
 import { section, table } from "/page/parts.js";
 import { ranges, rangesKey } from "/page/ranges.js";
+import { videoPart } from "/page/video.js";
 
 const SHOWN = 20; // in the picture
 const BYTES = ["bytes", "kB", "MB", "GB"];
@@ -59,6 +60,9 @@ export function policyList(name, spec, { role, refresh }) {
       policy.evaluations.map((each) => [ACTING[each.controller], each.note || "–", each.episodes, meanWords(each), percent(each.success_rate), each.steps, episodesOf(policy, each)]), "No real episodes yet; run some with surrogym evaluate."));
     inside.replaceChildren(...parts, files(policy), naming(policy));
     if (detail.curve.length > 1) inside.append(...curve(detail.curve));
+    const video = videoPart(`${url}/${policy.version}`, policy);
+    charts.add(video);
+    inside.append(video.element);
     await episodes(policy, inside);
   }
 
@@ -115,7 +119,7 @@ export function policyList(name, spec, { role, refresh }) {
       draw(policies);
       rows(policies, (policy) => policy.version);
     },
-    repaint: () => charts.forEach((chart) => chart.repaint()),
+    repaint: () => charts.forEach((chart) => chart.repaint?.()),
     close: () => charts.forEach((chart) => chart.close()),
   };
 }
