@@ -2,12 +2,13 @@
 
     python tests/benchmarks/bench_page.py
 
-Prints milliseconds to the first paint, to the facts, to the last policy, and from a key to the next frame: the median
-of some loads.
+Prints milliseconds to the first paint, to the facts, to the last policy, from a key and from a click on a policy to the
+next frame, and to the sentence of the comparison: the median of some loads, and the load of the machine.
 """
 
 from __future__ import annotations
 
+import os
 import statistics
 import sys
 import time
@@ -30,12 +31,17 @@ from surrogym_shared import wire
 SAMPLES, MODELS, POLICIES, LOADS = 10_000, 50, 20, 5
 NAME = "big"
 PAINT = "performance.getEntriesByName('first-contentful-paint')[0]?.startTime"
-KEY = """async () => {
+FRAME = """async () => {{
   const begun = performance.now();
-  document.querySelector('.heat canvas').dispatchEvent(new KeyboardEvent('keydown', { key: 'ArrowRight' }));
+  {act};
   await new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve, 0)));
   return performance.now() - begun;
-}"""
+}}"""
+KEY = FRAME.format(
+    act="document.querySelector('.heat canvas').dispatchEvent(new KeyboardEvent('keydown', { key: 'ArrowRight' }))"
+)
+CLICK = FRAME.format(act="document.querySelector('.policies summary').click()")
+NAMES = ("first paint", "facts", "last policy", "a key", "a click", "comparison")
 
 
 def fill(api: Api) -> None:
@@ -53,8 +59,8 @@ def fill(api: Api) -> None:
         store(api, NAME, number, -200.0 - number)
 
 
-def load(browser: Browser, url: str) -> tuple[float, float, float, float]:
-    """Milliseconds to the first paint, the facts, the last policy, and of a key."""
+def load(browser: Browser, url: str) -> tuple[float, ...]:
+    """Milliseconds of each of ``NAMES``."""
     page = browser.new_page(viewport={"width": 1280, "height": 900})
     page.goto("about:blank")
     begun = time.perf_counter()
@@ -64,10 +70,13 @@ def load(browser: Browser, url: str) -> tuple[float, float, float, float]:
     page.locator(".policies summary").nth(POLICIES - 1).wait_for()
     policies = time.perf_counter()
     page.wait_for_timeout(4_000)  # samples and models come
-    key = page.evaluate(KEY)
-    painted = page.evaluate(PAINT)
+    key, click, painted = (page.evaluate(script) for script in (KEY, CLICK, PAINT))
+    compared = time.perf_counter()
+    page.goto(f"{url}/#/compare/{NAME}/{NAME}")
+    page.locator("p.big").wait_for()
+    said = time.perf_counter() - compared
     page.close()
-    return painted, 1e3 * (facts - begun), 1e3 * (policies - begun), key
+    return painted, 1e3 * (facts - begun), 1e3 * (policies - begun), key, click, 1e3 * said
 
 
 def main() -> None:
@@ -76,7 +85,8 @@ def main() -> None:
             fill(api)
         with launched() as browser:
             loads = [load(browser, server.url) for _ in range(LOADS)]
-    for name, column in zip(("first paint", "facts", "last policy", "a key"), zip(*loads, strict=True), strict=True):
+    print(f"load {os.getloadavg()[0]:.1f}")
+    for name, column in zip(NAMES, zip(*loads, strict=True), strict=True):
         print(f"{name:12} {statistics.median(column):7.0f} ms, at most {max(column):.0f}")
 
 

@@ -177,11 +177,18 @@ def test_a_video_plays_on_the_page_and_a_broken_one_is_named(url: str, open_page
 
 
 @pytest.mark.parametrize(
-    ("where", "scheme", "width"), [("", "light", 1280), ("s/better", "dark", 1280), ("s/pendulum", "light", 390)]
+    ("where", "scheme", "width"),
+    [("", "light", 1280), ("s/better", "dark", 1280), ("s/pendulum", "light", 390)]
+    + [(where, "dark", 390) for where in ("compare/worse/better", "register")],
 )
 def test_axe_finds_nothing_serious(url: str, open_page: Open, where: str, scheme: str, width: int):
     page = open_page(f"{url}/#/{where}", scheme=scheme, width=width)
-    if where:
+    if where == "register":
+        page.get_by_text("Start from a log instead").click()
+        page.get_by_text("The columns have other names").click()
+    elif where.startswith("compare"):
+        expect(page.locator(".ranges")).to_be_visible()
+    elif where:
         page.locator("#policies").wait_for()
         if where == "s/pendulum":
             expect(page.locator("#maps")).to_contain_text("of the tolerance on this cut")
@@ -191,3 +198,5 @@ def test_axe_finds_nothing_serious(url: str, open_page: Open, where: str, scheme
     else:
         expect(page.get_by_role("link", name=re.compile("^pendulum"))).to_be_visible()
     assert serious(page) == []
+    if width == 390:
+        assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0  # no sideways scrolling

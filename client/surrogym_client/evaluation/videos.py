@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 Form = Literal["mp4", "gif"]
 FORMS: tuple[Form, ...] = ("mp4", "gif")
 PANEL = 240  # pixels of width of one episode
-LINE = 18  # pixels of height of a line of text
+LINE, TEXT = 20, 13  # pixels of height of a line, and of its text
 MOST_FRAMES = 600  # of a video: longer episodes are shown faster
 GIF_FRAMES_PER_SECOND = 10  # a GIF of all frames has six times the size of an MP4
 INK, PAPER = (23, 32, 42), (255, 255, 255)
@@ -104,15 +104,16 @@ def _scaled(picture: Picture) -> Image:
 
 def _composed(drawn: list[Image], headings: list[str], caption: str) -> Image:
     """Panels with their headings and the caption. Sides are even numbers, as MP4 needs them."""
-    from PIL import Image, ImageDraw
+    from PIL import Image, ImageDraw, ImageFont
 
     height = max(picture.height for picture in drawn) + 2 * LINE
     frame = Image.new("RGB", (PANEL * len(drawn), height + height % 2), PAPER)
     pen = ImageDraw.Draw(frame)
+    pen.font = ImageFont.load_default(TEXT)
     for place, (picture, heading) in enumerate(zip(drawn, headings, strict=True)):
         frame.paste(picture, (place * PANEL, LINE))
-        pen.text((place * PANEL + 6, 3), heading, fill=INK)
-    pen.text((6, height - LINE + 3), caption, fill=INK)
+        pen.text((place * PANEL + 6, 2), heading, fill=INK)
+    pen.text((6, height - LINE + 2), caption, fill=INK)
     return frame
 
 

@@ -33,6 +33,7 @@ function chart(label) {
 const samplesAxis = (more) => axis({ label: "real steps the model has seen", font: FONT, labelFont: FONT, labelSize: 20, size: 34, space: 40, incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000], ...more });
 const FONT = "12px system-ui";
 const STROKES = [[], [8, 5], [2, 4]];
+const DASHES = ["solid", "dashed", "dotted"]; // the same in a legend
 const samplesScale = { time: false, range: (_, low, high) => (low === high ? [low - 1, high + 1] : [low, high]) };
 
 /** Where no point is pointed at, the legend has the values of the last one. */
@@ -96,12 +97,13 @@ export function learningCurves() {
 /** A plain chart of lines that differ by their strokes; `show(data, names, x)` draws it. */
 export function lines(label, height) {
   const part = chart(label);
+  part.place.classList.add("stroked");
   return {
     place: part.place,
     show: (data, names, x) => part.draw(() => ({
       height: height + (names.length > 1 ? 0 : 20),
       cursor: { show: false },
-      legend: { show: names.length > 1, live: false, markers: { ...LEGEND.markers, dash: (plot, at) => (at > 1 ? "dashed" : "solid") } },
+      legend: { show: names.length > 1, live: false, markers: { width: 1, stroke: LEGEND.markers.fill, fill: () => "transparent", dash: (plot, at) => DASHES[(at - 1) % DASHES.length] } },
       scales: { x: { time: false } },
       axes: [axis({ size: x ? 40 : 26, space: x ? 90 : 45, label: x, labelFont: FONT, labelSize: 16 }), axis({ size: 56, space: 22, values: (_, at) => at.map((value) => number(value, 2)) })],
       series: [{}, ...names.map((name, at) => ({ label: name, stroke: css(`--series-${at}`), width: 2, dash: STROKES[at % STROKES.length], points: { show: false } }))],

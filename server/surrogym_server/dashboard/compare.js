@@ -34,8 +34,15 @@ function everyPolicy(entries, pairs) {
   const [best] = entries;
   const gap = (entry) => (entry === best ? "the best" : (({ by, ...ends }) => `${number(by)} (${interval(ends)})`)(difference(entry, best, pairs)));
   const shown = (found) => (found ? meanWords(found) : "–");
-  return table("Each policy beside the best", [["policy", ""], ["mean real return (95 %)", "num"], ["difference from the best (95 %, all together)", "num"], ["success", "num"], ["without the policy", "num"], ["reference controller", "num"]],
-    entries.map((entry) => [entry.label, meanWords(realOf(entry.policy)), gap(entry), percent(realOf(entry.policy).success_rate), shown(withoutOf(entry.policy)), shown(referenceOf(entry.policy))]), "");
+  const columns = [
+    ["policy", "", ({ label }) => label],
+    ["mean real return (95 %)", "num", ({ policy }) => meanWords(realOf(policy))],
+    ["difference from the best (95 %)", "num", gap],
+    ["success", "num", ({ policy }) => percent(realOf(policy).success_rate)],
+    ["without the policy", "num", ({ policy }) => shown(withoutOf(policy))],
+    ["reference controller", "num", ({ policy }) => shown(referenceOf(policy))],
+  ].filter(([, , said]) => entries.some((entry) => said(entry) !== "–"));
+  return table("Each policy beside the best", columns.map(([title, kind]) => [title, kind]), entries.map((entry) => columns.map(([, , said]) => said(entry))), "");
 }
 
 export function compareView(main, given) {

@@ -25,8 +25,9 @@ export function policyList(name, spec, { role, refresh }) {
   const trouble = h("p", { class: "bad", role: "alert", hidden: true });
   const charts = new Set();
   const element = section("policies", "Policies", "The promise of each policy, and its return in the original environment. Higher is better.", place, trouble, list);
+  const judged = (policies) => policies.slice(0, SHOWN).map((policy) => ({ label: who(policy), marks: marksOf(policy) }));
   const draw = shown(place, (policies) => (policies.length
-    ? [rangesKey(), ranges(policies.slice(0, SHOWN).map((policy) => ({ label: who(policy), marks: marksOf(policy) })), "Returns of the newest policies"), h("a", { href: `#/compare/${encodeURIComponent(name)}` }, "Compare with the policies of another surrogate")].filter(Boolean)
+    ? [rangesKey(judged(policies)), ranges(judged(policies), "Returns of the newest policies"), h("a", { href: `#/compare/${encodeURIComponent(name)}` }, "Compare with the policies of another surrogate")].filter(Boolean)
     : [h("p", { class: "empty" }, "No policy is stored. ", h("code", {}, `surrogym train ${name}`), " stores the policy that it trains; ", h("code", {}, "surrogym policy push"), " stores a policy from a file.")]));
   const rows = keyed(list, one);
 

@@ -3,11 +3,14 @@
 import { h } from "/page/dom.js";
 import { number } from "/page/format.js";
 
-const WIDTH = 600;
+const WIDEST = 600;
 const STEP = 11; // from a mark to the next in a row
 const MARKS = 3; // that a row has room for, at least
-const LABEL = 24; // characters
-const PAD = { left: 170, right: 8, top: 4, bottom: 22 };
+const LETTER = 7; // width of one
+const PAD = { right: 8, top: 4, bottom: 22 };
+const KEY = {
+  promise: "promised: 90 % interval", real: "real: mean with 95 % interval", without: "real, without the policy", reference: "real, reference controller",
+};
 
 const text = (x, y, said, anchor = "middle") => h("text", { x, y, "text-anchor": anchor }, said);
 
@@ -32,22 +35,26 @@ export function ranges(rows, label, least = MARKS) {
   const [lowest, most] = [Math.min(...all), Math.max(...all)];
   const span = most - lowest || Math.abs(most) || 1;
   const [from, to] = [lowest - 0.04 * span, most + 0.04 * span];
-  const x = (value) => PAD.left + ((WIDTH - PAD.left - PAD.right) * (value - from)) / (to - from);
+  const width = Math.min(WIDEST, Math.max(260, window.innerWidth - 60)); // text keeps its size on a phone
+  const left = Math.min(170, 0.32 * width);
+  const letters = Math.floor(left / LETTER);
+  const x = (value) => left + ((width - left - PAD.right) * (value - from)) / (to - from);
   const height = PAD.top + row * rows.length + PAD.bottom;
   const said = rows.map(({ label: who, marks }) => `${who}: ${marks.map(({ kind, value, low, high }) => `${kind} ${number(value)}${low === null || low === undefined ? "" : ` between ${number(low)} and ${number(high)}`}`).join(", ") || "nothing known"}`);
   const ticks = [from + 0.04 * span, (from + to) / 2, to - 0.04 * span];
-  return h("svg", { class: "ranges", viewBox: `0 0 ${WIDTH} ${height}`, role: "img", "aria-label": `${label}. ${said.join("; ")}` },
+  return h("svg", { class: "ranges", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${label}. ${said.join("; ")}` },
     rows.map(({ label: who, marks }, at) => {
       const top = PAD.top + row * at;
-      const label = text(0, top + (row + 6) / 2, who.length > LABEL ? `${who.slice(0, LABEL - 1)}…` : who, "start");
+      const label = text(0, top + (row + 6) / 2, who.length > letters ? `${who.slice(0, letters - 1)}…` : who, "start");
       label.append(h("title", {}, who));
       return [label, ...marks.map((mark, which) => shape(mark, x, top + 8 + STEP * which))];
     }),
-    h("line", { class: "axis", x1: PAD.left, x2: WIDTH - PAD.right, y1: height - PAD.bottom, y2: height - PAD.bottom }),
+    h("line", { class: "axis", x1: left, x2: width - PAD.right, y1: height - PAD.bottom, y2: height - PAD.bottom }),
     ticks.map((value, at) => text(x(value), height - 6, number(value), ["start", "middle", "end"][at])));
 }
 
-/** What the shapes mean. */
-export const rangesKey = () => h("p", { class: "key" },
-  h("span", { class: "shape promise" }, "promised: 90 % interval"), h("span", { class: "shape real" }, "real: mean with 95 % interval"),
-  h("span", { class: "shape without" }, "real, without the policy"), h("span", { class: "shape reference" }, "real, reference controller"));
+/** What the shapes in these rows mean. */
+export function rangesKey(rows) {
+  const kinds = new Set(rows.flatMap(({ marks }) => marks.map(({ kind }) => kind)));
+  return h("p", { class: "key" }, Object.entries(KEY).filter(([kind]) => kinds.has(kind)).map(([kind, words]) => h("span", { class: `shape ${kind}` }, words)));
+}
