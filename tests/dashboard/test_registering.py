@@ -67,6 +67,18 @@ def test_each_wrong_field_is_named_with_what_came(url: str, open_page: Open):
     expect(page.get_by_role("alert").filter(has_text="Expected JSON")).to_be_visible()
 
 
+def test_the_example_can_be_registered_as_it_stands(url: str, open_page: Open, complaints: list[str]):
+    page = open_page(f"{url}/#/register")
+    page.get_by_role("button", name=re.compile("^Insert an example")).click()
+    page.get_by_role("button", name="Check", exact=True).click()
+    page.get_by_role("button", name="Register cart").click()
+    expect(page.locator(".title")).to_contain_text("collecting")
+    with Api(url) as api:
+        assert api.surrogate("cart").spec.coordinate_names == ("x", "speed")
+        api.delete_surrogate("cart")
+    assert complaints == []
+
+
 def test_everything_shown_can_be_downloaded(
     pendulum_server: ServerProcess, url: str, open_page: Open, complaints: list[str], tmp_path: Path
 ):

@@ -9,6 +9,19 @@ import { specificationParts } from "/page/specification.js";
 
 const MOST_BYTES = 128 * 1024; // of the server's route
 
+/** A cart that is pushed along a rail: what somebody begins with who has an environment without a name. */
+const EXAMPLE = {
+  environment: "cart",
+  coordinates: [
+    { name: "x", unit: "m", sampling: { kind: "uniform", low: -1, high: 1 } },
+    { name: "speed", unit: "m/s", sampling: { kind: "uniform", low: -2, high: 2 } },
+  ],
+  observation: ["x", "speed"].map((name) => ({ name, term: { parts: [{ function: "linear", weights: { [name]: 1 } }] } })),
+  action: { kind: "box", low: [-1], high: [1] },
+  start: { x: { kind: "uniform", low: -1, high: 1 }, speed: { kind: "fixed", value: 0 } },
+  time_limit: 100,
+};
+
 /** The name that `surrogym register` would choose: Pendulum-v1 becomes pendulum. */
 function nameOf(environment) {
   const plain = environment.slice(environment.lastIndexOf(":") + 1).replace(/-v\d+$/, "").toLowerCase();
@@ -25,7 +38,8 @@ function read(text) {
     throw new Error(`Expected JSON, as surrogym describe writes it: ${error.message}.`);
   }
   if (read === null || typeof read !== "object" || Array.isArray(read)) throw new Error("Expected a JSON object, as surrogym describe writes it.");
-  return read.specification ? { spec: read.specification, found: read.found ?? [], asked: read.asked ?? [] } : { spec: read, found: [], asked: [] };
+  const listed = (entries) => (Array.isArray(entries) ? entries : []);
+  return read.specification ? { spec: read.specification, found: listed(read.found), asked: listed(read.asked) } : { spec: read, found: [], asked: [] };
 }
 
 const lines = (title, entries) => (entries.length ? [h("h3", {}, title), h("ul", {}, entries.map((entry) => h("li", {}, String(entry))))] : []);
@@ -53,6 +67,7 @@ export function registerView(main, { role }) {
     h("p", {}, "A specification says what is known of an environment beforehand. ", h("code", {}, "surrogym describe ENV > env.json"), " drafts one from some random steps. Nothing is stored before you have seen it."),
     h("label", { for: "spec-file" }, "Choose the file"), file,
     h("label", { for: "spec" }, "or paste its text"), text,
+    h("button", { type: "button", class: "link", onclick: () => insert(JSON.stringify(EXAMPLE, null, 1)) }, "Insert an example to change: a cart on a rail"),
     h("label", { for: "spec-name" }, "Name of the surrogate (empty: from the environment)"), name,
     forbidden, h("p", { class: "buttons" }, h("button", { class: "main" }, "Check")));
   const fromLog = h("details", { class: "card" }, h("summary", {}, "Start from a log instead"),
@@ -74,6 +89,13 @@ export function registerView(main, { role }) {
     check();
   });
   main.replaceChildren(h("a", { class: "back", href: "#/" }, "All surrogates"), h("h1", {}, "Register an environment"), fromLog, form, answer);
+
+  function insert(example) {
+    log = null;
+    text.value = example;
+    forget();
+    text.focus();
+  }
 
   function drafted({ spec, notes }, given) {
     text.value = JSON.stringify({ found: notes, specification: spec }, null, 1);
