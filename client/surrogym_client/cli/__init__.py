@@ -19,6 +19,8 @@ COMMANDS = (
     "register",
     "sample",
     "train",
+    "work",
+    "jobs",
     "audit",
     "evaluate",
     "policies",

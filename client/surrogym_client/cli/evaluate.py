@@ -137,7 +137,7 @@ def command(
     from surrogym_shared.terminal import give
 
     card, settings = read_card(policy), episodes.settings()
-    opener = _opener(env, read_spec(spec), card, quiet=output.quiet)
+    opener = opener_of(env, read_spec(spec), card, quiet=output.quiet)
     ledger = _ledger(surrogate, service.server, card, card_path(policy), quiet=output.quiet)
     enter = partial(_enter, ledger, service.server, service.token_for(context), quiet=output.quiet)
     run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
@@ -249,7 +249,9 @@ def _run(
         raise
 
 
-def _opener(env: str | None, given: EnvironmentSpec | None, card: PolicyCard, *, quiet: bool) -> Callable[[], Episode]:
+def opener_of(
+    env: str | None, given: EnvironmentSpec | None, card: PolicyCard, *, quiet: bool
+) -> Callable[[], Episode]:
     """Return a function that opens an episode. An environment named by a card alone is opened only if it is Gymnasium's
     own, because a module would run code.
     """

@@ -31,7 +31,7 @@ class TrainTask(Request):
     """Training of a policy, as by ``surrogym train``."""
 
     kind: Literal["train"]
-    algorithm: JobAlgorithm = "ppo"
+    algorithm: JobAlgorithm | None = Field(default=None, description="null: as ``surrogym train`` chooses")
     steps: Annotated[int, Field(ge=1, le=MAX_JOB_STEPS)] | None = Field(
         default=None, description="virtual steps at most; null: as the algorithm suggests"
     )

@@ -1,0 +1,130 @@
+"""``surrogym work``: run the trainings and evaluations that people start on the page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from surrogym_client.cli.groups import Output, Service, add
+from surrogym_client.cli.options import ExitWithParent, SpecFile, Surrogate, Wait, awaited_surrogate, read_spec
+
+if TYPE_CHECKING:
+    from surrogym_client.work.reporter import Stand
+    from surrogym_client.work.worker import Environment, WorkerReport
+    from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.terminal import Update
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``surrogym work`` to the app."""
+    add(app, "work", command)
+
+
+def command(
+    context: typer.Context,
+    surrogate: Surrogate,
+    env: Annotated[
+        str | None,
+        typer.Option(
+            help="Environment to evaluate in: a Gymnasium id or package.module:factory. [default: the surrogate's, if "
+            "it is Gymnasium's own; otherwise the worker only trains]"
+        ),
+    ] = None,
+    spec: SpecFile = None,
+    most_episodes: Annotated[
+        int,
+        typer.Option(min=0, max=1_000, help="Most real episodes of one evaluation. 0: the worker only trains."),
+    ] = 100,
+    folder: Annotated[Path, typer.Option(help="Folder for policies, and for results that wait for the server.")] = Path(
+        "work"
+    ),
+    once: Annotated[bool, typer.Option("--once", help="Stop after the first job.")] = False,
+    worker: Annotated[str | None, typer.Option(help="Name of this worker. [default: host and process]")] = None,
+    wait: Wait = 0.0,
+    exit_with_parent: ExitWithParent = False,
+    *,
+    service: Service,
+    output: Output,
+) -> None:
+    """Run the trainings and evaluations that people start.
+
+    People start jobs on the page. The worker waits for those of one surrogate, and runs them as surrogym train and
+    surrogym evaluate do. It reports how far it is, and stores the policy on the server. Evaluations take real steps in
+    the environment that is given here; a job can't choose another one. Ctrl-C ends the command, and keeps the best
+    policy so far.
+
+    Example: surrogym work pendulum --env Pendulum-v1
+    """
+    from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
+    from surrogym_client.runtime.lifetime import terminations_as_interrupts
+    from surrogym_client.sampler.worker import worker_name
+    from surrogym_client.work.worker import Worker, WorkerSettings
+    from surrogym_shared.terminal import on_interrupt, progress, say
+
+    if exit_with_parent:
+        watch_parent()
+    settings = WorkerSettings(name=worker or worker_name(), folder=folder, once=once)
+    with service.connect(context, wait, quiet=output.quiet) as api:
+        asked = awaited_surrogate(api, surrogate, wait, quiet=output.quiet).spec
+        environment = _environment(surrogate, env, read_spec(spec), asked, most_episodes, quiet=output.quiet)
+        with progress("work", quiet=output.quiet) as update:
+            run = Worker(
+                api,
+                surrogate,
+                settings,
+                environment,
+                service.token_for(context),
+                tell=lambda text: say(text, quiet=output.quiet),
+                show=_showing(update),
+            )
+            update(None, f"waiting for jobs of {surrogate}")
+            with terminations_as_interrupts(), on_interrupt(lambda: f"interrupted; {_words(run.report())}"):
+                report = run.run()
+    output.give(asdict(report), lambda: _words(report))
+
+
+def _environment(
+    surrogate: str,
+    env: str | None,
+    given: EnvironmentSpec | None,
+    asked: EnvironmentSpec,
+    most_episodes: int,
+    *,
+    quiet: bool,
+) -> Environment | None:
+    """Return the environment to evaluate in, after a check that it fits the surrogate; None if there is none."""
+    from surrogym_client.cli.evaluate import opener_of
+    from surrogym_client.original.loading import is_known
+    from surrogym_client.policies.card import PolicyCard
+    from surrogym_client.sampler.query_limits import check_environment
+    from surrogym_client.work.tasks import Environment
+    from surrogym_shared.terminal import say
+
+    if most_episodes == 0 or (env is None and not is_known(asked.environment)):
+        say("this worker only trains; to evaluate as well: --env package.module:factory", quiet=quiet)
+        return None
+    opener = opener_of(env, given, PolicyCard(spec=asked), quiet=quiet)
+    episode = opener()
+    try:
+        check_environment(surrogate, asked, episode.spec)
+        return Environment(episode.spec, opener, most_episodes)
+    finally:
+        episode.close()
+
+
+def _showing(update: Update) -> Callable[[Stand], None]:
+    from surrogym_client.training.words import words_of
+
+    def show(stand: Stand) -> None:
+        now = stand.now
+        update(stand.share, stand.stage if now is None or stand.stage != "training" else words_of(vars(now)))
+
+    return show
+
+
+def _words(report: WorkerReport) -> str:
+    return f"{report.done} jobs done, {report.failed} failed, {report.cancelled} cancelled"

@@ -1,0 +1,80 @@
+"""Reports of a job: the curve goes on over several trainings, and a job that is lost or cancelled stops."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from surrogym_client.errors import LeaseExpired, ServerUnreachable
+from surrogym_client.training import TrainProgress
+from surrogym_client.work.reporter import JobStopped, Reporter, Stand
+from surrogym_shared import wire
+from surrogym_shared.codes import Code, Problem
+
+JOB = wire.LeasedJob(id=1, attempt=1, lease_token="a", lease_seconds=0.03, task=wire.TrainTask(kind="train"))
+ENDED = LeaseExpired(Problem(title="ended", status=409, code=Code.LEASE_EXPIRED, detail="another worker has it"))
+
+
+class Jobs:
+    """A server's jobs: answers a report as it is told to."""
+
+    def __init__(self, answers: list[bool | Exception]) -> None:
+        self.answers, self.states = answers, list[Any]()
+
+    @property
+    def jobs(self) -> Jobs:
+        return self
+
+    def report(self, *_: object, state: wire.JobState | None, **__: object) -> bool:
+        self.states.append(state)
+        answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+
+def progress(steps: int, imagined: float | None = -1.0) -> TrainProgress:
+    return TrainProgress(steps, 10, imagined, 0.0)
+
+
+def test_a_second_training_continues_the_curve():
+    stand = Stand()
+    for steps in (4, 8, 3, 6):
+        stand = stand.trained(progress(steps), 1.0)
+    sent = stand.as_sent()
+    assert [point.steps for point in sent.curve] == [4, 8, 11, 14]
+    assert (sent.steps, sent.total_steps, sent.share) == (14, 18, 0.6)
+
+
+def test_a_long_curve_is_thinned_and_a_return_that_is_no_number_left_out():
+    stand = Stand()
+    for steps in range(1, 1_000):
+        stand = stand.trained(TrainProgress(steps, 1_000, float("inf"), 0.0), 1.0)
+    sent = stand.as_sent()
+    assert len(sent.curve) <= wire.MAX_JOB_POINTS
+    assert (sent.curve[-1].steps, sent.curve[-1].imagined_return, sent.imagined_return) == (999, None, None)
+
+
+@pytest.mark.parametrize(("answer", "taken"), [(True, False), (ENDED, True)])
+def test_a_job_that_is_cancelled_or_lost_stops_at_its_next_progress(answer: bool | Exception, taken: bool):
+    with Reporter(Jobs([answer]), "pendulum", JOB) as reporter:
+        with pytest.raises(JobStopped):
+            work_on(reporter.trained)
+        assert (reporter.cancelled, reporter.taken) == (not taken, taken)
+
+
+def test_a_server_that_is_away_stops_nothing_and_hears_of_it_later():
+    jobs = Jobs([ServerUnreachable("away"), ServerUnreachable("away"), False])
+    with Reporter(jobs, "pendulum", JOB) as reporter:
+        reporter.trained(progress(1))
+        while len(jobs.states) < 4:
+            reporter.at("training")
+    assert (reporter.cancelled, reporter.taken) == (False, False)
+    assert [point.steps for point in jobs.states[2].curve] == [1]
+
+
+def work_on(note: Callable[[TrainProgress], None]) -> None:
+    for steps in range(1, 10**9):
+        note(progress(min(steps, 10)))

@@ -1,0 +1,29 @@
+"""What a task means for the code of ``surrogym train``."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import pytest
+
+from surrogym_client.original.classic import pendulum
+from surrogym_client.training.search import SEARCHES
+from surrogym_client.work.tasks import QUICK, settings_of
+from surrogym_shared import wire
+
+
+def test_a_task_without_choices_trains_as_the_command_does():
+    settings = settings_of(wire.TrainTask(kind="train", seed=7), pendulum())
+    assert (settings.algorithm, settings.total_steps, settings.prolong) == ("FASTPPO", None, None)
+    assert (settings.seed, settings.tracker, settings.hyperparameters) == (7, None, {})
+
+
+def test_a_quick_training_takes_a_part_of_the_steps_and_is_never_prolonged():
+    settings = settings_of(wire.TrainTask(kind="train", algorithm="cmaes", preset="quick"), pendulum())
+    assert settings.total_steps == SEARCHES.get("CMAES").suggested_steps // QUICK
+    assert settings.prolong is False
+
+
+@pytest.mark.parametrize("name", get_args(wire.JobAlgorithm))
+def test_every_algorithm_of_a_task_is_a_policy_search(name: str):
+    assert SEARCHES.name_of(name) == name.upper()

@@ -1,0 +1,131 @@
+"""The trainer worker against a real server: jobs are run, shown, stopped and never lost."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from support.policies import network_file
+from support.server import ServerProcess
+from surrogym_client.original.classic import pendulum
+from surrogym_client.original.episodes import GymnasiumEpisode
+from surrogym_client.policies import load_policy
+from surrogym_client.transport import Api
+from surrogym_client.work.worker import Environment, Worker, WorkerReport, WorkerSettings
+from surrogym_shared import wire
+
+NAME = "pendulum"
+SHORT = wire.TrainTask(kind="train", algorithm="fastppo", steps=1_000, audit=False)
+LONG = SHORT.model_copy(update={"steps": 500_000})
+
+
+@pytest.fixture
+def api(pendulum_server: ServerProcess) -> Iterator[Api]:
+    with Api(pendulum_server.url) as opened:
+        yield opened
+        for job in opened.jobs.list(NAME).jobs:
+            opened.jobs.cancel(NAME, job.id)
+
+
+@pytest.fixture
+def run_one(api: Api, tmp_path: Path) -> Callable[..., wire.JobDetail]:
+    """Queue a job, let a worker run it, and give what became of it."""
+
+    def run(task: wire.Task, environment: Environment | None = None) -> wire.JobDetail:
+        id = api.jobs.add(NAME, task).id
+        Worker(api, NAME, WorkerSettings("tester", tmp_path, once=True), environment).run()
+        return api.jobs.get(NAME, id)
+
+    return run
+
+
+def until(happened: Callable[[], bool], seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < deadline, "it never happened"
+        time.sleep(0.05)
+
+
+def evaluating(most_episodes: int = 10) -> Environment:
+    return Environment(pendulum(), lambda: GymnasiumEpisode(pendulum()), most_episodes)
+
+
+def test_a_training_is_stored_with_its_curve_and_promise(api: Api, run_one, tmp_path: Path):
+    job = run_one(SHORT)
+    assert (job.status, job.error, job.worker) == ("done", None, "tester")
+    assert job.version is not None
+    policy = api.policies.get(NAME, job.version)
+    assert policy.promise is not None
+    assert [point.steps for point in policy.curve] == [8_192]  # one rollout
+    assert [point.steps for point in job.curve] == [8_192]
+    (file,) = tmp_path.glob("pendulum-job*.zip")
+    assert api.policies.file(NAME, job.version, "zip") == file.read_bytes()
+    load_policy(file)
+    assert list(tmp_path.glob("*.waiting.json")) == []
+
+
+def test_a_running_training_shows_its_curve_and_stops_when_cancelled(api: Api, tmp_path: Path):
+    id = api.jobs.add(NAME, LONG).id
+    reports: list[WorkerReport] = []
+    settings = WorkerSettings("tester", tmp_path, lease_seconds=6, once=True)
+    thread = threading.Thread(target=lambda: reports.append(Worker(api, NAME, settings).run()))
+    thread.start()
+    until(lambda: api.jobs.get(NAME, id).imagined_return is not None)
+    seen = api.jobs.get(NAME, id)
+    assert (seen.status, seen.stage, seen.steps) == ("running", "training", seen.curve[-1].steps)
+    assert seen.curve[-1].imagined_return == seen.imagined_return
+    assert sorted(point.steps for point in seen.curve) == [point.steps for point in seen.curve]
+    api.jobs.cancel(NAME, id)
+    thread.join(60)
+    ended = api.jobs.get(NAME, id)
+    assert (ended.status, ended.error) == ("cancelled", "cancelled by a person")
+    assert ended.version is not None  # the best policy so far
+    assert reports == [WorkerReport(cancelled=1)]
+
+
+def test_an_evaluation_counts_its_real_steps_and_stores_its_episodes(api: Api, run_one):
+    version = api.policies.push(NAME, wire.PushedCard(algorithm="CMAES"), [], "zip", network_file(seed=3)).version
+    before = api.surrogate(NAME).ledger.evaluation
+    job = run_one(wire.EvaluateTask(kind="evaluate", policy=str(version), episodes=2, compare="zero"), evaluating())
+    assert (job.status, job.error, job.version) == ("done", None, version)
+    assert api.surrogate(NAME).ledger.evaluation - before == 2 * 2 * 200
+    stored = api.policies.get(NAME, version).evaluations
+    assert [(one.controller, one.episodes) for one in stored] == [("policy", 2), ("zero", 2)]
+    assert job.evaluation == stored[0].id
+
+
+def test_a_job_that_fails_says_why_and_the_worker_goes_on(api: Api, run_one):
+    job = run_one(SHORT.model_copy(update={"algorithm": "dqn"}))
+    assert job.status == "failed"
+    assert "can't be trained here" in (job.error or "")
+    version = api.policies.push(NAME, wire.PushedCard(), [], "zip", network_file(seed=4)).version
+
+    def broken() -> GymnasiumEpisode:
+        raise RuntimeError("no power\nat all")
+
+    task = wire.EvaluateTask(kind="evaluate", policy=str(version), episodes=1)
+    job = run_one(task, Environment(pendulum(), broken, 10))
+    assert (job.status, job.error) == ("failed", "RuntimeError: no power at all")
+
+
+@pytest.mark.e2e
+def test_ctrl_c_keeps_the_best_policy_and_says_so(api: Api, tmp_path: Path):
+    id = api.jobs.add(NAME, LONG).id
+    command = [sys.executable, "-m", "surrogym_client", "work", NAME, "--folder", str(tmp_path), "--server", api.url]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    until(lambda: len(api.jobs.get(NAME, id).curve) > 0)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    ended = api.jobs.get(NAME, id)
+    assert (ended.status, ended.error) == ("cancelled", "the worker was stopped")
+    assert ended.version is not None
+    assert "interrupted; 0 jobs done, 0 failed, 1 cancelled" in said
