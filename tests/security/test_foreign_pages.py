@@ -93,8 +93,9 @@ def requests_of(metrics: str) -> Counter[tuple[str, str, str]]:
 
 
 def changing(openapi: dict[str, Any]) -> list[tuple[str, str]]:
+    parts = {"name": "pendulum", "id": "none", "query_id": 1, "job_id": 1, "version": 1, "form": "zip"}
     return [
-        (method.upper(), path.format(name="pendulum", id="none", query_id=1, version=1, form="zip", alias="production"))
+        (method.upper(), path.format(**parts, alias="production"))
         for path, methods in openapi["paths"].items()
         for method in methods
         if method.upper() not in SAFE
