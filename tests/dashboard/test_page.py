@@ -16,6 +16,7 @@ from surrogym_client.transport import Api
 Open = Callable[..., Page]
 PARTS = (
     "Policies",
+    "Train and evaluate",
     "Learning",
     "Maps",
     "Probe",
@@ -109,7 +110,7 @@ def test_the_keyboard_reaches_a_surrogate_and_moves_its_point(url: str, open_pag
 
 
 FOCUSABLE = """() => [...document.querySelectorAll("a[href], button, input, select, summary, [tabindex='0']")]
-    .filter((element) => !element.disabled && element.checkVisibility())"""
+    .filter((element) => !element.matches(":disabled") && element.checkVisibility())"""
 
 
 def test_tab_reaches_everything_that_can_be_operated_and_jumps_land_in_their_part(url: str, open_page: Open):

@@ -13,9 +13,10 @@ import { pointControls } from "/page/point.js";
 import { policyList } from "/page/policies.js";
 import { probe } from "/page/probe.js";
 import { ledgerTable, modelTable, queueTable, sessionTable } from "/page/tables.js";
+import { work } from "/page/work.js";
 
 const PAGE = 10_000;
-const LINKS = [["policies", "Policies"], ["learning", "Learning"], ["maps", "Maps"], ["probe", "Probe"], ["queue", "Queue"], ["sessions", "Sessions"], ["ledger", "Ledger"], ["models", "Models"], ["actions", "Steer"], ["log", "Log"], ["downloads", "Downloads"]];
+const LINKS = [["policies", "Policies"], ["work", "Train"], ["learning", "Learning"], ["maps", "Maps"], ["probe", "Probe"], ["queue", "Queue"], ["sessions", "Sessions"], ["ledger", "Ledger"], ["models", "Models"], ["actions", "Steer"], ["log", "Log"], ["downloads", "Downloads"]];
 
 export function surrogateView(main, name, context) {
   const url = path(name);
@@ -78,6 +79,7 @@ function build(main, name, spec, context) {
   const facts = h("div", { class: "facts" });
   const curves = learningCurves();
   const stored = policyList(name, spec, context);
+  const jobs = work(name, context);
   const controls = pointControls(spec, () => { map.moved(); probing.moved(); });
   const map = maps(name, spec, controls);
   const steer = actions(name, context);
@@ -104,6 +106,7 @@ function build(main, name, spec, context) {
   main.replaceChildren(title, facts,
     h("nav", { class: "jumps", "aria-label": "Parts of this page" }, LINKS.map(([id, text]) => h("a", { href: `#${id}`, onclick: jump(id) }, text))),
     stored.element,
+    jobs.element,
     section("learning", "Learning", "Confidence index and leave-one-out error of each output, against the number of real steps in the model.", curves.parts),
     section("maps", "Maps", "Each map shows two coordinates; the sliders set the others. Click a map, or use the arrow keys, to move the point.",
       h("div", { class: "cut" }, controls.form, h("div", {}, map.parts))),
@@ -131,6 +134,7 @@ function build(main, name, spec, context) {
       main.classList.toggle("unmodelled", !now.fidelity);
       if (models && models.length) curves.show(models);
       if (policies) stored.show(policies);
+      jobs.show({ now, policies });
       if (models) versions.show(models);
       const point = { samples, fidelity: now.fidelity, version: now.model_version };
       map.show(point);
@@ -143,7 +147,7 @@ function build(main, name, spec, context) {
       files.show(now);
       look(rest);
     },
-    repaint: () => [curves, map, probing, stored].forEach((part) => part.repaint()),
-    close: () => [curves, map, probing, stored].forEach((part) => part.close()),
+    repaint: () => [curves, map, probing, stored, jobs].forEach((part) => part.repaint()),
+    close: () => [curves, map, probing, stored, jobs].forEach((part) => part.close()),
   };
 }

@@ -43,7 +43,8 @@ class TrainTask(Request):
     seed: Seed = 0
     audit: bool = Field(
         default=True,
-        description="audit the policy by a few real steps, if a sampler is connected; they don't count to the budget",
+        description="audit the policy by a few real steps, if a sampler is connected; if the audit fails, further "
+        "steps of the budget are taken",
     )
 
     @model_validator(mode="after")
