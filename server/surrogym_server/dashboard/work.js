@@ -22,7 +22,8 @@ export function asked({ task }) {
     return `train${task.algorithm ? ` by ${task.algorithm}` : ""}, seed ${task.seed}${steps}`;
   }
   const beside = { zero: ", compared with an action of zero", random: ", compared with random actions" }[task.compare] ?? "";
-  return `evaluate version ${task.policy} in ${count(task.episodes)} real episodes${beside}`;
+  const starts = task.wide ? " from anywhere in the sampling range" : "";
+  return `evaluate version ${task.policy} in ${count(task.episodes)} real episodes${starts}${beside}`;
 }
 
 /** How far a job is, as one sentence. */
@@ -84,7 +85,11 @@ export function work(name, { role, refresh }) {
   let closed = false;
   let looking = false;
 
+  let sending = false;
+
   async function attempt(work, done) {
+    if (sending) return; // a second click
+    sending = true;
     try {
       const job = await work();
       said.className = "note good";
@@ -92,6 +97,8 @@ export function work(name, { role, refresh }) {
     } catch (error) {
       said.className = "bad";
       said.textContent = error.message;
+    } finally {
+      sending = false;
     }
     look();
   }
@@ -191,7 +198,7 @@ export function work(name, { role, refresh }) {
     } finally {
       looking = false;
     }
-    if (!closed && known?.jobs.some(({ status }) => OPEN.includes(status))) timer = setTimeout(look, LOOK_MS);
+    if (!closed && document.visibilityState === "visible" && known?.jobs.some(({ status }) => OPEN.includes(status))) timer = setTimeout(look, LOOK_MS);
   }
 
   return {

@@ -55,6 +55,7 @@ export function evaluationForm(start) {
   const policy = h("select", {});
   const episodes = whole({ min: 1, value: EPISODES, required: true });
   const compare = select([["", "nothing"], ["zero", "an action of zero"], ["random", "random actions"]]);
+  const starts = select([["", "as declared"], ["wide", "anywhere in the sampling range"]]);
   const cost = h("p", { class: "note" });
   let now = { most: 0, limit: null };
   const adapt = () => {
@@ -64,11 +65,12 @@ export function evaluationForm(start) {
     cost.textContent = now.limit === null ? `${count(all)} episodes of the original environment.` : `${count(all)} episodes of the original environment: up to ${count(all * now.limit)} real steps.`;
   };
   for (const input of [episodes, compare]) input.addEventListener("input", adapt);
-  const parts = form("Evaluate a policy", [field("Policy", policy), field("Real episodes", episodes), field("Compare with", compare), cost],
+  const parts = form("Evaluate a policy", [field("Policy", policy), field("Real episodes", episodes), field("Starts", starts), field("Compare with", compare), cost],
     h("button", { class: "main" }, "Evaluate"), () => start({
       kind: "evaluate",
       policy: policy.value,
       episodes: numberOf(episodes),
+      wide: starts.value === "wide",
       compare: compare.value || null,
     }));
   let listed = null;
