@@ -144,7 +144,7 @@ def _as_reader(route: Route) -> None:
     route.fulfill(json={"role": "read", "tokens": True})
 
 
-@pytest.mark.parametrize(("scheme", "width"), [("dark", 1280), ("light", 390), ("dark", 320)])
+@pytest.mark.parametrize(("scheme", "width"), [("dark", 1280), ("light", 320)])
 def test_it_is_readable_in_the_dark_and_on_a_phone(api: Api, open_page: Open, scheme: str, width: int):
     id = api.jobs.add(NAME, wire.TrainTask(kind="train")).id
     job = api.jobs.claim(NAME, "by-hand")

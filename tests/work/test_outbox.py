@@ -94,8 +94,17 @@ def test_a_policy_that_the_server_refuses_ends_its_job_and_stays(api: Api, outbo
     outbox.send(api)
     ended = api.jobs.get(NAME, job.id)
     assert ended.status == "failed"
-    assert "the policy was not stored: expected a policy for 'pendulum'" in (ended.error or "")
+    assert "the result was not stored: expected a policy for 'pendulum'" in (ended.error or "")
     assert (tmp_path / name).exists()
+
+
+def test_a_policy_whose_file_was_deleted_ends_its_job(api: Api, outbox: Outbox):
+    job = claimed(api)
+    outbox.put(Waiting(surrogate=NAME, job=job.id, lease_token=job.lease_token, status="cancelled", policy="gone.zip"))
+    outbox.send(api)
+    ended = api.jobs.get(NAME, job.id)
+    assert (ended.status, ended.version) == ("cancelled", None)
+    assert "no such policy file" in (ended.error or "")
 
 
 def test_a_job_that_another_worker_has_keeps_nothing_waiting(api: Api, outbox: Outbox, tmp_path: Path, told: list[str]):

@@ -19,6 +19,8 @@ from surrogym_client.original.classic import pendulum
 from surrogym_client.original.episodes import GymnasiumEpisode
 from surrogym_client.policies import load_policy
 from surrogym_client.transport import Api
+from surrogym_client.work.reporter import JobStopped, Stand
+from surrogym_client.work.tasks import Gathered, run_episodes
 from surrogym_client.work.worker import Environment, Worker, WorkerReport, WorkerSettings
 from surrogym_shared import wire
 
@@ -116,7 +118,50 @@ def test_a_job_that_fails_says_why_and_the_worker_goes_on(api: Api, run_one):
     assert (job.status, job.error) == ("failed", "RuntimeError: no power at all")
 
 
+def test_a_cancelled_evaluation_counts_the_real_steps_that_it_took(api: Api, tmp_path: Path):
+    version = api.policies.push(NAME, wire.PushedCard(algorithm="CMAES"), [], "zip", network_file(seed=5)).version
+    task = wire.EvaluateTask(kind="evaluate", policy=str(version), episodes=2)
+    gathered = Gathered()
+
+    class Cancelled:
+        """A reporter that is asked to stop after the seventh step."""
+
+        steps = 0
+
+        def at(self, *_: object) -> None:
+            self.steps += 1
+            if self.steps == 7:
+                raise JobStopped
+
+    one_machine = Environment(pendulum(), lambda: OneAtATime(pendulum()), 10)
+    with pytest.raises(KeyboardInterrupt):
+        run_episodes(api, NAME, task, one_machine, tmp_path, Cancelled(), gathered)
+    assert [(steps.steps, steps.note) for steps in gathered.steps] == [(7, "interrupted")]
+    assert gathered.evaluations == []
+
+
+class OneAtATime(GymnasiumEpisode):
+    """A machine, of which there is one."""
+
+    parallel = False
+
+
+def test_a_worker_that_is_stopped_keeps_the_best_policy(api: Api, tmp_path: Path):
+    id = api.jobs.add(NAME, LONG).id
+
+    def interrupt(stand: Stand) -> None:
+        if stand.stage == "training":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Worker(api, NAME, WorkerSettings("tester", tmp_path), show=interrupt).run()
+    ended = api.jobs.get(NAME, id)
+    assert (ended.status, ended.error) == ("cancelled", "the worker was stopped")
+    assert ended.version is not None
+
+
 @pytest.mark.e2e
+@pytest.mark.long
 def test_ctrl_c_keeps_the_best_policy_and_says_so(api: Api, tmp_path: Path):
     id = api.jobs.add(NAME, LONG).id
     command = [sys.executable, "-m", "surrogym_client", "work", NAME, "--folder", str(tmp_path), "--server", api.url]

@@ -11,7 +11,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from surrogym_client.errors import LeaseExpired, ProblemError, ServerUnreachable, SurrogymClientError, Unavailable
+from surrogym_client.errors import LeaseExpired, ServerUnreachable, SurrogymClientError, Unavailable
 from surrogym_client.policies.card import UnusablePolicy, first_fault
 from surrogym_client.policies.pushing import push
 from surrogym_client.transport.api import Api
@@ -69,53 +69,59 @@ class Outbox:
         """
         for path in sorted(self._folder.glob(f"*{ENDING}")):
             try:
-                self._tell(self._sent(api, _read(path)))
-                path.unlink(missing_ok=True)
+                waiting = _read(path)
             except FileNotFoundError:
                 continue  # another worker has sent it
+            except UnusablePolicy as error:
+                self._set_aside(path, error)
+                continue
+            try:
+                self._tell(self._sent(api, waiting))
+                path.unlink(missing_ok=True)
             except AWAY:
                 raise
-            except (SurrogymClientError, ValueError) as error:
-                aside = path.with_name(path.name.removesuffix(ENDING) + REFUSED)
-                with suppress(FileNotFoundError):
-                    os.replace(path, aside)
-                self._tell(f"the server does not take the result in {aside}: {error}")
+            except SurrogymClientError as error:
+                self._set_aside(path, error)
+
+    def _set_aside(self, path: Path, error: Exception) -> None:
+        aside = path.with_name(path.name.removesuffix(ENDING) + REFUSED)
+        with suppress(FileNotFoundError):
+            os.replace(path, aside)
+        self._tell(f"the server does not take the result in {aside}: {error}")
 
     def _sent(self, api: Api, waiting: Waiting) -> str:
         """Send one result, and describe what became of it."""
-        name = waiting.surrogate
+        name, status = waiting.surrogate, waiting.status
         for steps in waiting.steps:
             key = steps.idempotency_key
             api.report_steps(name, steps.steps, episodes=steps.episodes, note=steps.note, idempotency_key=key)
-        version, error = waiting.version, waiting.error
-        if waiting.policy is not None:
-            try:
+        version, number, error = waiting.version, None, waiting.error
+        try:
+            if waiting.policy is not None:
                 version = push(api, self._folder / waiting.policy, name).policy.version
-            except ProblemError as refused:
-                if isinstance(refused, AWAY):
-                    raise
-                error = _joined(error, f"the policy was not stored: {refused}")
-        number = None
-        for evaluation in waiting.evaluations:
-            stored = api.policies.evaluate(name, version or 0, evaluation)
-            number = stored.id if evaluation.controller == "policy" else number
-        status: wire.JobEnd = "failed" if error != waiting.error and waiting.status == "done" else waiting.status
+            number = _evaluated(api, name, version, waiting.evaluations)
+        except AWAY:
+            raise
+        except (SurrogymClientError, OSError) as refused:  # the job has to end all the same
+            error = in_one_line("; ".join([*([error] if error else []), f"the result was not stored: {refused}"]))
+            status = "failed" if status == "done" else status
         try:
             api.jobs.finish(
                 name, waiting.job, waiting.lease_token, status, error=error, version=version, evaluation=number
             )
         except LeaseExpired:
             return f"job {waiting.job}: the server gave it to another worker meanwhile{_stored(name, version)}"
-        said = f": {error}" if error else ""
-        return f"job {waiting.job} {status}{said}{_stored(name, version)}"
+        return f"job {waiting.job} {status}{f': {error}' if error else ''}{_stored(name, version)}"
+
+
+def _evaluated(api: Api, name: str, version: int | None, evaluations: tuple[wire.AddEvaluation, ...]) -> int | None:
+    """Send the evaluations of a policy, and return the number of its own; None without one."""
+    stored = [api.policies.evaluate(name, version or 0, evaluation) for evaluation in evaluations]
+    return next((one.id for one in stored if one.controller == "policy"), None)
 
 
 def _stored(name: str, version: int | None) -> str:
     return "" if version is None else f"; see {name}@{version}"
-
-
-def _joined(before: str | None, more: str) -> str:
-    return in_one_line(more if before is None else f"{before}; {more}")
 
 
 def in_one_line(text: str) -> str:

@@ -38,7 +38,9 @@ class Stand:
         base = self.base + before.steps if before is not None and now.steps < before.steps else self.base
         point = wire.CurvePoint(steps=base + now.steps, imagined_return=finite(now.imagined_return), seconds=seconds)
         curve = (*self.curve, point)
-        return replace(self, stage="training", share=now.steps / now.total_steps, now=now, curve=curve, base=base)
+        return replace(
+            self, stage="training", share=now.steps / max(now.total_steps, 1), now=now, curve=curve, base=base
+        )
 
     def as_sent(self) -> wire.JobState:
         """Return the form that the server stores."""

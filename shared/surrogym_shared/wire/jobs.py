@@ -68,6 +68,14 @@ class EvaluateTask(Request):
         default=None, description="also run the same starts without the policy, with these actions"
     )
 
+    @model_validator(mode="after")
+    def _within_limit(self) -> EvaluateTask:
+        if self.real_episodes > MAX_JOB_EPISODES:
+            raise ValueError(
+                f"expected at most {MAX_JOB_EPISODES} episodes with the comparison's, got {self.real_episodes}"
+            )
+        return self
+
     @property
     def real_episodes(self) -> int:
         """Of the policy and of the comparison together."""
