@@ -34,7 +34,7 @@ class Part:
 @dataclass(frozen=True)
 class Judgement:
     """Results of an evaluation. ``also`` is from the task's other starts, None without any. ``without`` is without the
-    policy, from the first of the declared starts, None if starts are not drawn."""
+    policy, from the first of the declared starts."""
 
     real: Part
     also: Part | None
@@ -46,10 +46,9 @@ class Judgement:
         return [part for part in (self.real, self.also, self.without) if part is not None]
 
     @property
-    def results(self) -> tuple[Evaluation, Evaluation | None, Evaluation | None]:
+    def results(self) -> tuple[Evaluation, Evaluation | None, Evaluation]:
         """The results of the policy, of the other starts, and without the policy."""
-        also, without = (None if part is None else part.result for part in (self.also, self.without))
-        return self.real.result, also, without
+        return self.real.result, None if self.also is None else self.also.result, self.without.result
 
     @property
     def steps(self) -> int:
