@@ -32,6 +32,8 @@ ELSEWHERE = {
     "reproduce trust": "tests/experiments/test_unseen.py",
     "serve": "tests/server/cli/test_serve.py",
     "train": "test_commands.py",
+    "jobs": "test_jobs.py",
+    "work": "tests/work",
 }
 LINES = """
 register CartPole-v1 --name NAME --budget 6 --initial 4
