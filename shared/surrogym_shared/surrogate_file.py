@@ -41,7 +41,7 @@ Header = dict[str, Any]
 
 
 class NotASurrogateFile(ValueError):
-    """The bytes are not a surrogate's file. The message says what was expected and what came."""
+    """The bytes are not a surrogate's file. The message says what was expected and what was found."""
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,7 @@ def _registries() -> Iterator[Registry[Any]]:
 
 
 def service(api: Api) -> Iterator[Finding]:
-    """The server: whether it answers, is ready, speaks this protocol, and accepts this token; and the time of a round
+    """Check whether the server answers, is ready, speaks this protocol and accepts this token, and measure a round
     trip.
 
     Findings that depend on a failed one are left out.

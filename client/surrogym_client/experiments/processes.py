@@ -47,7 +47,7 @@ class Child:
 
 
 class Children:
-    """The processes of one run. Leaving the context stops them all, for any reason."""
+    """Operating-system processes of one run. Leaving the context stops them all, also after an error or Ctrl-C."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

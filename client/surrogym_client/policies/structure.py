@@ -103,7 +103,7 @@ class Structure(BaseModel):
 
     @property
     def weights(self) -> int:
-        """Smallest number of weights of a network with the described layers."""
+        """Number of weights that a network with the described layers needs at least, without biases."""
         inputs, arch = len(self.observation_space.low), self.net_arch
         parts = {"pi": arch} if isinstance(arch, list) else dict(arch)
         actor, others = parts.pop("pi", []), parts.values()

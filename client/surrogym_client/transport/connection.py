@@ -67,7 +67,7 @@ class Retries:
     factor: float = 2.0
 
     def delays(self) -> Iterator[float]:
-        """Iterate over the pauses between attempts, in seconds, until the retry budget is spent."""
+        """Iterate over the pauses between attempts, in seconds, until the time for retries has passed."""
         if self.seconds <= 0:
             return
         deadline = time.monotonic() + self.seconds

@@ -28,7 +28,8 @@ R = TypeVar("R", frames.ResetReply, frames.StepReply, frames.RolloutReply, frame
 
 
 class Form(Protocol):
-    """Encoding of requests and replies. Writers raise ``InvalidInput`` for values that can't be sent."""
+    """Encoding of requests and replies. Its methods that write raise ``InvalidInput`` for values that can't be sent,
+    such as NaN in JSON."""
 
     media_type: str
 

@@ -51,7 +51,7 @@ class Door:
 
         Raises:
             Unauthenticated: no token, or an unknown one.
-            Forbidden: a token of another role.
+            Forbidden: the token's role does not allow this route.
             HTTPException: 415 for another media type or an encoded body, 413 if the announced size is too large.
         """
         state = scope["app"].state

@@ -27,7 +27,8 @@ async def healthz(request: Request) -> Health:
 @router.head("/readyz", include_in_schema=False, dependencies=[PUBLIC])
 @router.get("/readyz", summary="That it can work", dependencies=[PUBLIC], responses=documented(Code.UNAVAILABLE))
 def readyz(use: Use) -> Ready:
-    """Whether the database has its tables and accepts writes, checked at most once a second. Needs no token."""
+    """Whether the server can serve: its database has the tables and accepts writes. Otherwise the answer is 503.
+    Checked at most once a second; needs no token."""
     use.storage.ping()
     return Ready(status="ready", storage="ok")
 

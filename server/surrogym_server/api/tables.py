@@ -33,7 +33,8 @@ def as_csv(coordinate_names: Sequence[str], records: Sequence[SampleRecord]) -> 
 
 
 def as_npz(coordinate_names: Sequence[str], records: Sequence[SampleRecord]) -> bytes:
-    """Arrays of n samples: coordinates (n, C), action (n, F), next_coordinates (n, C), the others (n,)."""
+    """Write samples as an NPZ archive: coordinates (n, C), action (n, F) and next_coordinates (n, C), and reward,
+    termination, purpose and the like (n,)."""
     arrays: dict[str, Any] = {name: np.array([getattr(record, name) for record in records]) for name in ARRAYS}
     buffer = io.BytesIO()
     np.savez(buffer, coordinate_names=np.array(coordinate_names), **arrays)

@@ -43,7 +43,7 @@ def connect(settings: Settings, store: LiveSessions) -> SessionEngine:
         store: the records of sessions, in the same database.
 
     Raises:
-        InvalidInput: as ``check``; no cluster there; or one of other versions or other settings.
+        InvalidInput: the settings can't serve a cluster, there is no cluster, or it runs other versions or settings.
         Unavailable: the hosts do not become ready.
     """
     check(settings)

@@ -126,8 +126,10 @@ class OutputOutlook(ABC):
 
     @abstractmethod
     def reduction(self, weights: Tensor) -> Tensor:
-        """Return how much a sample at each candidate lowers the variance over the reference points, weighted by
-        weights (r,): (m,)."""
+        """Return by how much a sample at each of m candidates lowers the weighted sum of the variances at r reference
+        points.
+
+        Shapes: weights (r,), result (m,)."""
 
     @abstractmethod
     def observe(self, index: int) -> OutputOutlook:
@@ -283,5 +285,5 @@ class CompiledSteps(ABC):
 class Differentiable:
     """Mark of a model whose ``transition`` autograd can differentiate with respect to q and u. It has no methods.
 
-    Fallback of ``gradients``: the search by gradients is refused in one sentence.
+    For a model without this mark, the policy search ``gradient`` is refused with one sentence.
     """

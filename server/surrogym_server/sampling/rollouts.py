@@ -72,8 +72,8 @@ def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random
 def plan_round(
     model: DynamicsModel, aim: Aim, steps: int, pending: Sequence[Tensor], rng: np.random.Generator
 ) -> list[Tensor]:
-    """Plan sequences with ``steps`` real steps in all, each given answers to those before it and to the
-    pending ones."""
+    """Plan action sequences with ``steps`` real steps in all. Each one is planned as if the earlier and the pending
+    ones had already been answered."""
     rollouts: list[Tensor] = []
     done = list(pending)
     while steps > 0:

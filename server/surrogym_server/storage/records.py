@@ -134,7 +134,8 @@ class NewDesign:
 
 @dataclass(frozen=True)
 class Asked:
-    """Content of a query: one real step from given coordinates, or an action sequence from a reset."""
+    """Content of a stored query, without its state and lease: one real step from given coordinates, or an action
+    sequence from a reset."""
 
     kind: QueryKind
     coordinates: Vector  # (C,) of a step; () of a rollout

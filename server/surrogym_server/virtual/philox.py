@@ -35,7 +35,7 @@ def uniforms(words: Tensor) -> Tensor:
 
 
 def normals(words: Tensor) -> Tensor:
-    """Standard normal numbers from words (..., 4), by Box and Muller on pairs; same shape."""
+    """Standard normal numbers (..., 4) from random 32-bit words (..., 4), two from each pair (Box and Muller 1958)."""
     u = uniforms(words)
     radius = (-2 * u[..., 0::2].log()).sqrt()
     angle = 2 * math.pi * u[..., 1::2]

@@ -24,7 +24,8 @@ INNER: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, *
 
 
 def compiled(function: F) -> F:
-    """Compile a function that compiled code calls. A product and a sum may be rounded together."""
+    """Compile a function that is called from compiled code. The compiler may round a product and the sum that follows
+    it only once."""
     return cast(F, njit(fastmath={"contract"}, **INNER)(function))
 
 

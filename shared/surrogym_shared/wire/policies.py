@@ -114,7 +114,7 @@ class EpisodeTrace(Request):
 
 
 class AddEvaluation(Request):
-    """Real episodes of a policy, or of a baseline from the same starts.
+    """Add the results of real episodes: of a policy, or of a baseline that ran the same starts.
 
     ``returns``, ``lengths`` and ``success`` have one entry for each episode.
     """

@@ -27,7 +27,7 @@ class Run(Protocol):
         ...
 
     def keep(self, judgement: Judgement) -> None:
-        """Enter the steps of the evaluation, and write pictures and data into the run folder."""
+        """Enter the real steps of the evaluation into the ledger, and write pictures and data into the run folder."""
         ...
 
     def linger(self) -> None:

@@ -187,7 +187,7 @@ def make_learner(
     statistics: Statistics,
     gamma: float,
 ) -> BaseAlgorithm:
-    """Make a new network, or load the saved one to start from.
+    """Make a new network, or load the policy of ``settings.start_from``.
 
     Raises:
         ValueError: the algorithm does not support this surrogate.

@@ -105,7 +105,7 @@ def share(connection: Connection, name: str) -> Row[Any]:
 
 
 def sweep_if_needed(connection: Connection, name: str) -> None:
-    """Hold and sweep the surrogate if it exists and has leases to end."""
+    """Lock the surrogate's row and end its expired leases, if it exists and has some."""
     own = sa.select(surrogates.c.id).where(surrogates.c.name == name).scalar_subquery()
     ended = expiry.has_ended(connection, leases, IS_OPEN)
     wanted = sa.select(leases.c.id).where(leases.c.surrogate_id == own, ended).limit(1)

@@ -61,7 +61,8 @@ class Axes:
 
 @dataclass(frozen=True)
 class Cut:
-    """A cut: states lie inside beyond a level of one axis, which is somewhere between ``outside`` and ``inside``."""
+    """Threshold on one axis. A state is inside the region if its value on the axis lies beyond the threshold, on the
+    side of ``inside``. The threshold itself is only known to lie between ``outside`` and ``inside``."""
 
     axis: int
     outside: float
