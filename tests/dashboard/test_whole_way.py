@@ -67,8 +67,8 @@ def test_a_page_alone_leads_to_a_judged_policy_of_ones_own_environment(
         here.get_by_label("Compare with").select_option("an action of zero")
         here.get_by_role("button", name="Evaluate").click()
         expect(ended).to_contain_text(
-            re.compile("Promised .*; really .* in 50 episodes: the promise was (kept|broken)")
+            re.compile("Promised .*; real mean return .* in 50 episodes: the promise was (kept|broken)")
         )
-        expect(page.locator("#policies summary").first).to_contain_text("really")
+        expect(page.locator("#policies summary").first).to_contain_text("real mean return")
         assert serious(page) == []
     assert complaints == []

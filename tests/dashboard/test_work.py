@@ -127,7 +127,7 @@ def test_an_evaluation_is_started_and_its_result_shown(api: Api, open_page: Open
     here.get_by_role("button", name="Evaluate").click()
     row = here.get_by_role("list", name="Jobs that have ended").locator("li").first
     expect(row).to_contain_text(f"evaluate version {version} in 3 real episodes, compared with an action of zero")
-    expect(row).to_contain_text(re.compile(f"done.*version {version}: Nothing was promised; really .* in 3 episodes"))
+    expect(row).to_contain_text(re.compile(f"done.*version {version}: No promise; real mean return .* in 3 episodes"))
 
 
 def test_a_token_that_only_reads_sees_jobs_and_starts_none(api: Api, open_page: Open):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -72,15 +73,9 @@ def command(
         asked = awaited_surrogate(api, surrogate, wait, quiet=output.quiet).spec
         environment = _environment(surrogate, env, read_spec(spec), asked, most_episodes, quiet=output.quiet)
         with progress("work", quiet=output.quiet) as update:
-            run = Worker(
-                api,
-                surrogate,
-                settings,
-                environment,
-                service.token_for(context),
-                tell=lambda text: say(text, quiet=output.quiet),
-                show=_showing(update),
-            )
+            tell = partial(say, quiet=output.quiet)
+            token = service.token_for(context)
+            run = Worker(api, surrogate, settings, environment, token, tell, _showing(update))
             update(None, f"waiting for jobs of {surrogate}")
             with terminations_as_interrupts(), on_interrupt(lambda: f"interrupted; {_words(run.report())}"):
                 report = run.run()
