@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import pytest
 
+from support.policies import left_alone
 from surrogym_client.transport import Api
 from surrogym_shared import wire
 
 
 @pytest.fixture
 def api(pendulum_server):
-    with Api(pendulum_server.url) as opened:
+    with Api(pendulum_server.url) as opened, left_alone(opened, "pendulum"):
         yield opened
 
 

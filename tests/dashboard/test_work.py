@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import Locator, Page, Route, expect
 
 from support.browser import serious
-from support.policies import network_file
+from support.policies import left_alone, network_file
 from support.server import ServerProcess
 from surrogym_client.original.classic import pendulum
 from surrogym_client.original.episodes import GymnasiumEpisode
@@ -27,10 +27,8 @@ OVERFLOW = "document.documentElement.scrollWidth - innerWidth"
 @pytest.fixture
 def api(pendulum_server: ServerProcess) -> Iterator[Api]:
     expect.set_options(timeout=60_000)
-    with Api(pendulum_server.url) as opened:
+    with Api(pendulum_server.url) as opened, left_alone(opened, NAME):
         yield opened
-        for job in opened.jobs.list(NAME).jobs:
-            opened.jobs.cancel(NAME, job.id)
 
 
 @pytest.fixture

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -12,6 +14,20 @@ from surrogym_client.original.classic import pendulum
 from surrogym_client.transport import Api
 from surrogym_shared import wire
 from surrogym_shared.network import Network
+
+
+@contextmanager
+def left_alone(api: Api, surrogate: str) -> Iterator[None]:
+    """End without the jobs and policies that came in the context: other tests share the surrogate."""
+    before = {policy.version for policy in api.policies.list(surrogate)}
+    try:
+        yield
+    finally:
+        for job in api.jobs.list(surrogate).jobs:
+            api.jobs.cancel(surrogate, job.id)
+        for policy in api.policies.list(surrogate):
+            if policy.version not in before:
+                api.policies.delete(surrogate, policy.version)
 
 
 def network_file(seed: int) -> bytes:

@@ -10,6 +10,7 @@ from uuid import uuid4
 import numpy as np
 import pytest
 
+from support.policies import left_alone
 from support.server import ServerProcess
 from surrogym_client.errors import ServerUnreachable
 from surrogym_client.original.classic import cartpole, pendulum
@@ -26,10 +27,8 @@ TASK = wire.TrainTask(kind="train")
 
 @pytest.fixture
 def api(pendulum_server: ServerProcess) -> Iterator[Api]:
-    with Api(pendulum_server.url) as opened:
+    with Api(pendulum_server.url) as opened, left_alone(opened, NAME):
         yield opened
-        for job in opened.jobs.list(NAME).jobs:
-            opened.jobs.cancel(NAME, job.id)
 
 
 @pytest.fixture

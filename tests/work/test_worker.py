@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from support.policies import network_file
+from support.policies import left_alone, network_file
 from support.server import ServerProcess
 from surrogym_client.original.classic import pendulum
 from surrogym_client.original.episodes import GymnasiumEpisode
@@ -31,10 +31,8 @@ LONG = SHORT.model_copy(update={"steps": 500_000})
 
 @pytest.fixture
 def api(pendulum_server: ServerProcess) -> Iterator[Api]:
-    with Api(pendulum_server.url) as opened:
+    with Api(pendulum_server.url) as opened, left_alone(opened, NAME):
         yield opened
-        for job in opened.jobs.list(NAME).jobs:
-            opened.jobs.cancel(NAME, job.id)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
-from support.policies import network_file
+from support.policies import left_alone, network_file
 from support.server import ServerProcess
 from surrogym_client.errors import InvalidInput, LeaseExpired, NoModel, Overloaded, UnknownJob, UnknownPolicy
 from surrogym_client.original.classic import pendulum
@@ -29,11 +29,9 @@ def api(server_process: ServerProcess) -> Iterator[Api]:
 
 @pytest.fixture
 def known(api: Api, taught: str) -> Iterator[str]:
-    """A surrogate with a model; jobs that nobody claimed are cancelled at the end."""
-    yield taught
-    for job in api.jobs.list(taught).jobs:
-        if job.status == "queued":
-            api.jobs.cancel(taught, job.id)
+    """A surrogate with a model; jobs that are queued at the end are cancelled."""
+    with left_alone(api, taught):
+        yield taught
 
 
 def test_a_job_is_seen_from_its_queue_to_its_end(api: Api, known: str):
