@@ -65,6 +65,14 @@ def test_a_job_that_is_cancelled_or_lost_stops_at_its_next_progress(answer: bool
         assert (reporter.cancelled, reporter.taken) == (not taken, taken)
 
 
+def test_the_end_of_a_short_training_is_reported_before_its_result():
+    jobs, slow = Jobs([False]), JOB.model_copy(update={"lease_seconds": 600.0})
+    with Reporter(jobs, "pendulum", slow) as reporter:
+        reporter.trained(progress(10))
+        reporter.storing()
+    assert [point.steps for point in jobs.states[-1].curve] == [10]
+
+
 def test_a_server_that_is_away_stops_nothing_and_hears_of_it_later():
     jobs = Jobs([ServerUnreachable("away"), ServerUnreachable("away"), False])
     with Reporter(jobs, "pendulum", JOB) as reporter:

@@ -112,9 +112,10 @@ class Reporter:
         self._note(replace(self.stand, stage=stage, share=share))
 
     def storing(self) -> None:
-        """Note that the result is being sent, which nothing stops."""
+        """Report at once that the result is being sent, which nothing stops, with the end of the curve."""
         self.stand = replace(self.stand, stage="storing", share=0.0)
         self.show(self.stand)
+        self._report(self.stand)
 
     def _note(self, stand: Stand) -> None:
         self.stand = stand
