@@ -68,6 +68,7 @@ def take_registration(browser: Browser, url: str) -> None:
     page.get_by_label("or paste its text").fill(mountain_car().model_dump_json(indent=1))
     page.get_by_role("button", name="Check", exact=True).click()
     page.get_by_role("button", name="Register").wait_for()
+    page.evaluate("document.querySelector('#spec').scrollTop = 0")
     page.screenshot(path=IMAGES / "page-register.png", full_page=True)
     page.close()
 

@@ -39,6 +39,7 @@ def test_a_drafted_specification_is_shown_and_then_registered(
     expect(shown).to_contain_text("is 8 the limit of speed?")
     expect(shown.get_by_role("region", name="Coordinates")).to_contain_text(re.compile("speed.*−8.00 to 8.00"))
     expect(shown).to_contain_text(re.compile("budget30 real steps"))
+    expect(shown).to_contain_text(re.compile("success.*cos.*theta"))
     assert serious(page) == []
     with Api(url) as api:
         assert "by-page" not in [one.name for one in api.surrogates()]

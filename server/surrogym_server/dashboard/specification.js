@@ -41,6 +41,16 @@ function actionWords({ kind, low, high, n, nvec }) {
 
 const rewardWords = ({ kind, terms }) => (kind === "learned" ? "learned from the real steps" : `declared, with ${plural(terms.length, "term")}`);
 
+/** What an episode must meet to count as a success. */
+function successWords({ hold, hold_steps: steps, min_steps: least, terminated, min_return: most }) {
+  return [
+    hold.length && `${holds(hold)}${steps > 1 ? ` in the last ${plural(steps, "step")}` : " at the end"}`,
+    least !== null && `at least ${plural(least, "step")}`,
+    terminated !== null && (terminated ? "the episode was ended by a rule" : "no rule ended the episode"),
+    most !== null && `a return of at least ${number(most)}`,
+  ].filter(Boolean).join("; and ");
+}
+
 function facts(spec) {
   return [
     ["environment", spec.environment || "an own one"],
@@ -49,7 +59,7 @@ function facts(spec) {
     ["an episode ends", endings(spec)],
     ["a sampler", spec.query === "step" ? "sets the environment to any state" : "resets the environment and acts from there"],
     spec.starts.length && ["episodes start", `at one of ${plural(spec.starts.length, "state")}`],
-    spec.success && ["success", holds(spec.success.hold)],
+    spec.success && ["success", successWords(spec.success)],
   ].filter(Boolean);
 }
 
