@@ -179,13 +179,15 @@ def test_a_video_plays_on_the_page_and_a_broken_one_is_named(url: str, open_page
 @pytest.mark.parametrize(
     ("where", "scheme", "width"),
     [("", "light", 1280), ("s/better", "dark", 1280), ("s/pendulum", "light", 390)]
-    + [(where, "dark", 390) for where in ("compare/worse/better", "register")],
+    + [(where, "dark", 390) for where in ("compare/worse/better", "register", "s/absent")],
 )
 def test_axe_finds_nothing_serious(url: str, open_page: Open, where: str, scheme: str, width: int):
     page = open_page(f"{url}/#/{where}", scheme=scheme, width=width)
     if where == "register":
         page.get_by_text("Start from a log instead").click()
         page.get_by_text("The columns have other names").click()
+    elif where == "s/absent":
+        expect(page.get_by_role("alert").filter(has_text="no surrogate")).to_be_visible()
     elif where.startswith("compare"):
         expect(page.locator(".ranges")).to_be_visible()
     elif where:

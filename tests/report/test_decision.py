@@ -115,6 +115,7 @@ def test_the_report_of_a_tested_policy_is_complete(modelled: Known):
     assert "Reality came out as predicted" in parts["Was it predicted?"]
     assert "Another unit of the machine" in parts["What was not tested"]
     assert "not every start succeeded" in parts["What to do next"]
+    assert "surrogym evaluate policy.zip --reference module:Class" in parts["What to do next"]
     assert "What could not be read" not in parts
 
 
@@ -136,6 +137,7 @@ def test_a_reference_controller_stands_beside_the_policy(modelled: Known):
     assert "with the reference controller: 10.0 more with it (95 %: 10.0 to 10.0)" in beside
     assert beside.count("[picture]") == 1
     assert "A controller of reference" not in parts["What was not tested"]
+    assert "--reference" not in parts["What to do next"]
 
 
 def test_a_broken_promise_comes_first_in_the_next_steps(modelled: Known):

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from surrogym_client.report.doubts import next_steps, untested
 from surrogym_client.report.episodes import Range, draw_episodes, draw_ranges
 from surrogym_client.report.figures import svg
-from surrogym_client.report.html import bullets, moving, paragraph, picture, section, table
+from surrogym_client.report.html import bullets, moving, on_screen, paragraph, picture, section, table
 from surrogym_client.report.known import Known
 from surrogym_client.report.maps import Cut
 from surrogym_client.surrogates.advice import verdict
@@ -121,7 +121,7 @@ def _video(known: Known) -> str:
         return ""
     alt = "Video: the best, the median and the worst real episode beside each other"
     words = "The video shows the best, the median and the worst episode beside each other, drawn from their states."
-    return moving(*known.video, alt) + paragraph(words)
+    return on_screen(moving(*known.video, alt) + paragraph(words))
 
 
 def _beside(known: Known) -> str:

@@ -57,6 +57,10 @@ def next_steps(known: Known) -> list[str]:
         found.append(f"Run more episodes: surrogym evaluate policy.zip --episodes {FEW}")
     if known.without is None:
         found.append("Run the same starts without it: surrogym evaluate policy.zip --compare random")
+    if not any(one.controller == "reference" for one in policy.evaluations):
+        found.append(
+            "Compare it with the controller in use today: surrogym evaluate policy.zip --reference module:Class"
+        )
     if not any("changed by" in one.note for one in policy.evaluations):
         found.append("Find out how much change of the machine it stands: surrogym evaluate policy.zip --perturb 0.1")
     if real.promise_kept and PREFERRED not in policy.aliases:

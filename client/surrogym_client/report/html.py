@@ -24,7 +24,7 @@ img, video { width: 100%; max-width: 45rem; background: white; border-radius: 0.
 pre { overflow-x: auto; font-size: 0.85em; }
 @media print {
   body { max-width: none; margin: 0; color: black; } section { break-inside: avoid; } h1.part { break-before: page; }
-  img { max-width: 100%; }
+  img { max-width: 100%; } .moving { display: none; }
 }
 """
 
@@ -66,6 +66,11 @@ def moving(kind: str, content: bytes, alt: str) -> str:
     if kind.startswith("image/"):
         return f'<img alt="{escape(alt)}" src="{source}">'
     return f'<video controls muted aria-label="{escape(alt)}" src="{source}">This browser plays no {kind}.</video>'
+
+
+def on_screen(content: str) -> str:
+    """Content that is left out where the page is printed."""
+    return f'<div class="moving">{content}</div>'
 
 
 def rows(pairs: Iterable[tuple[str, Any]]) -> str:
