@@ -169,16 +169,16 @@ def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum
     assert (card["surrogate"], card["seed"]) == (pendulum, 3)
     assert 0 < card["virtual_steps"] == trained.json["virtual_steps"] <= 2000
     assert trained.json["version"] == 1
-    evaluated = on_server(
-        "evaluate", "policy.zip", "--episodes", "3", "--compare", "zero", "--where", "--json", "--quiet"
-    )
+    besides = ("--compare", "zero", "--reference", "policy.zip")
+    evaluated = on_server("evaluate", "policy.zip", "--episodes", "3", *besides, "--where", "--json", "--quiet")
     assert evaluated.code == 0, evaluated.err
     assert (evaluated.json["version"], evaluated.json["steps"], evaluated.json["without"]["steps"]) == (1, 600, 600)
+    assert evaluated.json["reference"]["per_episode"] == evaluated.json["per_episode"]  # it is the policy itself
     assert evaluated.json["disagreements"]["compared"] == 400
     assert [episode["seed"] for episode in evaluated.json["disagreements"]["episodes"]] == [10_000, 10_001, 10_002]
     assert len(evaluated.json["per_episode"]) == 3
     with Api(server_process.url) as api:
-        assert api.surrogate(pendulum).ledger.evaluation == 1200
+        assert api.surrogate(pendulum).ledger.evaluation == 1800
     _look_at(on_server, pendulum, tmp_path)
     nothing = on_server("sample", pendulum, "--max-queries", "1", "--time-limit", "0.5")
     assert "None" not in nothing.out
@@ -206,6 +206,7 @@ def _look_at(on_server, pendulum, tmp_path):
     assert "production" in listed
     shown = on_server("policy", f"{pendulum}@production").out
     assert re.search(r"zero +declared starts, from seed 10000 +3 ", shown)
+    assert re.search(r"reference +declared starts, from seed 10000 +3 ", shown)
     taken = on_server("policy", "get", f"{pendulum}@production", "--out", "taken.zip")
     assert taken.code == 0, taken.err
     assert (tmp_path / "taken.zip").read_bytes() == (tmp_path / "policy.zip").read_bytes()

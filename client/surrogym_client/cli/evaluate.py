@@ -143,10 +143,11 @@ def command(
     run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
     reports = _reports(beside.controllers(policy, card, reading, opener), run, enter, settings, policy)
     result = reports[0][1]
-    filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if video else None
-    version = None
-    if push and ledger is not None:
+    version, stored = None, push and ledger is not None
+    if stored:
         _keep(policy, reports, settings, quiet=output.quiet)
+    filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if video else None
+    if stored:
         version = push_or_say(service.server, service.token_for(context), policy, ledger, quiet=output.quiet)
     promise = card.promise if settings.declared and settings.episodes >= FEWEST_TO_JUDGE else None
     found, token = None, service.token_for(context)

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings
     from surrogym_client.original.episodes import Episode
     from surrogym_client.policies.card import PolicyCard
+    from surrogym_shared.spec import EnvironmentSpec
 
 
 def film(
@@ -25,24 +26,23 @@ def film(
 ) -> Path | None:
     """Write a video of the best, median and worst episode beside the policy, in the place of an older one.
 
-    An environment without a picture must not spoil an evaluation: the terminal then shows the reason, and the result is
-    None.
+    No trouble with pictures may spoil an evaluation: the terminal then shows the reason, and the result is None.
     """
     from surrogym_client.evaluation.reporting import words_of
     from surrogym_client.evaluation.videos import FORMS, record
     from surrogym_client.original.errors import NotRenderable
     from surrogym_shared.terminal import progress, say
 
-    episode = opener()
-    spec = episode.spec
-    episode.close()
-    name = env or (card.spec.environment if card.spec is not None else spec.environment)
     try:
+        spec = _spec(env, card, opener)
         with progress("video", quiet=quiet) as update:
             update(None, "drawing the best, the median and the worst episode")
-            video = record(spec, name, result, words_of(settings))
+            video = record(spec, env or spec.environment, result, words_of(settings))
     except NotRenderable as error:
         say(f"no video: {error}", quiet=quiet)
+        return None
+    except Exception as error:  # one's own environment may raise anything when it is opened or drawn
+        say(f"no video: {type(error).__name__}: {error}", quiet=quiet)
         return None
     for form in FORMS:
         policy.with_suffix(f".{form}").unlink(missing_ok=True)
@@ -50,3 +50,17 @@ def film(
     path.write_bytes(video.content)
     say(f"video written to {path} ({len(video.content) / 1000:.0f} kB)", quiet=quiet)
     return path
+
+
+def _spec(env: str | None, card: PolicyCard, opener: Callable[[], Episode]) -> EnvironmentSpec:
+    """Return the specification of what is drawn. One's own environment, which may be a machine, is not opened for it if
+    the card has one."""
+    from surrogym_client.original.loading import is_own
+
+    if env is not None and is_own(env) and card.spec is not None:
+        return card.spec
+    episode = opener()
+    try:
+        return episode.spec
+    finally:
+        episode.close()
