@@ -1,10 +1,24 @@
-"""Address of a Ray cluster."""
+"""How a Ray cluster is reached: its address, and the token that it asks for."""
 
 from __future__ import annotations
 
+import os
 import socket
+from pathlib import Path
 
 KNOCKING_SECONDS = 10.0
+AUTH_MODE, TOKEN, TOKEN_PATH = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"
+
+
+def send_token() -> None:
+    """Let Ray send this user's token, if there is one. To be called before Ray is imported.
+
+    ``ray start`` asks for the token if there is one. But Ray 2.60 reads whether to send it when it is imported, and
+    decides to send it later, in ``ray.init``. A cluster that asks for no token ignores it.
+    """
+    path = Path(os.environ.get(TOKEN_PATH) or Path.home() / ".ray" / "auth_token")
+    if os.environ.get(TOKEN) or path.is_file():
+        os.environ.setdefault(AUTH_MODE, "token")
 
 
 def require_cluster(address: str) -> None:

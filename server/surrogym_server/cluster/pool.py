@@ -16,7 +16,7 @@ from surrogym_server.engine.port import Compute, SessionEngine
 from surrogym_server.errors import InvalidInput, Unavailable
 from surrogym_server.settings import Settings
 from surrogym_server.storage.live_sessions import LiveSessions
-from surrogym_shared.ray_address import require_cluster
+from surrogym_shared.ray_address import require_cluster, send_token
 
 logger = logging.getLogger(__name__)
 
@@ -47,6 +47,7 @@ def connect(settings: Settings, store: LiveSessions) -> SessionEngine:
         Unavailable: the hosts do not become ready.
     """
     check(settings)
+    send_token()
     import ray
 
     try:

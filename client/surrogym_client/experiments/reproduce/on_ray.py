@@ -16,7 +16,7 @@ from typing import Any
 from surrogym_client.experiments.processes import RunFailed
 from surrogym_client.experiments.reproduce.cells import ONE_THREAD, Cell, Command, Places, Run, failed, row_of_run
 from surrogym_client.experiments.reproduce.rows import Row
-from surrogym_shared.ray_address import require_cluster
+from surrogym_shared.ray_address import require_cluster, send_token
 
 RETRIES = 1  # of a run whose process or machine died
 
@@ -38,6 +38,7 @@ def connect(address: str) -> None:
     """
     if find_spec("ray") is None:
         raise RunFailed("--on-ray: expected the package ray, got none: pip install 'surrogym[ray]'")
+    send_token()
     import ray
 
     try:
