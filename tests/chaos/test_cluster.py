@@ -6,21 +6,26 @@ import os
 import random
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+import numpy as np
 import pytest
 import sqlalchemy as sa
+from numpy.typing import NDArray
 
 from support.chaos import SEED, times
-from support.disturbed import disturbed_training, require_same_policy
+from support.disturbed import PATIENT, disturbed_training, require_same_policy
 from support.postgresql import running_postgresql
+from support.ray_cluster import RayCluster
 from support.server import RestartingServer
 from support.teaching import teach
 from surrogym_client.original.classic import pendulum
 from surrogym_client.training import TrainResult
-from surrogym_client.transport import Api
+from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_shared.wire import OpenSession
 
 ray = pytest.importorskip("ray")
 
@@ -90,6 +95,48 @@ def test_a_killed_front_server_changes_no_bit_of_the_policy(
         server.start()
 
     require_same_policy(disturbed_training(server.url, tmp_path / "killed.zip", FAULTS, strike), calm)
+
+
+def test_a_cluster_that_is_killed_whole_and_begun_again_goes_on_with_its_sessions(tmp_path: Path):
+    """With its front server, which ends or is started again when its cluster is gone. PostgreSQL has the sessions."""
+    actions = np.random.default_rng(SEED).uniform(-2, 2, (200, 2, 1))
+    with running_postgresql() as postgresql, TemporaryDirectory(prefix="ray") as folder:
+        cluster = RayCluster(Path(folder), HOSTS)
+        cluster.start()
+        try:
+            options = ("--database", postgresql.new_database(), "--engine", "ray", "--ray-address", cluster.address)
+            server = RestartingServer(tmp_path, *options, **ENVIRONMENT)
+            try:
+                with Api(server.url) as api:
+                    teach(api, "pendulum", pendulum(), queries=12)
+
+                def strike() -> None:
+                    cluster.kill()
+                    server.stop(signal.SIGKILL)
+                    cluster.start()
+                    server.start()
+
+                with HttpSurrogate(server.url, "pendulum", retries=PATIENT) as port:
+                    undisturbed = walked(port, actions)
+                    np.testing.assert_array_equal(walked(port, actions, strike), undisturbed)
+            finally:
+                server.stop()
+        finally:
+            cluster.kill()
+
+
+def walked(
+    port: HttpSurrogate, actions: NDArray[np.float64], strike: Callable[[], None] | None = None
+) -> NDArray[np.float32]:
+    """Observations of a new session's steps, (T + 1, N, D); something strikes before the middle one."""
+    session = port.open(OpenSession(num_envs=actions.shape[1], seed=SEED)).id
+    observations = [port.reset(session).observation]
+    for number, action in enumerate(actions):
+        if strike is not None and number == len(actions) // 2:
+            strike()
+        observations.append(port.step(session, action).observation)
+    port.close(session)
+    return np.array(observations)
 
 
 def pid_of(database: str, number: int) -> int:
