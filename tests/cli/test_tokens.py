@@ -71,7 +71,7 @@ def test_a_token_file_that_others_may_read_is_taken_with_a_warning(surrogym, ser
     said = surrogym("status", "--server", server.url, "--token-file", "token")
     assert (said.code, sent(server)) == (0, "Bearer in-a-file")
     assert said.err == (
-        "warning: token may be read by other users of this machine (mode 644): chmod 600 token closes it\n"
+        "warning: token may be read by other users of this machine (mode 644): chmod 600 token prevents this\n"
     )
     assert surrogym("status", "--server", server.url, "--token-file", "token", "--quiet").err == ""
 

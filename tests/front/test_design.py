@@ -233,7 +233,7 @@ def test_numbers_of_numpy_are_numbers():
         (1, [[np.nan, 0.0]], "visited: expected finite numbers"),
         (1, np.zeros((0, 2)), "visited: expected at least one state, got none"),
         (1, "x", "visited: expected numbers, got 'x'"),
-        (1, [[1e308, 0.0]], "visited: expected '.*' within"),
+        (1, [[1e308, 0.0]], "visited: expected '.*' from"),
     ],
 )
 def test_an_impossible_request_for_more_queries_changes_nothing(steps: Any, visited: Any, said: str):

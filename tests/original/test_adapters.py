@@ -121,7 +121,7 @@ def test_parameters_of_a_process_come_from_a_file(tmp_path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [("{", "is no JSON"), ("[]", "expected an object with model"), (None, "expected pcgym:cstr, or pcgym:FILE.json")],
+    [("{", "is not JSON"), ("[]", "expected an object with model"), (None, "expected pcgym:cstr, or pcgym:FILE.json")],
 )
 def test_a_file_that_describes_no_process_is_refused(tmp_path, content: str | None, message: str) -> None:
     file = tmp_path / "tank.json"

@@ -82,7 +82,7 @@ def test_the_described_observation_is_the_environments_own() -> None:
 @installed("mujoco")
 def test_entries_that_terms_can_not_express_are_replaced_by_coordinates() -> None:
     found = describe("Pusher-v5", STEPS)
-    assert any("no sums of 1, q, sin and cos" in line for line in found.found)
+    assert any("of 1, q, sin(q) and cos(q)" in line for line in found.found)
     shown = {name for entry in found.spec.observation for part in entry.term.parts for name in part.weights}
     assert shown == set(found.spec.coordinate_names)
     assert any("obj_slidey, obj_slidex: no random action moved it" in line for line in found.asked)

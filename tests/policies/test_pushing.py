@@ -101,7 +101,7 @@ def test_a_policy_for_another_specification_stays_with_what_waits(api: Api, tmp_
 @pytest.mark.parametrize("content", ["", "[{}]", '{"returns": 1}', "[" * 1000])
 def test_a_broken_list_of_evaluations_is_named_and_left_alone(api: Api, policy: Path, content: str):
     pushing.waiting_path(policy).write_text(content)
-    with pytest.raises(UnusablePolicy, match=r"policy\.evaluations\.json is no list of evaluations"):
+    with pytest.raises(UnusablePolicy, match=r"policy\.evaluations\.json is not a list of evaluations"):
         pushing.push(api, policy)
     assert pushing.waiting_path(policy).read_text() == content
 

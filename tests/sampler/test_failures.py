@@ -33,7 +33,7 @@ def _no_delay(monkeypatch):
 def test_a_machine_that_is_off_ends_the_sampler_before_every_query_is_set_aside(api, line, batch):
     machine = Switched()
     settings = SamplerSettings(name="worker", until_done=True, batch=batch, time_limit=60.0)
-    with pytest.raises(MachineFails, match=r"different queries in a row.*the bus is off; mend it"):
+    with pytest.raises(MachineFails, match=r"different queries in a row.*the bus is off; repair it"):
         Sampler(api, line, machine, settings).run()
     view = api.surrogate(line)
     assert (view.phase, view.queries.set_aside, view.queries.pending) == ("collecting", 0, 6)

@@ -262,7 +262,7 @@ def test_idle_connections_are_closed_and_others_are_served(server: ServerProcess
 def test_a_flood_of_empty_frames_ends_its_stream(server: ServerProcess, session: str, frame: bytes):
     with upgraded(server.url, session) as attacker, contextlib.suppress(ConnectionError):
         attacker.sendall(b"\x02\x80\0\0\0\0" + frame * 40_000)
-        assert b"at most 256 frames at once" in read_all(attacker)
+        assert b"at most 256 frames in one message and in one read" in read_all(attacker)
 
 
 def test_unfinished_messages_have_a_bound_together(narrow: ServerProcess):
@@ -284,7 +284,7 @@ def test_an_unfinished_message_is_waited_for_as_long_as_a_request(server: Server
 def test_few_requests_may_wait_for_the_one_before_them(server: ServerProcess):
     with connected(server.url) as attacker, contextlib.suppress(ConnectionError):
         attacker.sendall(b"GET /v1/surrogates HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n" * 4_000)
-        assert b"at most 16 requests that wait for an answer" in read_all(attacker)
+        assert b"at most 16 unanswered requests on one connection" in read_all(attacker)
 
 
 def test_a_stream_is_opened_by_get_alone(server: ServerProcess):

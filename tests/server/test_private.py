@@ -34,7 +34,7 @@ def test_a_served_database_and_what_lies_beside_it_are_private(tmp_path: Path):
         os.umask(before)
     (line,) = (line for line in server.log.splitlines() if "other users" in line)
     assert line.startswith("WARNING surrogym_server.private: ")
-    assert f"{tokens} may be read by other users of this machine (mode 644): chmod 600 {tokens} closes it" in line
+    assert f"{tokens} may be read by other users of this machine (mode 644): chmod 600 {tokens} prevents this" in line
 
 
 @pytest.mark.parametrize("permissions", [0o644, 0o640, 0o604])

@@ -217,7 +217,10 @@ def test_the_same_key_with_another_body(client: httpx.Client, fresh: str):
         ({"coordinates": [[0, 9]], "action": [[0]]}, "'theta_dot': expected a value in [-8, 8], got 9"),
         ({"coordinates": [[4, 0]], "action": [[0]]}, "'theta': expected a value in [-3.1416, 3.1416], got 4"),
         ({"coordinates": [[0, 0], [0]], "action": [[0], [0]]}, "coordinates: expected rows of one length"),
-        ({"coordinates": [[0, 0]], "action": [[0], [0]]}, "as many actions as coordinates, got 2 and 1"),
+        (
+            {"coordinates": [[0, 0]], "action": [[0], [0]]},
+            "as many actions as coordinates, got 2 actions and 1 coordinates",
+        ),
         ({"coordinates": [], "action": []}, "at least 1 item"),
     ],
 )

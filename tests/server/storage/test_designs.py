@@ -301,7 +301,7 @@ def test_a_refused_commit_leaves_nothing_behind(storage: Storage, due: str, desi
     lease = begun(storage, due)
     uneven = design(queries=2)
     broken = NewDesign(uneven.model, uneven.state, "sampling", uneven.query_coordinates, uneven.query_action[:1])
-    with pytest.raises(InvalidInput, match="2 and 1"):
+    with pytest.raises(InvalidInput, match="got 2 queries and 1 actions"):
         storage.designs.commit(lease, broken)
     assert storage.models.list(due) == []
     assert storage.surrogates.get(due).round == 0

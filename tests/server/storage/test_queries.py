@@ -235,7 +235,7 @@ def test_asking_by_hand_twice_with_one_key_queues_once(storage: Storage, make: C
 
 def test_queries_need_as_many_actions_as_coordinates(storage: Storage, make: Callable[..., str]) -> None:
     name = make(queries=0)
-    with pytest.raises(InvalidInput, match="2 and 1"):
+    with pytest.raises(InvalidInput, match="got 2 queries and 1 actions"):
         storage.queries.enqueue(name, np.ones((2, 2)), np.ones((1, 1)))
 
 

@@ -104,7 +104,7 @@ def test_an_answer_with_a_gap_or_too_many_steps_is_refused(
 ) -> None:
     batch = [answer(long, reward=float(i)) for i in steps]
     batch = [NewSample(**vars(sample) | {"step": i}) for sample, i in zip(batch, steps, strict=True)]
-    with pytest.raises(InvalidInput, match=rf"steps 0, 1, ... of query {long.id}, 3 at most"):
+    with pytest.raises(InvalidInput, match=rf"steps 0, 1, ... of query {long.id}, at most 3"):
         storage.samples.add(name, "a", batch)
     assert storage.samples.count(name) == 0
     assert storage.queries.get(name, long.id).status == "leased"
