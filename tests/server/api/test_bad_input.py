@@ -219,7 +219,7 @@ def test_the_same_key_with_another_body(client: httpx.Client, fresh: str):
         ({"coordinates": [[0, 0], [0]], "action": [[0], [0]]}, "coordinates: expected rows of one length"),
         (
             {"coordinates": [[0, 0]], "action": [[0], [0]]},
-            "as many actions as coordinates, got 2 actions and 1 coordinates",
+            "actions as coordinates, got 2 actions and 1 coordinates",
         ),
         ({"coordinates": [], "action": []}, "at least 1 item"),
     ],
