@@ -71,6 +71,7 @@ OTHERWISE = {
     "docs/how-to/policies.md": "tests/cli/test_commands.py, as it needs three versions and an alias",
     "docs/http-api.md": "test_http_api.py sends its requests without curl",
     "docs/how-to/containers.md": "tests/docker reads it; no container engine is needed",
+    "docs/how-to/operate.md": "tests/server and tests/security start servers with these settings",
     "docs/how-to/plugins.md": "tests/plugins installs the package and compares its class with the page",
     "docs/how-to/logs.md": "tests/logs runs its commands",
     "docs/how-to/environments-by-name.md": "tests/original and tests/cli/test_describe.py run its commands",
