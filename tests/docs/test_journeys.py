@@ -32,6 +32,7 @@ ALL_PAGES = [
     "docs/how-to/no-teleport.md",
     "docs/how-to/own-environment.md",
     "docs/how-to/page.md",
+    "docs/how-to/paper-method.md",
     "docs/how-to/pictures.md",
     "docs/how-to/policy-search.md",
     "docs/how-to/remote-gymnasium.md",
@@ -40,6 +41,7 @@ ALL_PAGES = [
     "docs/how-to/terminal.md",
     "docs/how-to/tracking.md",
     "docs/how-to/trainers.md",
+    "docs/how-to/variants.md",
 ]
 SHORTER = {
     "sample": ["--until-done"],
