@@ -83,7 +83,7 @@ class SurrogateVecEnv(VecEnv):
         return self._lanes.view.id
 
     def submit_occupancy(self, checkpoint: str) -> SubmittedOccupancy:
-        """Submit the states visited so far as the occupancy of a checkpoint.
+        """Submit the states visited since the session was opened, as the occupancy of a checkpoint. Its name is free.
 
         The design can then choose queries near these states. Returns the number of states, and the confidence index
         over them.

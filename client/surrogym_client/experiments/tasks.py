@@ -109,5 +109,5 @@ def design_budget(budget: int) -> int:
 
 
 def queries_a_round(budget: int) -> int:
-    """Real steps of each round of the closed loop; 0 if the design has taken all."""
+    """Return the real steps of each round of the closed loop for a whole ``budget``; 0 if the design takes it all."""
     return (budget - design_budget(budget)) // ROUNDS

@@ -19,7 +19,8 @@ def reset_seed(query: Query, design_seed: int) -> int:
 
 
 def sample_of(query: Query, step: RealStep, size: int, number: int = 0) -> NewSample:
-    """Return the sample of step ``number`` of a query with ``size`` coordinates.
+    """Return the sample of a query's step. ``number`` counts the steps of an action sequence from 0; ``size`` is the
+    number of coordinates.
 
     Raises:
         StepFailed: the step has numbers that are not finite, or of the wrong shape.

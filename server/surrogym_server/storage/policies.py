@@ -114,7 +114,7 @@ class Policies(ABC):
 
     @abstractmethod
     def blobs(self) -> set[str]:
-        """Return the names of all blobs that a row refers to, of all surrogates."""
+        """Return the names of all blobs that rows of policies refer to, of all surrogates."""
 
 
 class Blobs(ABC):

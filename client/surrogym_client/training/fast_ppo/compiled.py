@@ -79,8 +79,11 @@ def through(slope: Floats, y: Floats, relu: bool) -> None:
 
 @compiled
 def forward(parameters: Floats, sizes: Ints, relu: bool, x: Floats, passed: Floats) -> Floats:
-    """Return the outputs (n, O) of a network for inputs (n, I). ``passed`` receives the outputs of all layers,
-    concatenated."""
+    """Return the outputs (n, O) of a network for inputs (n, I).
+
+    ``passed`` is a flat buffer. It receives the outputs (n, units) of all layers but the input, one after the other.
+    Hidden units are rectified if ``relu``, and tanh otherwise.
+    """
     rows, begin, at, last = len(x), 0, 0, sizes.size - 2
     for layer in range(last + 1):
         inputs, outputs = sizes[layer], sizes[layer + 1]

@@ -82,7 +82,7 @@ class StableBaselinesSearch(PolicySearch):
         return {}
 
     def exploring_by_state(self, spec: EnvironmentSpec) -> dict[str, Any]:  # noqa: ARG002
-        """Return hyperparameters of the network that follows an abandoned one."""
+        """Return hyperparameters that replace the usual ones in the network that follows an abandoned one."""
         return {}
 
     @contextmanager

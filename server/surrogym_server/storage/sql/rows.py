@@ -62,7 +62,7 @@ def recall(connection: Connection, held: Row[Any], operation: str, key: str | No
     """Return the earlier result of the operation for this key; None if the key is new.
 
     Raises:
-        IdempotencyConflict: it was used with another body.
+        IdempotencyConflict: the key was used with another body.
     """
     if key is None:
         return None

@@ -27,7 +27,10 @@ SIDES: tuple[Side, ...] = ("above", "below", "beyond")
 
 @dataclass(frozen=True)
 class Axes:
-    """Every order of states by one value: coordinates and observation entries, from each side: A = 3 T axes."""
+    """Every order of states by one value x: by x, -x and |x|, where x is one of T coordinates and observation entries.
+
+    There are A = 3 T axes.
+    """
 
     names: tuple[str, ...]  # (T,)
     terms: TermSet
