@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -209,7 +210,7 @@ def _with_tolerances(spec: EnvironmentSpec, tolerances: dict[str, float]) -> Env
 def _words(view: SurrogateView, environment: str) -> str:
     from surrogym_client.original.loading import is_known
 
-    own = f" --env {environment}" if environment and not is_known(environment) else ""
+    own = f" --env {shlex.quote(environment)}" if environment and not is_known(environment) else ""
     return (
         f"{view.name}: {view.environment or 'own environment'}, {len(view.spec.coordinates)} coordinates, "
         f"budget of {view.budget} real steps, target {view.target:g}; next: surrogym sample {view.name}{own}"

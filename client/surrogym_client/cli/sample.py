@@ -5,9 +5,8 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict
-from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -24,7 +23,8 @@ from surrogym_client.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from surrogym_client.original.protocol import Factory
+    from surrogym_client.original.executables import Executable
+    from surrogym_client.original.isolated import IsolatedEnvironment
     from surrogym_client.sampler.worker import Outcome, SamplerReport
     from surrogym_client.transport.api import Api
     from surrogym_shared.spec import EnvironmentSpec
@@ -37,6 +37,14 @@ Environment = Annotated[
     str | None,
     typer.Option(
         help="Environment to take real steps in: a Gymnasium id or package.module:factory. [default: the surrogate's]"
+    ),
+]
+Command = Annotated[
+    str | None,
+    typer.Option(
+        "--exec",
+        metavar="COMMAND",
+        help='Program that takes the real steps, such as "./plant --port 7". Short for --env "exec:COMMAND".',
     ),
 ]
 UntilDone = Annotated[bool, typer.Option("--until-done", help="Stop when the design is ready or has spent its budget.")]
@@ -55,6 +63,7 @@ def command(
     context: typer.Context,
     surrogate: Surrogate,
     env: Environment = None,
+    program: Command = None,
     spec: SpecFile = None,
     once: Annotated[bool, typer.Option("--once", help="Stop after the first claim that returns queries.")] = False,
     until_done: UntilDone = False,
@@ -77,7 +86,6 @@ def command(
 
     Example: surrogym sample pendulum --until-done
     """
-    from surrogym_client.original.isolated import IsolatedEnvironment
     from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
     from surrogym_client.runtime.lifetime import terminations
     from surrogym_client.sampler.worker import Sampler, SamplerSettings, worker_name
@@ -95,9 +103,9 @@ def command(
     )
     with service.connect(context, wait, quiet=output.quiet) as api:
         asked = awaited_surrogate(api, surrogate, wait, quiet=output.quiet).spec
-        factory = _factory(env, read_spec(spec), asked)
+        opened = _opened(_named(env, program), read_spec(spec), asked, step_limit)
         with (
-            IsolatedEnvironment(factory, step_limit) as environment,
+            closing(opened) as environment,
             _telling(api, surrogate, quiet=output.quiet) as tell,
         ):
             sampler = Sampler(api, surrogate, environment, settings, tell)
@@ -110,21 +118,33 @@ def command(
         raise typer.Exit(1)
 
 
-def _factory(env: str | None, given: EnvironmentSpec | None, asked: EnvironmentSpec) -> Factory:
-    """Return a function that makes the environment. The server's choice is trusted only for Gymnasium's own ids,
-    because a module would run code.
+def _named(env: str | None, program: str | None) -> str | None:
+    """Return the environment's name, from either option."""
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.original.executables import name_of
+
+    if env is not None and program is not None:
+        raise CommandError(f"expected --env or --exec, got both: {env!r} and {program!r}")
+    return env if program is None else name_of(program)
+
+
+def _opened(
+    env: str | None, given: EnvironmentSpec | None, asked: EnvironmentSpec, step_limit: float
+) -> IsolatedEnvironment | Executable:
+    """Open the environment. The server's choice is trusted only for Gymnasium's own ids, because a module or a program
+    would run code.
     """
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.original.loading import is_known, is_own, make
+    from surrogym_client.original.loading import is_known, is_own, isolated
 
     if env is None and not is_known(asked.environment):
         raise CommandError(
             f"the surrogate's environment {asked.environment!r} has no built-in adapter: "
-            "expected --env package.module:factory"
+            "expected --env package.module:factory, or --exec COMMAND"
         )
     name = env or asked.environment
     own = is_own(name) and given is None
-    return partial(make, name) if own else partial(make, name, spec=given or asked)
+    return isolated(name, step_limit, None if own else given or asked)
 
 
 @contextmanager

@@ -12,7 +12,8 @@ OriginalError
 ├── EvaluationFailed        the environment or the policy failed after real steps had been taken
 └── StepFailed              the environment did not give a step; the query fails, the worker continues
     ├── StepTimedOut        it took longer than its limit and was killed; the next step starts a fresh one
-    └── EnvironmentDied     its process ended; the next step starts a fresh one
+    ├── EnvironmentDied     its process ended; the next step starts a fresh one
+    └── RequestRefused      its program answered with an error, and keeps running
 """
 
 from __future__ import annotations
@@ -79,6 +80,18 @@ class StepTimedOut(StepFailed):
 
 class EnvironmentDied(StepFailed):
     """The environment's process ended."""
+
+
+class RequestRefused(StepFailed):
+    """An environment's program answered a request with an error. ``code`` is "unsupported", or another word of it."""
+
+    def __init__(self, message: str, code: str = "failed") -> None:
+        super().__init__(message)
+        self.code = code
+        self._arguments = (message, code)
+
+    def __reduce__(self) -> tuple[type[RequestRefused], tuple[str, str]]:
+        return type(self), self._arguments
 
 
 def sentence(error: Exception) -> str:

@@ -12,7 +12,9 @@ from typing import Any, Literal
 from surrogym_client.original.adapters import adapter_of, is_trusted, open_simulator
 from surrogym_client.original.classic import TASKS
 from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.executables import Executable, is_executable, open_executable
 from surrogym_client.original.gymnasium import GymnasiumEnvironment, task_for
+from surrogym_client.original.isolated import IsolatedEnvironment
 from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
 from surrogym_client.original.protocol import LONGEST_EPISODE, Environment
 from surrogym_client.original.rollouts import answering
@@ -37,16 +39,19 @@ def make(
     bins: int | None = None,
     teleport: bool = True,
     max_rollout: int | None = None,
+    step_limit: float = 30.0,
 ) -> Environment:
     """Build an original environment.
 
     Args:
-        name: a Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL``, or ``package.module:factory``.
+        name: a Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL``, ``exec:COMMAND``, or
+            ``package.module:factory``.
         spec: a specification that replaces the adapter's own; most names have none until ``describe`` writes one.
         preset, budget, initial, target, acquisition, seed: choices of the design; None keeps the specification's.
         bins: number of discrete values that replace each dimension of a continuous action for policies.
         teleport: False uses rollouts from resets, as if the state could not be set.
         max_rollout: the longest of them.
+        step_limit: seconds that one step of ``exec:COMMAND`` may take; ``isolated`` limits the others.
 
     Raises:
         UnknownEnvironment: no adapter knows the name, or its module or factory can't be found.
@@ -59,13 +64,22 @@ def make(
     asked = {"budget": budget, "initial": initial, "target": target, "acquisition": acquisition, "seed": seed}
     chosen = {key: value for key, value in {"preset": preset, **asked}.items() if value is not None}
     choose = partial(with_choices, design=chosen, bins=bins, teleport=teleport, max_rollout=max_rollout)
+    if is_executable(name):
+        return open_executable(name, spec, choose, step_limit)
     if is_own(name):
         return _own(load_factory(name)(), spec, choose)
     return _known(name, spec, choose, preset or "default")
 
 
+def isolated(name: str, step_limit: float, spec: EnvironmentSpec | None = None) -> IsolatedEnvironment | Executable:
+    """Build an original environment that runs in a process of its own, where a step has a time limit in seconds."""
+    if is_executable(name):
+        return open_executable(name, spec, step_limit=step_limit)
+    return IsolatedEnvironment(partial(make, name, spec=spec), step_limit)
+
+
 def is_own(name: str) -> bool:
-    """Whether a name is ``package.module:factory``, and not an adapter's."""
+    """Whether a name is ``package.module:factory`` or ``exec:COMMAND``, and not an adapter's."""
     return ":" in name and adapter_of(name) is None
 
 

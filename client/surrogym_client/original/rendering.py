@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from surrogym_client.original.adapters.gymnasium_ids import settable
 from surrogym_client.original.classic import TASKS
 from surrogym_client.original.errors import NotRenderable
+from surrogym_client.original.executables import is_executable
 from surrogym_client.original.loading import is_known, is_own, load_factory
 from surrogym_client.original.protocol import Array, Native
 from surrogym_shared.spec import EnvironmentSpec
@@ -57,7 +58,7 @@ def renderer_of(spec: EnvironmentSpec, original: str | None = None) -> Renderer:
     Raises:
         NotRenderable: it has none, or what that needs is not installed.
     """
-    if original is not None and is_own(original):
+    if original is not None and _is_class(original):
         return _Own(original)
     name = original or spec.environment
     if not _is_gymnasiums(name):
@@ -70,10 +71,14 @@ def renderer_of(spec: EnvironmentSpec, original: str | None = None) -> Renderer:
 def can_be_drawn(spec: EnvironmentSpec, original: str | None = None) -> bool:
     """Whether ``renderer_of`` has a renderer here: a built-in adapter's, with what it imports installed, or one that a
     person names. Finding out imports nothing."""
-    if original is not None and is_own(original):
+    if original is not None and _is_class(original):
         return True
     name = original or spec.environment
     return _is_gymnasiums(name) and all(find_spec(module) is not None for module, _ in _drawn_with(name))
+
+
+def _is_class(name: str) -> bool:
+    return is_own(name) and not is_executable(name)
 
 
 def _is_gymnasiums(name: str) -> bool:

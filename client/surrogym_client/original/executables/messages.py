@@ -1,0 +1,143 @@
+"""Lines of the protocol between this client and a program. Pure functions: docs/how-to/executables.md has the protocol.
+
+Shapes: C coordinates, F action entries.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any, NoReturn
+
+import numpy as np
+from pydantic import ValidationError
+
+from surrogym_client.original.errors import RequestRefused, StepFailed, UnknownEnvironment
+from surrogym_client.original.protocol import Array
+from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_shared.spec.actions import Action
+
+PROTOCOL = 1
+LONGEST_LINE = 1 << 20  # bytes, without the end of the line
+SHOWN = 80  # characters of a line that an error repeats
+
+Reply = dict[str, Any]
+
+
+def encode(number: int, method: str, **fields: object) -> bytes:
+    """Return the line of a request.
+
+    Raises:
+        StepFailed: a number is not finite, or the line is too long.
+    """
+    try:
+        line = json.dumps({"id": number, "method": method, **fields}, allow_nan=False).encode()
+    except ValueError as error:
+        raise StepFailed(f"expected finite numbers for {method}, got {fields}") from error
+    if len(line) > LONGEST_LINE:
+        raise StepFailed(f"expected a request of at most {LONGEST_LINE} bytes, got {len(line)}")
+    return line + b"\n"
+
+
+def decode(line: bytes, number: int) -> Reply:
+    """Return the result in the line that answers request ``number``.
+
+    Raises:
+        RequestRefused: the program answered with an error.
+        StepFailed: the line is not an answer to this request.
+    """
+    try:
+        answer = json.loads(line, parse_constant=_not_finite)
+    except (ValueError, RecursionError) as error:
+        raise StepFailed(
+            f"expected one line of JSON from the program, got {_short(line)}; let it print everything else to "
+            "standard error"
+        ) from error
+    if not isinstance(answer, dict) or type(answer.get("id")) is not int or answer["id"] != number:
+        raise StepFailed(f"expected an answer with id {number} from the program, got {_short(line)}")
+    if "error" in answer:
+        raise RequestRefused(f"the program answered: {answer['error']}", str(answer.get("code", "failed")))
+    if not isinstance(answer.get("result"), dict):
+        raise StepFailed(f"expected 'result' or 'error' in the program's answer, got {_short(line)}")
+    result: Reply = answer["result"]
+    return result
+
+
+def numbers(reply: Reply, key: str, size: int) -> Array:
+    """Return a list of finite numbers as an array (``size``,).
+
+    Raises:
+        StepFailed: the reply has no such list.
+    """
+    came = reply.get(key)
+    if not isinstance(came, list) or len(came) != size or not all(map(_is_number, came)):
+        raise StepFailed(f"expected {size} finite numbers for {key!r} in the program's answer, got {_short(came)}")
+    return np.array(came, dtype=np.float64)
+
+
+def number(reply: Reply, key: str) -> float:
+    """Return a finite number.
+
+    Raises:
+        StepFailed: the reply has none under this key.
+    """
+    if not _is_number(reply.get(key)):
+        raise StepFailed(f"expected a finite number for {key!r} in the program's answer, got {_short(reply.get(key))}")
+    return float(reply[key])
+
+
+def truth(reply: Reply, key: str) -> bool:
+    """Return true or false.
+
+    Raises:
+        StepFailed: the reply has neither under this key.
+    """
+    came = reply.get(key)
+    if not isinstance(came, bool):
+        raise StepFailed(f"expected true or false for {key!r} in the program's answer, got {_short(came)}")
+    return came
+
+
+def action_entries(space: Action, action: Array) -> list[float] | list[int]:
+    """Return an action (F,) as it is sent: whole numbers if the action is discrete."""
+    if isinstance(space, BoxAction):
+        return [float(entry) for entry in np.atleast_1d(action)]
+    return [int(entry) for entry in np.atleast_1d(action)]
+
+
+def specification_in(reply: Reply) -> EnvironmentSpec:
+    """Return the specification in the answer to ``spec``.
+
+    Raises:
+        UnknownEnvironment: the program has another version of the protocol, or the specification is not valid.
+    """
+    version = reply.get("protocol")
+    if type(version) is not int or version != PROTOCOL:
+        raise UnknownEnvironment(
+            f"expected protocol {PROTOCOL} from the program, got {_short(version)}: update surrogym, or start the "
+            f"program with protocol {PROTOCOL}"
+        )
+    try:
+        return EnvironmentSpec.model_validate_json(json.dumps(reply.get("spec")))
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "spec"
+        raise UnknownEnvironment(
+            f"expected a valid specification from the program, got one with an error in {place}: {first['msg']}"
+        ) from error
+
+
+def _is_number(value: object) -> bool:
+    try:
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # an int beyond the range of a float
+        return False
+
+
+def _not_finite(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} is not JSON")
+
+
+def _short(value: object) -> str:
+    text = value.decode(errors="replace") if isinstance(value, bytes) else repr(value)
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}…"

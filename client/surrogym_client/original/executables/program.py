@@ -1,0 +1,170 @@
+"""One running program: its start, its requests within a time limit, and its end."""
+
+from __future__ import annotations
+
+import os
+import selectors
+import shlex
+import signal
+import subprocess
+import time
+from contextlib import suppress
+
+from surrogym_client.original.errors import (
+    EnvironmentDied,
+    RequestRefused,
+    StepFailed,
+    StepTimedOut,
+    UnknownEnvironment,
+)
+from surrogym_client.original.executables.messages import LONGEST_LINE, Reply, decode, encode
+
+END_SECONDS = 2.0  # after the request to close, and again after SIGTERM
+CHUNK = 1 << 16  # bytes
+
+
+class Program:
+    """A program that is started without a shell, in a session of its own, so that Ctrl-C does not reach it.
+
+    Its standard error is that of this process. After a time-out, an end or a line that is no answer, the program is
+    ended, and ``start`` starts it anew.
+
+    Args:
+        command: the program and its arguments, quoted as for a shell.
+
+    Raises:
+        UnknownEnvironment: the command is empty, or its quotes don't match.
+    """
+
+    def __init__(self, command: str) -> None:
+        try:
+            self._words = shlex.split(command)
+        except ValueError as error:
+            raise UnknownEnvironment(
+                f"expected a command such as './plant --port 7', got {command!r}: {error}"
+            ) from error
+        if not self._words:
+            raise UnknownEnvironment("expected a command such as './plant --port 7', got an empty one")
+        if os.name == "nt":
+            raise UnknownEnvironment("expected Linux or macOS to start a program, got Windows")
+        self._process: subprocess.Popen[bytes] | None = None
+        self._unread = b""
+        self._number = 0  # of the last request
+
+    @property
+    def running(self) -> bool:
+        """Whether the process exists and has not ended."""
+        return self._process is not None and self._process.poll() is None
+
+    def start(self) -> None:
+        """Start the program, and end one that is left.
+
+        Raises:
+            UnknownEnvironment: there is no such program, or it can't be executed.
+        """
+        self.end()
+        try:
+            self._process = subprocess.Popen(
+                self._words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0, start_new_session=True
+            )
+        except OSError as error:
+            raise UnknownEnvironment(
+                f"expected a program that can be started, got {self._words[0]!r}: {error}"
+            ) from error
+        self._unread = b""
+        assert self._process.stdin is not None
+        os.set_blocking(self._process.stdin.fileno(), False)
+
+    def ask(self, method: str, deadline: float, **fields: object) -> Reply:
+        """Send one request, and return the result.
+
+        Args:
+            method: what the program shall do.
+            deadline: when the answer must be complete, on the monotonic clock, in seconds.
+            fields: of the request.
+
+        Raises:
+            RequestRefused: the program answered with an error; it keeps running.
+            StepFailed: it died, hung or sent something else; it was ended.
+        """
+        self._number += 1
+        line = encode(self._number, method, **fields)
+        try:
+            self._write(line, method)
+            return decode(self._read(method, deadline), self._number)
+        except RequestRefused:
+            raise
+        except StepFailed:
+            self.end()
+            raise
+
+    def close(self) -> None:
+        """Ask the program to close, and end it if it does not."""
+        process = self._process
+        if process is not None and self.running:
+            assert process.stdin is not None
+            with suppress(OSError, StepFailed):
+                self._write(encode(self._number + 1, "close"), "close")
+                process.stdin.close()
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(END_SECONDS)
+        self.end()
+
+    def end(self) -> int | None:
+        """End the program by SIGTERM, then by SIGKILL, and return its exit code; None if there was no program."""
+        process, self._process = self._process, None
+        if process is None:
+            return None
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            if process.poll() is None:
+                with suppress(ProcessLookupError, PermissionError):
+                    os.killpg(process.pid, number)
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(END_SECONDS)
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                with suppress(OSError):
+                    pipe.close()
+        return process.wait()
+
+    def _write(self, line: bytes, method: str) -> None:
+        process = self._process
+        if process is None or process.stdin is None:
+            raise EnvironmentDied(f"expected a running program for {method}, got none")
+        try:
+            written = os.write(process.stdin.fileno(), line)
+        except BlockingIOError:
+            written = 0
+        except OSError as error:
+            raise self._death(method) from error
+        if written < len(line):
+            raise StepFailed(f"expected the program to read a request of {len(line)} bytes, got {written} of them read")
+
+    def _read(self, method: str, deadline: float) -> bytes:
+        assert self._process is not None
+        assert self._process.stdout is not None
+        begun, output = time.monotonic(), self._process.stdout.fileno()
+        with selectors.DefaultSelector() as selector:
+            selector.register(output, selectors.EVENT_READ)
+            while b"\n" not in self._unread:
+                if len(self._unread) > LONGEST_LINE:
+                    raise StepFailed(
+                        f"expected a line of at most {LONGEST_LINE} bytes from the program, got a longer one"
+                    )
+                left = deadline - time.monotonic()
+                if left <= 0 or not selector.select(left):
+                    raise StepTimedOut(
+                        f"the program did not answer {method} within {max(0.0, deadline - begun):.3g} s and was ended"
+                    )
+                if not (chunk := os.read(output, CHUNK)):
+                    raise self._death(method)
+                self._unread += chunk
+        line, _, self._unread = self._unread.partition(b"\n")
+        return line
+
+    def _death(self, method: str) -> EnvironmentDied:
+        """The error of a program that closed its input or output. It has a moment to end by itself."""
+        if self._process is not None:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(END_SECONDS)
+        return EnvironmentDied(f"the program ended with exit code {self.end()} during {method}")

@@ -1,0 +1,85 @@
+"""A program that dies, hangs or prints nonsense costs one step, and the next step starts it anew."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from surrogym_client import original
+from surrogym_client.original.errors import StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_client.original.loading import is_known
+
+SHELL = Path(__file__).parents[2] / "examples" / "executables" / "rail.sh"
+MOODY = """
+import json, os, sys, time
+from surrogym_client.original.classic import cartpole
+for line in sys.stdin:
+    asked = json.loads(line)
+    result = {"state": asked.get("state", [0, 0, 0, 0])}
+    if asked["method"] == "spec":
+        result = {"protocol": VERSION, "spec": cartpole().model_dump(mode="json")}
+    if asked["method"] == "step":
+        MOOD
+        result |= {"reward": os.getpid(), "terminated": False, "truncated": False}
+    print(json.dumps({"id": asked["id"], "result": result}), flush=True)
+    if asked["method"] == "close":
+        break
+"""
+
+
+def moody(mood: str, version: int = 1, step_limit: float = 30.0):
+    """A program that does ``mood`` at action 1."""
+    code = MOODY.replace("MOOD", f"if asked['action'] == [1]: {mood}").replace("VERSION", str(version))
+    return original.make(f"exec:{shlex.join([sys.executable, '-c', code])}", step_limit=step_limit)
+
+
+def test_a_shell_program_takes_exact_steps():
+    plant = original.make(f"exec:{shlex.quote(str(SHELL))}")
+    step = plant.step_from(np.array([7.0]), np.array([1.0]))
+    plant.close()
+    assert (list(step.coordinates), list(step.next_coordinates), step.reward) == ([7.0], [8.0], -64.0)
+
+
+@pytest.mark.parametrize(
+    ("mood", "message"),
+    [
+        ("os._exit(7)", "exit code 7 during step"),
+        ("print('hello', flush=True)", "one line of JSON from the program, got hello"),
+        ("result = {'state': [0]}", "4 finite numbers"),
+    ],
+)
+def test_a_fault_costs_one_step(mood, message):
+    plant = moody(mood)
+    try:
+        with pytest.raises(StepFailed, match=message):
+            plant.step_from(np.zeros(4), np.ones(1))
+        assert plant.step_from(np.zeros(4), np.zeros(1)).reward > 0
+    finally:
+        plant.close()
+
+
+def test_a_hanging_program_is_ended_and_started_anew():
+    plant = moody("time.sleep(3600)", step_limit=5.0)
+    try:
+        before = int(plant.step_from(np.zeros(4), np.zeros(1)).reward)
+        with pytest.raises(StepTimedOut, match="did not answer step"):
+            plant.step_from(np.zeros(4), np.ones(1))
+        with pytest.raises(ProcessLookupError):
+            os.kill(before, 0)
+        assert int(plant.step_from(np.zeros(4), np.zeros(1)).reward) != before
+    finally:
+        plant.close()
+
+
+def test_a_newer_protocol_is_refused_with_the_way_out():
+    with pytest.raises(UnknownEnvironment, match="expected protocol 1 from the program, got 2: update surrogym"):
+        moody("pass", version=2)
+
+
+def test_a_server_never_starts_a_program():
+    assert not is_known("exec:./plant")
