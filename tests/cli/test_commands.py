@@ -170,7 +170,9 @@ def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum
     assert 0 < card["virtual_steps"] == trained.json["virtual_steps"] <= 2000
     assert trained.json["version"] == 1
     besides = ("--compare", "zero", "--reference", "policy.zip")
-    evaluated = on_server("evaluate", "policy.zip", "--episodes", "3", *besides, "--where", "--json", "--quiet")
+    changed = on_server("evaluate", "policy.zip", "--learn", "4", "--perturb", "0.1")
+    assert (changed.code, "got --perturb" in changed.err) == (1, True)
+    evaluated = on_server("evaluate", "policy.zip", "--episodes", "3", *besides, "--learn", "4", "--json", "--quiet")
     assert evaluated.code == 0, evaluated.err
     assert (evaluated.json["version"], evaluated.json["steps"], evaluated.json["without"]["steps"]) == (1, 600, 600)
     assert evaluated.json["reference"]["per_episode"] == evaluated.json["per_episode"]  # it is the policy itself
@@ -178,7 +180,10 @@ def test_from_samples_to_an_evaluated_policy(on_server, server_process, pendulum
     assert [episode["seed"] for episode in evaluated.json["disagreements"]["episodes"]] == [10_000, 10_001, 10_002]
     assert len(evaluated.json["per_episode"]) == 3
     with Api(server_process.url) as api:
-        assert api.surrogate(pendulum).ledger.evaluation == 1800
+        ledger = api.surrogate(pendulum).ledger
+    differing = evaluated.json["disagreements"]
+    assert ledger.evaluation == 1800
+    assert ledger.logged == differing["learned"] == min(4, len(differing["steps"]))
     _look_at(on_server, pendulum, tmp_path)
     nothing = on_server("sample", pendulum, "--max-queries", "1", "--time-limit", "0.5")
     assert "None" not in nothing.out

@@ -8,7 +8,7 @@ import pytest
 from support.moody import SPEC
 from surrogym_client.cli.disagreement import Differing
 from surrogym_client.evaluation.audit import Compared
-from surrogym_client.evaluation.comparing import MOST, Disagreements, disagreements, steps_of
+from surrogym_client.evaluation.comparing import MOST, Disagreements, disagreements, samples_of, steps_of
 from surrogym_client.evaluation.evaluator import Trace
 
 NAMES = ("x", "reward")
@@ -63,3 +63,17 @@ def test_a_correct_model_has_no_disagreements() -> None:
     assert Differing(found, 0).in_words(SPEC) == [
         "none of 20 real steps differs from the model by more than the model's uncertainty"
     ]
+
+
+def test_samples_are_the_worst_of_each_episode_in_turn() -> None:
+    traces, errors = episodes(2, 10), np.zeros((20, 2))
+    errors[3], errors[4], errors[5], errors[12] = (4.0, 0.0), (3.0, 0.0), (2.0, 0.0), (1.0, 0.0)
+    found = held(traces, errors)
+    samples = samples_of(found, 3)
+    expected = [(0, 3), (1, 2), (0, 4)]
+    assert [sample.coordinates for sample in samples] == [traces[e].coordinates[t].tolist() for e, t in expected]
+    assert [sample.next_coordinates for sample in samples] == [
+        traces[e].coordinates[t + 1].tolist() for e, t in expected
+    ]
+    assert len(samples_of(found, 100)) == 4
+    assert samples_of(found, 0) == []

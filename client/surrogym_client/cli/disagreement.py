@@ -3,14 +3,83 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 if TYPE_CHECKING:
     from surrogym_client.evaluation.comparing import Disagreement, Disagreements
-    from surrogym_client.evaluation.evaluator import Evaluation
+    from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings
     from surrogym_client.policies.evidence import Promise
+    from surrogym_client.transport.api import Api
     from surrogym_shared.spec import EnvironmentSpec
+
+
+@dataclass(frozen=True)
+class Differences:
+    """Options for comparing the real steps of an evaluation with the model."""
+
+    where: Annotated[
+        bool,
+        typer.Option(
+            "--where",
+            help="Show the states at which real steps differ from the model. [default: on if the mean return is "
+            "outside the promise]",
+        ),
+    ] = False
+    learn: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Maximum number of differing steps to add to the surrogate's samples. They were taken already, so "
+            "they cost no real step and none of the budget.",
+        ),
+    ] = 0
+
+    def check(self, settings: EvaluationSettings) -> None:
+        """Refuse to learn from an environment that was changed on purpose.
+
+        Raises:
+            CommandError: ``--learn`` was given together with ``--perturb``.
+        """
+        from surrogym_client.cli.errors import CommandError
+
+        if self.learn and settings.perturb:
+            raise CommandError(
+                "expected --learn with the environment as it is, got --perturb, which changes it; give one of the two"
+            )
+
+    def between(
+        self,
+        surrogate: str | None,
+        server: str | None,
+        token: str | None,
+        result: Evaluation,
+        settings: EvaluationSettings,
+        promise: Promise | None,
+        *,
+        quiet: bool,
+    ) -> Differing | None:
+        """Compare the real steps of the episodes with the surrogate's model, and let it learn from them if asked.
+
+        Returns None if nobody asked and the promise was kept, or if the steps can't be compared.
+        """
+        from surrogym_client.cli.options import connect
+        from surrogym_client.errors import SurrogymClientError
+        from surrogym_shared.terminal import say
+
+        if not (self.where or self.learn or left(promise, result)):
+            return None
+        if surrogate is None:
+            say("not compared with a model: expected --surrogate, got none", quiet=quiet or not self.learn)
+            return None
+        try:
+            with connect(server, token) as api:
+                return _compare(api, surrogate, result, settings.first_seed, self.learn)
+        except SurrogymClientError as error:
+            say(f"not compared with the model of {surrogate!r}: {error}", quiet=quiet)
+            return None
 
 
 def left(promise: Promise | None, result: Evaluation) -> bool:
@@ -18,35 +87,35 @@ def left(promise: Promise | None, result: Evaluation) -> bool:
     return promise is not None and not promise.low <= result.returns.mean() <= promise.high
 
 
-def differ_from(
-    surrogate: str | None, server: str | None, token: str | None, result: Evaluation, first_seed: int, *, quiet: bool
-) -> Differing | None:
-    """Compare the real steps of the episodes with the surrogate's model; None if that is not possible."""
-    from surrogym_client.cli.options import connect
-    from surrogym_client.errors import SurrogymClientError
-    from surrogym_client.evaluation.comparing import compared, disagreements, steps_of
-    from surrogym_shared.terminal import say
+def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, learn: int) -> Differing | None:
+    """Compare steps with the model, and add at most ``learn`` of those that differ to the surrogate's samples."""
+    from surrogym_client.evaluation.comparing import compared, disagreements, samples_of, steps_of
 
-    if surrogate is None:
+    view = api.surrogate(surrogate)
+    if view.fidelity is None or result.trace.coordinates.shape[1] != len(view.spec.coordinates):
         return None
-    try:
-        with connect(server, token) as api:
-            view = api.surrogate(surrogate)
-            if view.fidelity is None or result.trace.coordinates.shape[1] != len(view.spec.coordinates):
-                return None
-            steps = steps_of(result.traces)
-            return Differing(disagreements(steps, compared(api, view.spec, view, steps)), first_seed)
-    except SurrogymClientError as error:
-        say(f"not compared with the model of {surrogate!r}: {error}", quiet=quiet)
-        return None
+    steps = steps_of(result.traces)
+    differing = Differing(disagreements(steps, compared(api, view.spec, view, steps)), first_seed)
+    samples = samples_of(differing.found, learn)
+    if samples:
+        added = api.add_samples(surrogate, "evaluate", samples, purpose="logged")
+        differing = replace(differing, learned=len(added.sample_ids) - added.duplicates)
+    return differing
 
 
 @dataclass(frozen=True)
 class Differing:
-    """Steps at which reality and the model disagree, for episodes whose reset seeds begin at ``first_seed``."""
+    """Steps at which reality and the model disagree.
+
+    Attributes:
+        found: the steps.
+        first_seed: reset seed of the first episode; each further episode has the next one.
+        learned: number of these steps that were added to the surrogate's samples.
+    """
 
     found: Disagreements
     first_seed: int
+    learned: int = 0
 
     def in_words(self, spec: EnvironmentSpec | None) -> list[str]:
         """Return one line about all steps, one for each of the worst episodes, and one for each of the worst steps."""
@@ -66,13 +135,17 @@ class Differing:
                 f"{paid:+.4g} compared with the prediction"
             )
         names = () if spec is None else spec.coordinate_names
-        return [*lines, *(f"  {self._at(one, names)}" for one in found.found[:SHOWN])]
+        lines += [f"  {self._at(one, names)}" for one in found.found[:SHOWN]]
+        if self.learned:
+            lines.append(f"the model learns from {self.learned} of these steps; train again in the new model")
+        return lines
 
     def as_json(self) -> dict[str, Any]:
         """Return all disagreements as JSON."""
         counts = self.found.by_episode()
         return {
             "compared": self.found.compared,
+            "learned": self.learned,
             "episodes": [
                 {"seed": self.first_seed + episode, "steps": counts.get(episode, 0), "missing_reward": missing}
                 for episode, missing in self.found.missing.items()

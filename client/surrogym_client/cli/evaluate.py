@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from surrogym_client.cli.beside import Beside
+from surrogym_client.cli.disagreement import Differences
 from surrogym_client.cli.filming import film
 from surrogym_client.cli.groups import Output, PolicyReading, Service, add
 from surrogym_client.cli.options import SpecFile, read_spec
@@ -35,14 +36,6 @@ Environment = Annotated[
     str | None,
     typer.Option(
         help="Gymnasium id or package.module:factory. [default: the environment that the policy was trained for]"
-    ),
-]
-Where = Annotated[
-    bool,
-    typer.Option(
-        "--where",
-        help="Show the states at which real steps differ from the model. [default: on if the mean return is "
-        "outside the promise]",
     ),
 ]
 Ledger = Annotated[
@@ -107,7 +100,7 @@ def command(
     *,
     episodes: Episodes,
     reading: PolicyReading,
-    where: Where = False,
+    differences: Differences,
     surrogate: Ledger = None,
     beside: Beside,
     video: Annotated[
@@ -128,15 +121,18 @@ def command(
 
     The real steps count in the surrogate's ledger. The server stores the policy and the episodes; if it does not
     answer, they wait beside the policy until surrogym policy push. If the mean return lies outside the promise's
-    interval, the command compares the steps with the model and shows the states at which the two disagree.
+    interval, the command compares the steps with the model and shows the states at which the two disagree. With
+    --learn, the model learns from these steps.
 
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 100
+
+    Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 10 --learn 16
     """
-    from surrogym_client.cli.disagreement import differ_from, left
     from surrogym_client.policies.card import card_path, read_card
     from surrogym_shared.terminal import give
 
     card, settings = read_card(policy), episodes.settings()
+    differences.check(settings)
     opener = opener_of(env, read_spec(spec), card, quiet=output.quiet)
     ledger = _ledger(surrogate, service.server, card, card_path(policy), quiet=output.quiet)
     enter = partial(_enter, ledger, service.server, service.token_for(context), quiet=output.quiet)
@@ -150,9 +146,9 @@ def command(
     if stored:
         version = push_or_say(service.server, service.token_for(context), policy, ledger, quiet=output.quiet)
     promise = card.promise if settings.declared and settings.episodes >= FEWEST_TO_JUDGE else None
-    found, token = None, service.token_for(context)
-    if where or left(promise, result):
-        found = differ_from(ledger, service.server, token, result, settings.first_seed, quiet=output.quiet)
+    found = differences.between(
+        ledger, service.server, service.token_for(context), result, settings, promise, quiet=output.quiet
+    )
     judged = {"promise_kept": _kept(promise, result), "version": version, "disagreements": found and found.as_json()}
     summary = {"policy": str(policy), **_settings(settings), **_summary(reports, beside.reference), **judged}
     if filmed is not None:

@@ -16,7 +16,7 @@ from surrogym_client.evaluation.audit import ALARM, Compared, chi_squared, diffe
 from surrogym_client.evaluation.evaluator import Trace
 from surrogym_client.transport.api import Api
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire import OutputFidelity, SurrogateView
+from surrogym_shared.wire import NewSample, OutputFidelity, SurrogateView
 
 MOST = 400  # most real steps to compare
 SHOWN = 3  # number of worst steps, and of worst episodes, to show
@@ -156,3 +156,25 @@ def disagreements(steps: Sequence[StepOfEpisode], beside: Compared) -> Disagreem
         for step, error in zip(steps, errors.tolist(), strict=True):
             missing[step.episode] = missing.get(step.episode, 0.0) + error
     return Disagreements(n, found, missing)
+
+
+def samples_of(found: Disagreements, most: int) -> list[NewSample]:
+    """Return at most ``most`` of the steps as samples: the worst step of each episode, then the second worst, and so
+    on. Neighbours in one episode often err for the same reason, so the episodes take turns.
+    """
+    rank: dict[int, int] = {}
+    turns: list[tuple[int, StepOfEpisode]] = []
+    for one in found.found:
+        turn = rank[one.step.episode] = rank.get(one.step.episode, 0) + 1
+        turns.append((turn, one.step))
+    chosen = [step for _, step in sorted(turns, key=lambda item: item[0])[:most]]
+    return [
+        NewSample(
+            coordinates=list(step.coordinates),
+            action=list(step.action),
+            next_coordinates=list(step.next_coordinates),
+            reward=step.reward,
+            terminated=step.terminated,
+        )
+        for step in chosen
+    ]
