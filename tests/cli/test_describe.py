@@ -45,6 +45,10 @@ def test_registering_by_name_alone_describes_and_enters_the_steps(on_server, nam
     steps = int(said.err.partition("described by ")[2].split()[0])
     view = on_server("status", name, "--json").json
     assert view["ledger"]["evaluation"] == steps >= 400
+    again = on_server("register", name, "--env", "Swimmer-v5")
+    assert (again.code, again.out) == (1, "")
+    assert f"a surrogate named {name!r} exists already, and no real step was taken" in again.err
+    assert "described by" not in again.err
 
 
 def test_a_name_of_no_environment_is_one_sentence(surrogym) -> None:

@@ -84,6 +84,19 @@ def test_results_are_sent_later_if_the_server_is_unreachable(api: Api, away: Api
     assert api.policies.file(NAME, 1, "zip") == policy.read_bytes()
 
 
+def test_an_evaluation_kept_during_a_push_still_waits(api: Api, policy: Path, monkeypatch: pytest.MonkeyPatch):
+    pushing.keep(policy, evaluation("a"))
+    send = type(api.policies).evaluate
+
+    def sent_while_another_is_kept(calls: object, *arguments: object) -> object:
+        pushing.keep(policy, evaluation("b"))
+        return send(calls, *arguments)
+
+    monkeypatch.setattr(type(api.policies), "evaluate", sent_while_another_is_kept)
+    assert pushing.push(api, policy).evaluations == 1
+    assert [one["idempotency_key"] for one in json.loads(pushing.waiting_path(policy).read_text())] == ["b"]
+
+
 def test_the_address_of_a_card_is_not_passed_on(api: Api, policy: Path):
     pushing.push(api, policy)
     assert "secret" not in api.policies.get(NAME).model_dump_json()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -21,6 +22,7 @@ from surrogym_client.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from surrogym_client.transport.api import Api
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import SurrogateView
 
@@ -123,9 +125,14 @@ def command(
 
     Example: surrogym register Pendulum-v1 --name pendulum --budget 30
     """
+    from surrogym_client.original.loading import has_specification
+
     environment, name, spec = _sorted_out(environment, file, env, name, spec)
     given, steps = read_spec(spec), 0
-    if given is None and environment is not None:
+    if given is None and environment is not None and not has_specification(environment):
+        if not print_spec:
+            with service.connect(context, wait, quiet=output.quiet) as api:
+                _require_free(api, name or default_name(environment))
         given, steps = _described(environment, quiet=output.quiet)
     chosen = _specification(environment, given, **vars(choices))
     if tolerance:
@@ -157,15 +164,28 @@ def _sorted_out(
     return env, environment or name, spec
 
 
-def _described(environment: str, *, quiet: bool) -> tuple[EnvironmentSpec | None, int]:
-    """Draft a specification if the environment has none. Returns it with the number of real steps taken, or None and
-    0."""
+def _require_free(api: Api, name: str) -> None:
+    """Check that no surrogate has this name, before a description takes real steps for it.
+
+    Raises:
+        CommandError: there is one.
+    """
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.errors import UnknownSurrogate
+
+    with suppress(UnknownSurrogate):
+        api.surrogate(name)
+        raise CommandError(
+            f"a surrogate named {name!r} exists already, and no real step was taken; choose another name, or delete it "
+            f"with surrogym delete {name}"
+        )
+
+
+def _described(environment: str, *, quiet: bool) -> tuple[EnvironmentSpec, int]:
+    """Draft a specification, and return it with the number of real steps that were taken."""
     from surrogym_client.original.describing import describe
-    from surrogym_client.original.loading import has_specification
     from surrogym_shared.terminal import say
 
-    if has_specification(environment):
-        return None, 0
     description = describe(environment)
     for line in description.words():
         say(line, quiet=quiet)

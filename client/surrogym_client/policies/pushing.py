@@ -73,9 +73,9 @@ def push(api: Api, policy: Path, surrogate: str | None = None) -> Pushed:
         raise UnusablePolicy(f"the card beside {policy} can't be stored: {first_fault(error)}") from error
     sent = api.policies.push(name, card_sent, curve, form, policy.read_bytes())
     waiting = _read(policy)
-    for done, evaluation in enumerate(waiting, start=1):
+    for evaluation in waiting:
         api.policies.evaluate(name, sent.version, evaluation)
-        _write(policy, waiting[done:])
+        _write(policy, [one for one in _read(policy) if one.idempotency_key != evaluation.idempotency_key])
     return Pushed(name, sent, len(waiting), _push_video(api, name, sent, policy))
 
 
