@@ -223,7 +223,6 @@ def _too_wide(promise: Promise, floor: float | None) -> str | None:
     if floor is None or promise.median - promise.low <= WIDE * abs(promise.median - floor):
         return None
     return (
-        f"the promise, from {promise.low:.4g} to {promise.high:.4g}, is too wide to be told apart from the "
-        f"{floor:.4g} of an "
-        "untrained policy"
+        f"the promise, from {promise.low:.4g} to {promise.high:.4g}, is too wide compared with the gain over an "
+        f"untrained policy, whose return is {floor:.4g}"
     )

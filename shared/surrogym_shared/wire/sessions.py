@@ -27,7 +27,10 @@ OF_PARTICLES = ("particles", "propagation", "weighting", "spread")
 
 
 class OpenSession(Request):
-    """Options of a session, one trainer's virtual environment. None takes the preset's value."""
+    """Options of a session: the virtual environment of one trainer.
+
+    For ``time_limit`` and ``penalty``, None takes the surrogate's value. Each other field says what its None means.
+    """
 
     num_envs: Annotated[int, Field(ge=1, le=MAX_LANES)] = 1
     variant: Variant = "deterministic"
