@@ -85,7 +85,6 @@ class _Looking:
     def __init__(self, environment: IsolatedEnvironment, spec: EnvironmentSpec) -> None:
         self._environment, self._spec = environment, spec
         self._rng = np.random.default_rng(0)
-        self._widths = np.array([np.ptp(limits(c.sampling)) for c in spec.coordinates])
         self._steps = self._resets = 0
         self._errors: dict[str, float] = {}
 
@@ -143,26 +142,37 @@ class _Looking:
         """The largest difference between the results of steps; that of the rewards if the states are equal."""
         if len(ones) != len(others):
             return 1.0  # one episode ended earlier
-        apart = [self._apart(a.next_coordinates, b.next_coordinates) for a, b in zip(ones, others, strict=True)]
+        states = [self._apart(a.next_coordinates, b.next_coordinates) for a, b in zip(ones, others, strict=True)]
         paid = [
             abs(float(a.reward) - float(b.reward)) / max(1.0, abs(float(a.reward)))
             for a, b in zip(ones, others, strict=True)
         ]
-        return max([*apart, *paid])
+        return max([*states, *paid])
 
     def _apart(self, one: object, other: object) -> float:
-        difference = np.asarray(one, dtype=np.float64) - np.asarray(other, dtype=np.float64)
-        for i, coordinate in enumerate(self._spec.coordinates):
-            if coordinate.kind == "angle":
-                difference[i] = (difference[i] + np.pi) % (2 * np.pi) - np.pi
-        return float((np.abs(difference) / self._widths).max())
+        return apart(self._spec, one, other)
 
     def _note(self, which: str, error: float) -> None:
         self._errors[which] = max(self._errors.get(which, 0.0), error)
 
     def _action(self) -> Array:
-        action = self._spec.action
-        if isinstance(action, BoxAction):
-            return self._rng.uniform(action.low, action.high)
-        counts = [action.n] if action.kind == "discrete" else action.nvec
-        return self._rng.integers(0, counts).astype(np.float64)
+        return random_action(self._spec, self._rng)
+
+
+def random_action(spec: EnvironmentSpec, rng: np.random.Generator) -> Array:
+    """Draw an action (F,) from the whole action space."""
+    action = spec.action
+    if isinstance(action, BoxAction):
+        return rng.uniform(action.low, action.high)
+    counts = [action.n] if action.kind == "discrete" else action.nvec
+    return rng.integers(0, counts).astype(np.float64)
+
+
+def apart(spec: EnvironmentSpec, one: object, other: object) -> float:
+    """Return the largest difference between coordinates (C,), as a share of the sampling range."""
+    difference = np.asarray(one, dtype=np.float64) - np.asarray(other, dtype=np.float64)
+    for i, coordinate in enumerate(spec.coordinates):
+        if coordinate.kind == "angle":
+            difference[i] = (difference[i] + np.pi) % (2 * np.pi) - np.pi
+    widths = np.array([np.ptp(limits(coordinate.sampling)) for coordinate in spec.coordinates])
+    return float((np.abs(difference) / widths).max())

@@ -3,21 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 from surrogym_client.diagnosis.conformance import leases, sessions
-from surrogym_client.diagnosis.conformance.target import Mismatch, Target
+from surrogym_client.diagnosis.conformance.target import Target
+from surrogym_client.diagnosis.outcomes import Mismatch, Outcome
 from surrogym_client.errors import SurrogymClientError
 
 Check = Callable[[Target], None]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """One check. ``failure`` says what was expected and what came; None if the check passed."""
-
-    name: str
-    failure: str | None
 
 
 def conformance(url: str | None, token: str | None, surrogate: str) -> Iterator[Outcome]:

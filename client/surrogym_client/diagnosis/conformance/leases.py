@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 
-from surrogym_client.diagnosis.conformance.target import Target, answer, expect
+from surrogym_client.diagnosis.conformance.target import Target, answer
+from surrogym_client.diagnosis.outcomes import expect
 
 SHORT_LEASE = 0.3  # seconds
 

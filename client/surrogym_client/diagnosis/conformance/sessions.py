@@ -6,7 +6,8 @@ from typing import Any, get_args
 
 import numpy as np
 
-from surrogym_client.diagnosis.conformance.target import END, TIME_LIMIT, Target, expect
+from surrogym_client.diagnosis.conformance.target import END, TIME_LIMIT, Target
+from surrogym_client.diagnosis.outcomes import expect
 from surrogym_client.transport.http_surrogate import HttpSurrogate, Transport
 from surrogym_shared.wire import OpenSession
 

@@ -7,6 +7,7 @@ from typing import Any, Self
 
 import httpx
 
+from surrogym_client.diagnosis.outcomes import Mismatch, expect
 from surrogym_client.errors import NotThere, SurrogymClientError
 from surrogym_client.transport.api import Api
 from surrogym_shared import wire
@@ -33,20 +34,6 @@ SPEC = EnvironmentSpec(
     time_limit=TIME_LIMIT,
     design=Design(initial=6, budget=6),
 )
-
-
-class Mismatch(Exception):
-    """A check failed; the message says what was expected and what came."""
-
-
-def expect(what: str, expected: object, came: object) -> None:
-    """Compare two values.
-
-    Raises:
-        Mismatch: they differ.
-    """
-    if expected != came:
-        raise Mismatch(f"{what}: expected {expected!r}, got {came!r}")
 
 
 class Target:
