@@ -5,16 +5,18 @@ spec='{"environment":"rail-sh","coordinates":[{"name":"x","unit":"mm","sampling"
 spec=$(printf '%s' "$spec" | tr -d '\n')
 x=0
 while IFS= read -r line; do
-  id=$(printf '%s' "$line" | sed 's/.*"id": *\([0-9]*\).*/\1/')
-  list=$(printf '%s' "$line" | sed -n 's/.*\[\(-*[0-9]*\).*\].*/\1/p')
+  id=$(printf '%s' "$line" | sed -n 's/.*"id": *\([0-9][0-9]*\).*/\1/p')
+  list=$(printf '%s' "$line" | sed -n 's/.*\[\(-*[0-9][0-9]*\).*\].*/\1/p')
   case $line in
     *'"method": "spec"'*) result="\"result\":{\"protocol\":1,\"spec\":$spec}" ;;
     *'"method": "reset"'*) x=0; result="\"result\":{\"state\":[$x]}" ;;
     *'"method": "set"'*) x=$list; result="\"result\":{\"state\":[$x]}" ;;
     *'"method": "get"'*) result="\"result\":{\"state\":[$x]}" ;;
-    *'"method": "step"'*) x=$((x + 2 * list - 1)); result="\"result\":{\"state\":[$x],\"reward\":$((-x * x)),\"terminated\":false,\"truncated\":false}" ;;
+    *'"method": "step"'*'['*) x=$((x + 2 * list - 1)); result="\"result\":{\"state\":[$x],\"reward\":$((-x * x)),\"terminated\":false,\"truncated\":false}" ;;
     *'"method": "close"'*) printf '{"id":%s,"result":{}}\n' "$id"; exit 0 ;;
-    *) result='"error":"expected spec, reset, set, get, step or close","code":"unsupported"' ;;
+    *'"method": "step"'*) result='"error":"expected an action, got none","code":"invalid"' ;;
+    *'"method"'*) result='"error":"expected spec, reset, set, get, step or close","code":"unsupported"' ;;
+    *) result='"error":"expected a request, got another line","code":"invalid"' ;;
   esac
-  printf '{"id":%s,%s}\n' "$id" "$result"
+  printf '{"id":%s,%s}\n' "${id:-null}" "$result"
 done

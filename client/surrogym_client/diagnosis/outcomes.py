@@ -7,10 +7,17 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Outcome:
-    """One check. ``failure`` says what was expected and what came; None if the check passed."""
+    """One check.
+
+    Attributes:
+        name: what has to hold.
+        failure: what was expected and what came; None if the check passed, or was left out.
+        left_out: why the check does not apply; None if it was made.
+    """
 
     name: str
     failure: str | None
+    left_out: str | None = None
 
 
 class Mismatch(Exception):

@@ -50,15 +50,15 @@ def decode(line: bytes, number: int) -> Reply:
         answer = json.loads(line, parse_constant=_not_finite)
     except (ValueError, RecursionError) as error:
         raise StepFailed(
-            f"expected one line of JSON from the program, got {_short(line)}; let it print everything else to "
+            f"expected one line of JSON from the program, got {short(line)}; let it print everything else to "
             "standard error"
         ) from error
     if not isinstance(answer, dict) or type(answer.get("id")) is not int or answer["id"] != number:
-        raise StepFailed(f"expected an answer with id {number} from the program, got {_short(line)}")
+        raise StepFailed(f"expected an answer with id {number} from the program, got {short(line)}")
     if "error" in answer:
         raise RequestRefused(f"the program answered: {answer['error']}", str(answer.get("code", "failed")))
     if not isinstance(answer.get("result"), dict):
-        raise StepFailed(f"expected 'result' or 'error' in the program's answer, got {_short(line)}")
+        raise StepFailed(f"expected 'result' or 'error' in the program's answer, got {short(line)}")
     result: Reply = answer["result"]
     return result
 
@@ -71,7 +71,7 @@ def numbers(reply: Reply, key: str, size: int) -> Array:
     """
     came = reply.get(key)
     if not isinstance(came, list) or len(came) != size or not all(map(_is_number, came)):
-        raise StepFailed(f"expected {size} finite numbers for {key!r} in the program's answer, got {_short(came)}")
+        raise StepFailed(f"expected {size} finite numbers for {key!r} in the program's answer, got {short(came)}")
     return np.array(came, dtype=np.float64)
 
 
@@ -82,7 +82,7 @@ def number(reply: Reply, key: str) -> float:
         StepFailed: the reply has none under this key.
     """
     if not _is_number(reply.get(key)):
-        raise StepFailed(f"expected a finite number for {key!r} in the program's answer, got {_short(reply.get(key))}")
+        raise StepFailed(f"expected a finite number for {key!r} in the program's answer, got {short(reply.get(key))}")
     return float(reply[key])
 
 
@@ -94,7 +94,7 @@ def truth(reply: Reply, key: str) -> bool:
     """
     came = reply.get(key)
     if not isinstance(came, bool):
-        raise StepFailed(f"expected true or false for {key!r} in the program's answer, got {_short(came)}")
+        raise StepFailed(f"expected true or false for {key!r} in the program's answer, got {short(came)}")
     return came
 
 
@@ -114,7 +114,7 @@ def specification_in(reply: Reply) -> EnvironmentSpec:
     version = reply.get("protocol")
     if type(version) is not int or version != PROTOCOL:
         raise UnknownEnvironment(
-            f"expected protocol {PROTOCOL} from the program, got {_short(version)}: update surrogym, or start the "
+            f"expected protocol {PROTOCOL} from the program, got {short(version)}: update surrogym, or start the "
             f"program with protocol {PROTOCOL}"
         )
     try:
@@ -138,6 +138,7 @@ def _not_finite(constant: str) -> NoReturn:
     raise ValueError(f"{constant} is not JSON")
 
 
-def _short(value: object) -> str:
+def short(value: object) -> str:
+    """Return a line, or another value, as an error repeats it."""
     text = value.decode(errors="replace") if isinstance(value, bytes) else repr(value)
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}…"

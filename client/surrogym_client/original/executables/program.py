@@ -17,7 +17,7 @@ from surrogym_client.original.errors import (
     StepTimedOut,
     UnknownEnvironment,
 )
-from surrogym_client.original.executables.messages import LONGEST_LINE, Reply, decode, encode
+from surrogym_client.original.executables.messages import LONGEST_LINE, Reply, decode, encode, short
 
 END_SECONDS = 2.0  # after the request to close, and again after SIGTERM
 CHUNK = 1 << 16  # bytes
@@ -88,15 +88,54 @@ class Program:
             StepFailed: it died, hung or sent something else; it was ended.
         """
         self._number += 1
-        line = encode(self._number, method, **fields)
+        answer = self.exchange(encode(self._number, method, **fields), method, deadline)
         try:
-            self._write(line, method)
-            return decode(self._read(method, deadline), self._number)
+            return decode(answer, self._number)
         except RequestRefused:
             raise
         except StepFailed:
             self.end()
             raise
+
+    def exchange(self, line: bytes, what: str, deadline: float) -> bytes:
+        """Send one line, and return the next line that the program prints, without its end.
+
+        Args:
+            line: with its end.
+            what: name of the request, for errors.
+            deadline: when the answer must be complete, on the monotonic clock, in seconds.
+
+        Raises:
+            StepFailed: the program died, hung or printed too long a line; it was ended.
+        """
+        try:
+            self._write(line, what)
+            return self._read(what, deadline)
+        except StepFailed:
+            self.end()
+            raise
+
+    def surplus(self, seconds: float) -> bytes:
+        """Wait, and return what the program printed beyond its answers."""
+        if self._process is not None and self._process.stdout is not None:
+            with selectors.DefaultSelector() as selector:
+                selector.register(self._process.stdout.fileno(), selectors.EVENT_READ)
+                if selector.select(seconds):
+                    self._unread += os.read(self._process.stdout.fileno(), CHUNK)
+        return self._unread
+
+    def end_input(self) -> None:
+        """Close the program's standard input."""
+        if self._process is not None and self._process.stdin is not None:
+            with suppress(OSError):
+                self._process.stdin.close()
+
+    def wait(self, seconds: float) -> int | None:
+        """Return the exit code; None if the program still runs after ``seconds``."""
+        try:
+            return None if self._process is None else self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            return None
 
     def close(self) -> None:
         """Ask the program to close, and end it if it does not."""
@@ -164,7 +203,7 @@ class Program:
 
     def _death(self, method: str) -> EnvironmentDied:
         """The error of a program that closed its input or output. It has a moment to end by itself."""
-        if self._process is not None:
-            with suppress(subprocess.TimeoutExpired):
-                self._process.wait(END_SECONDS)
-        return EnvironmentDied(f"the program ended with exit code {self.end()} during {method}")
+        self.wait(END_SECONDS)
+        printed = self.surplus(0.0)
+        after = f", after it printed {short(printed.strip())}" if printed else ""
+        return EnvironmentDied(f"the program ended with exit code {self.end()} during {method}{after}")

@@ -1,0 +1,103 @@
+"""The conformance suite of programs: one that keeps the protocol passes, and a broken promise fails its check alone."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from support.programs import program
+from surrogym_client.cli import build
+from surrogym_client.diagnosis.executables import FIRST, conformance
+
+SHELL = Path(__file__).parents[2] / "examples" / "executables" / "rail.sh"
+SEEDED = 'random.Random(request["seed"]).uniform(-0.5, 0.5)'
+SAME = "a program that was started anew is the same"
+
+
+def failures(command: str) -> dict[str, str]:
+    return {outcome.name: outcome.failure for outcome in conformance(command, 10.0) if outcome.failure}
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "broken"),
+    [
+        ('"protocol": 1', '"protocol": request["protocol"]', {"a newer protocol is not accepted"}),
+        ('"code": "unsupported"', '"code": "unknown"', {"an unknown method is unsupported"}),
+        ("except (ValueError, ", "except (", {"a line that is no request gets an error"}),
+        ('[u] = request["action"]', '[u] = request.get("action", [0.0])', {"a step without an action gets an error"}),
+        (SEEDED, "random.uniform(-0.5, 0.5)", {"a seed repeats its start", SAME}),
+        (SEEDED, "0.25", {"other seeds give other starts"}),
+        ("return go(to)", "return go(float(int(to)))", {"set reaches the state"}),
+        (
+            'return {"state": [x]}\n\ndef save',
+            'return {"state": [0]}\n\ndef save',
+            {"get gives the state that was set"},
+        ),
+        (
+            "x + 0.1 * u",
+            "x + 0.1 * u + 0.05 * last",
+            {"a step depends on nothing but state and action", "restore returns to what was saved"},
+        ),
+        ('float(request["snapshot"])', "0.0", {"restore returns to what was saved"}),
+        ('    if method == "close":\n        break', "", {"close ends the program"}),
+        (
+            "        break\n",
+            "        os._exit(3)\ntime.sleep(3600)\n",
+            {"the end of its input ends the program", "close ends the program"},
+        ),
+    ],
+)
+def test_a_broken_promise_fails_its_check_alone(tmp_path: Path, before: str, after: str, broken: set[str]):
+    assert failures(program(tmp_path, (before, after))).keys() == broken
+
+
+def test_an_answer_without_its_number_ends_the_program_and_fails(tmp_path: Path):
+    number = ('number, method = request["id"]', "number, method = 1")
+    assert "an answer repeats the number of its request" in failures(program(tmp_path, number))
+
+
+def test_a_missing_field_is_named_with_the_way_out(tmp_path: Path):
+    said = failures(program(tmp_path, ('"truncated": False', '"time": 0')))["a step gives state reward and ends"]
+    assert "expected true or false for 'truncated'" in said
+    assert said.endswith("give all four fields in every answer to step")
+
+
+def test_a_program_with_rollouts_alone_needs_no_set(tmp_path: Path):
+    command = program(tmp_path, ('"query":"step"', '"query":"rollout"'), ('"set": put, "get": get, ', ""))
+    left_out = {outcome.name for outcome in conformance(command, 10.0) if outcome.left_out}
+    assert failures(command) == {}
+    assert left_out == {
+        "set reaches the state",
+        "get gives the state that was set",
+        "a step depends on nothing but state and action",
+    }
+
+
+@pytest.mark.parametrize(
+    ("command", "reason"),
+    [
+        ("./no-such-plant", "can be started"),
+        ("sh -c 'exit 3'", "exit code 3"),
+        ("echo hello", "hello"),
+    ],
+)
+def test_a_program_without_a_specification_is_not_checked_further(command: str, reason: str):
+    [outcome] = conformance(command, 10.0)
+    assert outcome.name == FIRST
+    assert outcome.failure is not None
+    assert reason in outcome.failure
+
+
+def test_the_command_shows_each_check_and_fails_with_them(tmp_path: Path):
+    def run(*options: str):
+        return CliRunner().invoke(build(), ["conformance", *options])
+
+    passed = run("--exec", f"sh {shlex.quote(str(SHELL))}")
+    failed = run("--exec", program(tmp_path, (SEEDED, "0.25")), "--json")
+    assert (passed.exit_code, failed.exit_code) == (0, 1)
+    assert passed.stdout.endswith("16 of 16 checks passed, 2 left out\n")
+    assert json.loads(failed.stdout)["failed"].keys() == {"other seeds give other starts"}

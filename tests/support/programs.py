@@ -1,0 +1,78 @@
+"""A program that keeps the protocol of executables, and copies of it with faults."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+
+from support.moody import SPEC
+
+SOURCE = f"""
+import json, os, random, sys, time
+
+SPEC = json.loads({SPEC.model_dump_json()!r})
+x = last = 0.0
+
+def spec(request):
+    return {{"protocol": 1, "spec": SPEC}}
+
+def go(to):
+    global x
+    x = to
+    return {{"state": [x]}}
+
+def reset(request):
+    return go(random.Random(request["seed"]).uniform(-0.5, 0.5))
+
+def put(request):
+    [to] = request["state"]
+    return go(to)
+
+def get(request):
+    return {{"state": [x]}}
+
+def save(request):
+    return {{"snapshot": repr(x)}}
+
+def restore(request):
+    return go(float(request["snapshot"]))
+
+def step(request):
+    global last
+    [u] = request["action"]
+    before, after = x, x + 0.1 * u
+    last = u
+    return go(after) | {{"reward": -abs(before), "terminated": False, "truncated": False}}
+
+def close(request):
+    return {{}}
+
+methods = {{"spec": spec, "reset": reset, "set": put, "get": get, "save": save, "restore": restore, "step": step}}
+methods["close"] = close
+for line in sys.stdin:
+    number = method = None
+    try:
+        request = json.loads(line)
+        number, method = request["id"], request["method"]
+        if method in methods:
+            answer = {{"result": methods[method](request)}}
+        else:
+            answer = {{"error": "unknown", "code": "unsupported"}}
+    except (ValueError, LookupError, TypeError) as error:
+        answer = {{"error": repr(error), "code": "invalid"}}
+    print(json.dumps({{"id": number, **answer}}), flush=True)
+    if method == "close":
+        break
+"""
+
+
+def program(folder: Path, *faults: tuple[str, str]) -> str:
+    """Write a copy in which each fault's first text is replaced by its second; the command that runs it."""
+    source = SOURCE
+    for before, after in faults:
+        assert before in source
+        source = source.replace(before, after)
+    path = folder / "program.py"
+    path.write_text(source)
+    return shlex.join([sys.executable, "-I", "-S", str(path)])
