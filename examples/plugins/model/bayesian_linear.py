@@ -155,7 +155,7 @@ class LinearModel(DynamicsModel, FunctionDraws, LeaveOneOut, Differentiable):
     ) -> Transition:
         """The step of changes (m, M), paid by weights ``pay`` (d, 1), or (m, d, 1) of each row's own function."""
         change = change if process is None else change + self.changes.noise * process
-        q_next = moved(self.definition, self._inverse, q, placed(self.definition, change))
+        q_next = moved(self.definition, self._inverse, q, u, placed(self.definition, change))
         state = q_next if self.definition.reward_timing == "after" else q
         x = features(self.definition, state, u)
         reward, doubt = (x[:, None] @ pay)[:, 0, 0], self.pay.deviation(x)[:, 0]

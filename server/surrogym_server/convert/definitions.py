@@ -148,7 +148,15 @@ def _coordinate(coordinate: wire.Coordinate, spec: wire.EnvironmentSpec) -> core
         low=-math.inf if bounds is None else _or(bounds.low, -math.inf),
         high=math.inf if bounds is None else _or(bounds.high, math.inf),
         stops=stops,
+        lag=None if coordinate.lag is None else _lag(coordinate.lag, spec.coordinate_names),
     )
+
+
+def _lag(lag: wire.Lag, names: tuple[str, ...]) -> core.Lag:
+    if lag.entry is not None:
+        return core.Lag(lag.kind, lag.entry)
+    assert lag.of is not None
+    return core.Lag(lag.kind, names.index(lag.of))
 
 
 def _distribution(distribution: wire.Uniform | wire.Normal | wire.Fixed) -> distributions.Distribution:

@@ -31,7 +31,7 @@ export function maps(name, spec, controls) {
     select.addEventListener("change", () => ask());
     return { select, label: h("label", { class: "pick" }, label, select) };
   };
-  const moving = ranges.flatMap((range, at) => (range.kind === "constant" ? [] : [at]));
+  const moving = ranges.flatMap((range, at) => (range.kind === "constant" || range.lag ? [] : [at]));
   const x = pick("across", names, moving[0] ?? 0);
   const y = pick("up", names, moving[1] ?? moving[0] ?? 0);
   const output = h("select", {}, h("option", { value: -1 }, WORST));

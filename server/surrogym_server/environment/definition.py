@@ -27,6 +27,15 @@ Kind = Literal["linear", "angle", "constant"]
 
 
 @dataclass(frozen=True)
+class Lag:
+    """Past value that a coordinate repeats: the change of a coordinate in the step, or its value or an entry of the
+    action before it."""
+
+    kind: Literal["change", "value", "action"]
+    source: int  # index of the coordinate, or entry of the action
+
+
+@dataclass(frozen=True)
 class CoordinateDefinition:
     name: str
     kind: Kind
@@ -35,6 +44,7 @@ class CoordinateDefinition:
     low: float = -np.inf  # saturation bounds
     high: float = np.inf
     stops: int | None = None  # index of the coordinate that a bound sets to zero
+    lag: Lag | None = None
 
     @property
     def saturates(self) -> bool:
@@ -166,8 +176,18 @@ class EnvironmentDefinition:
 
     @cached_property
     def moving(self) -> tuple[int, ...]:
-        """Indices of the coordinates that the dynamics move."""
-        return tuple(i for i, c in enumerate(self.coordinates) if c.kind != "constant")
+        """Indices of the coordinates that the dynamics move, without lags."""
+        return tuple(i for i, c in enumerate(self.coordinates) if c.kind != "constant" and c.lag is None)
+
+    @cached_property
+    def lags(self) -> tuple[int, ...]:
+        """Indices of the coordinates that repeat the past."""
+        return tuple(i for i, c in enumerate(self.coordinates) if c.lag is not None)
+
+    @cached
+    def lag_columns(self) -> Tensor:
+        """``lags`` as a tensor on the device."""
+        return torch.tensor(self.lags, device=self.device)
 
     @cached
     def moving_columns(self) -> Tensor:

@@ -43,8 +43,32 @@ def placed(definition: EnvironmentDefinition, change: Tensor) -> Tensor:
     return every.index_copy(1, definition.moving_columns, change)
 
 
-def moved(definition: EnvironmentDefinition, inverse: ObservationInverse | None, q: Tensor, change: Tensor) -> Tensor:
-    """Next coordinates after a change (m, C) of coordinates q (m, C), or after a change (m, D) of their observation,
-    given its inverse. The rules of the environment are applied."""
+def moved(
+    definition: EnvironmentDefinition, inverse: ObservationInverse | None, q: Tensor, u: Tensor, change: Tensor
+) -> Tensor:
+    """Next coordinates after a change (m, C) of coordinates q (m, C) under u (m, F), or after a change (m, D) of their
+    observation, given its inverse. The rules of the environment are applied, and lags repeat the step."""
     arrived = q + change if inverse is None else inverse(definition.observe(q) + change, q)
-    return settle(definition, arrived)
+    return with_lags(definition, q, u, settle(definition, arrived))
+
+
+def with_lags(definition: EnvironmentDefinition, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
+    """Set the lags of next coordinates q_next (m, C) to what they repeat of the step from q (m, C) under u (m, F)."""
+    if not definition.lags:
+        return q_next
+    repeated = [_repeated(definition, index, q, u, q_next) for index in definition.lags]
+    return clip(definition, q_next.index_copy(1, definition.lag_columns, torch.stack(repeated, 1)))
+
+
+def _repeated(definition: EnvironmentDefinition, index: int, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
+    """Next value (m,) of a lag."""
+    lag = definition.coordinates[index].lag
+    assert lag is not None
+    match lag.kind:
+        case "action":
+            return u[:, lag.source].to(q.dtype)
+        case "value":
+            return q[:, lag.source]
+        case "change":
+            change = q_next[:, lag.source] - q[:, lag.source]
+            return wrap(change) if definition.coordinates[lag.source].kind == "angle" else change

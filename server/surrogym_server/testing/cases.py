@@ -14,7 +14,7 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
-from surrogym_server.environment.step_rules import settle
+from surrogym_server.environment.step_rules import settle, with_lags
 from surrogym_server.models.port import DynamicsModel, Learned, Learner
 from surrogym_server.models.registry import learner_of
 from surrogym_server.sampling.latin_hypercube import random_points
@@ -43,12 +43,19 @@ FAST = {
     "value": END,
 }
 COST = {"kind": "declared", "terms": [{"shape": "square", "weight": -1, "of": [{"action": [1.0]}]}]}
+LAGS: list[dict[str, Any]] = [
+    {"name": "turned", "sampling": {"kind": "uniform", "low": -0.6, "high": 0.6}},
+    {"name": "pushed", "sampling": {"kind": "uniform", "low": -2.0, "high": 2.0}},
+]
+LAGS[0]["lag"], LAGS[1]["lag"] = {"kind": "change", "of": "angle"}, {"kind": "action", "entry": 0}
+REST = {lag["name"]: {"kind": "fixed", "value": 0.0} for lag in LAGS}
 VARIATIONS: dict[str, dict[str, Any]] = {
     "learned reward": {},
     "declared reward": {"reward": COST},
     "declared end": {"termination": [[FAST]]},
     "learned end": {"termination": "learned"},
     "discrete actions": {"action": {"kind": "discrete", "n": 3}},
+    "lags": {"coordinates": [*PENDULUM["coordinates"], *LAGS], "start": PENDULUM["start"] | REST, "query": "rollout"},
 }
 
 
@@ -111,10 +118,11 @@ def _real_steps(case: ModelCase, count: int, seed: int) -> Samples:
     """Steps from anywhere in the sampling range of a pushed pendulum, whose reward depends on its angle and
     the push."""
     q, u = random_points(case.definition, count, np.random.default_rng(seed))
-    angle, speed = q.unbind(-1)
+    angle, speed = q[:, 0], q[:, 1]
     push = u[:, 0] - 1 if case.definition.action.nvec else u[:, 0]
     faster = (speed + 0.1 * (5 * angle.sin() + 3 * push)).clamp(-LARGEST_SPEED, LARGEST_SPEED)
-    q_next = settle(case.definition, torch.stack([angle + 0.1 * faster, faster], -1))
+    arrived = settle(case.definition, torch.cat([torch.stack([angle + 0.1 * faster, faster], -1), q[:, 2:]], -1))
+    q_next = with_lags(case.definition, q, u, arrived)
     known = case.definition.declared_reward
     reward = angle.cos() - 0.1 * push.square() if known is None else known(q, u)
     ends = case.definition.learns_termination | bool(case.definition.termination_groups)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from surrogym_server.engine.fidelity import fidelity_of
 from surrogym_server.environment.samples import Samples
-from surrogym_server.environment.step_rules import settle
+from surrogym_server.environment.step_rules import placed, settle, with_lags
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.files import METADATA, from_bytes, to_bytes
 from surrogym_server.models.port import DynamicsModel, Transition
@@ -87,7 +87,13 @@ def a_draw_is_the_mean_and_noise_times_the_deviation(case: ModelCase) -> None:
     made = case.model.transition(q, u, noise=noise, deviations=True)
     assert made.deviation is not None
     change = case.model.means(q, u)[:, :-1] + made.deviation * noise
-    assert close(made.q_next[:, 1], settle(case.definition, q + change)[:, 1])
+    assert close(made.q_next[:, 1], settle(case.definition, q + placed(case.definition, change))[:, 1])
+
+
+def lags_repeat_the_step(case: ModelCase) -> None:
+    q, u = case.points.q, case.points.u
+    q_next = case.model.transition(q, u).q_next
+    assert torch.equal(q_next, with_lags(case.definition, q, u, q_next))
 
 
 def it_learns(case: ModelCase) -> None:
@@ -208,7 +214,7 @@ def every_variant_steps(case: ModelCase) -> None:
 def a_round_of_the_design_asks_for_more(case: ModelCase) -> None:
     request = Request(budget=len(case.samples) + 6, target=1 - 1e-9, pending=case.points[:1])
     decision = advance(case.definition, case.samples, DesignState(), request)
-    assert len(decision.q) or decision.verdict == "ready"
+    assert len(decision.q) or decision.rollouts or decision.verdict == "ready"
     assert len(decision.confidences) == len(case.definition.outputs)
     json.dumps([decision.state.to_json(), fidelity_of(decision.model, (), 0.9)], allow_nan=False)
 
@@ -221,6 +227,7 @@ LAWS_OF_MODELS: tuple[Callable[[ModelCase], None], ...] = (
     points_do_not_see_those_beside_them,
     next_states_are_where_the_environment_can_be,
     a_draw_is_the_mean_and_noise_times_the_deviation,
+    lags_repeat_the_step,
     it_learns,
     scales_and_words_are_there_for_every_output,
     what_is_declared_is_not_learned,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from surrogym_shared.spec.actions import BoxAction, DiscreteAction, MultiDiscreteAction
 from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, NAME_IN_WORDS, NAME_PATTERN
-from surrogym_shared.spec.coordinates import Bounds, Coordinate, Fixed, Normal, Uniform, limits
+from surrogym_shared.spec.coordinates import Bounds, Coordinate, Fixed, Lag, Normal, Uniform, limits
 from surrogym_shared.spec.environment import AcquisitionChoice, Choice, Design, EnvironmentSpec, ModelChoice
 from surrogym_shared.spec.rewards import DeclaredReward, Quantity, Reward, RewardTerm, Success
 from surrogym_shared.spec.terms import AllOf, Inequality, ObservationEntry, Part, Term
@@ -31,6 +31,7 @@ __all__ = [
     "EnvironmentSpec",
     "Fixed",
     "Inequality",
+    "Lag",
     "ModelChoice",
     "MultiDiscreteAction",
     "Normal",

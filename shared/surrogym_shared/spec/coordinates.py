@@ -88,11 +88,32 @@ class Bounds(Frozen):
         return self
 
 
+class Lag(Frozen):
+    """Past value that a coordinate repeats. Its next value is known, so no process learns it.
+
+    ``change``: how far coordinate ``of`` moved in the step, an angle by at most half a turn. ``value``: the value of
+    coordinate ``of`` before the step. ``action``: entry ``entry`` of the step's action.
+    """
+
+    kind: Literal["change", "value", "action"]
+    of: Name | None = None
+    entry: Annotated[int, Field(ge=0, strict=True)] | None = None
+
+    @model_validator(mode="after")
+    def _sourced(self) -> Self:
+        if self.kind == "action":
+            require(self.entry is not None and self.of is None, "a lag of an action: expected an entry alone")
+        else:
+            require(self.of is not None and self.entry is None, f"a lag of kind {self.kind!r}: expected 'of' alone")
+        return self
+
+
 class Coordinate(Frozen):
     """One entry of q: a part of the state that the original environment is set to.
 
     The dynamics move ``linear`` and ``angle`` coordinates; an angle is wrapped to [-pi, pi). A ``constant`` is drawn at
-    the start of an episode and does not change (Reacher's target). ``sampling`` is the distribution of design queries.
+    the start of an episode and does not change (Reacher's target). A coordinate with a ``lag`` repeats the past.
+    ``sampling`` is the distribution of design queries.
     """
 
     name: Name
@@ -100,9 +121,16 @@ class Coordinate(Frozen):
     sampling: SamplingDistribution
     bounds: Bounds | None = None
     unit: str = ""
+    lag: Lag | None = None
+
+    @property
+    def moves(self) -> bool:
+        """Whether a model has to learn how the coordinate moves."""
+        return self.kind != "constant" and self.lag is None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        require(self.lag is None or self.kind == "linear", f"coordinate {self.name!r}: a lag must be linear")
         if self.kind != "linear":
             require(self.bounds is None, f"coordinate {self.name!r}: only a linear coordinate can have bounds")
         if self.bounds is not None:

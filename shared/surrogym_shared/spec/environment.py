@@ -130,8 +130,9 @@ class EnvironmentSpec(Frozen):
         require_known("start", self.start, names)
         missing = [n for n in names if n not in self.start]
         require(not missing, f"start distribution lacks {missing}: expected every coordinate of {list(names)}")
-        moving = [c.name for c in self.coordinates if c.kind != "constant"]
+        moving = [c.name for c in self.coordinates if c.moves]
         require(bool(moving), "expected at least one coordinate that moves (linear or angle)")
+        self._require_lags()
         learned = moving if self.design.preset == "default" else self.observation_names
         require_known("tolerances", self.tolerances, (*learned, REWARD))
         for c in self.coordinates:
@@ -175,6 +176,35 @@ class EnvironmentSpec(Frozen):
                 f"design: initial {self.design.initial} exceeds the budget {self.design.budget}",
             )
         return self
+
+    def _require_lags(self) -> None:
+        """Check that each lag repeats something that is known, no older than an episode, and that there is a past."""
+        known: dict[str, Coordinate] = {}
+        age = dict.fromkeys(self.coordinate_names, 0)
+        longest = min((limit for limit in (self.time_limit, self.max_rollout) if limit is not None), default=math.inf)
+        for c in self.coordinates:
+            if c.lag is not None:
+                where = f"coordinate {c.name!r}: lag"
+                require(
+                    self.query == "rollout",
+                    f"{where}: an environment that is set to a state has no past, so lags need one that can only be "
+                    "reset: expected query 'rollout', got 'step'",
+                )
+                if c.lag.entry is not None:
+                    size = self.action.size
+                    require(c.lag.entry < size, f"{where}: expected an entry below {size}, got {c.lag.entry}")
+                else:
+                    sources = [
+                        n for n, k in known.items() if (k.moves if c.lag.kind == "change" else k.kind == "linear")
+                    ]
+                    expected = "of an earlier coordinate; lags of an angle are of kind 'change'"
+                    require_known(f"{where} ({expected})", (c.lag.of or "",), sources)
+                age[c.name] = 1 + age[c.lag.of or c.name]
+                require(
+                    age[c.name] < longest,
+                    f"{where}: looks {age[c.name]} steps back: expected fewer than an episode's {longest}",
+                )
+            known[c.name] = c
 
     def _require_reward(self) -> None:
         if not isinstance(self.reward, DeclaredReward):

@@ -9,15 +9,17 @@ from numpy.typing import NDArray
 
 from surrogym_server.compiled.elementary import wrapped
 from surrogym_server.compiled.tables import TablesBuilder, matrix
-from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.definition import EnvironmentDefinition, Lag
 from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_shared.compiled.jit import compiled, inlined
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Of each coordinate: ends of its reach, its bounds, the coordinate that they stop or -1, and whether it is an angle.
-REACH_LOW, REACH_HIGH, LOW, HIGH, STOPS, ANGLE = range(6)
+# Of each coordinate: ends of its reach, its bounds, the coordinate that they stop or -1, whether it is an angle, and
+# for a lag what it repeats, and of which row of coordinates and action; -1 otherwise.
+REACH_LOW, REACH_HIGH, LOW, HIGH, STOPS, ANGLE, LAG, SOURCE = range(8)
+CHANGE, TURN, REPEAT = range(3)  # of a coordinate, of an angle, or a row as it was before the step
 
 
 def add_rules(tables: TablesBuilder, definition: EnvironmentDefinition) -> int:
@@ -25,10 +27,23 @@ def add_rules(tables: TablesBuilder, definition: EnvironmentDefinition) -> int:
     low, high = (end.tolist() for end in definition.reach)
     return tables.add(
         [
-            (low[i], high[i], c.low, c.high, -1 if c.stops is None else c.stops, c.kind == "angle")
+            (
+                *(low[i], high[i], c.low, c.high, -1 if c.stops is None else c.stops, c.kind == "angle"),
+                *((-1, -1) if c.lag is None else _lag(definition, c.lag)),
+            )
             for i, c in enumerate(definition.coordinates)
         ]
     )
+
+
+def _lag(definition: EnvironmentDefinition, lag: Lag) -> tuple[int, int]:
+    match lag.kind:
+        case "action":
+            return REPEAT, len(definition.coordinates) + lag.source
+        case "value":
+            return REPEAT, lag.source
+        case "change":
+            return TURN if definition.coordinates[lag.source].kind == "angle" else CHANGE, lag.source
 
 
 def add_inverse(tables: TablesBuilder, inverse: ObservationInverse | None) -> int:
@@ -62,6 +77,19 @@ def settle(rules: Floats, q: Floats) -> None:
         if rules[c, ANGLE]:
             for b in range(lanes):
                 q[c, b] = wrapped(q[c, b])
+
+
+@inlined
+def repeat(rules: Floats, raw: Floats, q: Floats) -> None:
+    """Set the lags of next coordinates q (C, B) to what they repeat of coordinates and action, raw (C + F, B)."""
+    size, lanes = q.shape
+    for c in range(size):
+        lag, source = int(rules[c, LAG]), int(rules[c, SOURCE])
+        if lag < 0:
+            continue
+        for b in range(lanes):
+            value = raw[source, b] if lag == REPEAT else q[source, b] - raw[source, b]
+            q[c, b] = clipped(rules, c, wrapped(value) if lag == TURN else value)
 
 
 @inlined

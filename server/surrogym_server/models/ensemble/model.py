@@ -84,7 +84,7 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, Differentiable):
 
     def means(self, q: Tensor, u: Tensor) -> Tensor:
         change = self.transitions(self._inputs.of_transition(q, u)).mean(0)
-        q_next = self._arrived(q, change)
+        q_next = self._arrived(q, u, change)
         reward = paid(self.terminal_reward, self._rewards(q, u, q_next).mean(0), self.terminated(q_next))
         return torch.cat([change, reward[:, None]], -1)
 
@@ -148,7 +148,7 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, Differentiable):
         spread = changes.std(0) if deviations or noise is not None else q.new_zeros(len(q), 0)
         change = _chosen(changes, member)
         change = change if noise is None else change + spread * noise
-        q_next = self._arrived(q, change)
+        q_next = self._arrived(q, u, change)
         rewards = self._rewards(q, u, q_next)
         doubt = rewards.std(0) if reward_deviation else q.new_zeros(len(q), 0)
         return q_next, _chosen(rewards, member), spread, doubt
@@ -160,8 +160,8 @@ class NetworkEnsembleModel(DynamicsModel, FunctionDraws, Differentiable):
         assert self.reward is not None
         return self.reward(self._inputs.of_reward(q, u, q_next))[..., 0]
 
-    def _arrived(self, q: Tensor, change: Tensor) -> Tensor:
-        return moved(self.definition, self._inverse, q, placed(self.definition, change))
+    def _arrived(self, q: Tensor, u: Tensor, change: Tensor) -> Tensor:
+        return moved(self.definition, self._inverse, q, u, placed(self.definition, change))
 
     @cached_property
     def _inverse(self) -> ObservationInverse | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 
 from surrogym_server.environment.angle_unwrapping import angle_increments
-from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.definition import EnvironmentDefinition, Lag
 from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.features import Drift
 from surrogym_server.environment.samples import Samples
@@ -20,7 +20,7 @@ POINTS_A_WEIGHT = 3
 def learn_drift(definition: EnvironmentDefinition, samples: Samples) -> Drift:
     """For each angle, the weights (C,) with which linear coordinates turn it: increment = w . q + constant, by least
     squares. Empty if there is no angle, or too little data."""
-    moved_by = [i for i in definition.moving if definition.coordinates[i].kind == "linear"]
+    moved_by = [i for i, c in enumerate(definition.coordinates) if c.kind == "linear" and not _is_action(c.lag)]
     if not definition.angles or not moved_by or len(samples) < POINTS_A_WEIGHT * (len(moved_by) + 1):
         return ()
     centre, scale = torch.tensor([scaling(definition.coordinates[i].sampling) for i in moved_by], dtype=torch.float64).T
@@ -30,3 +30,7 @@ def learn_drift(definition: EnvironmentDefinition, samples: Samples) -> Drift:
     weights = torch.zeros(len(definition.angles), len(definition.coordinates), dtype=torch.float64)
     weights[:, moved_by] = fitted[1:].T / scale
     return tuple(tuple(row) for row in weights.tolist())
+
+
+def _is_action(lag: Lag | None) -> bool:
+    return lag is not None and lag.kind == "action"

@@ -95,7 +95,7 @@ class Predictor:
             lead = clip(self.definition, q + mean[:, :-1])[:, leading(self.definition)]
             following = second.predict(first.encoder.with_lead(x, lead), wanted, kick, shake, paths)
             mean, spread = _sum((mean, spread), following)
-        q_next = moved(self.definition, self._inverse, q, mean[:, :-1])
+        q_next = moved(self.definition, self._inverse, q, u, mean[:, :-1])
         if after is not None:
             reward = after.predict(after.encoder(q_next, u), wanted, None, None, paths)
             mean, spread = _sum((mean, spread), reward)

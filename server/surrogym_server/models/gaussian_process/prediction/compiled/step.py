@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from surrogym_server.compiled.tables import Tables, TablesBuilder, matrix
 from surrogym_server.environment.compiled.features import add_features, encode
 from surrogym_server.environment.compiled.reward import add_declared, add_reward
-from surrogym_server.environment.compiled.rules import add_inverse, add_rules, clipped, recover, settle
+from surrogym_server.environment.compiled.rules import add_inverse, add_rules, clipped, recover, repeat, settle
 from surrogym_server.environment.compiled.terms import add_conditions, add_terms, evaluate, holding
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import leading
@@ -182,7 +182,7 @@ def _predict_stage(
 
 @inlined
 def _arrive(numbers: Floats, places: Ints, head: Floats, raw: Floats, mean: Floats, arrived: Floats) -> None:
-    """Next coordinates (C, B) of those in raw, after a change by mean (columns, B)."""
+    """Next coordinates (C, B) of those in raw (C + F + L, B), after a change by mean (columns, B)."""
     size, lanes = arrived.shape
     for c in range(size):
         for b in range(lanes):
@@ -197,7 +197,9 @@ def _arrive(numbers: Floats, places: Ints, head: Floats, raw: Floats, mean: Floa
         for c in range(size):
             for b in range(lanes):
                 arrived[c, b] += mean[c, b]
-    settle(matrix(numbers, places, int(head[0, RULES])), arrived)
+    rules = matrix(numbers, places, int(head[0, RULES]))
+    settle(rules, arrived)
+    repeat(rules, raw, arrived)
 
 
 @inlined
