@@ -1,4 +1,4 @@
-"""Routes of jobs: people queue, look and cancel; trainer workers claim, report and finish."""
+"""Routes of jobs: people queue, read and cancel jobs; trainer workers claim, report on and finish them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ THERE = (Code.UNKNOWN_SURROGATE, Code.UNKNOWN_JOB, Code.INVALID_REQUEST)
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def list_all(name: str, use: Use) -> JobList:
-    """Newest first, with the trainer workers that are connected."""
+    """List all jobs, newest first, and the connected trainer workers."""
     return convert.job_list(*use.jobs.list(name))
 
 
@@ -59,9 +59,9 @@ def list_all(name: str, use: Use) -> JobList:
     ),
 )
 def add(name: str, body: Annotated[AddJob, example(examples.JOB)], use: Use) -> JobView:
-    """A worker (``surrogym work``) runs it with code of its own: a task is numbers and words from fixed lists. An
-    evaluation runs in the environment that the worker was started with, and only if the worker takes so many real
-    episodes."""
+    """Queue a job for a trainer worker (``surrogym work``). A task consists of numbers and of words from fixed lists;
+    all code is the worker's own. An evaluation runs in the environment that the worker was started with, if the worker
+    accepts that many real episodes."""
     task, fields = body.task, body.task.model_dump(mode="json")
     if isinstance(task, TrainTask):
         return convert.job_view(use.jobs.train(name, fields, body.idempotency_key))
@@ -70,14 +70,14 @@ def add(name: str, body: Annotated[AddJob, example(examples.JOB)], use: Use) -> 
 
 @router.get("/jobs/{job_id}", summary="One job", dependencies=[READ], responses=documented(*THERE))
 def get(name: str, job_id: Number, use: Use) -> JobDetail:
-    """With the curve of its training so far."""
+    """Return a job with the curve of its training so far."""
     return convert.job_detail(use.jobs.get(name, job_id))
 
 
 @router.post("/jobs/{job_id}:cancel", summary="Cancel a job", dependencies=[TRAIN], responses=documented(*THERE))
 def cancel(name: str, job_id: Number, use: Use) -> JobView:
-    """One that waits ends at once. The worker of a running one stops at its next report, and stores the best policy
-    so far."""
+    """Cancel a job. A queued job ends at once. The worker of a running job stops at its next report, and stores the
+    best policy so far."""
     return convert.job_view(use.jobs.cancel(name, job_id))
 
 
@@ -90,7 +90,8 @@ def cancel(name: str, job_id: Number, use: Use) -> JobView:
 async def claim(
     name: str, body: Annotated[ClaimJob, example(examples.CLAIM_JOB)], request: Request, use: Use
 ) -> ClaimedJob:
-    """To one worker only. While there is none the reply waits, at most ``wait_seconds``."""
+    """Lease the oldest queued job to this worker only. If there is none, the reply waits for one, up to
+    ``wait_seconds``."""
     job = await use.jobs.claim(
         name, body.worker, body.most_episodes, body.lease_seconds, body.wait_seconds, request.is_disconnected
     )
@@ -99,15 +100,15 @@ async def claim(
 
 @router.post(
     "/jobs/{job_id}:report",
-    summary="Keep a job, and say how far it is",
+    summary="Report the progress of a job",
     dependencies=[TRAIN],
     responses=documented(*THERE, Code.LEASE_EXPIRED),
 )
 def report(
     name: str, job_id: Number, body: Annotated[ReportJob, example(examples.REPORT_JOB)], use: Use
 ) -> ReportedJob:
-    """The heartbeat of a worker. The reply says whether it is to stop. Without reports the lease ends: a training goes
-    to the next worker, an evaluation fails."""
+    """Renew the lease of a job and store its progress. The reply tells the worker whether to stop. Without reports the
+    lease ends: a training then goes to the next worker, and an evaluation fails."""
     progress = convert.job_progress(body.state)
     return ReportedJob(cancel=use.jobs.report(name, job_id, body.lease_token, body.lease_seconds, progress))
 
@@ -119,5 +120,5 @@ def report(
     responses=documented(*THERE, Code.LEASE_EXPIRED),
 )
 def finish(name: str, job_id: Number, body: Annotated[FinishJob, example(examples.FINISH_JOB)], use: Use) -> JobView:
-    """With the version of the policy that was stored. A repeat is harmless."""
+    """End a job, with the version of the policy that was stored. A repeat is harmless."""
     return convert.job_view(use.jobs.finish(name, job_id, body.lease_token, convert.job_result(body)))

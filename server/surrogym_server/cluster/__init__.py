@@ -1,1 +1,1 @@
-"""A Ray cluster behind the ports: sessions in a fixed pool of processes, with leases and checkpoints; fits as tasks."""
+"""Sessions in a fixed pool of processes of a Ray cluster, with leases and checkpoints; fits as tasks of the cluster."""

@@ -1,4 +1,4 @@
-"""RayEngine: sessions in a fixed pool of session hosts. This process holds nothing of them."""
+"""RayEngine: sends the requests of sessions to session hosts in a Ray cluster. This process keeps no session."""
 
 from __future__ import annotations
 
@@ -21,29 +21,31 @@ from surrogym_server.engine.tallies import Counts, Durations, SessionActivity
 from surrogym_server.errors import IdempotencyConflict, Overloaded, Unavailable, UnknownSession
 from surrogym_server.storage.live_sessions import LiveSessions
 
-COUNTING_SECONDS, ANSWERING_SECONDS, TAKING_SECONDS = 10.0, 5.0, 60.0
-MOVES = 3  # of a session, within one request
-REMEMBERED = 10_000  # sessions that are elsewhere than their ids say
+COUNTING_SECONDS, ANSWERING_SECONDS, TAKING_SECONDS = 10.0, 5.0, 60.0  # longest waits for a host
+MOVES = 3  # hosts that one request tries while its session changes hosts
+REMEMBERED = 10_000  # sessions whose present host is remembered, because it is not the one in their id
 
 
 class _Gone(Exception):
-    """A session host that has died, or does not answer."""
+    """A session host has died, or does not answer."""
 
 
 class RayEngine(SessionEngine):
-    """Asks the host that has a session. The id of a session ends with the number of the host that opened it. If that
-    host does not have it, the database says which one does. If its lease has ended, another host takes it over.
+    """Engine that sends each request to the session host that has the session.
+
+    The id of a session ends with the number of the host that opened it. If that host does not have the session, the
+    database names the host that does. If the session's lease has ended, another host takes it over.
 
     Args:
         hosts: actor handles of ``SessionHost``, by number.
-        machines: the kind of machine of each host.
-        store: the records of sessions.
-        idle_seconds: as the hosts have it.
-        lease_seconds: as the hosts have it.
+        machines: kind of machine of each host, as ``machine_kind`` returns it.
+        store: records of the sessions in the database.
+        idle_seconds: seconds without a request after which a session expires; the hosts' own setting.
+        lease_seconds: seconds of a host's lease of a session; the hosts' own setting.
     """
 
     lasting = True
-    replay = 10_000  # of those that a session takes in a second; a checkpoint may be some seconds old
+    replay = 10_000  # requests; a checkpoint may be some seconds old, and a session takes many requests in a second
 
     def __init__(
         self,
@@ -104,7 +106,7 @@ class RayEngine(SessionEngine):
         return [one for of_host in await self._ask_all("activity", surrogate) for one in of_host]
 
     def counts(self) -> Counts:
-        """Of the hosts that answer."""
+        """Return the counts of all hosts that answer, added together."""
         asked = [host.counts.remote() for host in self._hosts]
         found: list[Counts] = []
         for answer in asked:
@@ -121,10 +123,10 @@ class RayEngine(SessionEngine):
         await asyncio.to_thread(self._store.sweep, self.idle_seconds)
 
     async def start(self) -> None:
-        """The hosts have started."""
+        """Do nothing: the hosts have started already."""
 
     async def stop(self) -> None:
-        """The hosts go on: their sessions belong to every front server."""
+        """Do nothing: the hosts keep running, because other front servers use their sessions too."""
 
     async def save(self) -> list[Saved]:
         return [one for of_host in await self._ask_all("save") for one in of_host]
@@ -133,7 +135,7 @@ class RayEngine(SessionEngine):
         await self._reply(self._place(request.saved.id), "restore", request)
 
     async def _of(self, session: str, operation: str, *arguments: Any) -> Any:
-        """The reply of the host that has a session, wherever it is now."""
+        """Ask the host that has a session now, and return its reply."""
         host = self._place(session)
         for _ in range(MOVES):
             try:
@@ -148,10 +150,10 @@ class RayEngine(SessionEngine):
         number = session.rpartition(".")[2]
         if number.isascii() and number.isdigit() and len(number) <= 4 and int(number) < len(self._hosts):
             return int(number)
-        return crc32(session.encode()) % len(self._hosts)  # of one that was saved by another engine
+        return crc32(session.encode()) % len(self._hosts)  # the session was saved by another engine
 
     async def _moved(self, session: str, asked: int, error: Exception) -> int:
-        """The host that has a session which the asked one doesn't have."""
+        """Find the host of a session that the host ``asked`` does not have. Returns its number."""
         holder = await asyncio.to_thread(self._store.holder, session)
         if holder is None:
             self._places.pop(session, None)
@@ -160,7 +162,7 @@ class RayEngine(SessionEngine):
         if holder.seconds_left <= 0:
             return self._remember(session, await self._taken(session, asked, holder.machine))
         host = _number(holder.owner)
-        if host == asked or host >= len(self._hosts):  # of a larger pool that was here before
+        if host == asked or host >= len(self._hosts):  # the host belonged to an earlier, larger pool
             raise Unavailable(
                 f"session host {host} has ended, and another one takes session {session!r} in "
                 f"{holder.seconds_left:.1f} s: try again later"
@@ -168,7 +170,7 @@ class RayEngine(SessionEngine):
         return self._remember(session, host)
 
     async def _taken(self, session: str, asked: int, machine: str) -> int:
-        """The host that has taken a session whose lease has ended."""
+        """Let another host take over a session whose lease has ended. Returns its number."""
         alike = [host for host in self._in_turn(asked + 1) if self._machines[host] == machine]
         if not alike:
             await asyncio.to_thread(self._store.remove, session)
@@ -196,7 +198,7 @@ class RayEngine(SessionEngine):
         return host
 
     async def _lives(self, host: int) -> bool:
-        """Whether a host answers at all; one that was stopped by a signal does not."""
+        """Whether a host answers at all. A process that a signal has stopped does not."""
         try:
             async with asyncio.timeout(ANSWERING_SECONDS):
                 await cast(Awaitable[None], self._hosts[host].ping.remote())
@@ -205,7 +207,12 @@ class RayEngine(SessionEngine):
         return True
 
     async def _answer(self, session: str, host: int, operation: str, *arguments: Any) -> Any:
-        """A host's reply; it is waited for as long as the session is that host's. Raises ``_Gone``, and as the host."""
+        """Wait for a host's reply as long as the session belongs to that host.
+
+        Raises:
+            _Gone: the host died, does not answer, or has lost the session.
+            SurrogymError: the host refused the request.
+        """
         asked = self._hosts[host].ask.remote(operation, *arguments)
         while True:
             try:
@@ -217,7 +224,7 @@ class RayEngine(SessionEngine):
                 holder = await asyncio.to_thread(self._store.holder, session)
                 if holder is None or _number(holder.owner) != host:
                     raise _Gone from None
-                if holder.seconds_left <= 0 and not await self._lives(host):  # not one that is late on a busy machine
+                if holder.seconds_left <= 0 and not await self._lives(host):  # a host that is only late still answers
                     raise _Gone from None
 
     async def _reply(self, host: int, operation: str, *arguments: Any) -> Any:
@@ -227,7 +234,7 @@ class RayEngine(SessionEngine):
             raise Unavailable(f"session host {host} has ended and is started again: try again later") from error
 
     async def _ask_all(self, operation: str, *arguments: Any) -> list[Any]:
-        """The replies of all hosts that answer."""
+        """Return the replies of all hosts that answer."""
         replies = await asyncio.gather(*(self._asked(host, operation, *arguments) for host in range(len(self._hosts))))
         return [reply for reply in replies if not isinstance(reply, _Gone)]
 
@@ -238,7 +245,7 @@ class RayEngine(SessionEngine):
 
 
 def _number(owner: str) -> int:
-    """Of the host that an owner of leases is."""
+    """Return the number of the host from its name as an owner of leases."""
     return int(owner.partition(" ")[0])
 
 

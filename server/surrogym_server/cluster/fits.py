@@ -1,4 +1,4 @@
-"""RayFits: each round of a design is a task of a Ray cluster, which runs where a CPU is free."""
+"""RayFits: runs each round of a design as a task of a Ray cluster, on any machine that has a free CPU."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ RETRIES = 1  # of a job whose process or machine died
 
 
 class RayFits(Compute):
-    """A task for each job. Ray ends them when this process ends, however it ends.
+    """Runs each job as a task of Ray. When this process ends, for any reason, Ray ends its tasks.
 
     Args:
-        function: what does a job.
+        function: does a job.
     """
 
     def __init__(self, function: Function = run_design_job) -> None:
@@ -37,7 +37,7 @@ class RayFits(Compute):
         self._task: Any = ray.remote(num_cpus=1, max_retries=RETRIES)(_done_there)
 
     def start(self) -> None:
-        """Ray starts its processes itself."""
+        """Do nothing: Ray starts the processes of tasks itself."""
 
     async def run(self, job: DesignJob) -> DesignResult:
         asked = self._task.remote(self._function, job, versions())
@@ -72,7 +72,7 @@ def _end(asked: Any) -> None:
 
 
 def _done_there(function: Function, job: DesignJob, expected: Mapping[str, str]) -> DesignResult | Failure:
-    """In a process of the cluster, perhaps on another machine."""
+    """Do a job in a process of the cluster, which may be on another machine. Its versions must be the expected ones."""
     for name, here in versions().items():
         if here != expected[name]:
             wrong = f"expected {name} {expected[name]} on every machine of the cluster, got {here} on {platform.node()}"

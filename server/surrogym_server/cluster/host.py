@@ -1,4 +1,4 @@
-"""A session host: one process of the pool. It reads models from the database, and is asked by front servers."""
+"""A session host: one process of the pool. It steps sessions for front servers, with models from the database."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ OPERATIONS = frozenset(
 
 
 def versions() -> dict[str, str]:
-    """What all processes of a cluster have to have in common: they send each other Python objects."""
+    """Return the versions that all processes of a cluster must share, because they exchange pickled objects."""
     packages = ("surrogym", "torch", "numpy", "ray")
     return {"Python": platform.python_version(), **{name: version(name) for name in packages}}
 
 
 @dataclass(frozen=True)
 class HostSettings:
-    """What the hosts of one pool are started with."""
+    """Settings that all hosts of a pool are started with."""
 
     hosts: int
     database: str = field(repr=False)  # it may hold a password
@@ -85,14 +85,14 @@ class HostSettings:
 
 @dataclass(frozen=True)
 class Refused:
-    """An error that was raised on purpose, as a value: Ray would wrap it."""
+    """A refusal, returned as a value. If it were raised, Ray would wrap it in an exception of its own."""
 
     error: SurrogymError
 
 
 @dataclass(frozen=True)
 class HostInfo:
-    """What a host was started with, and what it runs on."""
+    """Settings of a running host, its versions and its machine."""
 
     settings: HostSettings
     versions: dict[str, str]
@@ -102,11 +102,11 @@ class HostInfo:
 
 
 class SessionHost:
-    """An actor of Ray; it has one event loop, and many requests at once.
+    """Actor of Ray that steps sessions. It handles many requests at once, in one event loop.
 
     Args:
-        settings: of the pool.
-        number: of this host, from 0. Its sessions have it in their ids.
+        settings: settings of the pool.
+        number: number of this host, from 0. The ids of its sessions end with it.
     """
 
     def __init__(self, settings: HostSettings, number: int) -> None:
@@ -119,15 +119,15 @@ class SessionHost:
         self._starting: asyncio.Task[None] | None = None
 
     async def about(self) -> HostInfo:
-        """Start, unless it has been done, and describe this host."""
+        """Describe this host, after it has started."""
         await self._started()
         return HostInfo(self._settings, versions(), self._machine, platform.node(), os.getpid())
 
     async def ping(self) -> None:
-        """Return if this process runs."""
+        """Return, which shows that this process runs."""
 
     async def ask(self, operation: str, *arguments: Any) -> Any:
-        """Call a method of the engine; its reply, or ``Refused``."""
+        """Call a method of the engine, and return its reply, or ``Refused`` if the engine refused."""
         if operation not in OPERATIONS:
             raise ValueError(f"expected one of {sorted(OPERATIONS)}, got {operation!r}")
         await self._started()
@@ -137,11 +137,11 @@ class SessionHost:
             return Refused(error.with_traceback(None))
 
     async def counts(self) -> Any:
-        """As ``SessionEngine.counts``."""
+        """Return the counts of ``SessionEngine.counts`` for this host."""
         return self._engine.counts()
 
     async def _started(self) -> None:
-        """Start once: Ray starts a host again after its death, and tells no front server."""
+        """Start the engine, if it has not started. Ray restarts a dead host without informing any front server."""
         if self._starting is None:
             self._starting = asyncio.create_task(self._engine.start())
         if not self._starting.done():
@@ -151,14 +151,14 @@ class SessionHost:
 def recorded_engine(
     settings: HostSettings, storage: Storage, number: int, machine: str, clock: Callable[[], float] = seconds_now
 ) -> RecordedEngine:
-    """The engine of one host.
+    """Build the engine of one host.
 
     Args:
-        settings: of the pool.
+        settings: settings of the pool.
         storage: the database.
-        number: of the host.
-        machine: kind of the machine.
-        clock: seconds, by which leases end here.
+        number: number of the host.
+        machine: kind of the machine, as ``machine_kind`` returns it.
+        clock: returns seconds; leases end by it in this process.
     """
     definitions = Definitions(
         storage, lambda spec: stored_definition(read_stored(EnvironmentSpec, "a stored specification", spec))

@@ -1,4 +1,4 @@
-"""Leases and checkpoints of the sessions that one process holds. All methods belong to the event loop's thread."""
+"""Leases and checkpoints of the sessions of one process. Call all methods in the event loop's thread."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from surrogym_server.storage.live_sessions import Checkpoint, LiveSessions, NewL
 
 logger = logging.getLogger(__name__)
 
-MAX_BYTES = 16 * 2**20  # of a checkpoint; a session that is larger is not recorded
-BYTES_PER_SECOND = 8 * 2**20  # of one session's checkpoints
-RENEWALS = 5  # in the time of a lease
+MAX_BYTES = 16 * 2**20  # largest checkpoint; the state of a larger session is not recorded
+BYTES_PER_SECOND = 8 * 2**20  # highest rate at which checkpoints of one session are written
+RENEWALS = 5  # number of renewals within the time of a lease
 
 
 def seconds_now() -> float:
-    """Seconds that also pass while the machine sleeps, where its clock can say so."""
+    """Return seconds of a clock that also runs while the machine sleeps, if it has such a clock."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
 @dataclass(frozen=True)
 class Pace:
-    """Seconds between checkpoints of a session, and seconds of a lease."""
+    """How often checkpoints of a session are written, and how long a lease lasts."""
 
     checkpoint_seconds: float = 1.0
     lease_seconds: float = 10.0
@@ -43,18 +43,18 @@ class _Held:
 
 
 class Leases:
-    """The leases of one owner.
+    """Leases of the sessions that one owner, a process, holds.
 
-    The end of a lease is counted from before the statement that renewed it, so it comes no later here than in the
-    database. A step compares it with a clock and asks no database.
+    The time of a lease counts from before the statement that renews it. So a lease ends here no later than in the
+    database. A step only compares the end with a clock, and does not ask the database.
 
     Args:
         store: the database.
         owner: a name that no other process has or had.
-        machine: the kind of machine that numbers depend on.
-        pace: of checkpoints and leases.
-        drop: ends a session whose lease another owner has.
-        clock: seconds.
+        machine: kind of this machine; the last bits of a step depend on it.
+        pace: how often to write checkpoints, and how long leases last.
+        drop: called with the id of a session whose lease another owner has; it ends the session here.
+        clock: returns seconds.
     """
 
     def __init__(
@@ -78,13 +78,13 @@ class Leases:
         return id in self._held
 
     def require(self, id: str) -> None:
-        """Raise ``Unavailable`` if the lease of a session that is held has ended."""
+        """Raise ``Unavailable`` if this owner holds a session whose lease has ended."""
         held = self._held.get(id)
         if held is not None and self._clock() >= held.until:
             raise Unavailable(f"the lease of session {id!r} has ended, and is not renewed yet: try again later")
 
     async def add(self, session: Session, surrogate_id: int) -> None:
-        """Record a new session. Raises as ``LiveSessions.add``."""
+        """Record a new session, under a lease of this owner. Raises like ``LiveSessions.add``."""
         key, digest = session.opened_by or (None, None)
         checkpoint = await asyncio.to_thread(_checkpoint, session)
         new = NewLiveSession(session.id, surrogate_id, self.machine, checkpoint, key, digest)
@@ -93,24 +93,24 @@ class Leases:
         self._keep(lease, began, checkpoint)
 
     async def take(self, id: str) -> TakenSession:
-        """Take over a session. Raises as ``LiveSessions.take``."""
+        """Take over the lease of a session. Raises like ``LiveSessions.take``."""
         began = self._clock()
         taken = await asyncio.to_thread(self._store.take, id, self._owner, self._pace.lease_seconds)
         self._keep(taken.lease, began, taken.checkpoint)
         return taken
 
     async def release(self, id: str) -> None:
-        """Let others take a session."""
+        """End the lease of a session now, so that another owner can take it."""
         if held := self._held.pop(id, None):
             await asyncio.to_thread(self._store.release, held.lease)
 
     async def remove(self, id: str) -> None:
-        """End the record of a session."""
+        """Delete the record of a session."""
         self._held.pop(id, None)
         await asyncio.to_thread(self._store.remove, id)
 
     async def remove_all_but(self, alive: Sequence[str]) -> None:
-        """End the records of sessions that are no longer alive."""
+        """Delete the records of this owner's sessions whose ids are not in ``alive``."""
         for id in self._held.keys() - set(alive):
             await self.remove(id)
 
@@ -140,13 +140,13 @@ class Leases:
             _note(held, checkpoint, self._clock(), self._pace.checkpoint_seconds)
 
     async def keep_renewing(self) -> None:
-        """Renew for ever; ends by cancellation."""
+        """Renew all leases again and again, until cancelled."""
         while True:
             await _tried(self.renew())
             await asyncio.sleep(self._pace.lease_seconds / RENEWALS)
 
     async def keep_recording(self, sessions: Callable[[], Sequence[Session]]) -> None:
-        """Write checkpoints for ever; ends by cancellation."""
+        """Write checkpoints again and again, until cancelled."""
         while True:
             await asyncio.sleep(self._pace.checkpoint_seconds)
             alive = sessions()
@@ -164,7 +164,7 @@ def _note(held: _Held, checkpoint: Checkpoint, now: float, seconds: float) -> No
 
 
 def _checkpoint(session: Session) -> Checkpoint:
-    """A session's bytes, unless they are too many; those of its lanes and its answer are estimated first."""
+    """Make a checkpoint of a session. Its data is None if it would exceed ``MAX_BYTES``, which is estimated first."""
     if session.nbytes > MAX_BYTES:
         return Checkpoint(session.seq, None)
     data = session_to_bytes(session)

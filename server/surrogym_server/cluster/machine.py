@@ -1,4 +1,4 @@
-"""What the last bits of a step depend on, beside program and versions."""
+"""Kind of a machine. On machines of one kind, with the same versions, a step gives the same bits."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ NAMES = ("model name", "flags", "Features")
 
 
 def machine_kind(device: str, threads: int) -> str:
-    """The kind of processor, the number of threads of one operation, and the device.
+    """Return the kind of processor, the number of threads of one operation, and the device, as one text.
 
-    Sums are added in another order, or rounded differently, where one of these differs.
+    If one of these differs, sums may be added in another order or rounded differently.
     """
     parts = [platform.machine(), _processor(), f"threads {threads}"]
     return ", ".join([*parts, torch.cuda.get_device_name() if device == "cuda" else device])
 
 
 def _processor() -> str:
-    """Name of the first processor, and a digest of what it can do."""
+    """Return the name of the first processor, and a digest of its features."""
     try:
         lines = PROCESSORS.read_text().split("\n\n")[0].splitlines()
     except OSError:

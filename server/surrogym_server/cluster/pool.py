@@ -1,4 +1,4 @@
-"""The pool of session hosts in a cluster: found, or started by the first front server that comes."""
+"""The pool of session hosts in a cluster. The first front server starts it, and later ones find it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STARTING_SECONDS = 180.0
 
 
 def check(settings: Settings) -> None:
-    """Raise ``InvalidInput`` where this process can't serve sessions of a cluster."""
+    """Raise ``InvalidInput`` if this server can't use a cluster: Ray is not installed, or the database is SQLite."""
     if find_spec("ray") is None:
         raise InvalidInput("engine ray: expected the package ray, got none: pip install 'surrogym[ray]'")
     if settings.database_url.startswith("sqlite"):
@@ -36,11 +36,11 @@ def check(settings: Settings) -> None:
 
 
 def connect(settings: Settings, store: LiveSessions) -> SessionEngine:
-    """The engine of the cluster at ``ray_address``, once all hosts are ready.
+    """Connect to the cluster at ``ray_address``, wait until all session hosts are ready, and return its engine.
 
     Args:
-        settings: of this server.
-        store: the records of sessions, in the same database.
+        settings: settings of this server.
+        store: records of the sessions, in the same database.
 
     Raises:
         InvalidInput: the settings can't serve a cluster, there is no cluster, or it runs other versions or settings.
@@ -70,7 +70,7 @@ def connect(settings: Settings, store: LiveSessions) -> SessionEngine:
 
 
 def fits_of(settings: Settings, function: Callable[[DesignJob], DesignResult]) -> Compute | None:
-    """What computes fits in the cluster that ``connect`` has found; None if all its CPUs are taken by session hosts."""
+    """Return the object that runs fits in the connected cluster; None if session hosts occupy all its CPUs."""
     import ray
 
     from surrogym_server.cluster.fits import RayFits
@@ -120,7 +120,7 @@ def _about(hosts: Sequence[Any], wanted: HostSettings) -> list[HostInfo]:
 
 
 def pool_name(database: str) -> str:
-    """Name of the pool of a database, the same whatever the password."""
+    """Return the name of the pool that belongs to a database. It does not depend on user and password."""
     url = sa.make_url(database)
     return f"{url.host or url.query.get('host', '')}:{url.port or ''}/{url.database}"
 

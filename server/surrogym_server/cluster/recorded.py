@@ -1,4 +1,4 @@
-"""RecordedEngine: the sessions of one process, under leases, with checkpoints in the database."""
+"""RecordedEngine: steps the sessions of one process under leases, with checkpoints in the database."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ UNKNOWN = -1
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a session that is taken over needs beside its record.
+    """Functions that restoring a session needs in addition to its record.
 
     Args:
-        surrogate: name and definition of a surrogate, by its id; raises ``UnknownSurrogate``.
-        refresh: loads the newest model of a surrogate.
+        surrogate: returns name and definition of a surrogate, given its id; raises ``UnknownSurrogate``.
+        refresh: loads the newest model of a surrogate, given its id, and returns the version.
     """
 
     surrogate: Callable[[int], tuple[str, EnvironmentDefinition]]
@@ -40,16 +40,16 @@ class Surroundings:
 
 
 class RecordedEngine(SessionEngine):
-    """Wraps the engine of this process. A request is carried out only under the session's lease.
+    """Engine that wraps the engine of this process, and carries out a request only under the session's lease.
 
-    A session that was taken over is as it was at its checkpoint, so requests since then are missing. Until its client
-    has sent them again, in order, the session answers to nothing else.
+    A session that was taken over from another process is in the state of its last checkpoint, so the requests since
+    then are missing. The session refuses all other requests until its client has sent these again, in order.
 
     Args:
-        inner: the engine that steps.
+        inner: engine that steps the sessions.
         store: the database.
-        leases: of this process.
-        surroundings: for sessions that are taken over.
+        leases: leases of this process.
+        surroundings: functions for sessions that are taken over.
     """
 
     lasting = True
@@ -140,12 +140,12 @@ class RecordedEngine(SessionEngine):
         await self._add(request.saved.id, request.surrogate_id)
 
     async def take(self, session: str) -> SessionInfo:
-        """Go on with a session whose host has died, from its last checkpoint.
+        """Take over a session whose host has died, in the state of its last checkpoint.
 
         Raises:
-            UnknownSession: it can't be continued; says why.
-            Unavailable: another host's lease has time left.
-            Overloaded: this process has no room; another may take it.
+            UnknownSession: the session can't be continued; the message gives the reason.
+            Unavailable: the lease of another host has time left.
+            Overloaded: this process has no room for the session; another host may have.
         """
         async with self._taking:
             if not self._leases.holds(session):
@@ -179,7 +179,7 @@ class RecordedEngine(SessionEngine):
             raise
 
     async def _lost(self, id: str, why: str) -> UnknownSession:
-        """End a session for good; the error that says so."""
+        """End a session that can't be continued, and return the error to raise."""
         await self.close(id)
         return UnknownSession(f"session {id!r} was lost with its session host: {why}; open a new one")
 
@@ -189,13 +189,13 @@ class RecordedEngine(SessionEngine):
             raise await self._lost(id, "it was read before the requests since its last checkpoint came again")
 
     def _require_still(self, id: str) -> None:
-        """Raise if the lease was lost during a request: this process may have been stopped meanwhile."""
+        """Raise if the lease was lost during a request, for example while a signal had stopped this process."""
         self._leases.require(id)
         if not self._leases.holds(id):
             raise UnknownSession(f"session {id!r} was closed, or taken by another host, during this request")
 
     async def _settle(self) -> None:
-        """End the records of sessions that the inner engine has ended."""
-        async with self._taking:  # which holds a lease before its session is alive
+        """Delete the records of sessions that the inner engine has ended."""
+        async with self._taking:  # while a session is taken, its lease exists before the session itself
             await self._leases.remove_all_but([session.id for session in self._inner.sessions()])
             self._behind = {id: seq for id, seq in self._behind.items() if self._leases.holds(id)}

@@ -1,4 +1,4 @@
-"""Jobs: requests to records, records to replies."""
+"""Conversion of jobs: requests to records, and records to replies."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def job_view(record: JobRecord) -> wire.JobView:
 
 
 def job_detail(record: JobRecord) -> wire.JobDetail:
-    """A job with its curve so far."""
+    """Convert a job with its curve so far."""
     return read_stored(wire.JobDetail, JOB, {**_fields(record), "curve": record.curve})
 
 

@@ -1,4 +1,4 @@
-"""Jobs of trainer workers: queued by people, claimed with a long poll, reported on, and ended."""
+"""Jobs of trainer workers: people queue them, and workers claim them with a long poll, report on them and end them."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from surrogym_server.storage.records import JSON
 
 
 class JobService:
+    """Queues jobs, and hands them to trainer workers under leases."""
+
     def __init__(self, storage: Storage, notices: Notices, workers: Workers | None = None) -> None:
         self._storage = storage
         self._notices = notices
@@ -24,18 +26,18 @@ class JobService:
         """Queue a training.
 
         Raises:
-            NoModel: nothing has been fitted yet.
-            Overloaded: too many jobs wait.
+            NoModel: the surrogate has no model yet.
+            Overloaded: too many jobs are queued or running.
         """
         self._storage.models.get(name)
         return self._add(name, NewJob("train", task), key)
 
     def evaluate(self, name: str, task: JSON, episodes: int, key: str | None) -> JobRecord:
-        """Queue an evaluation of so many real episodes. The task then names the version of its policy.
+        """Queue an evaluation of ``episodes`` real episodes. An alias in the task is replaced by the policy's version.
 
         Raises:
-            UnknownPolicy: no such policy.
-            Overloaded: too many jobs wait.
+            UnknownPolicy: the policy does not exist.
+            Overloaded: too many jobs are queued or running.
         """
         version = self._storage.policies.get(name, task["policy"]).version
         return self._add(name, NewJob("evaluate", {**task, "policy": str(version)}, episodes), key)
@@ -49,10 +51,12 @@ class JobService:
         wait_seconds: float,
         gone: Callable[[], Awaitable[bool]] | None = None,
     ) -> LeasedJob | None:
-        """Lease a job; while there is none, wait for one. ``gone`` says whether the worker has left meanwhile.
+        """Lease a job to a worker. If there is none, wait up to ``wait_seconds``, and then return None.
+
+        ``gone`` returns whether the worker has closed its connection; then the wait ends.
 
         Raises:
-            UnknownSurrogate: no such surrogate, or it was deleted meanwhile.
+            UnknownSurrogate: the surrogate does not exist, or was deleted while the worker waited.
         """
         deadline = time.monotonic() + wait_seconds
 
@@ -74,10 +78,11 @@ class JobService:
         return job
 
     def report(self, name: str, id: int, token: str, lease_seconds: float, progress: JobProgress | None) -> bool:
-        """Keep a lease, and store how far the job is. Returns whether its worker is to stop.
+        """Renew the lease of a job, and store its progress. Returns whether the worker is to stop.
 
         Raises:
-            UnknownJob, LeaseExpired: as the storage says.
+            UnknownJob: the job does not exist.
+            LeaseExpired: the job has ended, or another worker has it.
         """
         cancel = self._storage.jobs.report(name, id, token, lease_seconds, progress)
         if worker := self._storage.jobs.get(name, id).worker:
@@ -85,19 +90,19 @@ class JobService:
         return cancel
 
     def finish(self, name: str, id: int, token: str, result: JobResult) -> JobRecord:
-        """End a job. Raises ``UnknownJob`` or ``LeaseExpired``, as the storage says."""
+        """End a job. Raises ``UnknownJob``, or ``LeaseExpired`` if another worker has it."""
         return self._changed(name, self._storage.jobs.finish(name, id, token, result))
 
     def cancel(self, name: str, id: int) -> JobRecord:
-        """Cancel a job that waits, or ask the worker of a running one to stop. Raises ``UnknownJob``."""
+        """Cancel a queued job, or ask the worker of a running one to stop. Raises ``UnknownJob``."""
         return self._changed(name, self._storage.jobs.cancel(name, id))
 
     def get(self, name: str, id: int) -> JobRecord:
-        """Raises ``UnknownJob``."""
+        """Return a job. Raises ``UnknownJob``."""
         return self._storage.jobs.get(name, id)
 
     def list(self, name: str) -> tuple[list[JobRecord], dict[str, int]]:
-        """All jobs, newest first, and the most real episodes of each connected worker."""
+        """Return all jobs, newest first, and for each connected worker the most real episodes that it takes."""
         return self._storage.jobs.list(name), self._workers.of(name)
 
     def _add(self, name: str, new: NewJob, key: str | None) -> JobRecord:

@@ -1,4 +1,4 @@
-"""The part of the storage port that keeps jobs: records, and laws that are tested for every adapter.
+"""The part of the storage port for jobs: records, and laws that every adapter is tested for.
 
 A job asks a trainer worker to train or to evaluate a policy. It is queued, running, done, failed or cancelled. A worker
 runs it under a lease, as a sampler answers a query: the lease ends by the database's clock, and each report renews it.
@@ -16,15 +16,15 @@ JobKind = Literal["train", "evaluate"]
 JobStatus = Literal["queued", "running", "done", "failed", "cancelled"]
 JobEnd = Literal["done", "failed", "cancelled"]
 
-MAX_JOBS = 100  # of a surrogate that have ended; older ones are removed
-MAX_OPEN = 20  # of a surrogate that are queued or running
-MAX_RUNS = 3  # of a training whose workers fall silent; an evaluation has one run, because it may move a machine
+MAX_JOBS = 100  # ended jobs of a surrogate; older ones are removed
+MAX_OPEN = 20  # jobs of a surrogate that are queued or running
+MAX_RUNS = 3  # runs of a training whose workers fall silent; an evaluation has one: it may move a machine
 SILENT = "its worker fell silent, and its lease ended"
 
 
 @dataclass(frozen=True)
 class NewJob:
-    """A job to queue. ``episodes`` is the number of real episodes that it asks for: 0 for a training."""
+    """A job to queue. ``episodes`` is the number of real episodes that it takes: 0 for a training."""
 
     kind: JobKind
     task: JSON
@@ -33,7 +33,7 @@ class NewJob:
 
 @dataclass(frozen=True)
 class JobProgress:
-    """How far a job is. ``state`` is what a list shows, ``curve`` the points so far; both replace the earlier ones."""
+    """Progress of a job: ``state``, which a list shows, and all points of the curve so far. Both replace earlier ones."""
 
     state: JSON = field(default_factory=dict)
     curve: list[JSON] = field(default_factory=list)
@@ -41,7 +41,7 @@ class JobProgress:
 
 @dataclass(frozen=True)
 class JobResult:
-    """How a job ended: the version of its policy, and the number of its evaluation, where there is one."""
+    """Result of a job: how it ended, the version of its policy, and the number of its evaluation, if there are any."""
 
     status: JobEnd
     error: str | None = None
@@ -51,6 +51,8 @@ class JobResult:
 
 @dataclass(frozen=True)
 class JobRecord:
+    """A stored job."""
+
     id: int
     kind: JobKind
     task: JSON
@@ -70,6 +72,8 @@ class JobRecord:
 
 @dataclass(frozen=True)
 class LeasedJob:
+    """A job that a worker has claimed, with the token of its lease."""
+
     id: int
     task: JSON
     attempt: int  # 1 for the first lease of this job
@@ -82,10 +86,10 @@ class Jobs(ABC):
     A training whose lease ends is queued again, and failed after ``MAX_RUNS``. An evaluation whose lease ends is
     failed, because its real steps may have been taken. A job that was to be cancelled is then cancelled.
 
-    A lease is known by its token. Its worker may go on although the lease has ended, as long as no other worker has
-    the job and nobody has cancelled it: then a report makes it running again, and a result counts.
+    A worker proves its lease by the token. It may continue although the lease has ended, as long as no other worker has
+    claimed the job and nobody has cancelled it: its next report makes the job running again, and its result counts.
 
-    An operation on a job that is not there raises ``UnknownJob``.
+    An operation on a job that does not exist raises ``UnknownJob``.
     """
 
     @abstractmethod
@@ -98,7 +102,7 @@ class Jobs(ABC):
 
     @abstractmethod
     def claim(self, name: str, worker: str, most_episodes: int, seconds: float) -> LeasedJob | None:
-        """Lease the oldest queued job of at most so many real episodes, to one caller only. None if there is none.
+        """Lease the oldest queued job of at most ``most_episodes`` real episodes to one caller. None if there is none.
 
         Expired leases are ended first. A new lease clears the progress of the one before.
         """
@@ -124,11 +128,12 @@ class Jobs(ABC):
         """Cancel a queued job at once, and ask the worker of a running one to stop. A job that has ended stays."""
 
     @abstractmethod
-    def get(self, name: str, id: int) -> JobRecord: ...
+    def get(self, name: str, id: int) -> JobRecord:
+        """Return a job with its curve."""
 
     @abstractmethod
     def list(self, name: str) -> list[JobRecord]:
-        """All jobs, newest first, without their curves."""
+        """Return all jobs, newest first, without their curves."""
 
     @abstractmethod
     def sweep_expired(self) -> int:

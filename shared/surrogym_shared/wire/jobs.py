@@ -31,20 +31,22 @@ class TrainTask(Request):
     """Training of a policy, as by ``surrogym train``."""
 
     kind: Literal["train"]
-    algorithm: JobAlgorithm | None = Field(default=None, description="null: as ``surrogym train`` chooses")
+    algorithm: JobAlgorithm | None = Field(
+        default=None, description="policy search; null: the one that ``surrogym train`` would choose"
+    )
     steps: Annotated[int, Field(ge=1, le=MAX_JOB_STEPS)] | None = Field(
-        default=None, description="virtual steps at most; null: as the algorithm suggests"
+        default=None, description="most virtual steps; null: as many as the algorithm suggests"
     )
     preset: JobPreset = Field(
         default="default",
-        description="``quick``: a quarter of the steps that the algorithm suggests, and never prolonged; to see "
-        "whether it learns",
+        description="``default``, or ``quick`` for a trial: a quarter of the steps that the algorithm suggests, "
+        "never prolonged",
     )
-    seed: Seed = 0
+    seed: Seed = Field(default=0, description="seed of the training")
     audit: bool = Field(
         default=True,
-        description="audit the policy by a few real steps, if a sampler is connected; if the audit fails, further "
-        "steps of the budget are taken",
+        description="whether to audit the policy by a few real steps, if a sampler is connected. If the audit "
+        "fails, the training takes further real steps of the budget",
     )
 
     @model_validator(mode="after")
@@ -55,17 +57,23 @@ class TrainTask(Request):
 
 
 class EvaluateTask(Request):
-    """Real episodes with a stored policy, in the environment of the worker, as by ``surrogym evaluate``."""
+    """Evaluation of a stored policy by real episodes in the worker's environment, as by ``surrogym evaluate``."""
 
     kind: Literal["evaluate"]
     policy: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")] = Field(
-        default="latest", description="version, alias, or latest"
+        default="latest", description="version or alias of the policy, or ``latest``"
     )
-    episodes: Annotated[int, Field(ge=1, le=MAX_JOB_EPISODES)] = 100
-    first_seed: Seed = 10_000
-    wide: bool = Field(default=False, description="start anywhere in the sampling range")
+    episodes: Annotated[int, Field(ge=1, le=MAX_JOB_EPISODES)] = Field(
+        default=100, description="number of real episodes of the policy"
+    )
+    first_seed: Seed = Field(
+        default=10_000, description="reset seed of the first episode; each further episode takes the next seed"
+    )
+    wide: bool = Field(default=False, description="whether to start anywhere in the sampling range")
     compare: Literal["zero", "random"] | None = Field(
-        default=None, description="also run the same starts without the policy, with these actions"
+        default=None,
+        description="also run the same starts without the policy, with an action of zero or with random actions; "
+        "null: don't",
     )
 
     @model_validator(mode="after")
@@ -86,98 +94,143 @@ Task = Annotated[TrainTask | EvaluateTask, Field(discriminator="kind")]
 
 
 class AddJob(Request):
-    task: Task
-    idempotency_key: Key | None = None
+    """Request to queue a job for a trainer worker."""
+
+    task: Task = Field(description="training or evaluation to run")
+    idempotency_key: Key | None = Field(default=None, description="a repeat with the same key queues no second job")
 
 
 class ClaimJob(Request):
-    worker: Key = Field(description="name of the worker, which people see")
+    """Request of a trainer worker for a job, which it holds under a lease."""
+
+    worker: Key = Field(description="name of the worker, shown to people")
     most_episodes: Annotated[int, Field(ge=0, le=MAX_JOB_EPISODES)] = Field(
-        default=0, description="most real episodes of an evaluation that this worker takes; 0: it only trains"
+        default=0,
+        description="most real episodes that an evaluation for this worker may have; 0: it takes only trainings",
     )
-    wait_seconds: Annotated[float, Field(ge=0, le=60)] = 0.0
-    lease_seconds: LeaseSeconds = 60.0
+    wait_seconds: Annotated[float, Field(ge=0, le=60)] = Field(
+        default=0.0, description="seconds that the reply may wait for a job; 0: reply at once"
+    )
+    lease_seconds: LeaseSeconds = Field(
+        default=60.0, description="seconds until the lease ends, unless a report renews it"
+    )
 
 
 class LeasedJob(Reply):
-    id: int
+    """A job that a worker has claimed."""
+
+    id: int = Field(description="id of the job")
     attempt: int = Field(description="1 for the first lease of this job")
-    lease_token: str
-    lease_seconds: float
-    task: Task
+    lease_token: str = Field(description="token of the lease, for reports and for the end of the job")
+    lease_seconds: float = Field(description="seconds from this reply until the lease ends, unless a report renews it")
+    task: Task = Field(description="training or evaluation to run")
 
 
 class ClaimedJob(Reply):
-    job: LeasedJob | None
+    """Reply to a claim."""
+
+    job: LeasedJob | None = Field(description="the leased job; null if none came in time")
 
 
 class JobPoint(Request):
     """One point of a training's curve."""
 
-    steps: Count
-    imagined_return: Measured | None = None
+    steps: Count = Field(description="virtual steps so far")
+    imagined_return: Measured | None = Field(
+        default=None, description="imagined return of the policy at this point; null if it was not measured"
+    )
 
 
 class JobState(Request):
-    """How far a job is. ``curve`` holds all points so far; it replaces the earlier one."""
+    """Progress of a job."""
 
-    stage: JobStage
-    share: Share = Field(default=0.0, description="of this stage that is done")
-    steps: Count | None = Field(default=None, description="virtual steps of a training so far")
-    total_steps: Count | None = None
-    imagined_return: Measured | None = Field(default=None, description="of the policy at its last check")
-    curve: list[JobPoint] = Field(default=[], max_length=MAX_JOB_POINTS)
+    stage: JobStage = Field(description="stage that the job is in")
+    share: Share = Field(default=0.0, description="share of this stage that is done, between 0 and 1")
+    steps: Count | None = Field(
+        default=None, description="virtual steps of the training so far; null outside of a training"
+    )
+    total_steps: Count | None = Field(
+        default=None, description="virtual steps that the training will take, as planned now; null if unknown"
+    )
+    imagined_return: Measured | None = Field(
+        default=None, description="imagined return of the policy at its last check"
+    )
+    curve: list[JobPoint] = Field(
+        default=[],
+        max_length=MAX_JOB_POINTS,
+        description="all points of the training's curve so far; they replace those of the last report",
+    )
 
 
 class ReportJob(Request):
-    """Heartbeat of a worker: its lease ends ``lease_seconds`` from now."""
+    """Heartbeat of a worker: the lease of its job ends ``lease_seconds`` from now."""
 
-    lease_token: Key
-    lease_seconds: LeaseSeconds = 60.0
-    state: JobState | None = None
+    lease_token: Key = Field(description="token of the lease")
+    lease_seconds: LeaseSeconds = Field(default=60.0, description="seconds from now until the lease ends")
+    state: JobState | None = Field(default=None, description="progress of the job; null: as in the last report")
 
 
 class ReportedJob(Reply):
-    cancel: bool = Field(description="the worker is to stop, and to keep the best policy so far")
+    """Reply to a report."""
+
+    cancel: bool = Field(
+        description="whether a person cancelled the job: the worker then stops, and keeps the best policy so far"
+    )
 
 
 class FinishJob(Request):
-    lease_token: Key
-    status: JobEnd
-    error: Said | None = None
-    version: Version | None = Field(default=None, description="of the policy that was stored or evaluated")
-    evaluation: Number | None = Field(default=None, description="number of the policy's evaluation")
+    """Report of a worker that its job has ended."""
+
+    lease_token: Key = Field(description="token of the lease")
+    status: JobEnd = Field(description="how the job ended")
+    error: Said | None = Field(default=None, description="why it failed, for people; null if it did not")
+    version: Version | None = Field(
+        default=None, description="version of the policy that was stored or evaluated; null if there is none"
+    )
+    evaluation: Number | None = Field(default=None, description="id of the stored evaluation; null if there is none")
 
 
 class JobView(Reply):
-    id: int
-    task: Task
-    status: JobStatus
-    cancelling: bool = Field(description="it runs, and its worker is asked to stop")
-    created_at: float
-    begun_at: float | None
-    finished_at: float | None
-    worker: str | None
-    attempts: int
-    stage: JobStage | None = None
-    share: float = 0.0
-    steps: int | None = None
-    total_steps: int | None = None
-    imagined_return: float | None = None
-    error: str | None
-    version: int | None
-    evaluation: int | None
+    """A job with its progress and its result, as people see it."""
+
+    id: int = Field(description="id of the job")
+    task: Task = Field(description="training or evaluation")
+    status: JobStatus = Field(description="queued, running, or how it ended")
+    cancelling: bool = Field(
+        description="whether a person cancelled the running job, and its worker has not ended it yet"
+    )
+    created_at: float = Field(description="when it was queued, in seconds since 1970, by the server's clock")
+    begun_at: float | None = Field(description="when its last worker began; null if none has")
+    finished_at: float | None = Field(description="when it ended; null before")
+    worker: str | None = Field(description="name of the last worker that claimed it")
+    attempts: int = Field(description="number of leases so far")
+    stage: JobStage | None = Field(default=None, description="stage that it is in; null before the first report")
+    share: float = Field(default=0.0, description="share of this stage that is done")
+    steps: int | None = Field(default=None, description="virtual steps so far")
+    total_steps: int | None = Field(default=None, description="virtual steps that are planned")
+    imagined_return: float | None = Field(default=None, description="imagined return of the policy at its last check")
+    error: str | None = Field(description="why it failed, or why its last lease ended")
+    version: int | None = Field(description="version of the policy that was stored or evaluated")
+    evaluation: int | None = Field(description="id of the stored evaluation")
 
 
 class JobDetail(JobView):
-    curve: list[JobPoint]
+    """A job with the curve of its training."""
+
+    curve: list[JobPoint] = Field(description="points of the training's curve so far")
 
 
 class WorkerView(Reply):
-    name: str
-    most_episodes: int = Field(description="most real episodes of an evaluation that it takes; 0: it only trains")
+    """A connected trainer worker."""
+
+    name: str = Field(description="name of the worker")
+    most_episodes: int = Field(
+        description="most real episodes that an evaluation for this worker may have; 0: it takes only trainings"
+    )
 
 
 class JobList(Reply):
+    """The jobs of a surrogate, and its connected workers."""
+
     jobs: list[JobView] = Field(description="newest first")
-    workers: list[WorkerView] = Field(description="trainer workers that asked or reported within a minute")
+    workers: list[WorkerView] = Field(description="trainer workers that claimed or reported within the last minute")

@@ -17,46 +17,60 @@ MAX_REJECTED = 1_000  # rows that a reply lists
 class SentLog(Request):
     """Base class of requests with a log."""
 
-    text: Annotated[str, Field(min_length=1, max_length=MAX_LOG, description="CSV with a heading")]
+    text: Annotated[str, Field(min_length=1, max_length=MAX_LOG, description="the log as CSV with a heading")]
     mapping: LogMapping | None = Field(
-        default=None, description="what each column is; null goes by the names of the columns"
+        default=None, description="role of each column; null: the names of the columns decide"
     )
 
 
 class DraftLog(SentLog):
-    environment: Annotated[str, Field(max_length=256, pattern=VISIBLE)] = ""
+    """Request to draft a specification from a log."""
+
+    environment: Annotated[str, Field(max_length=256, pattern=VISIBLE)] = Field(
+        default="", description="name of the environment"
+    )
     budget: Annotated[int, Field(ge=0, le=100_000)] = Field(
-        default=0, description="real steps that the design may take beyond the log; 0 if there is no machine"
+        default=0, description="real steps that the design may take in addition to the log; 0 without a machine"
     )
 
 
 class AddLog(SentLog):
-    check_only: bool = Field(default=False, description="whether the rows are only checked, and nothing is stored")
+    """Request to check the rows of a log against a specification, and to store them as samples."""
+
+    check_only: bool = Field(default=False, description="whether to check the rows without storing anything")
 
 
 class RejectedRow(Reply):
-    line: int = Field(description="of the CSV, the heading is line 1")
-    reason: str
+    """A row of a log that can't be used."""
+
+    line: int = Field(description="line of the CSV; the heading is line 1")
+    reason: str = Field(description="why the row can't be used")
 
 
 class LogReport(Reply):
     """Result of reading a log's rows."""
 
-    rows: int
-    steps: int = Field(description="usable ones")
-    without_next_state: int = Field(description="rows that end an episode, or stand before a gap in time")
-    rejected: int = Field(description="rows that can't be used")
+    rows: int = Field(description="number of rows, without the heading")
+    steps: int = Field(description="number of usable steps")
+    without_next_state: int = Field(
+        description="number of rows without a next state, because an episode ends there, or a gap in time follows"
+    )
+    rejected: int = Field(description="number of rows that can't be used")
     rejected_rows: list[RejectedRow] = Field(description=f"the first {MAX_REJECTED} of them, with line and reason")
-    columns: dict[str, str] = Field(description="the role of each column that is used")
-    ignored: dict[str, str] = Field(description="the reason for each column that is not used")
-    mapping: LogMapping = Field(description="the mapping that gives the columns these roles")
+    columns: dict[str, str] = Field(description="role of each column that is used")
+    ignored: dict[str, str] = Field(description="reason for each column that is not used")
+    mapping: LogMapping = Field(description="mapping that gives the columns these roles")
 
 
 class DraftedLog(LogReport):
-    spec: EnvironmentSpec
-    notes: list[str] = Field(description="what the draft was concluded from")
+    """A specification drafted from a log, with the report on the log's rows."""
+
+    spec: EnvironmentSpec = Field(description="the draft, to be checked by a person")
+    notes: list[str] = Field(description="what each part of the draft was concluded from")
 
 
 class AddedLog(LogReport):
-    stored: int = Field(description="new samples; 0 if the rows were only checked")
-    duplicates: int = Field(description="usable steps that were there before")
+    """Reply after the usable rows of a log were stored or checked."""
+
+    stored: int = Field(description="number of new samples; 0 if the rows were only checked")
+    duplicates: int = Field(description="number of usable steps that were stored before")

@@ -28,11 +28,11 @@ class PolicyPromise(BaseModel):
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
-    median: float
-    low: float
-    high: float
-    functions: Count = Field(default=0, description="how many functions of the posterior were drawn")
-    episodes: Count = Field(default=0, description="how many virtual episodes were run")
+    median: float = Field(description="median")
+    low: float = Field(description="5 % quantile")
+    high: float = Field(description="95 % quantile")
+    functions: Count = Field(default=0, description="number of functions that were drawn from the posterior")
+    episodes: Count = Field(default=0, description="number of virtual episodes")
 
 
 class PolicyAudit(BaseModel):
@@ -40,13 +40,19 @@ class PolicyAudit(BaseModel):
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
-    steps: Count
-    passed: bool
-    faults: tuple[Text, ...] = Field(default=(), max_length=100)
-    errors: dict[str, float] = Field(default={}, description="root mean square by output, in its unit")
-    expected: dict[str, float] = Field(default={}, description="the same, as the model expected it")
-    before: PolicyPromise | None = None
-    after: PolicyPromise | None = None
+    steps: Count = Field(description="number of real steps")
+    passed: bool = Field(description="whether the model agrees with the real steps")
+    faults: tuple[Text, ...] = Field(
+        default=(), max_length=100, description="reasons why the audit failed; empty if it passed"
+    )
+    errors: dict[str, float] = Field(default={}, description="root mean square error of each output, in its unit")
+    expected: dict[str, float] = Field(
+        default={}, description="root mean square error that the model expected of each output, in its unit"
+    )
+    before: PolicyPromise | None = Field(default=None, description="promise before the audit")
+    after: PolicyPromise | None = Field(
+        default=None, description="promise of the model that has learned from the audit's steps"
+    )
 
 
 class PushedCard(BaseModel):
@@ -54,20 +60,20 @@ class PushedCard(BaseModel):
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
-    algorithm: Text = ""
-    spec: EnvironmentSpec | None = None
-    seed: Count | None = None
-    virtual_steps: Count | None = None
-    seconds: float | None = None
-    imagined_return: float | None = None
+    algorithm: Text = Field(default="", description="name of the policy search")
+    spec: EnvironmentSpec | None = Field(default=None, description="specification that the policy was trained for")
+    seed: Count | None = Field(default=None, description="seed of the training")
+    virtual_steps: Count | None = Field(default=None, description="virtual steps of the training")
+    seconds: float | None = Field(default=None, description="duration of the training")
+    imagined_return: float | None = Field(default=None, description="imagined return of the policy")
     untrained: float | None = Field(default=None, description="imagined return of an untrained network")
-    promise: PolicyPromise | None = None
-    audit: PolicyAudit | None = None
-    trusted: bool | None = None
-    reason: Text = ""
-    networks: Count = 1
-    settings: dict[str, Any] = {}
-    versions: dict[str, Text] = {}
+    promise: PolicyPromise | None = Field(default=None, description="promise of the policy")
+    audit: PolicyAudit | None = Field(default=None, description="audit of the policy")
+    trusted: bool | None = Field(default=None, description="verdict on the promise; null: none was made")
+    reason: Text = Field(default="", description="reason of the verdict")
+    networks: Count = Field(default=1, description="number of networks that the training tried")
+    settings: dict[str, Any] = Field(default={}, description="settings of the training, by name")
+    versions: dict[str, Text] = Field(default={}, description="versions of the packages of the training, by name")
 
 
 class CurvePoint(BaseModel):
@@ -75,16 +81,16 @@ class CurvePoint(BaseModel):
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
-    steps: Count
-    imagined_return: float | None = None
-    seconds: float | None = None
+    steps: Count = Field(description="virtual steps so far")
+    imagined_return: float | None = Field(default=None, description="imagined return at this point")
+    seconds: float | None = Field(default=None, description="seconds since the training began")
 
 
 class FileNotice(Request):
     """Announcement of a file. The upload is accepted only if it is exactly this file."""
 
-    form: PolicyForm
-    bytes: Annotated[int, Field(ge=1)]
+    form: PolicyForm = Field(description="form of the file, which is also the ending of its name")
+    bytes: Annotated[int, Field(ge=1)] = Field(description="size of the file")
     digest: Digest
 
 
@@ -96,21 +102,24 @@ class AddPolicy(Request):
 
     model_config = ConfigDict(extra="forbid", strict=False)  # the card validates its own types
 
-    card: PushedCard
-    curve: list[CurvePoint] = Field(default=[], max_length=MAX_CURVE)
-    file: FileNotice
+    card: PushedCard = Field(description="settings and results of the training")
+    curve: list[CurvePoint] = Field(default=[], max_length=MAX_CURVE, description="curve of the training")
+    file: FileNotice = Field(description="announcement of the policy's file")
 
 
 class EpisodeTrace(Request):
     """One real episode of T steps."""
 
-    rank: TraceRank
-    seed: Count
-    coordinates: Annotated[list[Vector], Field(min_length=1, max_length=MAX_TRACE + 1)] = Field(
-        description="(T + 1, C), the start included"
+    rank: TraceRank = Field(
+        description="which episode it is: the best, median or worst of the evaluation, or ``paired``, from the "
+        "same start for every controller"
     )
-    action: Annotated[list[Vector], Field(max_length=MAX_TRACE)] = Field(description="(T, F)")
-    reward: Annotated[list[Measured], Field(max_length=MAX_TRACE)] = Field(description="(T,)")
+    seed: Count = Field(description="reset seed of the episode")
+    coordinates: Annotated[list[Vector], Field(min_length=1, max_length=MAX_TRACE + 1)] = Field(
+        description="(T + 1, C) states, the start included"
+    )
+    action: Annotated[list[Vector], Field(max_length=MAX_TRACE)] = Field(description="(T, F) actions")
+    reward: Annotated[list[Measured], Field(max_length=MAX_TRACE)] = Field(description="(T,) rewards")
 
 
 class AddEvaluation(Request):
@@ -121,105 +130,136 @@ class AddEvaluation(Request):
 
     controller: Controller = Field(
         default="policy",
-        description="who acted: the policy, a constant action of zero, random actions, or a controller of reference",
+        description="who chose the actions: the policy; nobody, so an action of ``zero`` or ``random`` actions; or "
+        "a ``reference`` controller, such as the one in use",
     )
-    note: Text = Field(default="", description="which starts, of which machine")
+    note: Text = Field(default="", description="remark for people, such as which machine was used")
     declared: bool = Field(
-        default=True, description="whether starts and machine are as the specification says; the promise is about those"
+        default=True,
+        description="whether starts and machine are as the specification declares them; the promise is about those "
+        "only",
     )
-    first_seed: Count
-    returns: Annotated[list[Measured], Field(min_length=1, max_length=MAX_EPISODES)]
-    lengths: Annotated[list[Count], Field(min_length=1, max_length=MAX_EPISODES)]
-    success: Annotated[list[bool], Field(max_length=MAX_EPISODES)] | None = None
-    traces: list[EpisodeTrace] = Field(default=[], max_length=MAX_TRACES)
-    idempotency_key: Key
+    first_seed: Count = Field(description="reset seed of the first episode; each further episode has the next seed")
+    returns: Annotated[list[Measured], Field(min_length=1, max_length=MAX_EPISODES)] = Field(
+        description="return of each episode"
+    )
+    lengths: Annotated[list[Count], Field(min_length=1, max_length=MAX_EPISODES)] = Field(
+        description="number of steps of each episode"
+    )
+    success: Annotated[list[bool], Field(max_length=MAX_EPISODES)] | None = Field(
+        default=None, description="whether each episode was a success; null without a criterion in the specification"
+    )
+    traces: list[EpisodeTrace] = Field(
+        default=[], max_length=MAX_TRACES, description="some of the episodes, step by step"
+    )
+    idempotency_key: Key = Field(description="a repeat with the same key adds nothing")
 
 
 class PutAlias(Request):
-    version: Annotated[int, Field(ge=1, le=2**31 - 1)]
+    """Request to point an alias to a version."""
+
+    version: Annotated[int, Field(ge=1, le=2**31 - 1)] = Field(description="version of the policy")
 
 
 class PolicyFileView(Reply):
-    form: PolicyForm
-    bytes: int
-    digest: str
-    stored: bool = Field(description="false: announced and not yet sent, or removed to make room")
+    """A file of a policy."""
+
+    form: PolicyForm = Field(description="form of the file, which is also the ending of its name")
+    bytes: int = Field(description="size of the file")
+    digest: str = Field(description="SHA-256 of the file, as hex")
+    stored: bool = Field(
+        description="whether the server has the file; false: it was announced and has not arrived yet, or it was "
+        "removed to make room"
+    )
 
 
 class Interval(Reply):
     """A 95 % interval."""
 
-    low: float
-    high: float
+    low: float = Field(description="lower end")
+    high: float = Field(description="upper end")
 
 
 class EvaluationView(Reply):
     """Statistics of real episodes."""
 
-    id: int
-    controller: Controller
-    created_at: float
-    note: str
-    declared: bool
-    first_seed: int
-    episodes: int
-    steps: int = Field(description="real steps that it took")
-    mean: float
-    mean_interval: Interval | None = Field(description="of the mean return over new starts; None for one episode")
-    median: float
-    least: float
-    most: float
-    success_rate: float | None = Field(description="None where the specification has no criterion")
-    success_interval: Interval | None
+    id: int = Field(description="number of the evaluation")
+    controller: Controller = Field(description="who chose the actions")
+    created_at: float = Field(description="when it was stored, in seconds since 1970, by the server's clock")
+    note: str = Field(description="remark for people")
+    declared: bool = Field(description="whether starts and machine are as the specification declares them")
+    first_seed: int = Field(description="reset seed of the first episode")
+    episodes: int = Field(description="number of episodes")
+    steps: int = Field(description="number of real steps")
+    mean: float = Field(description="mean return")
+    mean_interval: Interval | None = Field(
+        description="interval of the mean return over new starts; null for a single episode"
+    )
+    median: float = Field(description="median return")
+    least: float = Field(description="lowest return")
+    most: float = Field(description="highest return")
+    success_rate: float | None = Field(
+        description="share of the episodes that were a success; null without a criterion in the specification"
+    )
+    success_interval: Interval | None = Field(description="interval of the success rate")
     promise_kept: bool | None = Field(
-        description="whether the mean is at least the promise's lower end; None without a promise, or where the starts "
-        "are others than the promise's"
+        description="whether the mean return is at least the promise's lower end; null without a promise, or if "
+        "the starts are not those of the promise"
     )
 
 
 class EvaluationDetail(EvaluationView):
     """An evaluation with all its episodes, and traces of some."""
 
-    returns: list[float]
-    lengths: list[int]
-    success: list[bool] | None
-    traces: list[EpisodeTrace]
-    missing: str | None = Field(default=None, description="why episodes and traces can't be read; None: they are there")
+    returns: list[float] = Field(description="return of each episode")
+    lengths: list[int] = Field(description="number of steps of each episode")
+    success: list[bool] | None = Field(description="whether each episode was a success")
+    traces: list[EpisodeTrace] = Field(description="some of the episodes, step by step")
+    missing: str | None = Field(default=None, description="why episodes and traces can't be read; null if they can")
 
 
 class PolicyView(Reply):
     """One version of a surrogate's policies."""
 
-    version: int
-    created_at: float
-    aliases: list[str]
-    algorithm: str
-    virtual_steps: int | None
-    imagined_return: float | None
-    promise: PolicyPromise | None
-    audit: PolicyAudit | None
-    trusted: bool | None = Field(description="None: nobody checked whether the promise can be trusted")
-    reason: str
+    version: int = Field(description="version number; it is never used again")
+    created_at: float = Field(description="when it was stored, in seconds since 1970, by the server's clock")
+    aliases: list[str] = Field(description="aliases that point to this version")
+    algorithm: str = Field(description="name of the policy search")
+    virtual_steps: int | None = Field(description="virtual steps of the training")
+    imagined_return: float | None = Field(description="imagined return of the policy")
+    promise: PolicyPromise | None = Field(description="promise of the policy")
+    audit: PolicyAudit | None = Field(description="audit of the policy")
+    trusted: bool | None = Field(description="verdict on the promise; null: none was made")
+    reason: str = Field(description="reason of the verdict")
     differs: str | None = Field(
-        description="where the specification that it was made for differs from the surrogate's; None: it does not"
+        description="difference between the specification that the policy was trained for and the surrogate's; "
+        "null if there is none"
     )
-    files: list[PolicyFileView]
-    evaluations: list[EvaluationView]
+    files: list[PolicyFileView] = Field(description="files of the policy")
+    evaluations: list[EvaluationView] = Field(
+        description="real episodes of the policy, of no policy and of reference controllers"
+    )
 
 
 class PolicyDetail(PolicyView):
     """A policy with the settings and the curve of its training."""
 
-    seed: int | None
-    seconds: float | None
-    settings: dict[str, Any]
-    versions: dict[str, str]
-    curve: list[CurvePoint]
+    seed: int | None = Field(description="seed of the training")
+    seconds: float | None = Field(description="duration of the training")
+    settings: dict[str, Any] = Field(description="settings of the training, by name")
+    versions: dict[str, str] = Field(description="versions of the packages of the training, by name")
+    curve: list[CurvePoint] = Field(description="curve of the training")
 
 
 class PushedPolicy(PolicyView):
-    created: bool = Field(description="whether this request made the version; false: its file is known")
+    """Reply to a stored policy."""
+
+    created: bool = Field(
+        description="whether this request created the version; false: the server had this file already"
+    )
 
 
 class PolicyList(Reply):
+    """All policies of a surrogate."""
+
     policies: list[PolicyView] = Field(description="newest first")

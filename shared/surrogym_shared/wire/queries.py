@@ -28,29 +28,39 @@ ActionSequence = Annotated[list[Vector], Field(min_length=1, max_length=MAX_ROLL
 
 
 class ClaimQueries(Request):
-    sampler: Key = Field(description="name of the worker, shown in the ledger")
-    max_queries: Annotated[int, Field(ge=1, le=MAX_CLAIM)] = 1
-    wait_seconds: Annotated[float, Field(ge=0, le=60)] = 0.0
-    lease_seconds: Annotated[float, Field(gt=0, le=86_400)] = 60.0
+    """Request of a sampler for queries, which it holds under leases."""
+
+    sampler: Key = Field(description="name of the sampler, shown in the ledger")
+    max_queries: Annotated[int, Field(ge=1, le=MAX_CLAIM)] = Field(default=1, description="most queries to lease")
+    wait_seconds: Annotated[float, Field(ge=0, le=60)] = Field(
+        default=0.0, description="seconds that the reply may wait for a query; 0: reply at once"
+    )
+    lease_seconds: Annotated[float, Field(gt=0, le=86_400)] = Field(
+        default=60.0, description="seconds until the leases end, unless they are renewed"
+    )
 
 
 class LeasedQuery(Reply):
     """Fields of every query that a sampler has claimed."""
 
-    id: int
-    number: int = Field(description="how many queries of the surrogate came before it")
-    purpose: Purpose
+    id: int = Field(description="id of the query; its samples name it as ``query_id``")
+    number: int = Field(description="number of the surrogate's earlier queries")
+    purpose: Purpose = Field(description="why the real step is wanted")
     attempt: int = Field(description="1 for the first lease of this query")
-    lease_token: str
-    lease_seconds: float
+    lease_token: str = Field(
+        description="token of the lease; it is sent with the samples, and to renew or return the query"
+    )
+    lease_seconds: float = Field(description="seconds from this reply until the lease ends, unless it is renewed")
 
 
 class StepQuery(LeasedQuery):
     """Query of one step: set the original environment to ``coordinates``, apply ``action``, report one sample."""
 
     kind: Literal["step"] = "step"
-    coordinates: list[float]
-    action: list[float] = Field(description="(F,) continuous value, or the number of each discrete action")
+    coordinates: list[float] = Field(description="(C,) state to set")
+    action: list[float] = Field(
+        description="(F,) action to apply: continuous values, or the number of each discrete action"
+    )
 
 
 class RolloutQuery(LeasedQuery):
@@ -60,99 +70,143 @@ class RolloutQuery(LeasedQuery):
     """
 
     kind: Literal["rollout"] = "rollout"
-    actions: list[list[float]] = Field(description="(T, F)")
+    actions: list[list[float]] = Field(description="(T, F) actions to apply after a reset, in this order")
 
 
 Query = Annotated[StepQuery | RolloutQuery, Field(discriminator="kind")]
 
 
 class ClaimedQueries(Reply):
-    queries: list[Query]
-    phase: Phase
-    paused: bool
+    """The queries that a sampler has leased. There are none if none came in time."""
+
+    queries: list[Query] = Field(description="leased queries")
+    phase: Phase = Field(description="present phase of the design")
+    paused: bool = Field(description="whether the design is paused; then nobody gets queries")
 
 
 class RenewLease(Request):
-    lease_token: Key
-    lease_seconds: Annotated[float, Field(gt=0, le=86_400)] = 60.0
+    """Heartbeat of a sampler: the lease of a query ends ``lease_seconds`` from now."""
+
+    lease_token: Key = Field(description="token of the lease")
+    lease_seconds: Annotated[float, Field(gt=0, le=86_400)] = Field(
+        default=60.0, description="seconds from now until the lease ends"
+    )
 
 
 class FailQuery(Request):
-    lease_token: Key
-    error: Annotated[str, Field(min_length=1, max_length=4_000)]
-    begun: bool = Field(default=True, description="whether a real step may have been taken; false: it counts nowhere")
+    """Return of a query that has no answer. Another sampler may claim it."""
+
+    lease_token: Key = Field(description="token of the lease")
+    error: Annotated[str, Field(min_length=1, max_length=4_000)] = Field(
+        description="why there is no answer, shown to people"
+    )
+    begun: bool = Field(
+        default=True,
+        description="whether a real step may have been taken; if so, it counts as an attempt and as unresolved",
+    )
 
 
 class QueryView(Reply):
-    id: int
-    purpose: Purpose
-    status: QueryStatus
-    round: int
-    kind: QueryKind
-    coordinates: list[float] | None = Field(description="(C,) of a step; null for a rollout")
-    actions: list[list[float]] = Field(description="(T, F), with T = 1 for a step")
-    attempts: int
-    sampler: str | None
-    error: str | None
+    """A query as people see it."""
+
+    id: int = Field(description="id of the query")
+    purpose: Purpose = Field(description="why the real step is wanted")
+    status: QueryStatus = Field(
+        description="pending, leased by a sampler, answered, or set aside after its last attempt"
+    )
+    round: int = Field(description="number of fits before the query was made")
+    kind: QueryKind = Field(description="one step, or a rollout from a reset")
+    coordinates: list[float] | None = Field(description="(C,) state to set for a step; null for a rollout")
+    actions: list[list[float]] = Field(description="(T, F) actions; T = 1 for a step")
+    attempts: int = Field(description="number of leases so far")
+    sampler: str | None = Field(description="name of the last sampler that claimed it")
+    error: str | None = Field(description="error of the last attempt that failed")
     lease_seconds_left: float | None = Field(
-        default=None, description="of the lease that a sampler holds, by the server's clock; below 0 it has run out"
+        default=None,
+        description="seconds left of the lease that a sampler holds, by the server's clock; negative if it has "
+        "ended; null without a lease",
     )
 
 
 class QueryList(Reply):
-    queries: list[QueryView]
+    """Queries of a surrogate."""
+
+    queries: list[QueryView] = Field(description="the queries")
 
 
 class AddQueries(Request):
-    """Queries by hand: steps from ``coordinates`` with ``action``; or ``rollouts``, action sequences from a reset."""
+    """Request for queries that a person or a program chose.
 
-    coordinates: Matrix | None = None
-    action: Matrix | None = None
-    rollouts: Annotated[list[ActionSequence], Field(min_length=1, max_length=MAX_CLAIM)] | None = None
-    idempotency_key: Key | None = None
+    Give either ``coordinates`` with ``action``, for single steps, or ``rollouts``.
+    """
+
+    coordinates: Matrix | None = Field(default=None, description="(m, C) states to set")
+    action: Matrix | None = Field(default=None, description="(m, F) the action to apply in each of them")
+    rollouts: Annotated[list[ActionSequence], Field(min_length=1, max_length=MAX_CLAIM)] | None = Field(
+        default=None, description="action sequences, each (T, F), to apply after a reset"
+    )
+    idempotency_key: Key | None = Field(default=None, description="a repeat with the same key adds nothing")
 
 
 class AuditModel(AddQueries):
-    """Request for the real steps of an audit, which compare the model with reality where a policy goes.
+    """Request for the real steps of an audit, which compare the model with the original environment where a policy
+    goes.
 
-    They don't count towards the design's budget. All audits of a surrogate together have at most as many steps as this
-    budget.
+    They don't count towards the design's budget. All audits of a surrogate together have at most as many steps as
+    this budget, or 64 if the budget is smaller.
     """
 
 
 class WithdrawQueries(Request):
-    query_ids: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1, max_length=MAX_BATCH)]
+    """Request to remove pending queries that no sampler has begun."""
+
+    query_ids: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1, max_length=MAX_BATCH)] = Field(
+        description="ids of the queries"
+    )
 
 
 class WithdrawnQueries(Reply):
-    withdrawn: int = Field(description="how many were removed: pending ones that no sampler had begun")
+    """Reply to a request to remove queries."""
+
+    withdrawn: int = Field(description="number of queries that were removed; those that a sampler had begun stay")
 
 
 class NewSample(Request):
-    """One real step. ``coordinates`` and ``action`` are the achieved values, not the requested ones."""
+    """Result of one real step. ``coordinates`` and ``action`` are the achieved values, not the requested ones."""
 
-    query_id: Annotated[int, Field(ge=1)] | None = None
-    lease_token: Key | None = None
-    step: Annotated[int, Field(ge=0, lt=MAX_ROLLOUT_QUERY)] = Field(
-        default=0, description="place in the rollout; each begins where the one before ended"
+    query_id: Annotated[int, Field(ge=1)] | None = Field(
+        default=None, description="id of the query that this sample answers; null for a step without a query"
     )
-    coordinates: Vector
-    action: Vector
-    next_coordinates: Vector
-    reward: Measured
-    terminated: bool
-    truncated: bool = False
-    observation: Vector | None = None
-    next_observation: Vector | None = None
+    lease_token: Key | None = Field(
+        default=None, description="token of the query's lease; null for a step without a query"
+    )
+    step: Annotated[int, Field(ge=0, lt=MAX_ROLLOUT_QUERY)] = Field(
+        default=0, description="place in the rollout, from 0; each step begins where the one before ended"
+    )
+    coordinates: Vector = Field(description="(C,) state before the step")
+    action: Vector = Field(description="(F,) action")
+    next_coordinates: Vector = Field(description="(C,) state after the step")
+    reward: Measured = Field(description="reward of the step")
+    terminated: bool = Field(description="whether the step ended the episode in a terminal state")
+    truncated: bool = Field(
+        default=False, description="whether the step ended the episode for another reason, such as a time limit"
+    )
+    observation: Vector | None = Field(
+        default=None, description="(D,) the environment's own observation before the step; stored with the sample"
+    )
+    next_observation: Vector | None = Field(default=None, description="(D,) the same after the step")
 
 
 class AddSamples(Request):
-    sampler: Key
-    samples: Annotated[list[NewSample], Field(min_length=1, max_length=4_096)]
+    """Samples to store: answers to queries, real steps without a query, or recorded steps of a log."""
+
+    sampler: Key = Field(description="name of the sampler, shown with the samples")
+    samples: Annotated[list[NewSample], Field(min_length=1, max_length=4_096)] = Field(description="the samples")
     purpose: Literal["manual", "logged"] = Field(
         default="manual",
-        description="of samples without a query. ``logged``: they were recorded before and cost no budget; one that is "
-        "there already, the same in every number, is a duplicate",
+        description="purpose of the samples that answer no query. ``manual``: they count towards the budget. "
+        "``logged``: they were recorded before and don't; one that equals a stored sample in every "
+        "number is a duplicate",
     )
     complete: bool = Field(
         default=True, description="false: more of the same log follows, so no fit becomes due for this part"
@@ -164,53 +218,66 @@ class AddSamples(Request):
 
 
 class AddedSamples(Reply):
-    """Reply after the samples are committed."""
+    """Reply after the samples were stored durably."""
 
-    sample_ids: list[int]
-    duplicates: int = Field(description="how many of them were already there")
-    ledger: Ledger
+    sample_ids: list[int] = Field(description="id of each sample, in the order of the request")
+    duplicates: int = Field(description="number of samples that were stored before")
+    ledger: Ledger = Field(description="real steps so far")
 
 
 class SampleView(Reply):
-    id: int
-    purpose: SamplePurpose
-    query_id: int | None
-    sampler: str
-    attempt: int
-    late: bool = Field(description="answered under a lease that had expired")
-    trajectory: int | None = Field(description="equal for the samples of one rollout; null for others")
-    step: int = Field(description="place in the rollout")
-    requested_coordinates: list[float] | None
-    coordinates: list[float]
-    action: list[float]
-    next_coordinates: list[float]
-    reward: float
-    terminated: bool
-    truncated: bool
-    created_at: float
+    """A stored sample: the result of one real step."""
+
+    id: int = Field(description="id of the sample")
+    purpose: SamplePurpose = Field(description="why the real step was taken")
+    query_id: int | None = Field(description="id of the query that it answers; null without one")
+    sampler: str = Field(description="name of the sampler that sent it")
+    attempt: int = Field(description="number of the query's lease under which it was taken; 0 without a query")
+    late: bool = Field(description="whether the lease had ended when the sample came")
+    trajectory: int | None = Field(description="number shared by the samples of one rollout; null for others")
+    step: int = Field(description="place in the rollout, from 0")
+    requested_coordinates: list[float] | None = Field(
+        description="(C,) state that the query wanted; null without a query, and in a rollout"
+    )
+    coordinates: list[float] = Field(description="(C,) achieved state before the step")
+    action: list[float] = Field(description="(F,) achieved action")
+    next_coordinates: list[float] = Field(description="(C,) state after the step")
+    reward: float = Field(description="reward of the step")
+    terminated: bool = Field(description="whether the step ended the episode in a terminal state")
+    truncated: bool = Field(description="whether the step ended the episode for another reason")
+    created_at: float = Field(description="when it was stored, in seconds since 1970, by the server's clock")
 
 
 class SamplePage(Reply):
-    samples: list[SampleView]
-    next_after: int | None = Field(description="give it as ``after`` for the next page; null at the end")
+    """One page of a surrogate's samples."""
+
+    samples: list[SampleView] = Field(description="samples, oldest first")
+    next_after: int | None = Field(description="value of ``after`` for the next page; null on the last page")
 
 
 class ReportSteps(Request):
-    """Real steps taken outside the design, in an evaluation."""
+    """Report of real steps that an evaluation took, for the ledger. They don't count towards the budget."""
 
     purpose: Literal["evaluation"] = "evaluation"
-    steps: Annotated[int, Field(ge=1, le=1_000_000_000)]
-    episodes: Annotated[int, Field(ge=0, le=1_000_000_000)] = 0
-    note: Annotated[str, Field(max_length=1_000)] = ""
-    idempotency_key: Key
+    steps: Annotated[int, Field(ge=1, le=1_000_000_000)] = Field(description="number of real steps")
+    episodes: Annotated[int, Field(ge=0, le=1_000_000_000)] = Field(
+        default=0, description="number of episodes that they belong to"
+    )
+    note: Annotated[str, Field(max_length=1_000)] = Field(
+        default="", description="remark for people, stored with the report"
+    )
+    idempotency_key: Key = Field(description="a repeat with the same key adds nothing")
 
 
 class Improve(Request):
-    """Add queries to the design, chosen by the acquisition.
+    """Request for further queries, which the design's acquisition chooses.
 
-    The budget must have enough steps left; with a token of role admin it is raised as needed.
+    The budget must have enough real steps left. For a token of role ``admin`` it is raised if it has not.
     """
 
-    queries: Annotated[int, Field(ge=1, le=10_000, description="real steps: a rollout's count one by one")]
-    checkpoint: Key | None = Field(default=None, description="weigh by the occupancy submitted under this name")
-    idempotency_key: Key | None = None
+    queries: Annotated[int, Field(ge=1, le=10_000, description="number of real steps; each step of a rollout counts")]
+    checkpoint: Key | None = Field(
+        default=None,
+        description="name of submitted occupancy that weighs the queries; null: the latest, if there is any",
+    )
+    idempotency_key: Key | None = Field(default=None, description="a repeat with the same key adds nothing")

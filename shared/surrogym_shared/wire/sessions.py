@@ -32,41 +32,65 @@ class OpenSession(Request):
     For ``time_limit`` and ``penalty``, None takes the surrogate's value. Each other field says what its None means.
     """
 
-    num_envs: Annotated[int, Field(ge=1, le=MAX_LANES)] = 1
-    variant: Variant = "deterministic"
-    seed: Seed | None = Field(default=None, description="None draws one; the reply says which")
-    autoreset_mode: AutoresetMode = "next_step"
-    model: Annotated[int, Field(ge=1)] | Literal["latest"] = "latest"
-    time_limit: Annotated[int, Field(ge=1, le=10_000_000)] | None = Field(default=None, description="None: the spec's")
-    penalty: Annotated[float, Field(ge=0, le=100)] | None = Field(default=None, description="k of eq. 14")
+    num_envs: Annotated[int, Field(ge=1, le=MAX_LANES)] = Field(default=1, description="number of lanes, N")
+    variant: Variant = Field(
+        default="deterministic",
+        description="how the state moves: by the model's mean, as particles, or along a drawn function",
+    )
+    seed: Seed | None = Field(
+        default=None,
+        description="seed of all random numbers of the session; null: the server draws one, and the reply names it",
+    )
+    autoreset_mode: AutoresetMode = Field(
+        default="next_step", description="what happens to a lane after the end of its episode, as in Gymnasium"
+    )
+    model: Annotated[int, Field(ge=1)] | Literal["latest"] = Field(
+        default="latest",
+        description="version of the model; ``latest``: each reset takes the version that is latest then",
+    )
+    time_limit: Annotated[int, Field(ge=1, le=10_000_000)] | None = Field(
+        default=None, description="steps after which an episode is truncated; null: the surrogate's time limit"
+    )
+    penalty: Annotated[float, Field(ge=0, le=100)] | None = Field(
+        default=None,
+        description="k of eq. 14: predicted standard deviations of the reward that are subtracted from it; null: "
+        "the surrogate's penalty",
+    )
     start_box: Annotated[float, Field(ge=0, le=1)] = Field(
         default=0.0, description="share of episodes that start anywhere in the sampling range"
     )
-    process_noise: bool = Field(default=False, description="the learned noise moves the state")
+    process_noise: bool = Field(default=False, description="whether the learned noise of a step is added to the state")
     trust: Annotated[float, Field(gt=0, le=1_000)] | None = Field(
         default=None,
-        description="truncate an episode when an output's predicted standard deviation exceeds this factor times the "
-        "output's standard deviation in the samples; None: no limit",
+        description="truncate an episode when an output's predicted standard deviation exceeds this factor times "
+        "the output's standard deviation in the samples; null: no limit",
     )
     particles: Annotated[int, Field(ge=1, le=MAX_PARTICLES)] = Field(
-        default=1_000, description="of a lane; this and the next three are the probabilistic variant's"
+        default=1_000, description="variant probabilistic: number of particles of a lane"
     )
     propagation: Literal["mean", "sample"] = Field(
-        default="sample", description="a particle moves by the mean, or by a draw of its own"
+        default="sample", description="variant probabilistic: each particle moves by the mean, or by a draw of its own"
     )
     weighting: Literal["inverse_variance", "uniform"] = Field(
-        default="inverse_variance", description="of the particles' rewards"
+        default="inverse_variance", description="variant probabilistic: how the rewards of the particles are averaged"
     )
     spread: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.01, description="initial deviation of particles, as a share of each coordinate's sampling range"
+        default=0.01,
+        description="variant probabilistic: initial standard deviation of the particles, as a share of each "
+        "coordinate's sampling range",
     )
     functions: Annotated[int, Field(ge=1, le=MAX_LANES)] | None = Field(
         default=None,
-        description="variant pathwise: number of functions; lane i follows function i modulo it, so that lanes "
-        "share functions from different starts; None: one function for each lane",
+        description="variant pathwise: number of drawn functions; lane i follows function i modulo this number, so "
+        "that lanes share functions from different starts; null: one function for each lane",
     )
-    occupancy: bool = Field(default=False, description="collect visited coordinates, to be submitted at checkpoints")
-    idempotency_key: Key | None = None
+    occupancy: bool = Field(
+        default=False,
+        description="whether to collect the visited states, which can then be submitted under the name of a checkpoint",
+    )
+    idempotency_key: Key | None = Field(
+        default=None, description="a repeat with the same key opens no second session; null: each request opens one"
+    )
 
     @model_validator(mode="after")
     def _particles_are_the_probabilistic_variants(self) -> Self:
@@ -80,86 +104,117 @@ class OpenSession(Request):
 
 
 class SessionCoordinates(Reply):
-    coordinates: list[list[float]] = Field(description="(N, C) where each lane is now; of particles their mean")
+    """Present states of a session's lanes."""
+
+    coordinates: list[list[float]] = Field(
+        description="(N, C) state of each lane; the mean of its particles in the variant probabilistic"
+    )
 
 
 class BoxSpace(Reply):
+    """Space of vectors of numbers within limits."""
+
     kind: Literal["box"] = "box"
-    low: list[float | None] = Field(description="null is unbounded")
-    high: list[float | None]
+    low: list[float | None] = Field(description="lowest value of each entry; null: no limit")
+    high: list[float | None] = Field(description="highest value of each entry; null: no limit")
     dtype: Literal["float32"] = "float32"
 
 
 class DiscreteSpace(Reply):
+    """Space of the whole numbers from 0 to n - 1."""
+
     kind: Literal["discrete"] = "discrete"
-    n: int
+    n: int = Field(description="number of choices")
 
 
 class MultiDiscreteSpace(Reply):
+    """Space of vectors of whole numbers. Entry i is between 0 and nvec[i] - 1."""
+
     kind: Literal["multi_discrete"] = "multi_discrete"
-    nvec: list[int]
+    nvec: list[int] = Field(description="number of choices of each entry")
 
 
 ActionSpace = Annotated[BoxSpace | DiscreteSpace | MultiDiscreteSpace, Field(discriminator="kind")]
 
 
 class SessionView(Reply):
-    protocol: int = PROTOCOL
-    id: str
-    surrogate: str
-    num_envs: int
+    """An open session: its options, its spaces, and where it is."""
+
+    protocol: int = Field(default=PROTOCOL, description="version of the protocol")
+    id: str = Field(description="id of the session, for all its requests")
+    surrogate: str = Field(description="name of the surrogate")
+    num_envs: int = Field(description="number of lanes, N")
     variant: Variant
-    seed: int
+    seed: int = Field(description="seed of all random numbers of the session")
     autoreset_mode: AutoresetMode
-    model: int | Literal["latest"]
-    model_version: list[int] = Field(description="(N,) the version each lane's episode runs under")
-    seq: int = Field(description="the last seq answered; the next request carries seq + 1")
-    time_limit: int | None
-    penalty: float
+    model: int | Literal["latest"] = Field(description="version of the model that was chosen, or ``latest``")
+    model_version: list[int] = Field(description="(N,) version of the model that each lane's episode runs under")
+    seq: int = Field(description="number of the last answered request; the next request has seq + 1")
+    time_limit: int | None = Field(description="steps after which an episode is truncated; null: no limit")
+    penalty: float = Field(description="k of eq. 14")
     observation_space: BoxSpace
     action_space: ActionSpace
-    outputs: list[str] = Field(description="what the model predicts, in the order of a step's deviations")
-    idle_seconds: float = Field(description="the session expires when unused for so long")
+    outputs: list[str] = Field(
+        description="names of the quantities that the model predicts, in the order of a step's deviations"
+    )
+    idle_seconds: float = Field(description="seconds without a request after which the session expires")
     replay: int = Field(
         default=0,
-        description="how many of its last requests a client should keep: after a crash the server may wait for a lower "
-        "seq than the client's next one, and the client sends the requests from there again; 0: never",
+        description="number of its last requests that a client should keep. After a crash the server may expect a "
+        "lower seq than the client's next one, and the client sends the requests from there again; 0: "
+        "never",
     )
 
 
 class SessionActivity(Reply):
     """Activity of a session since this server process knows it."""
 
-    id: str
-    num_envs: int
+    id: str = Field(description="id of the session")
+    num_envs: int = Field(description="number of lanes")
     variant: Variant
-    model: Literal["latest"] | int
-    model_version: list[int] = Field(description="model versions that its lanes use now, each once")
-    steps: int = Field(description="of all lanes")
-    steps_per_second: float = Field(description="of all lanes, over about the last ten seconds")
-    idle_seconds: float = Field(description="since its last step")
+    model: Literal["latest"] | int = Field(description="version of the model that was chosen, or ``latest``")
+    model_version: list[int] = Field(description="versions of the model that its lanes use now, each listed once")
+    steps: int = Field(description="virtual steps so far, summed over lanes")
+    steps_per_second: float = Field(
+        description="virtual steps per second, summed over lanes, averaged over about ten seconds"
+    )
+    idle_seconds: float = Field(description="seconds since its last step")
     penalty: float = Field(description="k of eq. 14")
-    episodes: int = Field(description="that ended")
-    returns: list[float] = Field(description="imagined, of the last episodes that ended, oldest first")
-    penalties: list[float] = Field(description="penalty for deviations that was subtracted from each of them")
+    episodes: int = Field(description="number of episodes that ended")
+    returns: list[float] = Field(description="imagined returns of the last episodes that ended, oldest first")
+    penalties: list[float] = Field(description="penalty for uncertainty that was subtracted from each of these returns")
 
 
 class SessionList(Reply):
-    sessions: list[SessionActivity]
+    """Activity of a surrogate's open sessions."""
+
+    sessions: list[SessionActivity] = Field(description="open sessions, oldest first")
 
 
 class ResetSession(Request):
-    seq: Seq | None = None
-    seed: Seed | Annotated[list[Seed], Field(max_length=MAX_LANES)] | None = None
+    """Request to begin new episodes."""
+
+    seq: Seq | None = Field(
+        default=None,
+        description="number of the request: 1 for the first of a session, then one more each time; null: not checked",
+    )
+    seed: Seed | Annotated[list[Seed], Field(max_length=MAX_LANES)] | None = Field(
+        default=None,
+        description="new seed of all lanes, or one seed for each lane; null: each lane continues with its next episode",
+    )
     mask: Annotated[list[bool], Field(max_length=MAX_LANES)] | None = Field(
-        default=None, description="(N,) lanes to reset; None is all"
+        default=None, description="(N,) lanes to reset; null: all"
     )
 
 
 class ResetReply(Reply):
-    seq: int
-    observation: list[list[float]] = Field(description="(N, D); lanes outside the mask show their last observation")
-    model_version: list[int]
+    """First observations of the new episodes."""
+
+    seq: int = Field(description="number of the request")
+    observation: list[list[float]] = Field(
+        description="(N, D) first observation of each lane that was reset, last observation of the others"
+    )
+    model_version: list[int] = Field(description="(N,) version of the model that each lane's episode runs under")
 
 
 ActionRow = FiniteFloat | Annotated[list[FiniteFloat], Field(max_length=MAX_DIMENSIONS)]
@@ -167,30 +222,49 @@ Actions = Annotated[list[ActionRow], Field(min_length=1, max_length=MAX_LANES)]
 
 
 class StepSession(Request):
-    seq: Seq | None = None
-    action: Actions = Field(description="(N, F), or (N,) where the action is one number")
-    mask: Annotated[list[bool], Field(max_length=MAX_LANES)] | None = Field(
-        default=None, description="(N,) lanes to step; None is all. Other lanes keep their state, with reward 0"
+    """Request to take one virtual step."""
+
+    seq: Seq | None = Field(
+        default=None, description="number of the request: one more than that of the last one; null: not checked"
     )
-    deviations: bool = Field(default=False, description="send the deviation of each output along")
+    action: Actions = Field(description="(N, F) action of each lane; (N,) if an action is a single number")
+    mask: Annotated[list[bool], Field(max_length=MAX_LANES)] | None = Field(
+        default=None,
+        description="(N,) lanes to step; null: all. The other lanes keep their state and get a reward of 0",
+    )
+    deviations: bool = Field(
+        default=False, description="whether the reply has the predicted standard deviation of each output"
+    )
 
 
 class StepReply(Reply):
-    """Result of a step. ``final`` has the last observation of lanes that ended and were reset in this step (mode
-    same_step)."""
+    """Result of a virtual step in each lane.
 
-    seq: int
-    observation: list[list[float]]
-    reward: list[float]
-    terminated: list[bool]
-    truncated: list[bool]
-    final_lanes: list[int] = Field(default_factory=list, description="indices of lanes with a final observation")
-    final_observation: list[list[float]] = Field(default_factory=list, description="(len(final_lanes), D)")
-    model_version: list[int]
-    reward_mean: list[float] = Field(description="(N,) before the penalty")
-    deviation: list[list[float]] | None = Field(default=None, description="(N, O), when asked for")
+    In mode ``same_step``, a lane whose episode ended was reset in the same step. Its ``observation`` is then the
+    first of the next episode, and ``final_observation`` the last of the old one.
+    """
+
+    seq: int = Field(description="number of the request")
+    observation: list[list[float]] = Field(description="(N, D) observations after the step")
+    reward: list[float] = Field(description="(N,) rewards, after the penalty was subtracted")
+    terminated: list[bool] = Field(description="(N,) whether the episode ended in a terminal state")
+    truncated: list[bool] = Field(
+        description="(N,) whether the episode ended by the time limit, or by leaving the trusted range"
+    )
+    final_lanes: list[int] = Field(default_factory=list, description="lanes that have a final observation")
+    final_observation: list[list[float]] = Field(
+        default_factory=list, description="(len(final_lanes), D) last observations of the episodes that ended"
+    )
+    model_version: list[int] = Field(description="(N,) version of the model that each lane's episode runs under")
+    reward_mean: list[float] = Field(description="(N,) rewards before the penalty is subtracted")
+    deviation: list[list[float]] | None = Field(
+        default=None,
+        description="(N, O) predicted standard deviation of each output; null if the request did not ask for it",
+    )
     untrusted: list[bool] | None = Field(
-        default=None, description="(N,) lanes truncated for leaving the trusted range, in a session that has one"
+        default=None,
+        description="(N,) lanes whose episode was truncated because it left the trusted range; null in a session "
+        "without ``trust``",
     )
 
 
@@ -200,8 +274,8 @@ Numbers = Annotated[list[FiniteFloat], Field(min_length=1, max_length=MAX_UNITS)
 class PolicyLayer(Request):
     """One layer of a network: x @ weights + bias."""
 
-    weights: Annotated[list[Numbers], Field(min_length=1, max_length=MAX_UNITS)] = Field(description="(I, O)")
-    bias: Numbers = Field(description="(O,)")
+    weights: Annotated[list[Numbers], Field(min_length=1, max_length=MAX_UNITS)] = Field(description="(I, O) weights")
+    bias: Numbers = Field(description="(O,) biases")
 
 
 class PolicyArrays(Request):
@@ -212,38 +286,51 @@ class PolicyArrays(Request):
     highest score wins.
     """
 
-    mean: Numbers = Field(description="(D,) subtracted from an observation")
-    deviation: Numbers = Field(description="(D,) which divides the difference")
-    layers: Annotated[list[PolicyLayer], Field(min_length=1, max_length=MAX_LAYERS)]
-    activation: Activation = Field(default="tanh", description="of the hidden layers")
-    log_deviations: Numbers | None = Field(
-        default=None, description="(F,) logarithms of the deviations of continuous actions; needed for noise"
+    mean: Numbers = Field(description="(D,) mean that is subtracted from an observation")
+    deviation: Numbers = Field(description="(D,) deviation by which the difference is divided")
+    layers: Annotated[list[PolicyLayer], Field(min_length=1, max_length=MAX_LAYERS)] = Field(
+        description="layers of the network, from the observation to the outputs"
     )
-    precision: Literal["float32", "float64"] = Field(default="float32", description="that the network computes in")
+    activation: Activation = Field(default="tanh", description="activation of the hidden layers")
+    log_deviations: Numbers | None = Field(
+        default=None,
+        description="(F,) logarithm of the standard deviation of each continuous action; required for noise",
+    )
+    precision: Literal["float32", "float64"] = Field(
+        default="float32", description="type of the numbers that the network computes with"
+    )
 
 
 class ActionNoise(Request):
     """Key of the actions' noise. The same key, lane and entry give the same number."""
 
-    seed: Seed
-    step: Seed = Field(default=0, description="number of the rollout's first step; the next has the next number")
+    seed: Seed = Field(description="seed of the noise")
+    step: Seed = Field(
+        default=0, description="number of the rollout's first step; each further step has the next number"
+    )
 
 
 class RolloutSession(Request):
-    """Rollout of given ``actions``, or of a ``policy`` for a number of ``steps``."""
+    """Request to take several virtual steps: with given ``actions``, or with a ``policy`` for a number of ``steps``."""
 
-    seq: Seq | None = None
+    seq: Seq | None = Field(
+        default=None, description="number of the request: one more than that of the last one; null: not checked"
+    )
     actions: Annotated[list[Actions], Field(min_length=1, max_length=MAX_ROLLOUT)] | None = Field(
-        default=None, description="(T, N, F): T steps in one request"
+        default=None, description="(T, N, F) actions of T steps"
     )
-    policy: PolicyArrays | None = Field(default=None, description="acts in all lanes, on the server")
+    policy: PolicyArrays | None = Field(default=None, description="policy that acts in all lanes, on the server")
     steps: Annotated[int, Field(ge=1, le=MAX_ROLLOUT)] | None = Field(
-        default=None, description="T with a policy, at most"
+        default=None, description="number of steps of the policy, T; fewer if ``until`` ends the rollout"
     )
-    noise: ActionNoise | None = Field(default=None, description="of the policy's actions; None: the most probable ones")
+    noise: ActionNoise | None = Field(
+        default=None,
+        description="key of the noise that is added to the policy's actions; null: the most probable actions",
+    )
     until: Annotated[list[bool], Field(max_length=MAX_LANES)] | None = Field(
         default=None,
-        description="(N,) lanes; a policy's rollout stops after the step by which an episode has ended in each of them",
+        description="(N,) lanes: the policy's rollout stops after the step by which an episode has ended in each "
+        "of them",
     )
 
     @model_validator(mode="after")
@@ -259,23 +346,32 @@ class RolloutSession(Request):
 
 
 class RolloutReply(Reply):
-    seq: int
-    steps: list[StepReply]
+    """Results of the steps of a rollout."""
+
+    seq: int = Field(description="number of the request")
+    steps: list[StepReply] = Field(description="result of each step")
     action: list[list[list[float]]] | None = Field(
-        default=None, description="(T, N, F) of the policy, before it is clipped to its bounds"
+        default=None,
+        description="(T, N, F) actions of the policy, before they are clipped to their bounds; null for given actions",
     )
-    log_probability: list[list[float]] | None = Field(default=None, description="(T, N) of each action, with noise")
+    log_probability: list[list[float]] | None = Field(
+        default=None, description="(T, N) logarithm of each action's probability; null without noise"
+    )
 
 
 class SubmitOccupancy(Request):
-    checkpoint: Key
+    """Request to store the states that a session has visited."""
+
+    checkpoint: Key = Field(description="name under which they are stored")
 
 
 class SubmittedOccupancy(Reply):
-    checkpoint: str
-    states: int = Field(description="how many visited coordinates were stored")
+    """Reply to submitted occupancy."""
+
+    checkpoint: str = Field(description="name under which the states are stored")
+    states: int = Field(description="number of states that were stored")
     confidence_index: float | None = Field(
         default=None,
-        description="of the session's model over these states under random actions: the smallest over outputs, with "
-        "tolerances. None: there is no design here",
+        description="smallest confidence index of the outputs over these states, under random actions, by the "
+        "session's model; null without a server, because there is no design",
     )

@@ -12,54 +12,74 @@ from surrogym_shared.wire.base import Phase, Reply, Request, SurrogateName
 
 
 class CreateSurrogate(Request):
+    """Request to register a surrogate."""
+
     model_config = ConfigDict(extra="forbid", strict=False)  # the specification validates its own types
 
-    name: SurrogateName
-    spec: EnvironmentSpec
+    name: SurrogateName = Field(description="name of the surrogate")
+    spec: EnvironmentSpec = Field(
+        description="what is known of the original environment beforehand, and settings of the design"
+    )
 
 
 class PatchSurrogate(Request):
-    """Changes of a running design. None leaves a field as it is. With a budget of 0, the design takes no real step."""
+    """Changes of a surrogate's design. A field that is null stays as it is."""
 
-    paused: bool | None = None
-    budget: Annotated[int, Field(ge=0, le=100_000)] | None = None
-    target: Annotated[float, Field(gt=0.5, lt=1)] | None = None
+    paused: bool | None = Field(
+        default=None,
+        description="true pauses the design, false continues it and puts queries that were set aside back into the "
+        "queue",
+    )
+    budget: Annotated[int, Field(ge=0, le=100_000)] | None = Field(
+        default=None, description="real steps that the design may take; 0: none, so all samples come from a log"
+    )
+    target: Annotated[float, Field(gt=0.5, lt=1)] | None = Field(default=None, description="confidence index to reach")
     tolerances: dict[str, Positive | None] | None = Field(
         default=None,
-        description="by output, in its own unit; null takes back what was set, those of other outputs stay as they are",
+        description="tolerance of each named output, in its own unit; null removes a tolerance that was set "
+        "before; outputs without an entry stay as they are",
     )
 
 
 class OutputFidelity(Reply):
-    """How well one output is predicted. ``unit`` is the output's own."""
+    """How well the model predicts one output."""
 
-    name: str
-    structure: str = Field(description="Chosen inputs and kernel, in words.")
+    name: str = Field(description="name of the output")
+    structure: str = Field(description="inputs and kernel that were chosen, in words")
     confidence_index: float = Field(description="mean Phi(tolerance / deviation) over the Monte Carlo set (eq. 8, 9)")
     confidence_index_paper: float = Field(description="mean Phi(1 / deviation): the paper's, in raw units")
-    tolerance: float
+    tolerance: float = Field(description="error that is too small to matter, in the output's unit")
     coverage: float = Field(description="share of the Monte Carlo set whose deviation is below the tolerance")
     leave_one_out_error: float | None = Field(
-        description="root mean square, in the output's unit; None where the family of models can't tell"
+        description="root mean square error of each sample's prediction from all others, in the output's unit; "
+        "null if the family of models can't compute it"
     )
     leave_one_out_within_one: float | None = Field(
         default=None,
-        description="share of the samples that the model without them predicts within one of its deviations: near 0.68 "
-        "where the deviations tell the truth; None where the error is, and for a model fitted before this was counted",
+        description="share of the samples that are predicted from all others with an error below one predicted "
+        "deviation: near 0.68 if the deviations are right; null if the family can't compute it, or if "
+        "the model is older than this field",
     )
-    leave_one_out_within_two: float | None = Field(default=None, description="the same within two deviations: 0.95")
+    leave_one_out_within_two: float | None = Field(
+        default=None, description="the same below two predicted deviations: near 0.95"
+    )
     noise: float = Field(
         default=0.0,
-        description="deviation of the noise of a single step that repeated steps confirm; it widens the tolerance",
+        description="standard deviation of a single step's noise, if repeated steps confirm it, in the output's "
+        "unit; it is part of ``tolerance``; 0 without confirmed noise",
     )
 
 
 class Fidelity(Reply):
-    confidence_index: float = Field(description="smallest over outputs, with tolerances")
-    confidence_index_paper: float = Field(description="smallest over outputs, as printed in the paper")
-    target: float
-    samples: int
-    outputs: list[OutputFidelity]
+    """How well a model predicts: the smallest confidence index of its outputs, and the values of each output."""
+
+    confidence_index: float = Field(description="smallest confidence index of the outputs, with their tolerances")
+    confidence_index_paper: float = Field(
+        description="smallest confidence index as the paper defines it, with a tolerance of 1 in raw units"
+    )
+    target: float = Field(description="confidence index to reach")
+    samples: int = Field(description="number of samples that the model was fitted to")
+    outputs: list[OutputFidelity] = Field(description="values of each output")
 
 
 class Ledger(Reply):
@@ -71,65 +91,78 @@ class Ledger(Reply):
     ``failed`` of the unresolved ones were returned by a sampler with an error; the leases of the others expired.
     """
 
-    initial: int = 0
-    adaptive: int = 0
-    manual: int = 0
-    audit: int = 0
-    logged: int = 0
-    total: int = 0
-    evaluation: int = 0
-    unresolved: int = 0
-    failed: int = 0
+    initial: int = Field(default=0, description="steps of the first queries, before any model")
+    adaptive: int = Field(default=0, description="steps of queries that the acquisition chose")
+    manual: int = Field(default=0, description="steps of queries by hand, and steps without a query")
+    audit: int = Field(default=0, description="steps of audits")
+    logged: int = Field(default=0, description="steps that were recorded before")
+    total: int = Field(default=0, description="initial + adaptive + manual, which the budget limits")
+    evaluation: int = Field(default=0, description="steps of evaluations, as reported")
+    unresolved: int = Field(default=0, description="steps that may have been taken, but were not reported")
+    failed: int = Field(default=0, description="those of the unresolved steps that a sampler returned with an error")
 
 
 class QueryCounts(Reply):
-    pending: int = 0
-    leased: int = 0
-    answered: int = 0
-    set_aside: int = 0
+    """Numbers of a surrogate's queries, by status."""
+
+    pending: int = Field(default=0, description="no sampler has them")
+    leased: int = Field(default=0, description="a sampler has them")
+    answered: int = Field(default=0, description="with samples")
+    set_aside: int = Field(default=0, description="failed in all their attempts")
 
 
 class SurrogateSummary(Reply):
-    name: str
-    environment: str
-    phase: Phase
-    paused: bool
-    round: int = Field(description="fits so far")
-    samples: int
-    model_version: int | None
-    confidence_index: float | None
+    """A surrogate in a list."""
+
+    name: str = Field(description="name of the surrogate")
+    environment: str = Field(description="name of the original environment")
+    phase: Phase = Field(description="present phase of the design")
+    paused: bool = Field(description="whether the design is paused; then no sampler gets queries")
+    round: int = Field(description="number of fits so far")
+    samples: int = Field(description="number of samples")
+    model_version: int | None = Field(description="version of the newest model; null without a model")
+    confidence_index: float | None = Field(
+        description="smallest confidence index of the newest model's outputs; null without a model"
+    )
     target: float = Field(description="confidence index to reach")
-    budget: int = Field(description="real steps the design may take")
-    ledger: Ledger
-    queries: QueryCounts
+    budget: int = Field(description="real steps that the design may take")
+    ledger: Ledger = Field(description="real steps so far, by purpose")
+    queries: QueryCounts = Field(description="numbers of queries, by status")
     samplers: list[str] = Field(
         default=[], description="names of the samplers that sent a request within the last minute"
     )
-    sessions: int = Field(default=0, description="open ones")
-    created_at: float = Field(description="seconds since 1970, the server's clock")
+    sessions: int = Field(default=0, description="number of open sessions")
+    created_at: float = Field(description="when it was registered, in seconds since 1970, by the server's clock")
 
 
 class SurrogateView(SurrogateSummary):
-    spec: EnvironmentSpec
+    """A surrogate with its specification and the fidelity of its newest model."""
+
+    spec: EnvironmentSpec = Field(description="what was declared of the original environment")
     budget_left: int = Field(
-        description="real steps of the budget that are not taken, not queried, and not promised to a request for more"
+        description="real steps of the budget that are neither taken, nor requested by a query, nor reserved for a "
+        "request of more queries"
     )
-    tolerances: dict[str, float] = Field(description="set since the surrogate was created, by output, in its own unit")
-    outputs: list[str]
-    fidelity: Fidelity | None
-    error: str | None = Field(default=None, description="why the phase is failed, or the last query was set aside")
+    tolerances: dict[str, float] = Field(
+        description="tolerances that were set after the registration, by output, in the output's unit"
+    )
+    outputs: list[str] = Field(description="names of the quantities that the model predicts")
+    fidelity: Fidelity | None = Field(description="how well the newest model predicts; null without a model")
+    error: str | None = Field(
+        default=None, description="why the design failed, or why the last query was set aside; null if neither happened"
+    )
 
 
 class CreatedSurrogate(SurrogateView):
     """Reply to a registration: the surrogate, and whether it is new."""
 
-    created: bool = Field(description="whether this request made it; false: it was there, with the same specification")
+    created: bool = Field(description="whether this request created it; false: it existed, with the same specification")
 
 
 class CheckedSurrogate(Reply):
     """Reply to the check of a registration: what it would store. Nothing was stored."""
 
-    name: str
+    name: str = Field(description="name of the surrogate")
     spec: EnvironmentSpec = Field(description="with the default of every field that the request left out")
     budget: int = Field(description="real steps that the design would be allowed to take")
     target: float = Field(description="confidence index to reach")
@@ -145,9 +178,11 @@ class ImprovedSurrogate(SurrogateView):
 
 
 class SurrogateList(Reply):
-    surrogates: list[SurrogateSummary]
+    """One page of surrogates, oldest first."""
+
+    surrogates: list[SurrogateSummary] = Field(description="surrogates of this page")
     next_after: int | None = Field(
         default=None,
         exclude_if=lambda after: after is None,  # left out of a complete list, because older clients don't know pages
-        description="give it as ``after`` for the next page; left out where this is the last",
+        description="value of ``after`` for the next page; omitted on the last page",
     )

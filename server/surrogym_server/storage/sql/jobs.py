@@ -1,4 +1,4 @@
-"""Jobs and their leases, in rows of one table."""
+"""Jobs and their leases, stored as rows of one table."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def _sweep(connection: Connection, held: Row[Any]) -> int:
 
 
 def _require_room(connection: Connection, surrogate: int, name: str) -> None:
-    """Refuse a job if too many wait, and remove jobs that ended long ago."""
+    """Refuse a job if too many are queued or running, and remove the oldest jobs that have ended."""
     own = jobs.c.surrogate_id == surrogate
     waiting = sa.select(sa.func.count()).select_from(jobs).where(own, OPEN)
     if connection.execute(waiting).scalar_one() >= MAX_OPEN:
