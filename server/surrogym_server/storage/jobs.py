@@ -33,7 +33,7 @@ class NewJob:
 
 @dataclass(frozen=True)
 class JobProgress:
-    """Progress of a job: ``state``, which a list shows, and all points of the curve so far. Both replace earlier ones."""
+    """Progress of a job: ``state``, which a list shows, and the ``curve`` so far. Both replace the earlier ones."""
 
     state: JSON = field(default_factory=dict)
     curve: list[JSON] = field(default_factory=list)

@@ -1,1 +1,1 @@
-"""Logs of real steps: what their columns are, which rows can be used, and a specification drafted from them."""
+"""Logs of real steps: find the roles of their columns, check their rows, and draft a specification from them."""

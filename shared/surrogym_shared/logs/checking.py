@@ -1,4 +1,4 @@
-"""A log, checked: its rows against a specification, or a specification drafted from them."""
+"""Check the rows of a log against a specification, or draft a specification from them."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class ReadLog:
     """A log whose rows were checked.
 
     Attributes:
-        table: as it was read.
-        roles: what its columns are.
-        steps: what can be used of it.
+        table: the log as it was read.
+        roles: roles of its columns.
+        steps: its usable steps.
         spec: the specification that it was checked against, or that was drafted from it.
-        notes: what the draft was concluded from; none where a specification was given.
+        notes: reasons of the parts of a draft; empty if a specification was given.
     """
 
     table: Table
@@ -43,21 +43,21 @@ class ReadLog:
 
     @cached_property
     def rejected(self) -> list[tuple[int, str]]:
-        """The line and the reason of each row that was set aside."""
+        """Line and reason of each row that was set aside."""
         return [(int(self.table.lines[row]), reason) for row, reason in self.steps.rejected.items()]
 
     @property
     def ignored(self) -> dict[str, str]:
-        """The columns and arrays of the file that are not used, with the reason."""
+        """Reason for each column or array of the file that is not used."""
         return {**self.table.ignored, **dict.fromkeys(self.roles.ignored, "it has no role")}
 
     def write_rejected(self, path: Path) -> None:
-        """Write the rows that were set aside as CSV: line, reason, and the row as it stands in the log."""
+        """Write the rows that were set aside as CSV: line, reason, and the cells as in the log."""
         write_rejected(path, self.table, self.steps)
 
     @cached_property
     def reward(self) -> Floats:
-        """Rewards of the usable steps (m,): those of the log, or what the specification declares."""
+        """Rewards of the usable steps (m,), from the log, or from the declared reward if the log has none."""
         steps = self.steps
         if steps.reward is not None:
             return steps.reward
@@ -68,8 +68,8 @@ def check_log(table: Table, roles: Roles, spec: EnvironmentSpec) -> ReadLog:
     """Check the rows of a log against a specification.
 
     Raises:
-        UnusableLog: columns that don't fit the specification.
-        TooFewSteps: no usable step.
+        UnusableLog: the columns don't fit the specification.
+        TooFewSteps: no step is usable.
     """
     roles = _of_spec(roles, spec)
     rows = rows_of(table, roles, spec)
@@ -80,17 +80,17 @@ def check_log(table: Table, roles: Roles, spec: EnvironmentSpec) -> ReadLog:
 
 
 def draft_log(table: Table, roles: Roles, name: str, budget: int = 0) -> ReadLog:
-    """Check the rows of a log, and draft the specification of the environment that it is of.
+    """Check the rows of a log, and draft the specification of the environment that it was recorded in.
 
     Args:
-        table: as it was read.
-        roles: what its columns are.
-        name: what the environment is called.
-        budget: real steps that a design may ask for.
+        table: the log as it was read.
+        roles: roles of its columns.
+        name: name of the environment.
+        budget: real steps that a design may take in addition to the log.
 
     Raises:
         UnusableLog: no state ever moves, or an action never varies.
-        TooFewSteps: no usable step, or a single one.
+        TooFewSteps: fewer than two steps are usable.
     """
     steps = transitions_of(rows_of(table, roles))
     require_steps(table, steps, 2)
@@ -99,7 +99,7 @@ def draft_log(table: Table, roles: Roles, name: str, budget: int = 0) -> ReadLog
 
 
 def write_rejected(path: Path, table: Table, steps: Transitions) -> None:
-    """Write the rows that were set aside as CSV: line, reason, and the row as it stands in the log."""
+    """Write the rows that were set aside as CSV: line, reason, and the cells as in the log."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["line", "reason", *table.names])
@@ -108,7 +108,7 @@ def write_rejected(path: Path, table: Table, steps: Transitions) -> None:
 
 
 def _of_spec(roles: Roles, spec: EnvironmentSpec) -> Roles:
-    """The roles with the coordinates of a specification, in its order; other states are ignored."""
+    """Restrict the roles to the coordinates of a specification, in its order. Other states are ignored."""
     if missing := [name for name in spec.coordinate_names if name not in roles.state]:
         raise UnusableLog(
             f"expected the coordinates {list(spec.coordinate_names)} of the specification, got {list(roles.state)}: "
@@ -127,7 +127,7 @@ def _of_spec(roles: Roles, spec: EnvironmentSpec) -> Roles:
 
 
 def _shaped(spec: EnvironmentSpec, roles: Roles, steps: Transitions) -> Transitions:
-    """The steps with the coordinates of a specification alone, and their angles wrapped."""
+    """Keep only the coordinates of a specification, in its order, and wrap angles to [-pi, pi)."""
     names = list(roles.state)
     kept = [names.index(name) for name in spec.coordinate_names]
     q, q_next = steps.q[:, kept].copy(), steps.q_next[:, kept].copy()
@@ -138,8 +138,11 @@ def _shaped(spec: EnvironmentSpec, roles: Roles, steps: Transitions) -> Transiti
 
 
 def _consistent(spec: EnvironmentSpec, steps: Transitions) -> Transitions:
-    """The steps but those that the specification contradicts: a discrete action that is no whole number, an end where
-    none is declared, and none where one is."""
+    """Reject the steps that contradict the specification.
+
+    These are steps with a discrete action that is not a whole number, and steps that end, or don't end, against the
+    declared termination.
+    """
     reasons: dict[int, str] = {}
     if not isinstance(spec.action, BoxAction):
         for place in np.flatnonzero((steps.u != np.floor(steps.u)).any(1)).tolist():

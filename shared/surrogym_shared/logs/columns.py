@@ -1,4 +1,4 @@
-"""Which column of a log is what: by name, or by a mapping file."""
+"""Roles of the columns of a log, found by their names or given by a mapping."""
 
 from __future__ import annotations
 
@@ -39,16 +39,28 @@ EXPECTED = {
     "constants": NAMES,
     "discrete": "true or false",
 }
-SHOWN = 60  # letters of what came
+SHOWN = 60  # letters of a wrong value that a message shows
 LONGEST = 64  # letters of a coordinate's name
-MOST = 1_000  # columns that a mapping names for one role
+MOST = 1_000  # columns that a mapping may name for one role
 
 Limits = Annotated[list[float | None], Field(min_length=2, max_length=2)]
 
 
 @dataclass(frozen=True)
 class Roles:
-    """Roles of the columns of a log."""
+    """Roles of the columns of a log.
+
+    Attributes:
+        state: column of each coordinate, by the coordinate's name.
+        action: column of each action entry, by the entry's name.
+        following: column of each coordinate's next value, by the coordinate's name; empty without such columns.
+        reward, terminated, truncated, episode, time: column of that name's role; None without one.
+        limits: declared limits of coordinates and action entries, by name; None is no limit.
+        angles: names of coordinates that are declared as angles.
+        constants: names of coordinates that are declared as constants of an episode.
+        discrete: whether the action is declared as discrete; None lets the data decide.
+        ignored: columns without a role.
+    """
 
     state: Mapping[str, str]
     action: Mapping[str, str]
@@ -66,7 +78,7 @@ class Roles:
 
     @property
     def used(self) -> dict[str, str]:
-        """The role of each column that is used, in words, by the column."""
+        """Role of each used column in words, by the column's name."""
         found = {column: f"state {name}" for name, column in self.state.items()}
         found |= {column: f"action {name}" for name, column in self.action.items()}
         found |= {column: f"next state {name}" for name, column in self.following.items()}
@@ -74,7 +86,7 @@ class Roles:
 
     @property
     def mapping(self) -> LogMapping:
-        """The mapping that gives these columns the same roles."""
+        """Mapping that gives these columns the same roles."""
         single = {role: getattr(self, role) for role in SINGLE}
         return LogMapping(
             state=dict(self.state),
@@ -92,23 +104,36 @@ Columns = Annotated[dict[str, str], Field(max_length=MOST)] | Annotated[list[str
 
 
 class LogMapping(FailFast):
-    """What the columns of a log are. A list of columns names coordinates by their columns, a table gives names of one's
-    own."""
+    """Roles of the columns of a log, as a person declares them.
+
+    ``state`` and ``action`` are lists of columns, whose names are then also those of coordinates and action entries, or
+    tables from other names to columns.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
-    state: Columns
-    action: Columns
-    next: dict[str, str] = Field(default_factory=dict, max_length=MOST)
-    reward: str | None = None
-    terminated: str | None = None
-    truncated: str | None = None
-    episode: str | None = None
-    time: str | None = None
-    limits: dict[str, Limits] = Field(default_factory=dict, max_length=MOST)
-    angles: list[str] = Field(default_factory=list, max_length=MOST)
-    constants: list[str] = Field(default_factory=list, max_length=MOST)
-    discrete: bool | None = None
+    state: Columns = Field(description="columns of the coordinates")
+    action: Columns = Field(description="columns of the action")
+    next: dict[str, str] = Field(
+        default_factory=dict, max_length=MOST, description="column of each coordinate's next value, by its name"
+    )
+    reward: str | None = Field(default=None, description="column of the reward")
+    terminated: str | None = Field(default=None, description="column that marks ends in a terminal state")
+    truncated: str | None = Field(default=None, description="column that marks other ends, such as a time limit")
+    episode: str | None = Field(default=None, description="column of the episode's name or number")
+    time: str | None = Field(default=None, description="column of the time")
+    limits: dict[str, Limits] = Field(
+        default_factory=dict, max_length=MOST, description="lowest and highest value by name; null: no limit"
+    )
+    angles: list[str] = Field(
+        default_factory=list, max_length=MOST, description="names of coordinates that are angles in radians"
+    )
+    constants: list[str] = Field(
+        default_factory=list, max_length=MOST, description="names of coordinates that don't change within an episode"
+    )
+    discrete: bool | None = Field(
+        default=None, description="whether the action is the number of a discrete one; null: the data decide"
+    )
 
 
 def roles_by_name(names: Sequence[str]) -> Roles:
@@ -130,11 +155,11 @@ def roles_by_name(names: Sequence[str]) -> Roles:
 
 
 def roles_by_file(path: Path, names: Sequence[str]) -> Roles:
-    """What the columns are by a mapping file, JSON or TOML.
+    """Find the roles of columns by a mapping file, in JSON or TOML.
 
     Raises:
-        OSError: it can't be read.
-        UnusableLog: it is no mapping, or names a column that the log lacks.
+        OSError: the file can't be read.
+        UnusableLog: the file is not a mapping, or names a column that the log does not have.
     """
     text = path.read_text(encoding="utf-8")
     try:
@@ -176,7 +201,7 @@ def roles_by_mapping(mapped: LogMapping, names: Sequence[str], where: str = "the
 
 
 def _mapped(content: Mapping[str, Any], where: str) -> LogMapping:
-    """The mapping; everything that is wrong with it is named at once."""
+    """Parse a mapping. The error names everything that is wrong with it."""
     if not isinstance(content, Mapping):
         raise UnusableLog(f"expected a table with the keys state and action in {where}, got {_short(content)}")
     try:
@@ -201,7 +226,8 @@ def _short(value: object) -> str:
 
 
 def _checked(roles: Roles) -> Roles:
-    """The roles, if there is a next state for every coordinate or for none, and a model may have as many."""
+    """Return the roles if they are consistent: at most ``MAX_DIMENSIONS`` states and actions, and next states of all
+    coordinates or of none. Otherwise raise ``UnusableLog``."""
     for what, found in (("states", roles.state), ("actions", roles.action)):
         if len(found) > MAX_DIMENSIONS:
             raise UnusableLog(f"expected at most {MAX_DIMENSIONS} {what}, got {len(found)}: choose by --map")
@@ -226,13 +252,13 @@ def _require(names: Iterable[str], state: Mapping[str, str], action: Mapping[str
 
 
 def _first(names: Iterable[str], known: Sequence[str]) -> str | None:
-    """The first known name; a single letter has to be the letter itself: t is a time, and T a temperature."""
+    """Return the first column with a known name. Case only matters for single letters: t is a time, T a temperature."""
     written = {name.lower() if len(name) > 1 else name: name for name in reversed(list(names))}
     return next((written[name] for name in known if name in written), None)
 
 
 def _part(match: re.Match[str] | None) -> str:
-    """The part of a name without its prefix or its ending."""
+    """Return the part of a column's name without the prefix or ending that marks its role."""
     return "" if match is None else next((part for part in match.groups() if part), "")
 
 

@@ -1,4 +1,4 @@
-"""A specification drafted from a log: what the data show, and a note for each thing that was concluded."""
+"""Draft a specification from a log, with a note for each conclusion from the data."""
 
 from __future__ import annotations
 
@@ -28,34 +28,34 @@ from surrogym_shared.spec import (
     Uniform,
 )
 
-MARGIN = 0.05  # of the width of the data, on each side of a sampling range
-SATURATED_ROWS = 5  # at an extreme, exactly: below, it is one like any other
-SATURATED_SHARE = 0.002
-MOST_DISCRETE = 16  # values of an action that is the number of a discrete one
+MARGIN = 0.05  # share of the data's width that a sampling range adds on each side
+SATURATED_ROWS = 5  # fewest steps that end exactly at an extreme value before it counts as a limit
+SATURATED_SHARE = 0.002  # the same as a share of all steps
+MOST_DISCRETE = 16  # most different values of a discrete action
 FULL_TURN = (0.9 * 2 * math.pi, 1.1 * 2 * math.pi)  # sizes of a jump that is a turn around the circle
-FEW_EPISODES = 2
-USUAL_LIMIT = 200  # steps of a virtual episode, where the log is a single one
+FEW_EPISODES = 2  # with fewer, a log shows neither starts nor a time limit
+USUAL_LIMIT = 200  # time limit of virtual episodes if the log has too few episodes to show one
 MOST_STARTS = 64
-FEW_STARTS = 8  # episodes of a log: fewer begin at too few places to train from
-FAR = 8.0  # widths of the middle half of the data, from its middle: a remark, no fault
+FEW_STARTS = 8  # with fewer episodes, a log begins at too few states to train from
+FAR = 8.0  # distance from the median, in widths of the middle half of the data, from which a note names a value
 
 
 @dataclass(frozen=True)
 class Draft:
-    """A specification, and what it was concluded from."""
+    """A drafted specification, with a note for each conclusion."""
 
     spec: EnvironmentSpec
     notes: tuple[str, ...]
 
 
 def draft(roles: Roles, steps: Transitions, name: str, budget: int = 0) -> Draft:
-    """Draft the specification of the environment that a log is of.
+    """Draft the specification of the environment that a log was recorded in.
 
     Args:
-        roles: what the columns are, and what of it was declared.
-        steps: its usable transitions, two at least.
-        name: what the environment is called.
-        budget: real steps that a design may ask for.
+        roles: roles of the columns, and declarations about them.
+        steps: usable transitions of the log, at least two.
+        name: name of the environment.
+        budget: real steps that a design may take in addition to the log.
 
     Raises:
         UnusableLog: no state ever moves, or an action never varies.
@@ -117,7 +117,8 @@ def _why(declared: bool, shown: str) -> str:
 
 
 def _turns(before: Floats, after: Floats) -> bool:
-    """Whether the values stay within a circle and jump around it, where other steps are less than half a turn."""
+    """Whether the values look like an angle in radians: within one turn, with jumps of a whole turn, and otherwise with
+    small steps."""
     change = np.abs(after - before)
     jumps = change > math.pi
     width = max(before.max(), after.max()) - min(before.min(), after.min())
@@ -126,7 +127,7 @@ def _turns(before: Floats, after: Floats) -> bool:
 
 
 def _bounds(roles: Roles, name: str, after: Floats, ends: tuple[float, float], notes: list[str]) -> Bounds | None:
-    """Declared limits, and extremes at which the data stay exactly."""
+    """Return the limits of a coordinate: declared ones, or extreme values at which many steps end exactly."""
     low, high = roles.limits.get(name, (None, None))
     shown = [end if _stays_at(after, end, ends) else None for end in ends]
     for side, end, declared in (("low", shown[0], low), ("high", shown[1], high)):
@@ -138,7 +139,7 @@ def _bounds(roles: Roles, name: str, after: Floats, ends: tuple[float, float], n
 
 
 def _stays_at(after: Floats, end: float, ends: tuple[float, float]) -> bool:
-    """Whether the share of steps that end exactly at an extreme shows a limit there."""
+    """Whether so many steps end exactly at the extreme value ``end`` that it must be a limit."""
     rows = int((after == end).sum())
     others = np.unique(after[(after != ends[0]) & (after != ends[1])], return_counts=True)[1]
     often = rows >= max(SATURATED_ROWS, SATURATED_SHARE * len(after))
@@ -146,7 +147,7 @@ def _stays_at(after: Floats, end: float, ends: tuple[float, float]) -> bool:
 
 
 def _start(coordinate: Coordinate, steps: Transitions, index: int) -> Uniform | Fixed:
-    """Starts of the log's episodes. If the log is a single episode, any of its states is a start."""
+    """Return the range of a coordinate at the starts of the log's episodes. With a single episode, all states count."""
     begins = steps.q[steps.first, index]
     values = begins if len(begins) >= FEW_EPISODES else steps.q[:, index]
     if coordinate.kind == "angle":
@@ -156,8 +157,11 @@ def _start(coordinate: Coordinate, steps: Transitions, index: int) -> Uniform | 
 
 
 def _starts(steps: Transitions, kept: list[int], coordinates: list[Coordinate]) -> tuple[tuple[float, ...], ...]:
-    """States that virtual episodes start at: where episodes of the log begin, or, if these are few, any states of it,
-    evenly spaced. A box around them would have corners where the log has never been."""
+    """Return the states that virtual episodes start at: those at which episodes of the log begin.
+
+    If the log has few episodes, these are evenly spaced states of the whole log. A box around the states would not do,
+    because its corners may lie where the log has never been.
+    """
     rows = np.flatnonzero(steps.first)
     if len(rows) < FEW_STARTS:
         rows = np.arange(len(steps))
@@ -170,7 +174,7 @@ def _starts(steps: Transitions, kept: list[int], coordinates: list[Coordinate]) 
 
 
 def _outside_reward(steps: Transitions, budget: int, notes: list[str]) -> float | None:
-    """The worst reward of the log, where nobody can ask what is beyond it."""
+    """Return the log's worst reward if the design takes no real steps; else None."""
     if budget or steps.reward is None:
         return None
     worst = float(steps.reward.min())
@@ -182,7 +186,7 @@ def _outside_reward(steps: Transitions, budget: int, notes: list[str]) -> float 
 
 
 def wrapped(angles: Floats) -> Floats:
-    """Angles in [-pi, pi)."""
+    """Wrap angles to [-pi, pi)."""
     return np.remainder(angles + np.pi, 2 * np.pi) - np.pi
 
 
@@ -250,7 +254,7 @@ def _about(roles: Roles, steps: Transitions) -> list[str]:
 
 
 def _remarks(values: Floats) -> list[str]:
-    """That something lies far from everything else."""
+    """Return a note if some values lie far from all others."""
     quarter, middle, three = np.quantile(values, [0.25, 0.5, 0.75])
     far: Bools = np.abs(values - middle) > FAR * (three - quarter) if three > quarter else np.zeros(0, dtype=np.bool_)
     if not far.any():
@@ -260,11 +264,12 @@ def _remarks(values: Floats) -> list[str]:
 
 
 def ending(count: int) -> str:
+    """Return a number of steps with its verb: 1 step ends, 2 steps end."""
     return f"{count} step ends" if count == 1 else f"{count} steps end"
 
 
 def limited(spec: EnvironmentSpec) -> Mapping[str, str]:
-    """A line for each coordinate and the action, for a person."""
+    """Describe the range of each coordinate and of the action in words, by name."""
     lines = {}
     for c in spec.coordinates:
         low, high = (c.sampling.low, c.sampling.high) if isinstance(c.sampling, Uniform) else c.sampling.limits

@@ -4,4 +4,4 @@ from __future__ import annotations
 
 
 class UnusableLog(ValueError):
-    """The log, its mapping or its columns can't be used; says what was expected and what came."""
+    """A log, its mapping or its columns can't be used. The message says what was expected and what came."""

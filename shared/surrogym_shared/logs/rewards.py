@@ -1,4 +1,4 @@
-"""A declared reward, evaluated on the steps of a log that has no column of it."""
+"""Compute a declared reward for the steps of a log that has no column of rewards."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from surrogym_shared.terms import evaluate, holds
 
 
 def declared_reward(spec: EnvironmentSpec, q: Floats, u: Floats, q_next: Floats, terminated: Bools) -> Floats:
-    """Declared rewards of n steps, (n,). Raises ``TypeError`` if the reward is learned."""
+    """Compute the declared rewards of n steps, (n,). Raises ``TypeError`` if the reward is learned."""
     reward = spec.reward
     if not isinstance(reward, DeclaredReward):
         raise TypeError(f"expected a declared reward, got a {reward.kind} one")
@@ -20,7 +20,7 @@ def declared_reward(spec: EnvironmentSpec, q: Floats, u: Floats, q_next: Floats,
 
 
 def _paid(spec: EnvironmentSpec, term: RewardTerm, q: Floats, u: Floats) -> Floats:
-    """weight * shape(of) where every inequality holds, else 0."""
+    """Compute one term of the reward (n,): weight * shape(of) if every inequality of ``when`` holds, else 0."""
     of = [
         (0.0 if one.term is None else evaluate(spec, one.term, q)) + (u @ np.array(one.action) if one.action else 0.0)
         for one in term.of

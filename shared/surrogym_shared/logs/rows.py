@@ -1,4 +1,4 @@
-"""Rows of a log as numbers, and what is wrong with each row by itself."""
+"""Rows of a log as numbers, with the faults that a row shows by itself."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from surrogym_shared.logs.columns import Roles
 from surrogym_shared.logs.table import Bools, Floats, Ints, Table, flags, groups, numbers, times
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
 
-SLACK = 1e-6  # of a range: what a number in single precision may be off
+SLACK = 1e-6  # share of a range by which a value may exceed it: the rounding of single precision
 Ends = Mapping[str, tuple[float | None, float | None]]
 
 
@@ -22,13 +22,13 @@ class Rows:
     Attributes:
         q: states, (n, C).
         u: actions, (n, F).
-        following: next states, (n, C), where the log has columns of them.
-        reward: (n,), where it has a column.
-        terminated, truncated: (n,).
-        episode: a number for each episode, (n,), where it has a column.
-        time: (n,), where it has a column.
-        faults: the reason for each row that can't be used by itself.
-        sound: rows whose state can be used, (n,): as the next state of the row before, if for nothing else.
+        following: next states, (n, C); None if the log has no columns of them.
+        reward: rewards, (n,); None without a column.
+        terminated, truncated: whether the episode ended with the row, (n,).
+        episode: number of the episode, (n,); None without a column.
+        time: times, (n,); None without a column.
+        faults: reason for each row that can't be used, by the row's index.
+        sound: whether the row's state can be used, (n,), at least as the next state of the row before.
     """
 
     roles: Roles
@@ -49,7 +49,7 @@ class Rows:
 
 
 def rows_of(table: Table, roles: Roles, spec: EnvironmentSpec | None = None) -> Rows:
-    """The rows as numbers. Limits are those of the specification, and without one those of the mapping."""
+    """Convert the rows to numbers, and check them against the limits of the specification, or else of the mapping."""
     faults: dict[int, list[str]] = {row: [reason] for row, reason in table.faults.items()}
     whole = np.ones(len(table), dtype=np.bool_)
     whole[list(table.faults)] = False
@@ -88,7 +88,7 @@ def rows_of(table: Table, roles: Roles, spec: EnvironmentSpec | None = None) -> 
 
 
 def _matrix(table: Table, columns: Mapping[str, str], ends: Ends) -> tuple[Floats, dict[int, str]]:
-    """Columns as numbers (n, k), and the first thing that is wrong in each row."""
+    """Convert columns to numbers (n, k). Also returns the first fault of each row, by the row's index."""
     values, faults = [], dict[int, str]()
     for name, column in columns.items():
         cells, faulty = numbers(column, table.columns[column])
@@ -99,7 +99,7 @@ def _matrix(table: Table, columns: Mapping[str, str], ends: Ends) -> tuple[Float
 
 
 def _beyond(column: str, cells: Floats, low: float | None, high: float | None) -> dict[int, str]:
-    """The reason for each cell that leaves its ends."""
+    """Return a reason for each cell outside its limits, by the row's index."""
     least, most = -np.inf if low is None else low, np.inf if high is None else high
     ends = [end for end in (least, most) if np.isfinite(end)]
     width = most - least if len(ends) == 2 else max([1.0, *map(abs, ends)])

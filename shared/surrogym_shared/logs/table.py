@@ -1,4 +1,4 @@
-"""A log as it was read: named columns of cells that nobody has interpreted yet, and cells as numbers."""
+"""A log as it was read: named columns of cells, and functions that convert cells to numbers."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ MAX_MEASURED = 1e30  # the server takes no larger number
 
 @dataclass(frozen=True)
 class Table:
-    """n rows.
+    """A log of n rows.
 
     Attributes:
-        columns: cells by name, (n,) each; text in a CSV file, numbers elsewhere.
-        lines: where each row stands in its file, (n,): the line of a CSV file, else the number of the row from 1.
-        faults: what is wrong with a row as a whole, by row.
-        cells: the row as it stands in the file, where that is text.
-        delimiter: between two cells of that text.
-        ignored: arrays of the file that are no columns, with the reason.
+        columns: cells of each column (n,), by the column's name; text if the log is CSV, otherwise numbers.
+        lines: line of each row in a CSV file, (n,); in other files the number of the row, from 1.
+        faults: reason for each row that can't be read as a whole, by the row's index.
+        cells: cells of each row as text, as in the file; empty if the log is not text.
+        delimiter: character between two cells of the text.
+        ignored: reason for each array of the file that is not a column, by its name.
     """
 
     columns: dict[str, Cells]
@@ -47,21 +47,24 @@ class Table:
         return tuple(self.columns)
 
     def row(self, index: int) -> list[str]:
-        """A row as text."""
+        """Return the cells of a row as text."""
         if len(self.cells):
             return list(self.cells[index])
         return [str(column[index]) for column in self.columns.values()]
 
 
 def numbers(name: str, cells: Cells) -> tuple[Floats, dict[int, str]]:
-    """Cells as numbers (n,), NaN where they are none, and the reason for each of those."""
+    """Convert cells to numbers (n,). A cell that is not a number gives NaN, and a reason by the row's index."""
     values = _plain(cells) if cells.dtype.kind in "biuf" else _parsed(cells)
     unusable = np.flatnonzero(~(np.abs(values) <= MAX_MEASURED))
     return values, {int(row): f"{name}: {_reason(cells[row], values[row])}" for row in unusable}
 
 
 def times(name: str, cells: Cells) -> tuple[Floats, dict[int, str]]:
-    """Times (n,) in seconds, or in the column's own unit: numbers, dates of NumPy, or text as ISO 8601 has it."""
+    """Convert cells to times (n,), with a reason for each cell that is none.
+
+    Dates of NumPy and text in ISO 8601 become seconds. Numbers keep the column's own unit.
+    """
     if cells.dtype.kind == "M":
         seconds = cells.astype("datetime64[ns]").astype(np.int64) / 1e9
         values = np.where(np.isnat(cells), np.nan, seconds)
@@ -79,7 +82,7 @@ def times(name: str, cells: Cells) -> tuple[Floats, dict[int, str]]:
 
 
 def flags(name: str, cells: Cells) -> tuple[Bools, dict[int, str]]:
-    """Yes or no (n,): 1 and 0, true and false; and the reason for each cell that is neither."""
+    """Convert cells such as 1, 0, true and false to booleans (n,), with a reason for each cell that is neither."""
     if cells.dtype.kind not in "biuf":
         words = {**dict.fromkeys(TRUE, "1"), **dict.fromkeys(FALSE, "0")}
         cells = np.array([words.get(str(cell).strip().lower(), str(cell)) for cell in cells], dtype=np.str_)
@@ -90,7 +93,7 @@ def flags(name: str, cells: Cells) -> tuple[Bools, dict[int, str]]:
 
 
 def groups(cells: Cells) -> Ints:
-    """A number for each different cell (n,), in the order of first appearance; a row with an empty cell is alone."""
+    """Number the different cells in the order of their first appearance, (n,). Each empty cell has its own number."""
     codes: dict[str, int] = {}
     found = np.zeros(len(cells), dtype=np.int64)
     for row, cell in enumerate(cells):

@@ -1,4 +1,4 @@
-"""A log as text: CSV with a heading."""
+"""Read a log from text: CSV with a heading."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ LONGEST_NAME = 200  # letters
 
 
 def table_of_text(text: str, where: str, most_rows: int | None = None) -> Table:
-    """A table of text with a heading; separated by commas, semicolons or tabs.
+    """Read a table from CSV whose cells are separated by commas, semicolons or tabs.
 
     Args:
         text: the log.
-        where: it comes from, for messages.
-        most_rows: that it may have; None for any number.
+        where: source of the text, for messages.
+        most_rows: largest number of rows; None for any number.
 
     Raises:
-        UnusableLog: no heading, a column twice, or more than a log may have.
+        UnusableLog: the text has no heading, two columns of the same name, or too many rows or columns.
     """
     heading = text.partition("\n")[0]
     delimiter = max(DELIMITERS, key=heading.count)

@@ -1,4 +1,4 @@
-"""A log without enough usable steps: why, by the most frequent reason."""
+"""Error for a log with too few usable steps. It names the most frequent reason."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DECIMAL_COMMA = re.compile(r"^\s*[-+]?\d+,\d+\s*$")
 
 
 class TooFewSteps(UnusableLog):
-    """No model can be fitted to the usable steps of a log; has its rows, with the reason of each rejected one."""
+    """A log has too few usable steps. The error carries the log, and the reason of each rejected row."""
 
     def __init__(self, message: str, table: Table, steps: Transitions) -> None:
         super().__init__(message)
@@ -25,7 +25,7 @@ class TooFewSteps(UnusableLog):
 
 
 def require_steps(table: Table, steps: Transitions, least: int) -> None:
-    """Raise ``TooFewSteps``, with what was found in the log, where it has fewer usable steps than needed."""
+    """Raise ``TooFewSteps`` if the log has fewer than ``least`` usable steps. The message says what the log has."""
     if len(steps) >= least:
         return
     wanted = "two usable steps" if least == 2 else "one usable step"
@@ -52,15 +52,15 @@ def require_steps(table: Table, steps: Transitions, least: int) -> None:
 
 
 def _kind(reason: str) -> str:
-    """A reason without the value that came, and without the line that it names."""
+    """Return a reason without its value and line, so that equal kinds of faults compare as equal."""
     return re.sub(r"line \d+", "line", reason.partition(", got")[0])
 
 
 def counted(count: int, noun: str) -> str:
-    """A number with its noun: 1 row, 2 rows."""
+    """Return a number with its noun: 1 row, 2 rows."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def has(count: int, noun: str) -> str:
-    """The same with its verb: 1 row has, 2 rows have."""
+    """Return a number with its noun and verb: 1 row has, 2 rows have."""
     return f"{counted(count, noun)} {'has' if count == 1 else 'have'}"

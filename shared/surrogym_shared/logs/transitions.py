@@ -1,4 +1,4 @@
-"""Rows to transitions: which row follows which, and which rows contradict the others."""
+"""Convert rows to transitions: find which row follows which, and which rows contradict others."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ ONE_INTERVAL = 0.5  # a step's time may differ from the sampling interval by thi
 
 @dataclass(frozen=True)
 class Transitions:
-    """m steps that can be used, in the order of the log.
+    """The m usable steps of a log, in the order of the log.
 
     Attributes:
-        row: their rows in the log, (m,).
-        q, u, q_next: (m, C), (m, F), (m, C).
-        reward: (m,); None where the log has none.
-        terminated, truncated: (m,).
-        first: whether an episode of the log begins with it, (m,).
-        episodes: rows of each episode.
-        rejected: the reason for each row that was set aside, by row.
-        ends: rows that only end an episode or stand before a gap: they have no next state.
-        interval: between two rows, in the unit of the time column; None without one.
+        row: index of each step's row in the log, (m,).
+        q, u, q_next: state (m, C), action (m, F) and next state (m, C).
+        reward: rewards, (m,); None if the log has none.
+        terminated, truncated: whether the episode ended with the step, (m,).
+        first: whether an episode of the log begins with the step, (m,).
+        episodes: number of rows of each episode.
+        rejected: reason for each row that was set aside, by the row's index.
+        ends: number of rows without a next state, because an episode ends there or a gap in time follows.
+        interval: median time between two rows, in the unit of the time column; None without such a column.
     """
 
     row: Ints
@@ -49,7 +49,7 @@ class Transitions:
 
     @property
     def digest(self) -> str:
-        """Hash of the numbers: equal for equal transitions, whatever file they came in."""
+        """Hash of the numbers. Equal transitions have equal hashes, even if they come from different files."""
         sha = hashlib.sha256()
         for array in (self.q, self.u, self.q_next, self.reward, self.terminated, self.truncated):
             sha.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
@@ -57,7 +57,7 @@ class Transitions:
 
 
 def transitions_of(rows: Rows) -> Transitions:
-    """The transitions of a log, each row that can't be used with its reason."""
+    """Find the usable transitions of a log, and a reason for each row that can't be used."""
     rejected = dict(rows.faults)
     _reject(rejected, _duplicates(rows, rejected))
     episode = _episodes(rows)
@@ -95,7 +95,7 @@ def _reject(rejected: dict[int, str], found: dict[int, str]) -> None:
 
 
 def _duplicates(rows: Rows, rejected: dict[int, str]) -> dict[int, str]:
-    """Rows that repeat an earlier one in every number, its time and episode included."""
+    """Find rows that repeat an earlier row in every number, including time and episode."""
     parts: list[Floats | Ints | Bools | None] = [rows.q, rows.u, rows.following, rows.reward, rows.time, rows.episode]
     columns = [part.reshape(len(rows), -1).astype(np.float64) for part in parts if part is not None]
     whole = np.ascontiguousarray(np.concatenate([*columns, rows.terminated[:, None]], 1))
@@ -109,7 +109,10 @@ def _duplicates(rows: Rows, rejected: dict[int, str]) -> dict[int, str]:
 
 
 def _episodes(rows: Rows) -> Ints:
-    """The number of each row's episode, (n,): its column's, or a new one after an end and where the clock restarts."""
+    """Return the number of each row's episode, (n,).
+
+    Without a column of episodes, a new episode begins after each end, and where the time starts again.
+    """
     if rows.episode is not None:
         return rows.episode
     begins = np.zeros(len(rows), dtype=np.int64)
@@ -123,7 +126,7 @@ def _episodes(rows: Rows) -> Ints:
 
 
 def _backwards(rows: Rows, episode: Ints, order: Iterable[int], rejected: dict[int, str]) -> dict[int, str]:
-    """Rows whose time does not come after that of the row before in their episode."""
+    """Find rows whose time is not later than that of the row before in their episode."""
     if rows.time is None:
         return {}
     latest: dict[int, int] = {}
@@ -143,7 +146,7 @@ def _backwards(rows: Rows, episode: Ints, order: Iterable[int], rejected: dict[i
 
 
 def _going_on(rows: Rows, follower: dict[int, int], rejected: dict[int, str]) -> dict[int, str]:
-    """Rows that say their episode ended while another row of it follows."""
+    """Find rows that are marked as the end of their episode, although another row of the episode follows."""
     return {
         row: f"{rows.roles.terminated}: expected 0, as line {rows.lines[after]} continues the episode, got 1"
         for row, after in follower.items()
@@ -152,7 +155,7 @@ def _going_on(rows: Rows, follower: dict[int, int], rejected: dict[int, str]) ->
 
 
 def _interval(rows: Rows, follower: dict[int, int], rejected: dict[int, str]) -> float | None:
-    """The median time between rows that follow each other."""
+    """Return the median time between a row and the row that follows it; None without a column of times."""
     if rows.time is None or not follower:
         return None
     pairs = [(a, b) for a, b in follower.items() if a not in rejected and b not in rejected]
@@ -161,7 +164,10 @@ def _interval(rows: Rows, follower: dict[int, int], rejected: dict[int, str]) ->
 
 
 def _paired(rows: Rows, follower: dict[int, int], rejected: dict[int, str], interval: float | None) -> dict[int, int]:
-    """For each row that has a next state, the row that has it: itself where the log has columns of next states."""
+    """Return, for each row that has a next state, the row that contains it.
+
+    If the log has columns of next states, this is the row itself, otherwise the row that follows.
+    """
     if rows.following is not None:
         return {row: row for row in range(len(rows)) if row not in rejected}
     paired = {}
@@ -177,7 +183,7 @@ def _paired(rows: Rows, follower: dict[int, int], rejected: dict[int, str], inte
 
 
 def _firsts(episode: Ints, order: list[int]) -> Iterable[tuple[int, bool]]:
-    """Rows of the order, and whether each is the first of its episode."""
+    """Return the rows in the given order, each with whether it is the first of its episode."""
     seen: set[int] = set()
     for row in order:
         number = int(episode[row])

@@ -1,4 +1,4 @@
-"""Columns in another unit than the specification has."""
+"""Detect columns of a log that are in another unit than the specification's."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.table import Floats
 from surrogym_shared.spec import EnvironmentSpec, limits
 
-BEYOND = 20.0  # widths of its range from the middle, for the middle value of a column: no plant strays so far
+BEYOND = 20.0  # distance outside a coordinate's range, in widths of the range, that no real plant reaches
 
 
 def require_units(q: Floats, spec: EnvironmentSpec) -> None:
-    """Refuse states q (n, C) whose columns are in other units than the coordinates.
+    """Refuse states q (n, C) with a column that seems to be in another unit than its coordinate.
 
     Raises:
-        UnusableLog: the middle half of a column lies far beyond the range of its coordinate.
+        UnusableLog: the middle half of a column lies far outside the coordinate's range, or is far wider than it.
     """
     for index, coordinate in enumerate(spec.coordinates):
         column = q[np.isfinite(q[:, index]), index]
