@@ -271,7 +271,7 @@ def _name_lacking(definitions: Definitions) -> None:
 
 
 def _define(spec: dict[str, Any]) -> EnvironmentDefinition:
-    """Of a new specification, as JSON: the wire has checked what comes in."""
+    """Convert a new specification, as JSON, to a definition. The wire types have checked it."""
     return definition_from_spec(EnvironmentSpec.model_validate(spec))
 
 

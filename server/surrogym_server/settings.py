@@ -24,7 +24,7 @@ LogLevel = Literal["critical", "error", "warning", "info", "debug"]
 
 
 class Settings(BaseModel):
-    """What a server is started with. Every field can be given as ``SURROGYM_<FIELD>``."""
+    """Settings of a server. Every field can be given as ``SURROGYM_<FIELD>``."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
 

@@ -95,7 +95,7 @@ class ActingPolicy:
 
     @classmethod
     def of(cls, network: Network) -> Self:
-        """Make a policy of a network's most probable actions."""
+        """Make a policy that takes a network's most probable actions."""
         return cls(network.mean, network.deviation, network.layers, network.activation)
 
     @property

@@ -300,8 +300,10 @@ def _telling(update: Update, episodes: int) -> Progress:
 
 
 def _ledger(surrogate: str | None, server: str | None, card: PolicyCard, noted_in: Path, *, quiet: bool) -> str | None:
-    """Name of the surrogate whose ledger counts the real steps. None if only the card names a server, which is not
-    trusted."""
+    """Return the name of the surrogate whose ledger counts the real steps; None if no server may be contacted.
+
+    An address that only the policy's card names is never contacted, unless it is the default one of this machine.
+    """
     from surrogym_client.transport.connection import DEFAULT_URL
     from surrogym_shared.terminal import say
 

@@ -118,7 +118,7 @@ def _composed(drawn: list[Image], headings: list[str], caption: str) -> Image:
 
 
 def _mp4(frames: Iterator[Image], fps: int) -> bytes:
-    """Raises ``ImportError``, ``RuntimeError`` or ``OSError`` where ffmpeg is missing or fails."""
+    """Encode frames as MP4. Raises ``ImportError``, ``RuntimeError`` or ``OSError`` if ffmpeg is missing or fails."""
     import imageio_ffmpeg
 
     first = next(frames)

@@ -34,8 +34,10 @@ class NotedAddress(RootModel[str]):
 
 
 class PolicyCard(BaseModel):
-    """What a policy was trained for, its settings and its results. Stored in a JSON file of the same name beside the
-    policy."""
+    """Card of a policy: what it was trained for, its settings and its results.
+
+    It is stored in a JSON file of the same name beside the policy.
+    """
 
     model_config = ConfigDict(extra="ignore", frozen=True)  # the file has fields that are not read here
 

@@ -1,4 +1,4 @@
-"""Types of what acts in episodes: observations in, actions out."""
+"""Types of policies and controllers: functions from observations to actions."""
 
 from __future__ import annotations
 

@@ -162,7 +162,8 @@ def _certain(real: EvaluationDetail, other: EvaluationDetail, same: int) -> str:
 
 
 def _from_one_start(known: Known, real: EvaluationDetail, others: Sequence[EvaluationDetail]) -> str:
-    """One episode of each from the same state; nothing where those are not known."""
+    """Return a picture of one episode of each controller, all from the same start; empty if such episodes are
+    unknown."""
     pairs = [(_paired(real), "with the controller"), *((_paired(one), SHORT_NAMES[one.controller]) for one in others)]
     shown = [(name, trace) for trace, name in pairs if trace is not None]
     if len(shown) < 2 or len({trace.seed for _, trace in shown}) > 1:

@@ -61,7 +61,7 @@ def picture(image: str, alt: str) -> str:
 
 
 def moving(kind: str, content: bytes, alt: str) -> str:
-    """A video, or an animated picture, inside the page. ``kind`` is its media type."""
+    """Return HTML that embeds a video or an animated picture in the page. ``kind`` is its media type."""
     source = f"data:{kind};base64,{base64.b64encode(content).decode()}"
     if kind.startswith("image/"):
         return f'<img alt="{escape(alt)}" src="{source}">'

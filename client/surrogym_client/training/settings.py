@@ -71,12 +71,13 @@ class TrainSettings:
 def chosen_for(view: SurrogateView, settings: TrainSettings, *, by_mean: bool = False) -> TrainSettings:
     """Return settings adapted to the phase that the surrogate's design ended in.
 
-    If repeated steps have shown that the original environment is noisy, the learned noise moves the lanes. If the
-    design is not ready, the policy learns on draws, one state for each lane (TS1 of Chua et al. 2018), because a policy
-    that relies on an uncertain mean fails in the original environment. Policies are compared along drawn functions of
-    the posterior: independent draws would shake a lane out of a state in which the policy would remain. A variant in
-    ``settings`` is kept, and preset ``paper`` has AUR-D. If a specification penalises leaving the states of a log, no
-    episode starts outside of them.
+    - If repeated steps have shown that the original environment is noisy, the learned noise is added to the state.
+    - If the design is not ready, each step of a lane goes to a new draw from the model's prediction (TS1 of Chua et al.
+      2018), because a policy that relies on an uncertain mean fails in the original environment. Policies are then
+      compared along drawn functions of the posterior: independent draws would shake a lane out of a state in which the
+      policy would remain.
+    - If the specification penalises leaving the states of a log, no episode starts outside of them.
+    - A variant in ``settings`` is kept. With preset ``paper`` the settings are returned unchanged.
 
     Args:
         view: the surrogate.

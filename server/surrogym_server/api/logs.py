@@ -31,7 +31,7 @@ KIBIBYTES = 5 * 1024  # letters of a log, and what JSON adds to them
     responses=documented(Code.INVALID_REQUEST, Code.TOO_LARGE, Code.TOO_MANY_REQUESTS),
 )
 async def draft(body: Annotated[DraftLog, example(examples.DRAFT_LOG)], request: Request) -> DraftedLog:
-    """Each row is checked, and a specification is drafted from those that can be used. Nothing is stored."""
+    """Check each row of a log, and draft a specification from the usable ones. Nothing is stored."""
     turns: Turns = request.app.state.log_turns
     return await turns.take(request, lambda: convert.drafted_report(convert.drafted_log(body)))
 
@@ -44,7 +44,7 @@ async def draft(body: Annotated[DraftLog, example(examples.DRAFT_LOG)], request:
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST, Code.TOO_LARGE, Code.TOO_MANY_REQUESTS),
 )
 async def add(name: str, body: Annotated[AddLog, example(examples.ADD_LOG)], request: Request, use: Use) -> AddedLog:
-    """Each row is checked against the surrogate's specification. The usable ones are stored as ``logged`` samples,
+    """Check each row of a log against the surrogate's specification. The usable ones are stored as ``logged`` samples,
     unless ``check_only``. A step that equals a stored one in every number is a duplicate, so a repeat is harmless."""
     turns: Turns = request.app.state.log_turns
     return await turns.take(request, lambda: _added(name, body, use))

@@ -44,7 +44,7 @@ POINT_ERRORS = documented(
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def list_all(name: str, use: Use) -> ModelList:
-    """Every fit with its fidelity, oldest first."""
+    """List all versions of the model with their fidelity, oldest first."""
     return ModelList(models=[convert.model_view(record) for record in use.models.list(name)])
 
 
@@ -59,7 +59,7 @@ def list_all(name: str, use: Use) -> ModelList:
     },
 )
 def get(name: str, version: int, use: Use, format: Literal["json", "safetensors"] = "json") -> ModelView | Response:
-    """A model's structure and fidelity. With ``format=safetensors`` the complete model itself."""
+    """Return a model's structure and fidelity, or with ``format=safetensors`` the complete model as a file."""
     if format == "json":
         return convert.model_view(use.models.get(name, version))
     return Response(use.models.export(name, version), media_type=SAFETENSORS)
@@ -74,7 +74,7 @@ def get(name: str, version: int, use: Use, format: Literal["json", "safetensors"
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST, Code.TOO_LARGE, Code.NOT_INSTALLED),
 )
 async def add(name: str, request: Request, use: Use) -> ModelView:
-    """Import a file of the export with the same outputs. It becomes the newest version."""
+    """Import a model from an exported file that has the same outputs. It becomes the newest version."""
     data = await request.body()
     return convert.model_view(await run_in_threadpool(use.models.add, name, data))
 
@@ -88,7 +88,7 @@ async def add(name: str, request: Request, use: Use) -> ModelView:
 async def query_uncertainty(
     name: str, body: Annotated[Points, example(examples.POINTS)], request: Request, use: Use
 ) -> Uncertainty:
-    """For each point and output: mean, deviation, model uncertainty (eq. 10), input probability (eq. 11) and
+    """Return for each point and output: mean, deviation, model uncertainty (eq. 10), input probability (eq. 11) and
     uncertainty index (eq. 12) of Active Uncertainty Reduction."""
     q, u = convert.numbers("coordinates", body.coordinates), convert.numbers("action", body.action)
     said = await _in_turn(request, lambda: use.models.query_uncertainty(name, q, u, body.model))

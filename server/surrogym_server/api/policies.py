@@ -66,7 +66,8 @@ def add(name: str, body: Annotated[AddPolicy, example(examples.POLICY)], use: Us
 
 @router.get("/{which}", summary="One policy", dependencies=[READ], responses=documented(*THERE))
 def get(name: str, which: Which, use: Use) -> PolicyDetail:
-    """A policy with the settings and the curve of its training. ``which`` is a version, an alias, or ``latest``."""
+    """Return a policy with the settings and the curve of its training. ``which`` is a version, an alias, or
+    ``latest``."""
     return convert.policy_detail(use.policies.get(name, which))
 
 
@@ -111,7 +112,8 @@ async def put_file(
     responses={200: {"content": {BINARY: {}}}, **documented(*THERE, Code.DAMAGED)},
 )
 def file(name: str, which: Which, form: PolicyForm, use: Use) -> Response:
-    """The file as it was sent. A program that loads a zip should never unpickle content that it does not trust."""
+    """Download a file as it was sent. A program that loads a zip should never unpickle content that it does not
+    trust."""
     version, content = use.policies.file(name, which, form)
     disposition = f'attachment; filename="{name}-{version}.{form}"'
     media_type = MEDIA_TYPES.get(form, BINARY)
@@ -141,7 +143,8 @@ def evaluation(
     use: Use,
     traces: Annotated[bool, Query(description="whether the reply has traces too; they are most of its bytes")] = True,
 ) -> EvaluationDetail:
-    """An evaluation with the return of each episode, and traces of some. ``missing`` says why they can't be read."""
+    """Return an evaluation with the return of each episode, and traces of some. ``missing`` says why they can't be
+    read."""
     return convert.evaluation_detail(*use.policies.episodes(name, which, id), traces=traces)
 
 

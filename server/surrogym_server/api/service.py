@@ -20,7 +20,7 @@ router = APIRouter(tags=["service"], route_class=DoorRoute)
 @router.head("/healthz", include_in_schema=False, dependencies=[PUBLIC])
 @router.get("/healthz", summary="That the process lives", dependencies=[PUBLIC])
 async def healthz(request: Request) -> Health:
-    """Whether the process runs. Needs no token and no database."""
+    """Answer 200 as long as the process runs. This needs no token and no database."""
     return Health(version=request.app.version)
 
 
@@ -35,7 +35,7 @@ def readyz(use: Use) -> Ready:
 
 @router.get("/v1/access", summary="What the caller may do", dependencies=[READ])
 async def access(request: Request) -> Access:
-    """The role of the request's token."""
+    """Return the role of the request's token."""
     gate: Gate = request.app.state.gate
     token = bearer_token(request.scope)
     return Access(role="admin" if gate.open or token is None else gate.role_of(token), tokens=not gate.open)

@@ -46,36 +46,37 @@ SESSION_ERRORS = (Code.UNKNOWN_SESSION, Code.SESSION_EXPIRED, Code.INVALID_REQUE
     ),
 )
 async def open_session(name: str, body: Annotated[OpenSession, example(examples.OPEN)], use: Use) -> SessionView:
-    """N lanes with a seed, a variant and an autoreset mode. The reply names the spaces and the seed."""
+    """Open a session: N lanes with one seed, variant and autoreset mode. The reply has the spaces and the seed."""
     session = await use.sessions.open(name, convert.opening(body))
     return convert.session_view(session, use.sessions.idle_seconds, use.sessions.replay)
 
 
 @router.get(
     "/surrogates/{name}/sessions",
-    summary="What the sessions do",
+    summary="Activity of the sessions",
     dependencies=[READ],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 async def list_sessions(name: str, use: Use) -> SessionList:
-    """Those that are open: steps, imagined returns, and what the penalty took. Counted since this process started."""
+    """List the open sessions of a surrogate, with the virtual steps, imagined returns and penalties of each, counted
+    since the server started."""
     return SessionList(sessions=[convert.session_activity(activity) for activity in await use.sessions.activity(name)])
 
 
 @router.get("/sessions/{id}", summary="One session", dependencies=[TRAIN], responses=documented(*SESSION_ERRORS))
 async def get_session(id: str, use: Use) -> SessionView:
-    """Its settings, the last seq answered, and the model version of each lane."""
+    """Return a session's options, the last ``seq`` that was answered, and the model version of each lane."""
     return convert.session_view(await use.sessions.get(id), use.sessions.idle_seconds, use.sessions.replay)
 
 
 @router.get(
     "/sessions/{id}/coordinates",
-    summary="Where the lanes are",
+    summary="Coordinates of the lanes",
     dependencies=[TRAIN],
     responses=documented(*SESSION_ERRORS),
 )
 async def session_coordinates(id: str, use: Use) -> SessionCoordinates:
-    """The coordinates of every lane, as the original environment can be set to them."""
+    """Return the present coordinates of every lane, in the form to which the original environment can be set."""
     return convert.session_coordinates(await use.sessions.coordinates(id))
 
 
@@ -87,7 +88,7 @@ async def session_coordinates(id: str, use: Use) -> SessionCoordinates:
     responses=documented(Code.INVALID_REQUEST),
 )
 async def close_session(id: str, use: Use) -> Response:
-    """Closing one that has ended is harmless."""
+    """Close a session. This is harmless if the session has ended already."""
     await use.sessions.close(id)
     return Response(status_code=204)
 
@@ -101,7 +102,8 @@ async def close_session(id: str, use: Use) -> Response:
 async def submit_occupancy(
     id: str, body: Annotated[SubmitOccupancy, example(examples.OCCUPANCY)], use: Use
 ) -> SubmittedOccupancy:
-    """Under a name, for ``improve`` to weigh by; says how well the model is known there. Only a session opened with
-    ``occupancy`` collects them."""
+    """Store the states that a session has visited under a name, by which ``improve`` can weigh its queries. The reply
+    has the model's confidence index over these states. Only a session that was opened with ``occupancy`` collects
+    them."""
     states, index = await use.sessions.submit_occupancy(id, body.checkpoint)
     return SubmittedOccupancy(checkpoint=body.checkpoint, states=states, confidence_index=index)

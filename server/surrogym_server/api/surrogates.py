@@ -84,7 +84,7 @@ def list_all(
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def get(name: str, use: Use) -> SurrogateView:
-    """Phase, fidelity of every output, ledger of real steps, and counts of queries."""
+    """Return a surrogate's phase, the fidelity of every output, its ledger of real steps, and counts of its queries."""
     return convert.surrogate_view(use.surrogates.status(name))
 
 
@@ -124,8 +124,8 @@ def improve(
     name: str, body: Annotated[Improve, example(examples.IMPROVE)], request: Request, use: Use
 ) -> ImprovedSurrogate:
     """Request more queries from the design, chosen by the acquisition and weighted by the states that policies visited
-    and submitted. The budget must hold them, besides the steps that were taken, requested or promised before. A token
-    of role ``admin`` raises the budget, and ``budget_raised_by`` is the increase."""
+    and submitted. The budget must have room for them: steps that were taken, requested or reserved before count as
+    used. For a token of role ``admin`` the budget is raised if needed, and ``budget_raised_by`` is the increase."""
     may_raise = role_of(request.scope) == "admin"
     granted = use.designer.improve(name, body.queries, body.checkpoint, body.idempotency_key, raise_budget=may_raise)
     return convert.improved(use.surrogates.status(name), granted.raised)

@@ -16,7 +16,8 @@ T = TypeVar("T")
 
 
 class Turns:
-    """Lets ``at_work`` requests run, each in a thread, and ``waiting`` wait for their turn."""
+    """Limit on requests of one kind: ``at_work`` run at once, each in a thread, and ``waiting`` more wait for their
+    turn."""
 
     def __init__(self, what: str, at_work: int, waiting: int) -> None:
         """``what`` names the requests, for the message of a refusal."""

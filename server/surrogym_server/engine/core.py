@@ -176,8 +176,8 @@ def visited_states(session: Session) -> Array:
     """The states that a session visited, (v, C).
 
     Raises:
-        InvalidInput: it was opened without occupancy.
-        NotReset: it has visited no state yet.
+        InvalidInput: the session was opened without occupancy.
+        NotReset: the session has visited no state yet.
     """
     if session.visited is None:
         raise InvalidInput("expected a session opened with occupancy=true, got one without")

@@ -27,7 +27,7 @@ Function = Callable[[DesignJob], DesignResult]
 
 @dataclass(frozen=True)
 class Failure:
-    """What a job raised, as words: the exception itself may be one that can't be sent, or that ends who receives it."""
+    """Error of a job, as text. The exception itself might not pickle, or might end the process that receives it."""
 
     kind: type[PluginFailed]
     said: str
@@ -91,7 +91,7 @@ class Fits(Compute):
 
 
 class _Process:
-    """A pool of one process, which ends with this one.
+    """A pool of one process for fits. Its process ends when this process ends.
 
     The process holds one end of a pipe whose other end is here and never written. When this process dies and its end
     closes, the other process ends at once, even in the middle of a fit.

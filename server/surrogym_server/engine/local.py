@@ -137,7 +137,7 @@ class LocalEngine(SessionEngine):
         self.end(session)
 
     def end(self, session: str) -> None:
-        """As ``close``, in this call."""
+        """End a session, like ``close``, but without waiting for the event loop."""
         self._live.close(session)
 
     def session(self, id: str) -> Session:

@@ -217,13 +217,16 @@ def _prior(hyper: Hyperparameters, inputs: Sequence[int], width: int) -> Tensor:
 
 
 def _squares_alone(coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The arguments for ``_in_z`` of a function sum_j c_j x_j^2."""
+    """Return the first three arguments of ``_in_z`` for the function sum_j c_j x_j^2, with coefficients c (d,)."""
     column = coefficients[:, None]
     return torch.zeros_like(column), column, coefficients.new_zeros(1)
 
 
 def _in_z(linear: Tensor, quadratic: Tensor, constant: Tensor, inputs: Sequence[int], width: int) -> Tensor:
-    """Coefficients of a function of some inputs, (d, n), (d, n) and (n,), as rows of z: (2 width + 1, n)."""
+    """Arrange the coefficients of n quadratic functions of some inputs as columns for the entries of z.
+
+    Shapes: linear (d, n), quadratic (d, n), constant (n,), result (2 width + 1, n).
+    """
     rows = linear.new_zeros(2 * width + 1, linear.shape[1])
     at = torch.tensor(inputs, device=linear.device)
     rows[at], rows[width + at], rows[-1] = linear, quadratic, constant

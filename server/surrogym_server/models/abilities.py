@@ -181,7 +181,7 @@ class Lookahead(ABC):
     def outlook(self, candidates: Points, reference: Points, assumed: Points) -> tuple[OutputOutlook | None, ...]:
         """Forecast every output (O,) at m candidates and r reference points, once the queries ``assumed`` are answered.
 
-        An output that never varied has None.
+        The entry of an output that never varied is None.
         """
 
     @abstractmethod

@@ -63,8 +63,10 @@ class Definitions:
         return definition
 
     def lacking(self) -> list[str]:
-        """One sentence for each stored surrogate that needs a package which is not installed. Unreadable ones are left
-        out."""
+        """Return a sentence for each stored surrogate that needs a package which is not installed.
+
+        Surrogates whose specification can't be read are left out.
+        """
         found = []
         for summary in self._storage.surrogates.summaries():
             try:

@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 
 
 class SessionService:
-    """What sessions need of storage, beside their engine."""
+    """Opens, describes, saves and restores sessions. It connects their engine with the storage."""
 
     def __init__(self, storage: Storage, definitions: Definitions, engine: SessionEngine) -> None:
         self._storage = storage
@@ -40,7 +40,12 @@ class SessionService:
         return await self._engine.open(await asyncio.to_thread(self._asked, surrogate, opening))
 
     async def get(self, id: str) -> SessionInfo:
-        """Raises ``UnknownSession`` or ``SessionExpired``; the former also while a session is behind its last reply."""
+        """Return a session's present state.
+
+        Raises:
+            UnknownSession: the session does not exist, or it went back to a checkpoint before its last reply.
+            SessionExpired: the session was idle for too long.
+        """
         info = await self._engine.describe(id)
         if info.behind:  # whoever reads its seq here has no requests to send again
             raise UnknownSession(f"session {id!r} lost its session host, and is behind its last reply: open a new one")
@@ -70,7 +75,7 @@ class SessionService:
         return len(visited.states), visited.confidence_index
 
     async def activity(self, surrogate: str) -> list[SessionActivity]:
-        """What the open sessions of a surrogate are doing, oldest first. Raises ``UnknownSurrogate``."""
+        """Return the activity of a surrogate's open sessions, oldest first. Raises ``UnknownSurrogate``."""
         await asyncio.to_thread(self._storage.surrogates.get, surrogate)
         return await self._engine.activity(surrogate)
 

@@ -34,13 +34,13 @@ class Announcements(ABC):
 
 
 class Alone(Announcements):
-    """Of a database with one server: there is nobody to tell."""
+    """Announcements for a database with a single server: none are sent, and none come."""
 
     def announce(self, surrogate: str) -> None:
-        """Nobody hears it."""
+        """Do nothing: there is no other server."""
 
     def listen(self, hear: Hear) -> None:
-        """Nothing comes."""
+        """Do nothing: no announcement ever comes."""
 
     def close(self) -> None:
-        """Nothing to end."""
+        """Do nothing."""

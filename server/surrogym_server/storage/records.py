@@ -112,7 +112,7 @@ class ModelRecord:
 
     @property
     def tolerances(self) -> list[float]:
-        """Of each output, in its units."""
+        """Tolerance of each output, in the output's unit."""
         return [output["tolerance"] for output in self.fidelity["outputs"]]
 
 

@@ -86,7 +86,7 @@ class EvaluateTask(Request):
 
     @property
     def real_episodes(self) -> int:
-        """Of the policy and of the comparison together."""
+        """Number of real episodes, of the policy and of the comparison together."""
         return self.episodes * (1 if self.compare is None else 2)
 
 

@@ -143,12 +143,12 @@ class Cell:
 
     @property
     def policy_name(self) -> str:
-        """The same for its policy."""
+        """Name of the cell's policy: a hash of the steps that it is trained for."""
         return f"policy-{_hash(self.scale.steps)}"
 
     @property
     def episodes_name(self) -> str:
-        """The same for the variations of its episodes."""
+        """Name of the cell's episodes: a hash of the variations in which they run."""
         return f"episodes-{_hash([_plain(v) for v in self.variations])}"
 
     @property

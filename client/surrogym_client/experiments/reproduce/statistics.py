@@ -26,7 +26,10 @@ def bootstrap_interval(values: Array) -> tuple[float, float]:
 
 
 def difference_interval(first: Array, second: Array) -> tuple[float, float]:
-    """The same for the interquartile mean of first (n,) minus that of second (m,), resampled independently."""
+    """95 % percentile interval of the interquartile mean of first (n,) minus that of second (m,).
+
+    Both are resampled independently.
+    """
     rng = np.random.default_rng(0)
     return _interval(_resampled(first, rng) - _resampled(second, rng))
 

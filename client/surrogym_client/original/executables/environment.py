@@ -55,7 +55,7 @@ class Executable:
         return self._at
 
     def act(self, action: Array) -> RealStep:
-        """Apply action (F,) where the last step, or the reset, has led to.
+        """Take the next step of the running episode, with action (F,).
 
         Raises:
             StepFailed: no episode is running, or the program did not give a step.

@@ -286,8 +286,10 @@ def update(
     """Take one step of Adam on the loss of a batch. Changes the parameters (P,) and both moments (P,) in place.
 
     Args:
-        actor: sizes of the actor's layers, from inputs to outputs; likewise ``critic``.
-        ends: where the actor's parameters end, and where the critic's end behind them; the others are further ones.
+        actor: sizes of the actor's layers, from inputs to outputs.
+        critic: sizes of the critic's layers, likewise.
+        ends: two indices into the parameters. The actor's are those before the first, and the critic's those between
+            the two.
         counts: numbers of choices of each entry of a discrete action; empty for continuous actions.
         relu: whether the hidden layers use ReLU; otherwise tanh.
     """

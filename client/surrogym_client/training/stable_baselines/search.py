@@ -157,8 +157,10 @@ class _Training:
         raise AssertionError("unreachable")
 
     def _learn(self, learner: BaseAlgorithm, callbacks: Sequence[BaseCallback]) -> None:
-        """Take the remaining steps. In the prolonged part, the learning rate continues from the middle of its
-        schedule."""
+        """Let the algorithm learn for the training's remaining virtual steps.
+
+        If the training was prolonged, the learning rate continues from the middle of its schedule.
+        """
         verdicts = self._checks.verdicts
         steps = _whole_rollouts(learner, verdicts.left)
         learner.learn(steps, callback=[self._checks, *callbacks], reset_num_timesteps=not verdicts.prolonged)

@@ -1,4 +1,4 @@
-"""NetworkEnsembleCodec: weights to named arrays and back, with every shape and number checked."""
+"""NetworkEnsembleCodec: convert an ensemble to named arrays and back, and check every shape and number."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def squared_error(predicted: Tensor, target: Tensor) -> Tensor:
 
 
 def cross_entropy(predicted: Tensor, target: Tensor) -> Tensor:
-    """Of logits and labels 0 or 1; summed over members, averaged over samples."""
+    """Cross entropy of logits and labels 0 or 1, summed over members and averaged over samples."""
     each = binary_cross_entropy_with_logits(predicted, target.expand_as(predicted), reduction="none")
     total: Tensor = each.mean(1).sum()
     return total

@@ -112,7 +112,7 @@ def insert_model(connection: Connection, held: Row[Any], model: NewModel) -> int
 
 
 def _confidence_index(fidelity: str) -> float:
-    """One field of a fidelity, because parsing all of it takes ten times as long."""
+    """Read only the confidence index of a stored fidelity, because parsing all of it takes ten times as long."""
     try:
         return _JUDGED.decode(fidelity).confidence_index
     except msgspec.DecodeError:  # it may contain NaN, which only Python's parser reads

@@ -104,7 +104,10 @@ PLAIN: dict[type[sa.types.TypeEngine[Any]], tuple[str, tuple[type, ...]]] = {
 
 
 class Checked(sa.types.TypeDecorator[Any]):
-    """A number or a text. SQLite stores any value in any column, so a damaged file may hold a value of another type."""
+    """Column of numbers or text that checks the type of each value it reads.
+
+    SQLite stores any value in any column, so a damaged file may hold a value of another type.
+    """
 
     impl = sa.Text
     cache_ok = True

@@ -86,7 +86,7 @@ class Thresholds:
         return self.at(self._axes(q))
 
     def at(self, values: Tensor) -> Tensor:
-        """The same at values of all axes (m, A)."""
+        """Probability of lying inside, (m,), at given values of all axes (m, A)."""
         columns, outside, width, membership = self._compiled
         reached = ((values[:, columns] - outside) / width).clamp(0, 1)
         union = 1 - (1 - reached @ membership).clamp(0, 1).prod(-1)

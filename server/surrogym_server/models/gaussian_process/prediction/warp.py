@@ -1,7 +1,7 @@
 """Rewards learned by the logarithm of their distance from a base: r = base + sign exp(y).
 
-A reward that pays in one place alone is flat almost everywhere, and a process of its values learns that it is flat. Its
-logarithm is not flat: that of a bump is a parabola, which a few samples anywhere determine.
+A reward that differs from its base in one place only is flat almost everywhere, so a Gaussian process of its values
+learns that it is flat. Its logarithm is not flat: the logarithm of a bump is a parabola, which a few samples determine.
 
 Predictions are medians. Deviations are half the distance between the quantiles one deviation of y away from the median.
 Both stay meaningful if y is uncertain by several units; the moments of a log-normal distribution do not.
