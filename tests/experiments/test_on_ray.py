@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 from support.studies import ignore, stand_in
-from surrogym_client.experiments.processes import RunFailed
-from surrogym_client.experiments.reproduce import on_ray
 from surrogym_client.experiments.reproduce.cells import Cell, cells, done_already, run_cells
-from surrogym_client.experiments.reproduce.on_ray import RayRun, connect
+from surrogym_client.experiments.reproduce.on_ray import RayRun
 from surrogym_client.experiments.reproduce.rows import read_rows
+from surrogym_client.runtime import ray_cluster
+from surrogym_client.runtime.ray_cluster import NoCluster, connect
 
 ray = pytest.importorskip("ray")
 
@@ -80,11 +80,11 @@ def test_an_interruption_ends_runs_in_the_cluster(address: str, tmp_path: Path):
     [("127.0.0.1:9", "expected a cluster at '127.0.0.1:9', got none"), ("there", "expected auto or host:port")],
 )
 def test_an_address_without_a_cluster_is_one_sentence(address: str, said: str):
-    with pytest.raises(RunFailed, match=said):
+    with pytest.raises(NoCluster, match=said):
         connect(address)
 
 
 def test_without_ray_one_sentence_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(on_ray, "find_spec", lambda _: None)
-    with pytest.raises(RunFailed, match=r"pip install 'surrogym\[ray\]'"):
+    monkeypatch.setattr(ray_cluster, "find_spec", lambda _: None)
+    with pytest.raises(NoCluster, match=r"pip install 'surrogym\[ray\]'"):
         connect("auto")

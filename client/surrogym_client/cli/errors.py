@@ -20,13 +20,14 @@ def sentence(error: Exception) -> str | None:
 
     from surrogym_client.errors import SurrogymClientError
     from surrogym_client.original.errors import OriginalError
+    from surrogym_client.runtime.ray_cluster import NoCluster
     from surrogym_shared.logs.errors import UnusableLog
     from surrogym_shared.surrogate_file import NotASurrogateFile
 
     match error:
         case SurrogymClientError():
             return f"{error}{_way_out(error)}"
-        case CommandError() | OriginalError() | NotASurrogateFile() | UnusableLog():
+        case CommandError() | OriginalError() | NotASurrogateFile() | UnusableLog() | NoCluster():
             return str(error)
         case ModuleNotFoundError(name=str(name)):
             return missing(name.partition(".")[0])

@@ -88,7 +88,7 @@ def run_study(
 
     Raises:
         CommandError: a run failed.
-        RunFailed: there is no such cluster.
+        NoCluster: there is no such cluster.
     """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.cli.reproduce.table import present
@@ -118,7 +118,8 @@ def run_study(
 def _begin_on(address: str | None) -> Begin | None:
     if address is None:
         return None
-    from surrogym_client.experiments.reproduce.on_ray import RayRun, connect
+    from surrogym_client.experiments.reproduce.on_ray import RayRun
+    from surrogym_client.runtime.ray_cluster import connect
 
     connect(address)
     return RayRun

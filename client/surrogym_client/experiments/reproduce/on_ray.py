@@ -9,14 +9,11 @@ import tarfile
 import tempfile
 from contextlib import suppress
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from surrogym_client.experiments.processes import RunFailed
 from surrogym_client.experiments.reproduce.cells import ONE_THREAD, Cell, Command, Places, Run, failed, row_of_run
 from surrogym_client.experiments.reproduce.rows import Row
-from surrogym_shared.ray_address import require_cluster, send_token
 
 RETRIES = 1  # of a run whose process or machine died
 
@@ -28,27 +25,6 @@ class Ran:
     code: int
     log: bytes = field(repr=False)
     archive: bytes = field(repr=False)
-
-
-def connect(address: str) -> None:
-    """Connect to the cluster at ``auto`` or ``host:port``.
-
-    Raises:
-        RunFailed: Ray is not installed, or there is no cluster, or one of another version.
-    """
-    if find_spec("ray") is None:
-        raise RunFailed("--on-ray: expected the package ray, got none: pip install 'surrogym[ray]'")
-    send_token()
-    import ray
-
-    try:
-        require_cluster(address)
-        quiet: dict[str, Any] = {"log_to_driver": False, "configure_logging": False}
-        ray.init(address, ignore_reinit_error=True, **quiet)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        raise RunFailed(
-            f"--on-ray: the cluster at {address!r} can't be used: {' '.join(str(error).split())}"
-        ) from error
 
 
 class RayRun(Run):

@@ -1,0 +1,39 @@
+"""A Ray cluster that a command works in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.util import find_spec
+from typing import Any
+
+from surrogym_shared.ray_address import require_cluster, send_token
+
+
+class NoCluster(Exception):
+    """The Ray cluster can't be used. ``str(error)`` is one sentence for a person."""
+
+
+def connect(address: str, runtime_env: Mapping[str, Any] | None = None) -> None:
+    """Connect this process to a Ray cluster.
+
+    Args:
+        address: ``auto`` for the cluster that this machine belongs to, or ``host:port``.
+        runtime_env: what Ray prepares on each machine before it runs code of this process, as Ray documents it.
+
+    Raises:
+        NoCluster: Ray is not installed, or there is no cluster, or one of another version, or Ray refuses
+            ``runtime_env``.
+    """
+    if find_spec("ray") is None:
+        raise NoCluster("--on-ray: expected the package ray, got none: pip install 'surrogym[ray]'")
+    send_token()
+    import ray
+
+    try:
+        require_cluster(address)
+        quiet: dict[str, Any] = {"log_to_driver": False, "configure_logging": False}
+        ray.init(address, ignore_reinit_error=True, runtime_env=dict(runtime_env or {}), **quiet)
+    except (ConnectionError, ValueError, TypeError, RuntimeError) as error:
+        raise NoCluster(
+            f"--on-ray: the cluster at {address!r} can't be used: {' '.join(str(error).split())}"
+        ) from error
