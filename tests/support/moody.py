@@ -72,3 +72,11 @@ class Slow(Line):
     def step_from(self, coordinates, action):
         time.sleep(2.0)
         return super().step_from(coordinates, action)
+
+
+class Unhurried(Line):
+    """Takes half a second."""
+
+    def step_from(self, coordinates, action):
+        time.sleep(0.5)
+        return super().step_from(coordinates, action)

@@ -6,7 +6,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -21,16 +21,16 @@ from surrogym_client.cli.options import (
     awaited_surrogate,
     read_spec,
 )
+from surrogym_client.cli.sampling_on_ray import RayOptions
 
 if TYPE_CHECKING:
-    from surrogym_client.original.executables import Executable
-    from surrogym_client.original.isolated import IsolatedEnvironment
+    from surrogym_client.sampler.on_ray import Line, SamplerPlan
     from surrogym_client.sampler.worker import Outcome, SamplerReport
     from surrogym_client.transport.api import Api
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import Query
 
-    Tell = Callable[[Query, Outcome, str], None]
+    Tell = Callable[[Line], None]
 
 
 Environment = Annotated[
@@ -75,6 +75,7 @@ def command(
     wait: Wait = 0.0,
     exit_with_parent: ExitWithParent = False,
     *,
+    cluster: RayOptions,
     service: Service,
     output: Output,
 ) -> None:
@@ -85,12 +86,14 @@ def command(
     command.
 
     Example: surrogym sample pendulum --until-done
+
+    Example: surrogym sample cart --env cart:Cart --on-ray 32 --ray-resources CPU=2 --runtime-env env.yaml
     """
     from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
-    from surrogym_client.runtime.lifetime import terminations
-    from surrogym_client.sampler.worker import Sampler, SamplerSettings, worker_name
-    from surrogym_shared.terminal import on_interrupt
+    from surrogym_client.sampler.on_ray import SamplerPlan
+    from surrogym_client.sampler.worker import SamplerSettings, worker_name
 
+    cluster.require_fit(worker_limits=once or max_queries is not None)
     if exit_with_parent:
         watch_parent()
     settings = SamplerSettings(
@@ -103,18 +106,57 @@ def command(
     )
     with service.connect(context, wait, quiet=output.quiet) as api:
         asked = awaited_surrogate(api, surrogate, wait, quiet=output.quiet).spec
-        opened = _opened(_named(env, program), read_spec(spec), asked, step_limit)
-        with (
-            closing(opened) as environment,
-            _telling(api, surrogate, quiet=output.quiet) as tell,
-        ):
-            sampler = Sampler(api, surrogate, environment, settings, tell)
-            for number in terminations():
-                signal.signal(number, lambda *_: sampler.stop())
-            with on_interrupt(lambda: _words_of_interruption(sampler.summary())):
-                report = sampler.run()
-    output.give(asdict(report), lambda: _words(surrogate, report))
-    if report.phase == "failed":
+        name, replaced = _environment(_named(env, program), read_spec(spec), asked)
+        token = service.token_for(context)
+        plan = SamplerPlan(api.url, token, surrogate, name, replaced, step_limit, settings)
+        if cluster.on_ray is None:
+            _sample_here(api, plan, output)
+        else:
+            _sample_on_ray(api, plan, cluster, output)
+
+
+def _sample_here(api: Api, plan: SamplerPlan, output: Output) -> None:
+    from surrogym_client.original.loading import isolated
+    from surrogym_client.runtime.lifetime import terminations
+    from surrogym_client.sampler.on_ray import Line, line_of
+    from surrogym_client.sampler.worker import Sampler
+    from surrogym_shared.terminal import on_interrupt
+
+    with (
+        closing(isolated(plan.environment, plan.step_limit, plan.spec)) as environment,
+        _telling(api, plan.surrogate, quiet=output.quiet) as tell,
+    ):
+
+        def report(query: Query, outcome: Outcome, error: str) -> None:
+            if tell is not None:
+                tell(Line(line_of(query, outcome, error), bool(error)))
+
+        sampler = Sampler(api, plan.surrogate, environment, plan.settings, report)
+        for number in terminations():
+            signal.signal(number, lambda *_: sampler.stop())
+        with on_interrupt(lambda: _words_of_interruption(sampler.summary())):
+            result = sampler.run()
+    output.give(asdict(result), lambda: _words(plan.surrogate, result))
+    if result.phase == "failed":
+        raise typer.Exit(1)
+
+
+def _sample_on_ray(api: Api, plan: SamplerPlan, cluster: RayOptions, output: Output) -> None:
+    from surrogym_client.cli.sampling_on_ray import result_of, run_samplers, samplers_on_ray
+    from surrogym_client.runtime.lifetime import terminations_as_interrupts
+    from surrogym_shared.terminal import on_interrupt, say
+
+    time_limit, endless = plan.settings.time_limit, replace(plan.settings, time_limit=None)
+    samplers = samplers_on_ray(cluster, replace(plan, settings=endless))
+    with (
+        _telling(api, plan.surrogate, quiet=output.quiet) as tell,
+        terminations_as_interrupts(),
+        on_interrupt(lambda: _words_of_interruption(samplers.report())),
+    ):
+        run_samplers(samplers, time_limit, tell or (lambda _: None), lambda text: say(text, quiet=output.quiet))
+    report = samplers.report()
+    output.give(result_of(samplers), lambda: f"{_words(plan.surrogate, report)}{_restarts(samplers.restarts)}")
+    if report.phase == "failed" or samplers.errors:
         raise typer.Exit(1)
 
 
@@ -128,14 +170,14 @@ def _named(env: str | None, program: str | None) -> str | None:
     return env if program is None else name_of(program)
 
 
-def _opened(
-    env: str | None, given: EnvironmentSpec | None, asked: EnvironmentSpec, step_limit: float
-) -> IsolatedEnvironment | Executable:
-    """Open the environment. The server's choice is trusted only for Gymnasium's own ids, because a module or a program
-    would run code.
+def _environment(
+    env: str | None, given: EnvironmentSpec | None, asked: EnvironmentSpec
+) -> tuple[str, EnvironmentSpec | None]:
+    """Return the environment's name, and the specification that replaces its own. The server's choice is trusted only
+    for Gymnasium's own ids, because a module or a program would run code.
     """
     from surrogym_client.cli.errors import CommandError
-    from surrogym_client.original.loading import is_known, is_own, isolated
+    from surrogym_client.original.loading import is_known, is_own
 
     if env is None and not is_known(asked.environment):
         raise CommandError(
@@ -144,22 +186,22 @@ def _opened(
         )
     name = env or asked.environment
     own = is_own(name) and given is None
-    return isolated(name, step_limit, None if own else given or asked)
+    return name, None if own else given or asked
 
 
 @contextmanager
 def _telling(api: Api, surrogate: str, *, quiet: bool) -> Iterator[Tell | None]:
     """Show progress: one bar for the design on a terminal, or a line for each query otherwise."""
-    from surrogym_shared.terminal import progress
+    from surrogym_shared.terminal import progress, say
 
     if quiet or not sys.stderr.isatty():
-        yield None if quiet else _tell
+        yield None if quiet else lambda line: say(line.text)
         return
     with progress("design") as update:
 
-        def tell(query: Query, outcome: Outcome, error: str) -> None:
-            if error:
-                _tell(query, outcome, error)
+        def tell(line: Line) -> None:
+            if line.is_error:
+                say(line.text)
             with suppress(SurrogymClientError):  # the sampler itself handles a server that is away for a moment
                 view = api.surrogate(surrogate)
                 update(share_of_design(view), words_of_design(view))
@@ -179,11 +221,8 @@ def _words_of_interruption(report: SamplerReport) -> str:
     )
 
 
-def _tell(query: Query, outcome: Outcome, error: str) -> None:
-    from surrogym_shared.terminal import say
-
-    asked = f", {len(query.actions)} steps" if query.kind == "rollout" else ""
-    say(f"query {query.id} ({query.purpose}{asked}) {outcome}{': ' if error else ''}{error}")
+def _restarts(count: int) -> str:
+    return f"; {count} samplers died and were started again" if count else ""
 
 
 def _words(surrogate: str, report: SamplerReport) -> str:
