@@ -27,6 +27,7 @@ from surrogym_shared.spec import (
     EnvironmentSpec,
     Fixed,
     Inequality,
+    Lag,
     ModelChoice,
     MultiDiscreteAction,
     Normal,
@@ -38,6 +39,7 @@ from surrogym_shared.spec import (
     Success,
     Term,
     Uniform,
+    with_history,
 )
 from surrogym_shared.spec import Design as DesignSettings
 
@@ -64,6 +66,7 @@ __all__ = [
     "Fixed",
     "Imported",
     "Inequality",
+    "Lag",
     "ModelChoice",
     "MultiDiscreteAction",
     "Normal",
@@ -83,6 +86,7 @@ __all__ = [
     "make",
     "make_sb3",
     "make_vec",
+    "with_history",
 ]
 
 _LAZY = {  # name: module, its name there, the extra that brings what the module needs

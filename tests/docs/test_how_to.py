@@ -124,3 +124,9 @@ def test_a_reward_that_jumps_and_an_end_that_is_learned(server: ServerProcess, t
     assert (report["answered"], report["failed"]) == (6, 0)
     for program in programs("rewards-and-terminations.md")[1:]:
         run(tmp_path, "-c", program)
+
+
+def test_a_policy_acts_on_a_machine_with_a_past(tmp_path: Path) -> None:
+    machine, own_program = programs("history.md")
+    (tmp_path / "tank.py").write_text(machine, encoding="utf-8")
+    run(tmp_path, "-c", f"{own_program}\nassert abs(reading - 1) < 0.1, reading")

@@ -111,7 +111,7 @@ class ResettableEnvironment(Protocol):
         ...
 
     def coordinates(self, observation: Any) -> ArrayLike:
-        """The coordinates (C,) that an observation tells of."""
+        """The coordinates (C,) that an observation tells of, without lags."""
         ...
 
     def close(self) -> None:

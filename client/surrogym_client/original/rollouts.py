@@ -7,7 +7,8 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from surrogym_client.original.errors import StepFailed, UnknownEnvironment
-from surrogym_client.original.gymnasium import native_action, wrapped
+from surrogym_client.original.gymnasium import native_action
+from surrogym_client.original.lags import begun, followed, read_names
 from surrogym_client.original.protocol import (
     Array,
     Environment,
@@ -21,7 +22,10 @@ from surrogym_shared.spec import EnvironmentSpec
 
 
 class FromReset:
-    """A ``ResettableEnvironment`` as a ``RolloutEnvironment``: each step begins where the one before ended."""
+    """A ``ResettableEnvironment`` as a ``RolloutEnvironment``: each step begins where the one before ended.
+
+    The environment reads R coordinates; the others are lags of these and of the actions.
+    """
 
     def __init__(self, environment: ResettableEnvironment) -> None:
         self._environment = environment
@@ -36,32 +40,33 @@ class FromReset:
         """Reset the environment; the coordinates (C,) it starts at.
 
         Raises:
-            StepFailed: ``reset`` gives no pair, or ``coordinates`` no (C,).
+            StepFailed: ``reset`` gives no pair, or ``coordinates`` no (R,).
         """
         self._at = None
-        begun: Any = self._environment.reset(seed=seed)
-        if not isinstance(begun, tuple) or len(begun) != 2:
-            raise StepFailed(f"expected (observation, info) of reset, got a {type(begun).__name__}")
-        self._at = self._read(begun[0])
+        first: Any = self._environment.reset(seed=seed)
+        if not isinstance(first, tuple) or len(first) != 2:
+            raise StepFailed(f"expected (observation, info) of reset, got a {type(first).__name__}")
+        self._at = begun(self._spec, self._read(first[0]))
         return self._at
 
     def act(self, action: Array) -> RealStep:
         """Apply action (F,).
 
         Raises:
-            StepFailed: no episode is running, or ``coordinates`` gives no (C,).
+            StepFailed: no episode is running, or ``coordinates`` gives no (R,).
         """
         if self._at is None:
             raise StepFailed("expected an action in a running episode, got one after its end or before a reset")
         before, self._at = self._at, None
         native = native_action(self._spec.action, action)
         observation, reward, terminated, truncated, _ = self._environment.step(native)
-        reached = self._read(observation)
+        taken = np.atleast_1d(np.asarray(native, dtype=np.float64))
+        reached = followed(self._spec, before, taken, self._read(observation))
         if not (terminated or truncated):
             self._at = reached
         return RealStep(
             coordinates=before,
-            action=np.atleast_1d(np.asarray(native, dtype=np.float64)),
+            action=taken,
             next_coordinates=reached,
             reward=float(reward),
             terminated=bool(terminated),
@@ -73,10 +78,10 @@ class FromReset:
 
     def _read(self, observation: Any) -> Array:
         read = np.asarray(self._environment.coordinates(observation), dtype=np.float64)
-        names = self._spec.coordinate_names
+        names = read_names(self._spec)
         if read.shape != (len(names),):
             raise StepFailed(f"expected coordinates ({', '.join(names)}), got an array of shape {read.shape}")
-        return wrapped(self._spec, read)
+        return read
 
 
 def _only_resets(environment: object) -> TypeGuard[ResettableEnvironment]:

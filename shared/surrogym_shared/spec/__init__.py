@@ -11,6 +11,7 @@ from surrogym_shared.spec.actions import BoxAction, DiscreteAction, MultiDiscret
 from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, NAME_IN_WORDS, NAME_PATTERN
 from surrogym_shared.spec.coordinates import Bounds, Coordinate, Fixed, Lag, Normal, Uniform, limits
 from surrogym_shared.spec.environment import AcquisitionChoice, Choice, Design, EnvironmentSpec, ModelChoice
+from surrogym_shared.spec.history import with_history
 from surrogym_shared.spec.rewards import DeclaredReward, Quantity, Reward, RewardTerm, Success
 from surrogym_shared.spec.terms import AllOf, Inequality, ObservationEntry, Part, Term
 
@@ -44,4 +45,5 @@ __all__ = [
     "Term",
     "Uniform",
     "limits",
+    "with_history",
 ]

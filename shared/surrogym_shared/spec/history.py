@@ -1,0 +1,81 @@
+"""A specification with lags, for an environment whose observation does not determine what happens next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from surrogym_shared.checks import require, require_known
+from surrogym_shared.spec.actions import BoxAction
+from surrogym_shared.spec.coordinates import Coordinate, Fixed, Lag, StartDistribution, Uniform
+from surrogym_shared.spec.environment import EnvironmentSpec
+from surrogym_shared.spec.terms import ObservationEntry, Term
+
+
+def with_history(
+    spec: EnvironmentSpec, *, changes: int = 0, actions: int = 0, largest: Mapping[str, float] | None = None
+) -> EnvironmentSpec:
+    """Add lags to the coordinates and to what a policy observes.
+
+    Args:
+        spec: its coordinates are those that the environment reads; its queries are rollouts.
+        changes: number of earlier changes of each moving coordinate, such as 1 for a hidden speed.
+        actions: number of earlier actions. An action that takes effect after a dead time of three steps needs three,
+            and one more if the plant is sampled with a zero-order hold and has a lag of its own.
+        largest: largest change of each moving coordinate in one step, in its unit; needed for ``changes``.
+
+    Raises:
+        ValueError: the specification can be set to states, or ``largest`` does not fit the moving coordinates.
+
+    Examples:
+        >>> with_history(spec, changes=1, actions=4, largest={"level": 0.3})
+    """
+    largest = dict(largest or {})
+    moving = [c for c in spec.coordinates if c.moves]
+    require(changes >= 0 and actions >= 0, f"history: expected 0 or more lags, got {changes} and {actions}")
+    require_known("history: largest", largest, [c.name for c in moving])
+    lacking = [c.name for c in moving if c.name not in largest] if changes else []
+    require(not lacking, f"history: expected the largest change in one step of {lacking}, got none")
+    lags = [lag for c in moving for lag in _of_changes(c, changes, largest.get(c.name, 0.0))]
+    lags += [lag for entry in range(spec.action.size) for lag in _of_actions(spec, entry, actions)]
+    starts: dict[str, StartDistribution] = {lag.name: Fixed(value=_at_rest(lag)) for lag in lags}
+    own = {name: getattr(spec, name) for name in EnvironmentSpec.model_fields}
+    shown = tuple(ObservationEntry(name=lag.name, term=Term.linear(**{lag.name: 1.0})) for lag in lags)
+    return EnvironmentSpec(
+        **own
+        | {
+            "coordinates": (*spec.coordinates, *lags),
+            "observation": (*spec.observation, *shown),
+            "start": {**spec.start, **starts},
+            "starts": tuple((*start, *(_at_rest(lag) for lag in lags)) for start in spec.starts),
+        }
+    )
+
+
+def _of_changes(coordinate: Coordinate, count: int, largest: float) -> Iterable[Coordinate]:
+    """Lags of a coordinate's changes, the latest first."""
+    name = coordinate.name
+    for age in range(1, count + 1):
+        lag = Lag(kind="change", of=name) if age == 1 else Lag(kind="value", of=f"{name}.change{age - 1}")
+        yield Coordinate(
+            name=f"{name}.change{age}", sampling=Uniform(low=-largest, high=largest), unit=coordinate.unit, lag=lag
+        )
+
+
+def _of_actions(spec: EnvironmentSpec, entry: int, count: int) -> Iterable[Coordinate]:
+    """Lags of an entry of the action, the latest first."""
+    action = spec.action
+    if isinstance(action, BoxAction):
+        low, high = action.low[entry], action.high[entry]
+    else:
+        numbers = (action.n,) if action.kind == "discrete" else action.nvec
+        low, high = 0.0, float(numbers[entry] - 1)
+    for age in range(1, count + 1):
+        name = f"action{entry}.lag"
+        lag = Lag(kind="action", entry=entry) if age == 1 else Lag(kind="value", of=f"{name}{age - 1}")
+        yield Coordinate(name=f"{name}{age}", sampling=Uniform(low=low, high=high), lag=lag)
+
+
+def _at_rest(lag: Coordinate) -> float:
+    """The value of a lag before the first step: nothing has changed, and the action was 0, or the nearest to it."""
+    low, high = lag.settable
+    return min(max(0.0, low), high)

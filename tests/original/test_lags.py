@@ -1,0 +1,135 @@
+"""What an environment reads becomes coordinates with their past."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from support.rail import SPEC, Rail
+from surrogym_client.original.errors import StepFailed
+from surrogym_client.original.protocol import RolloutEnvironment
+from surrogym_client.original.rollouts import answering
+from surrogym_shared.spec import (
+    BoxAction,
+    Coordinate,
+    DiscreteAction,
+    EnvironmentSpec,
+    ObservationEntry,
+    Term,
+    Uniform,
+    with_history,
+)
+from surrogym_shared.terms import observe
+
+RIGHT, LEFT = np.array([1.0]), np.array([-0.5])
+CIRCLE = Uniform(low=-math.pi, high=math.pi)
+HAND = EnvironmentSpec(
+    coordinates=(Coordinate(name="hand", kind="angle", sampling=CIRCLE),),
+    observation=(ObservationEntry(name="sin", term=Term.sin(hand=1)),),
+    action=BoxAction(low=(1.0,), high=(4.0,)),
+    start={"hand": CIRCLE},
+    query="rollout",
+)
+
+
+class WithPast(Rail):
+    def spec(self):
+        return with_history(SPEC, changes=2, actions=2, largest={"x": 0.1})
+
+
+class Clock:
+    """A hand that turns by the action, and is read without whole turns being taken off."""
+
+    def spec(self):
+        return with_history(HAND, changes=1, actions=1, largest={"hand": 4.0})
+
+    def reset(self, *, seed=None):
+        self.hand = 3.0
+        return self.hand, {}
+
+    def step(self, action):
+        self.hand += float(action[0])
+        return self.hand, 0.0, False, False, {}
+
+    def coordinates(self, observation):
+        return [observation]
+
+    def close(self):
+        pass
+
+
+def rolled(environment: RolloutEnvironment) -> list[np.ndarray]:
+    """Coordinates after a reset, and after each of three steps."""
+    return [environment.begin(seed=0), *(environment.act(u).next_coordinates for u in (RIGHT, LEFT, RIGHT))]
+
+
+def test_coordinates_repeat_earlier_changes_and_actions():
+    environment = answering(WithPast())
+    start, one, two, three = rolled(environment)
+    assert environment.spec().coordinate_names == ("x", "x.change1", "x.change2", "action0.lag1", "action0.lag2")
+    np.testing.assert_array_equal(start[1:], 0.0)
+    np.testing.assert_allclose(one[1:], [0.1, 0.0, 1.0, 0.0])
+    np.testing.assert_allclose(two[1:], [-0.05, 0.1, -0.5, 1.0])
+    np.testing.assert_allclose(three[1:], [0.1, -0.05, 1.0, -0.5])
+
+
+def test_a_new_episode_has_no_past():
+    environment = answering(WithPast())
+    rolled(environment)
+    np.testing.assert_array_equal(environment.begin(seed=0)[1:], 0.0)
+
+
+def test_a_policy_observes_the_lags():
+    environment = answering(WithPast())
+    shown = observe(environment.spec(), np.stack(rolled(environment)))
+    np.testing.assert_allclose(shown[:, 1:], np.stack(rolled(environment))[:, 1:])
+
+
+def test_the_change_of_an_angle_goes_the_shorter_way():
+    environment = answering(Clock())
+    np.testing.assert_allclose(environment.begin(), [3.0, 0.0, 1.0])  # the action nearest to 0
+    step = environment.act(np.array([1.5]))
+    np.testing.assert_allclose(step.next_coordinates, [4.5 - 2 * math.pi, 1.5, 1.5])
+    step = environment.act(np.array([4.0]))
+    np.testing.assert_allclose(step.next_coordinates, [8.5 - 2 * math.pi, 4.0 - 2 * math.pi, 4.0])
+
+
+def test_logged_starts_get_a_past_at_rest():
+    spec = EnvironmentSpec.model_validate(HAND.model_dump() | {"starts": [[1.0], [2.0]]})
+    assert with_history(spec, actions=1).starts == ((1.0, 1.0), (2.0, 1.0))
+
+
+def test_lags_of_discrete_actions_are_their_numbers():
+    spec = EnvironmentSpec.model_validate(SPEC.model_dump() | {"action": DiscreteAction(n=3)})
+    assert with_history(spec, actions=1).coordinates[-1].settable == (0.0, 2.0)
+
+
+def test_lags_that_the_class_reads_itself_are_refused():
+    class Reads(WithPast):
+        def coordinates(self, observation):
+            return [observation[0], 0, 0, 0, 0]
+
+    with pytest.raises(StepFailed, match=r"coordinates \(x\), got an array of shape \(5,\)"):
+        answering(Reads()).begin()
+
+
+@pytest.mark.parametrize(
+    ("history", "message"),
+    [
+        ({"changes": 1}, r"expected the largest change in one step of \['x'\], got none"),
+        ({"changes": -1}, "expected 0 or more lags, got -1 and 0"),
+        ({"changes": 1, "largest": {"y": 1.0}}, r"history: largest names unknown \['y'\]: expected some of \['x'\]"),
+        ({"actions": 20}, "looks 20 steps back: expected fewer than an episode's 20"),
+    ],
+)
+def test_a_history_that_does_not_fit_is_refused(history, message):
+    with pytest.raises(ValueError, match=message):
+        with_history(SPEC, **history)
+
+
+def test_a_history_where_any_state_can_be_set_is_refused():
+    settable = SPEC.model_copy(update={"query": "step"})
+    with pytest.raises(ValueError, match="lags need one that can only be reset"):
+        with_history(settable, actions=1)
