@@ -13,9 +13,11 @@ while IFS= read -r line; do
     *'"method": "set"'*) x=$list; result="\"result\":{\"state\":[$x]}" ;;
     *'"method": "get"'*) result="\"result\":{\"state\":[$x]}" ;;
     *'"method": "step"'*'['*) x=$((x + 2 * list - 1)); result="\"result\":{\"state\":[$x],\"reward\":$((-x * x)),\"terminated\":false,\"truncated\":false}" ;;
+    *'"method": "save"'*) result="\"result\":{\"snapshot\":\"[$x]\"}" ;;
+    *'"method": "restore"'*) x=$list; result="\"result\":{\"state\":[$x]}" ;;
     *'"method": "close"'*) printf '{"id":%s,"result":{}}\n' "$id"; exit 0 ;;
     *'"method": "step"'*) result='"error":"expected an action, got none","code":"invalid"' ;;
-    *'"method"'*) result='"error":"expected spec, reset, set, get, step or close","code":"unsupported"' ;;
+    *'"method"'*) result='"error":"expected spec, reset, set, get, step, save, restore or close","code":"unsupported"' ;;
     *) result='"error":"expected a request, got another line","code":"invalid"' ;;
   esac
   printf '{"id":%s,%s}\n' "${id:-null}" "$result"

@@ -55,8 +55,23 @@ class Rail:
         pass
 
 
-def looked_at(**options) -> Access:
-    factory = partial(Rail, **options)
+class SavedRail(Rail):
+    """A rail that remembers its last motion and keeps all of it in a snapshot, or forgets the motion."""
+
+    def __init__(self, forgets=False, **options):
+        super().__init__(**options)
+        self._forgets = forgets
+
+    def save(self):
+        return np.array([self._x, 0.0 if self._forgets else self._moved]).tobytes()
+
+    def restore(self, snapshot):
+        self._x, self._moved = np.frombuffer(snapshot).tolist()
+        return np.array([self._x])
+
+
+def looked_at(rail=Rail, **options) -> Access:
+    factory = partial(rail, **options)
     with IsolatedEnvironment(factory) as environment:
         return examine(environment, factory().spec())
 
@@ -71,7 +86,7 @@ def test_an_exact_environment_is_set_to_any_state_and_its_steps_are_counted() ->
 def test_one_that_is_not_where_it_was_put_can_only_be_reset() -> None:
     access = looked_at(coarse=0.1)
     assert access.set_error == pytest.approx(0.05)
-    assert access.mode == "reset only (--no-teleport)"
+    assert access.mode == "reset only (--access reset)"
 
 
 def test_one_that_remembers_more_than_its_coordinates_can_only_be_reset() -> None:
@@ -96,4 +111,17 @@ def test_one_without_resets_is_looked_at_by_its_states_alone() -> None:
 def test_one_that_can_only_be_reset_is_not_set() -> None:
     access = looked_at(query="rollout")
     assert (access.set_error, access.memory_error) == (None, None)
-    assert (access.reset_error, access.mode) == (0, "reset only (--no-teleport)")
+    assert (access.reset_error, access.mode) == (0, "reset only (--access reset)")
+
+
+def test_one_that_remembers_and_saves_all_of_it_returns_to_snapshots() -> None:
+    access = looked_at(SavedRail, inertia=3.0)
+    assert (access.can_set, access.restore_error) == (False, 0)
+    assert access.mode == "snapshots (--access snapshot)"
+
+
+def test_one_whose_snapshots_forget_can_only_be_reset() -> None:
+    access = looked_at(SavedRail, inertia=3.0, forgets=True)
+    assert access.restore_error is not None
+    assert access.restore_error > 0.01
+    assert access.mode == "reset only (--access reset)"

@@ -22,7 +22,7 @@ RIGHT, LEFT = np.array([1.0]), np.array([-1.0])
 def test_a_builtin_environment_rolls_out_as_gymnasium_does(name):
     import gymnasium
 
-    environment = original.make(name, teleport=False)
+    environment = original.make(name, access="reset")
     native = gymnasium.make(name).unwrapped
     assert environment.spec().query == "rollout"
     assert isinstance(environment, RolloutEnvironment)

@@ -197,7 +197,7 @@ def test_a_query_of_the_wrong_kind_or_too_long_is_refused(api, rail):
 def test_an_environment_that_answers_another_kind_of_query_is_refused(api, rail):
     from support.moody import Line
 
-    with pytest.raises(UnknownEnvironment, match=r"expected coordinates .* rollout queries, got .* step queries"):
+    with pytest.raises(UnknownEnvironment, match=r"access to resets alone, got .* access to any state"):
         Sampler(api, rail, Line()).run()
 
 
@@ -223,7 +223,7 @@ def test_a_design_does_not_depend_on_other_requests(api):
 
 def test_classic_control_without_teleport_is_learned_from_resets(api):
     name = f"pendulum-{uuid.uuid4().hex[:8]}"
-    environment = original.make("Pendulum-v1", teleport=False, budget=24, seed=1)
+    environment = original.make("Pendulum-v1", access="reset", budget=24, seed=1)
     api.create_surrogate(name, environment.spec())
     report = Sampler(api, name, environment, SamplerSettings(until_done=True, time_limit=120.0)).run()
     view = api.surrogate(name)

@@ -19,12 +19,21 @@ def test_states_can_be_set_unless_the_specification_says_otherwise() -> None:
 
 
 @pytest.mark.parametrize(
+    ("changes", "access"),
+    [({}, "any"), ({"query": "rollout", "snapshots": True}, "snapshot"), ({"query": "rollout"}, "reset")],
+)
+def test_access_follows_from_query_and_snapshots(changes: dict[str, object], access: str) -> None:
+    assert changed(**changes).access == access
+
+
+@pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"max_rollout": 5}, "max_rollout 5 needs query 'rollout', got 'step'"),
         ({"query": "rollout", "design": {"preset": "paper"}}, "Latin hypercube over states: expected query 'step'"),
         ({"query": "rollout", "max_rollout": 0}, "greater than or equal to 1"),
         ({"query": "rollout", "max_rollout": 5000}, "less than or equal to 4096"),
+        ({"snapshots": True}, "snapshots need query 'rollout', got 'step'"),
         ({"query": "teleport"}, "'step' or 'rollout'"),
     ],
 )

@@ -7,7 +7,7 @@ import shlex
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -76,17 +76,23 @@ class DesignChoices:
             min=2, help="Offer each continuous action to policies as this many discrete values. [default: continuous]"
         ),
     ] = None
-    teleport: Annotated[
-        bool,
+    access: Annotated[
+        Literal["any", "snapshot", "reset"] | None,
         typer.Option(
-            "--teleport/--no-teleport",
-            help="Whether the environment can be set to any state. --no-teleport: it can only be reset.",
+            help="Where a query may begin. any: at any state, to which the environment is set. snapshot: at a state "
+            "that was visited and saved, or at a reset. reset: at a reset only. [default: from the specification]"
         ),
-    ] = True
+    ] = None
+    teleport: Annotated[
+        bool | None,
+        typer.Option("--teleport/--no-teleport", hidden=True, help="Older names of --access any and --access reset."),
+    ] = None
     max_rollout: Annotated[
         int | None,
         typer.Option(
-            min=1, help="Without teleport: maximum number of actions in one query. [default: from the specification]"
+            min=1,
+            help="If not any state can be set: maximum number of actions in one query. [default: from the "
+            "specification]",
         ),
     ] = None
 
@@ -203,6 +209,8 @@ def _specification(environment: str | None, spec: EnvironmentSpec | None, **choi
     from surrogym_client.original.loading import make, with_choices
 
     given = {key: value for key, value in choices.items() if value is not None}
+    if (teleport := given.pop("teleport", None)) is not None:
+        given.setdefault("access", "any" if teleport else "reset")
     try:
         if environment is not None:
             original = make(environment, spec=spec, **given)  # type: ignore[arg-type]
@@ -211,7 +219,7 @@ def _specification(environment: str | None, spec: EnvironmentSpec | None, **choi
             finally:
                 original.close()
         if spec is not None:
-            others = {name: given.pop(name) for name in ("bins", "teleport", "max_rollout") if name in given}
+            others = {name: given.pop(name) for name in ("bins", "access", "max_rollout") if name in given}
             return with_choices(spec, given, **others)  # type: ignore[arg-type]
     except ValueError as error:
         raise CommandError(invalid(error)) from error

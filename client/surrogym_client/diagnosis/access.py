@@ -36,6 +36,7 @@ class Access:
         reset_error: between two resets with one seed.
         replay_error: between two episodes from one seed under the same actions.
         memory_error: between a step of an episode and the same step after its state was set.
+        restore_error: between a step from a saved state and the same step after a return to it.
     """
 
     steps: int
@@ -45,6 +46,7 @@ class Access:
     reset_error: float | None = None
     replay_error: float | None = None
     memory_error: float | None = None
+    restore_error: float | None = None
 
     @property
     def noise(self) -> float:
@@ -56,14 +58,25 @@ class Access:
         """Whether the state can be set completely."""
         if self.set_error is None or self.set_error > CLOSE:
             return False
+        return self.memory_error is None or self.memory_error <= self._allowed
+
+    @property
+    def can_restore(self) -> bool:
+        """Whether the environment can return to a saved state."""
+        return self.restore_error is not None and self.restore_error <= self._allowed
+
+    @property
+    def _allowed(self) -> float:
+        """The largest error of a step that is repeated from the same state."""
         random = self.replay_error is None or self.replay_error > EXACT
-        allowed = max(CLOSE, FEW * self.noise) if random else CLOSE
-        return self.memory_error is None or self.memory_error <= allowed
+        return max(CLOSE, FEW * self.noise) if random else CLOSE
 
     @property
     def mode(self) -> str:
         """The recommended mode."""
-        return "set any state" if self.can_set else "reset only (--no-teleport)"
+        if self.can_set:
+            return "set any state"
+        return "snapshots (--access snapshot)" if self.can_restore else "reset only (--access reset)"
 
 
 def examine(environment: IsolatedEnvironment, spec: EnvironmentSpec) -> Access:
@@ -76,6 +89,7 @@ def examine(environment: IsolatedEnvironment, spec: EnvironmentSpec) -> Access:
     if spec.query == "step":
         looking.set_states()
     looking.begin_again()
+    looking.come_back()
     return looking.access()
 
 
@@ -117,13 +131,37 @@ class _Looking:
             again = self._step_from(np.asarray(wanted.coordinates), np.asarray(wanted.action))
             self._note("memory_error", self._between([wanted], [again]))
 
+    def come_back(self) -> None:
+        """Take a step from a saved state, go on, return to the state and repeat the step."""
+        if not self._spec.snapshots and not self._can_save():
+            return
+        action = self._action()
+        self._episode([self._action()])
+        snapshot = self._environment.save()
+        first = self._act(action)
+        if not (first.terminated or first.truncated):
+            self._act(self._action())
+        back = self._environment.restore(snapshot)
+        again = self._act(action)
+        self._note("restore_error", self._apart(back, first.coordinates))
+        self._note("restore_error", self._between([first], [again]))
+
+    def _can_save(self) -> bool:
+        try:
+            return bool(self._environment.save())
+        except StepFailed:
+            return False
+
+    def _act(self, action: Array) -> RealStep:
+        self._steps += 1
+        return self._environment.act(action)
+
     def _episode(self, actions: Sequence[Array]) -> tuple[Array, list[RealStep]]:
         start = self._environment.begin(0)
         self._resets += 1
         steps: list[RealStep] = []
         for action in actions:
-            self._steps += 1
-            steps.append(self._environment.act(action))
+            steps.append(self._act(action))
             if steps[-1].terminated or steps[-1].truncated:
                 break
         return start, steps

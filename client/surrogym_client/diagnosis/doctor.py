@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from surrogym_client.diagnosis.access import EXACT, examine
+from surrogym_client.diagnosis.access import EXACT, Access, examine
 from surrogym_client.errors import ProblemError, ProtocolMismatch, Refused, ServerUnreachable, SurrogymClientError
 from surrogym_client.original.episodes import draw
 from surrogym_client.original.errors import OriginalError, StepFailed
@@ -125,10 +125,22 @@ def _access_of(original: IsolatedEnvironment, spec: EnvironmentSpec) -> Iterator
         yield Finding("resets", f"two with one seed: {same}; the same actions from there: {alike}")
     if access.memory_error is not None:
         yield Finding("memory", f"a step of an episode, and from its state set anew: {_error(access.memory_error)}")
+    if access.restore_error is not None:
+        yield Finding(
+            "snapshots", f"a step from a saved state, and after a return to it: {_error(access.restore_error)}"
+        )
     taken = f"{access.mode}; this took {access.steps + 1} real steps and {access.resets + 1} resets at most"
-    wrong = spec.query == "step" and not access.can_set
-    way_out = "register it with --no-teleport; what it remembers must be a coordinate for more" if wrong else None
-    yield Finding("mode", taken, way_out)
+    yield Finding("mode", taken, _way_out(spec, access))
+
+
+def _way_out(spec: EnvironmentSpec, access: Access) -> str | None:
+    """What to do if the environment can't do what its specification declares."""
+    if spec.access == "any" and not access.can_set:
+        other = "snapshot" if access.can_restore else "reset"
+        return f"register it with --access {other}; what it remembers must be a coordinate for more"
+    if spec.access == "snapshot" and not access.can_restore:
+        return "register it with --access reset, or let save and restore keep everything that it remembers"
+    return None
 
 
 def _error(share: float | None) -> str:

@@ -78,6 +78,8 @@ class DemoSettings:
         """Everything that a result depends on and that is known before the run, without the seed; JSON-able."""
         spec = self.spec().model_dump(mode="json")
         spec["design"].pop("seed")
+        if not spec["snapshots"]:  # results that are older than snapshots stay valid
+            del spec["snapshots"]
         names = ["task", "real_steps", "virtual_steps", "prolong", "episodes"]
         search = {} if self.search == REFERENCE else {"algorithm": self.search.lower()}
         return {"spec": spec, "arm": self.way.fields(), **{name: getattr(self, name) for name in names}, **search}

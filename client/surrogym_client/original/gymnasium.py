@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surrogym_client.original.classic import PAPER_TASKS, TASKS, Task
+from surrogym_client.original.errors import StepFailed
 from surrogym_client.original.protocol import Array, RealStep
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.spec.actions import Action
@@ -64,6 +67,17 @@ class GymnasiumEnvironment:
             next_observation=np.asarray(observation, dtype=np.float64),
         )
 
+    def save(self) -> bytes:
+        """The state as the task holds it: an angle keeps its turns, a number its precision."""
+        return packed(np.asarray(self._env.state))
+
+    def restore(self, snapshot: bytes) -> Array:
+        """Return to a saved state; its coordinates (C,)."""
+        state = unpacked(snapshot, np.shape(self._env.state))
+        self._task.write(self._env, state)
+        self._env.state = state
+        return wrapped(self._spec, self._task.read(self._env))
+
     def close(self) -> None:
         self._env.close()
 
@@ -90,3 +104,25 @@ def wrapped(spec: EnvironmentSpec, coordinates: Array) -> Array:
             high = np.inf if coordinate.bounds.high is None else coordinate.bounds.high
             out[i] = np.clip(out[i], low, high)
     return out
+
+
+def packed(state: NDArray[Any]) -> bytes:
+    """An array as a snapshot, bit for bit."""
+    file = io.BytesIO()
+    np.save(file, state, allow_pickle=False)
+    return file.getvalue()
+
+
+def unpacked(snapshot: bytes, shape: tuple[int, ...]) -> NDArray[Any]:
+    """The array in a snapshot that ``packed`` made.
+
+    Raises:
+        StepFailed: the snapshot has another form, or its state another shape.
+    """
+    try:
+        state: NDArray[Any] = np.load(io.BytesIO(snapshot), allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise StepFailed(f"expected a snapshot of {shape} numbers, got one that can't be read: {error}") from error
+    if state.shape != shape:
+        raise StepFailed(f"expected a snapshot of {shape} numbers, got {state.shape}: another version made it")
+    return state

@@ -61,6 +61,14 @@ class IsolatedEnvironment:
         step: RealStep = self._call("act", (action,), self._step_limit)
         return step
 
+    def save(self) -> bytes:
+        snapshot: bytes = self._call("save", (), self._step_limit)
+        return snapshot
+
+    def restore(self, snapshot: bytes) -> Array:
+        at: Array = self._call("restore", (snapshot,), self._step_limit)
+        return at
+
     def close(self) -> None:
         """Let the environment finish its step and close. If that takes too long, or at Ctrl-C, it is killed."""
         try:

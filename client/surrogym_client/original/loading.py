@@ -19,11 +19,19 @@ from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
 from surrogym_client.original.protocol import LONGEST_EPISODE, Environment
 from surrogym_client.original.rollouts import answering
 from surrogym_client.original.simulator import Simulated
-from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_shared.spec import Access, BoxAction, EnvironmentSpec
 
 Preset = Literal["default", "paper"]
 Choose = Callable[[EnvironmentSpec], EnvironmentSpec]
-ATTRIBUTES = ("step_from", "reset", "step", "coordinates", "begin", "act", "picture", "close", "parallel")
+ACCESS: dict[Access, dict[str, Any]] = {  # fields of a specification
+    "any": {"query": "step", "snapshots": False},
+    "snapshot": {"query": "rollout", "snapshots": True},
+    "reset": {"query": "rollout", "snapshots": False},
+}
+ATTRIBUTES = (
+    *("step_from", "reset", "step", "coordinates", "begin", "act", "save", "restore"),
+    *("picture", "close", "parallel"),
+)
 
 
 def make(
@@ -37,7 +45,7 @@ def make(
     acquisition: str | None = None,
     seed: int | None = None,
     bins: int | None = None,
-    teleport: bool = True,
+    access: Access | None = None,
     max_rollout: int | None = None,
     step_limit: float = 30.0,
 ) -> Environment:
@@ -49,7 +57,8 @@ def make(
         spec: a specification that replaces the adapter's own; most names have none until ``describe`` writes one.
         preset, budget, initial, target, acquisition, seed: choices of the design; None keeps the specification's.
         bins: number of discrete values that replace each dimension of a continuous action for policies.
-        teleport: False uses rollouts from resets, as if the state could not be set.
+        access: where a query may begin: ``any`` state, a ``snapshot`` or a reset, or at a ``reset`` only. None keeps
+            the specification's.
         max_rollout: the longest of them.
         step_limit: seconds that one step of ``exec:COMMAND`` may take; ``isolated`` limits the others.
 
@@ -63,7 +72,7 @@ def make(
     """
     asked = {"budget": budget, "initial": initial, "target": target, "acquisition": acquisition, "seed": seed}
     chosen = {key: value for key, value in {"preset": preset, **asked}.items() if value is not None}
-    choose = partial(with_choices, design=chosen, bins=bins, teleport=teleport, max_rollout=max_rollout)
+    choose = partial(with_choices, design=chosen, bins=bins, access=access, max_rollout=max_rollout)
     if is_executable(name):
         return open_executable(name, spec, choose, step_limit)
     if is_own(name):
@@ -134,7 +143,7 @@ def with_choices(
     spec: EnvironmentSpec,
     design: Mapping[str, Any],
     bins: int | None = None,
-    teleport: bool = True,
+    access: Access | None = None,
     max_rollout: int | None = None,
 ) -> EnvironmentSpec:
     """Replace choices of a specification's design, and other options of ``make``, and validate the result.
@@ -148,8 +157,8 @@ def with_choices(
         if not isinstance(spec.action, BoxAction):
             raise ValueError(f"bins need a continuous action, got a {spec.action.kind} one")
         fields["action"]["bins"] = (bins,) * spec.action.size
-    if not teleport:
-        fields["query"] = "rollout"
+    if access is not None:
+        fields |= ACCESS[access]
     if max_rollout is not None:
         fields["max_rollout"] = max_rollout
     return EnvironmentSpec.model_validate(fields)

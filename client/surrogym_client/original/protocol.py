@@ -140,6 +140,33 @@ class RolloutEnvironment(Protocol):
         ...
 
 
+@runtime_checkable
+class SnapshotEnvironment(Protocol):
+    """The two methods of an environment that can return to a state it was in. Its specification says
+    ``snapshots=True``.
+
+    Examples:
+        A simulator whose whole state is one number::
+
+            class SavedCart(Cart):
+                def save(self):
+                    return struct.pack("<d", self.rail.x)
+
+                def restore(self, snapshot):
+                    (self.rail.x,) = struct.unpack("<d", snapshot)
+                    return self.rail.read()
+    """
+
+    def save(self) -> bytes:
+        """The whole state, in a form of the environment's own. The environment stays as it is."""
+        ...
+
+    def restore(self, snapshot: bytes) -> ArrayLike:
+        """Return to the state of a snapshot, in a new episode. A ``ResettableEnvironment`` returns the observation
+        there, a ``RolloutEnvironment`` the coordinates (C,). Raise an error if the snapshot can't be used."""
+        ...
+
+
 def runs_in_parallel(environment: object) -> bool:
     """Whether several instances of an environment may be open at once: its attribute ``parallel``, False without one.
 

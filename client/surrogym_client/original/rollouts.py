@@ -16,6 +16,7 @@ from surrogym_client.original.protocol import (
     RealStep,
     ResettableEnvironment,
     RolloutEnvironment,
+    SnapshotEnvironment,
     runs_in_parallel,
 )
 from surrogym_shared.spec import EnvironmentSpec
@@ -73,6 +74,19 @@ class FromReset:
             truncated=bool(truncated),
         )
 
+    def save(self) -> bytes:
+        """The whole state, in the environment's own form. Raises ``StepFailed`` if it is not bytes."""
+        snapshot: Any = _saving(self._environment).save()
+        if not isinstance(snapshot, bytes):
+            raise StepFailed(f"expected bytes from save, got a {type(snapshot).__name__}")
+        return snapshot
+
+    def restore(self, snapshot: bytes) -> Array:
+        """Return to the state of a snapshot; the coordinates (C,) there."""
+        self._at = None
+        self._at = self._read(_saving(self._environment).restore(snapshot))
+        return self._at
+
     def close(self) -> None:
         self._environment.close()
 
@@ -84,6 +98,13 @@ class FromReset:
         return read
 
 
+def _saving(environment: object) -> SnapshotEnvironment:
+    """Return the environment if it has ``save`` and ``restore``. Raises ``StepFailed`` otherwise."""
+    if not isinstance(environment, SnapshotEnvironment):
+        raise StepFailed("expected the methods save and restore for snapshots, got an environment without them")
+    return environment
+
+
 def _only_resets(environment: object) -> TypeGuard[ResettableEnvironment]:
     if isinstance(environment, RolloutEnvironment) or not isinstance(environment, ResettableEnvironment):
         return False
@@ -92,6 +113,7 @@ def _only_resets(environment: object) -> TypeGuard[ResettableEnvironment]:
 
 def answering(environment: object) -> Environment:
     """Adapt an environment to the kind of query that its specification declares."""
+    _check_snapshots(environment)
     if _only_resets(environment):
         environment = FromReset(environment)
     if not isinstance(environment, (OriginalEnvironment, RolloutEnvironment)):
@@ -110,3 +132,11 @@ def answering(environment: object) -> Environment:
             f"its specification declares query={query!r}, which needs {methods}: some of them are missing"
         )
     return environment
+
+
+def _check_snapshots(environment: object) -> None:
+    declared = callable(getattr(environment, "spec", None)) and environment.spec().snapshots  # type: ignore[attr-defined]
+    if declared and not isinstance(environment, SnapshotEnvironment):
+        raise UnknownEnvironment(
+            "its specification declares snapshots, which need the methods save and restore: some of them are missing"
+        )

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from surrogym_client.original.errors import NotPerturbable, UnknownEnvironment
-from surrogym_client.original.gymnasium import native_action, wrapped
+from surrogym_client.original.gymnasium import native_action, packed, unpacked, wrapped
 from surrogym_client.original.protocol import Array, RealStep
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.spec.actions import Action
@@ -88,6 +88,14 @@ class Simulator(ABC):
     def write(self, state: Array) -> None:
         """Set the state (V,) and forget everything else of earlier steps."""
 
+    def save(self) -> Array:
+        """All that decides what happens next, as numbers (K,): more than ``read`` where a solver remembers."""
+        return self.read()
+
+    def restore(self, saved: Array) -> None:
+        """Return to what ``save`` gave, (K,)."""
+        self.write(saved)
+
     @abstractmethod
     def observe(self) -> Array:
         """The observation (D,) of the state as it is, without a step."""
@@ -142,10 +150,10 @@ class Simulated:
         self.shows_own = shows_own
         self._spec = spec
         self._columns = simulator.columns(spec.coordinate_names)
-        if spec.query == "step" and not simulator.settable:
+        if spec.access != "reset" and not simulator.settable:
             raise UnknownEnvironment(
                 f"{spec.environment} can't be set to a state, because its state can't be read: register it with "
-                "--no-teleport, or give a specification with query 'rollout'"
+                "--access reset, or give a specification with query 'rollout' and no snapshots"
             )
 
     def spec(self) -> EnvironmentSpec:
@@ -178,6 +186,15 @@ class Simulated:
             truncated=taken.truncated,
             next_observation=taken.observation if self.shows_own else None,
         )
+
+    def save(self) -> bytes:
+        """The simulator's whole state, bit for bit."""
+        return packed(self.simulator.save())
+
+    def restore(self, snapshot: bytes) -> Array:
+        """Return to a saved state; its coordinates (C,)."""
+        self.simulator.restore(unpacked(snapshot, self.simulator.save().shape))
+        return self.coordinates()
 
     def coordinates(self) -> Array:
         """Present coordinates of the simulator, (C,)."""

@@ -31,8 +31,16 @@ class StatePart(Protocol):
         """Set them to values (n,)."""
         ...
 
+    def save(self) -> Array:
+        """All that decides what happens next, (k,)."""
+        return self.read()
 
-class MujocoState:
+    def restore(self, saved: Array) -> None:
+        """Return to what ``save`` gave, (k,)."""
+        self.write(saved)
+
+
+class MujocoState(StatePart):
     """Positions, velocities, activations of actuators and mocap poses of a MuJoCo model.
 
     A write restores the model's full integration state as it was at rest, so that nothing of earlier steps is left:
@@ -68,6 +76,16 @@ class MujocoState:
             at += array.size
         self._mujoco.mj_normalizeQuat(self._model, data.qpos)
         self._mujoco.mj_forward(self._model, data)
+
+    def save(self) -> Array:
+        full = np.zeros_like(self._rest)
+        self._mujoco.mj_getState(self._model, self._data, full, self._kept)
+        return full
+
+    def restore(self, saved: Array) -> None:
+        self._mujoco.mj_setState(self._model, self._data, saved, self._kept)
+        self._mujoco.mj_forward(self._model, self._data)
+        self._mujoco.mj_setState(self._model, self._data, saved, self._kept)  # the line above moved the warm start
 
     def _positions(self) -> list[Variable]:
         return [variable for joint in self._joints for variable in joint.positions]
@@ -131,7 +149,7 @@ def _quaternion(name: str) -> list[Variable]:
     return [Variable(f"{name}_{q}", "other", -1.0, 1.0) for q in QUATERNION]
 
 
-class Attribute:
+class Attribute(StatePart):
     """The numbers in an attribute of an object: an array, or a list or tuple of numbers."""
 
     def __init__(self, owner: Any, attribute: str, motion: Motion = "other") -> None:
@@ -162,7 +180,7 @@ def holds_numbers(owner: Any, attribute: str) -> bool:
     return numbers.size > 0 and bool(np.isfinite(numbers).all())
 
 
-class DrawnIntoModel:
+class DrawnIntoModel(StatePart):
     """Entries of a MuJoCo model that a task draws anew at each reset, such as the place of a target."""
 
     def __init__(self, model: Native, places: Sequence[tuple[str, int, int]]) -> None:

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from typing import TypeAlias
 
 from surrogym_client.original.errors import QueryRefused, UnknownEnvironment
-from surrogym_shared.spec import MAX_ROLLOUT_QUERY, BoxAction, DiscreteAction, EnvironmentSpec
+from surrogym_shared.spec import MAX_ROLLOUT_QUERY, Access, BoxAction, DiscreteAction, EnvironmentSpec
 from surrogym_shared.spec import limits as sampled
 from surrogym_shared.wire import Query, StepQuery
 
 ROUNDING = 1e-6  # share of the larger limit; float32 rounds by less
+
+IN_WORDS: dict[Access, str] = {"any": "any state", "snapshot": "snapshots", "reset": "resets alone"}
 
 Range: TypeAlias = tuple[float, float]
 
@@ -94,7 +96,8 @@ def _coordinate_ranges(spec: EnvironmentSpec) -> list[Range]:
 
 def _shape(spec: EnvironmentSpec) -> str:
     names = ", ".join(spec.coordinate_names)
-    return f"coordinates ({names}), a {spec.action.kind} action of {spec.action.size}, and {spec.query} queries"
+    access = IN_WORDS[spec.access]
+    return f"coordinates ({names}), a {spec.action.kind} action of {spec.action.size}, and access to {access}"
 
 
 def _words(ranges: Sequence[Range]) -> str:

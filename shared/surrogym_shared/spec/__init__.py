@@ -10,7 +10,7 @@ from __future__ import annotations
 from surrogym_shared.spec.actions import BoxAction, DiscreteAction, MultiDiscreteAction
 from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, NAME_IN_WORDS, NAME_PATTERN
 from surrogym_shared.spec.coordinates import Bounds, Coordinate, Fixed, Lag, Normal, Uniform, limits
-from surrogym_shared.spec.environment import AcquisitionChoice, Choice, Design, EnvironmentSpec, ModelChoice
+from surrogym_shared.spec.environment import Access, AcquisitionChoice, Choice, Design, EnvironmentSpec, ModelChoice
 from surrogym_shared.spec.history import with_history
 from surrogym_shared.spec.rewards import DeclaredReward, Quantity, Reward, RewardTerm, Success
 from surrogym_shared.spec.terms import AllOf, Inequality, ObservationEntry, Part, Term
@@ -20,6 +20,7 @@ __all__ = [
     "MAX_ROLLOUT_QUERY",
     "NAME_IN_WORDS",
     "NAME_PATTERN",
+    "Access",
     "AcquisitionChoice",
     "AllOf",
     "Bounds",

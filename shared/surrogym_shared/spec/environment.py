@@ -15,6 +15,8 @@ from surrogym_shared.spec.coordinates import Coordinate, StartDistribution, limi
 from surrogym_shared.spec.rewards import AnyReward, DeclaredReward, Reward, Success
 from surrogym_shared.spec.terms import AllOf, ObservationEntry, Term, Termination
 
+Access = Literal["any", "snapshot", "reset"]
+
 
 class Choice(Frozen):
     """Choice of one of several named parts, with settings of its own."""
@@ -96,6 +98,10 @@ class EnvironmentSpec(Frozen):
         default="step",
         description="``step``: it can be set to any state; ``rollout``: it can only be reset, and acted on from there",
     )
+    snapshots: StrictBool = Field(
+        default=False,
+        description="with query ``rollout``: it can also return to any state that it was in and that was saved",
+    )
     max_rollout: Annotated[int, Field(ge=1, le=MAX_ROLLOUT_QUERY, strict=True)] | None = Field(
         default=None, description="longest action sequence of one query; None: the time limit, 200 at most"
     )
@@ -115,6 +121,13 @@ class EnvironmentSpec(Frozen):
     def termination_groups(self) -> tuple[AllOf, ...]:
         """Groups of inequalities that declare terminations; empty if termination is learned."""
         return () if self.termination == "learned" else self.termination
+
+    @property
+    def access(self) -> Access:
+        """Where a query may begin: at any state, at a saved state or a reset, or at a reset only."""
+        if self.query == "step":
+            return "any"
+        return "snapshot" if self.snapshots else "reset"
 
     @property
     def observation_names(self) -> tuple[str, ...]:
@@ -164,6 +177,10 @@ class EnvironmentSpec(Frozen):
         require(
             self.max_rollout is None or self.query == "rollout",
             f"max_rollout {self.max_rollout} needs query 'rollout', got {self.query!r}",
+        )
+        require(
+            not self.snapshots or self.query == "rollout",
+            f"snapshots need query 'rollout', got {self.query!r}: any state can be set",
         )
         require(
             self.query == "step" or self.design.preset != "paper",

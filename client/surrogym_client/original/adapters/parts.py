@@ -34,6 +34,14 @@ class OfParts(Simulator):
         for part, values in reversed(list(zip(self._parts, np.split(state, ends), strict=True))):
             part.write(values)
 
+    def save(self) -> Array:
+        return np.concatenate([part.save() for part in self._parts])
+
+    def restore(self, saved: Array) -> None:
+        ends = np.cumsum([len(part.save()) for part in self._parts])[:-1]
+        for part, values in reversed(list(zip(self._parts, np.split(saved, ends), strict=True))):
+            part.restore(values)
+
     def touches(self) -> bool:
         return self._data is not None and int(self._data.ncon) > 0
 

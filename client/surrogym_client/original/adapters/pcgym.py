@@ -17,6 +17,7 @@ from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.gymnasium import native_action
 from surrogym_client.original.protocol import Array
 from surrogym_client.original.simulator import Simulator, Taken, Variable
+from surrogym_client.original.state_parts import StatePart
 
 STIRRED_TANK: dict[str, Any] = {  # the quick start of pc-gym 0.1.8
     "model": "cstr",
@@ -125,7 +126,7 @@ class Process(OfParts):
         self._env.close()
 
 
-class _State:
+class _State(StatePart):
     """The process's states, its setpoints, and its disturbances."""
 
     def __init__(self, env: Any) -> None:

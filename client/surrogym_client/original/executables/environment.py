@@ -15,6 +15,7 @@ from surrogym_client.original.executables.messages import (
     number,
     numbers,
     specification_in,
+    text,
     truth,
 )
 from surrogym_client.original.executables.program import Program
@@ -67,6 +68,18 @@ class Executable:
         if not (step.terminated or step.truncated):
             self._at = step.next_coordinates  # type: ignore[assignment]  # an array (C,), from _stepped
         return step
+
+    def save(self) -> bytes:
+        """The program's snapshot: the text that it answered with, as bytes."""
+        return text(self._program.ask("save", self._deadline()), "snapshot").encode()
+
+    def restore(self, snapshot: bytes) -> Array:
+        """Let the program return to a snapshot; the coordinates (C,) there."""
+        self._at = None
+        self._revive()
+        reply = self._program.ask("restore", self._deadline(), snapshot=snapshot.decode(errors="replace"))
+        self._at = self._state(reply)
+        return self._at
 
     def close(self) -> None:
         """Ask the program to close, and end it if it does not."""

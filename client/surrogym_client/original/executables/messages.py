@@ -98,6 +98,18 @@ def truth(reply: Reply, key: str) -> bool:
     return came
 
 
+def text(reply: Reply, key: str) -> str:
+    """Return a text.
+
+    Raises:
+        StepFailed: the reply has none under this key.
+    """
+    came = reply.get(key)
+    if not isinstance(came, str):
+        raise StepFailed(f"expected a text for {key!r} in the program's answer, got {short(came)}")
+    return came
+
+
 def action_entries(space: Action, action: Array) -> list[float] | list[int]:
     """Return an action (F,) as it is sent: whole numbers if the action is discrete."""
     if isinstance(space, BoxAction):

@@ -1,0 +1,109 @@
+"""A return to a saved state: the same steps follow, bit for bit, in any process."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.rail import SPEC, Rail
+from surrogym_client import original
+from surrogym_client.original.errors import StepFailed, UnknownEnvironment
+from surrogym_client.original.rollouts import FromReset, answering
+
+SHELL = Path(__file__).parents[2] / "examples" / "executables" / "rail.sh"
+CLASSIC = ("Pendulum-v1", "CartPole-v1", "MountainCarContinuous-v0", "Acrobot-v1", "surrogym/CartPoleSwingUp-v0")
+
+
+class SavedRail(Rail):
+    """The rail, with snapshots."""
+
+    def spec(self):
+        return SPEC.model_copy(update={"snapshots": True})
+
+    def save(self):
+        return repr(float(self.x)).encode()
+
+    def restore(self, snapshot):
+        self.x = float(snapshot)
+        return np.array([self.x, self.x])
+
+
+def going(environment, count, seed=0):
+    """Take steps with random actions; their results."""
+    rng, taken = np.random.default_rng(seed), []
+    for _ in range(count):
+        action = environment.spec().action
+        u = rng.uniform(action.low, action.high) if action.kind == "box" else rng.integers(action.n, size=1)
+        step = environment.act(np.asarray(u, dtype=np.float64))
+        taken.append((*np.asarray(step.next_coordinates).tolist(), step.reward, step.terminated))
+    return taken
+
+
+@pytest.mark.parametrize("name", CLASSIC)
+def test_a_classic_task_repeats_its_steps_after_a_return(name):
+    there, elsewhere = (original.make(name, access="snapshot") for _ in range(2))
+    there.begin(3)
+    going(there, 4)
+    snapshot = there.save()
+    first = going(there, 5, seed=1)
+    elsewhere.begin(8)
+    back = elsewhere.restore(snapshot)
+    assert going(elsewhere, 5, seed=1) == first
+    there.restore(snapshot)
+    assert there.save() == snapshot
+    assert len(back) == len(there.spec().coordinates)
+    for environment in (there, elsewhere):
+        environment.close()
+
+
+def test_a_mujoco_task_repeats_its_steps_after_a_return():
+    pytest.importorskip("mujoco")
+    plant = original.make("InvertedDoublePendulum-v5", access="snapshot")
+    plant.begin(0)
+    going(plant, 3)
+    snapshot = plant.save()
+    first = going(plant, 3, seed=1)
+    plant.begin(1)
+    plant.restore(snapshot)
+    assert going(plant, 3, seed=1) == first
+    plant.close()
+
+
+def test_ones_own_class_reads_its_coordinates_after_a_return():
+    rail = answering(SavedRail())
+    assert isinstance(rail, FromReset)
+    rail.begin(0)
+    snapshot = rail.save()
+    rail.act(np.ones(1))
+    assert rail.restore(snapshot) == pytest.approx([float(snapshot)])
+    assert rail.act(np.ones(1)).coordinates == pytest.approx([float(snapshot)])
+
+
+def test_a_program_returns_to_what_it_saved():
+    plant = original.make(f"exec:{shlex.quote(str(SHELL))}", access="snapshot")
+    plant.begin()
+    plant.act(np.ones(1))
+    snapshot = plant.save()
+    plant.act(np.ones(1))
+    assert list(plant.restore(snapshot)) == [1.0]
+    assert list(plant.act(np.zeros(1)).next_coordinates) == [0.0]
+    plant.close()
+
+
+@pytest.mark.parametrize("snapshot", [b"", b"nonsense", original.make("CartPole-v1").save()])
+def test_a_snapshot_of_something_else_is_refused(snapshot):
+    plant = original.make("Pendulum-v1", access="snapshot")
+    with pytest.raises(StepFailed, match="expected a snapshot of"):
+        plant.restore(snapshot)
+    plant.close()
+
+
+def test_declared_snapshots_need_both_methods():
+    class Half(SavedRail):
+        restore = None
+
+    with pytest.raises(UnknownEnvironment, match="need the methods save and restore"):
+        answering(Half())
