@@ -50,7 +50,7 @@ class InvalidSpec(InvalidInput):
 
 
 class TooLarge(InvalidInput):
-    """More than a limit allows."""
+    """A request exceeds a limit; the message names the limit."""
 
 
 class NotThere(SurrogymError):

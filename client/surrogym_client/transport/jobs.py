@@ -39,13 +39,13 @@ class JobCalls:
         Raises:
             NoModel: a training needs a model.
             UnknownPolicy: the policy to evaluate does not exist.
-            Overloaded: too many jobs wait.
+            Overloaded: too many jobs are queued or running.
         """
         body = wire.AddJob(task=task, idempotency_key=idempotency_key)
         return self._post(wire.JobView, f"{routes.surrogate(surrogate)}/jobs", body, repeatable=bool(idempotency_key))
 
     def cancel(self, surrogate: str, id: int) -> wire.JobView:
-        """Cancel a job that waits, or ask the worker of a running one to stop."""
+        """Cancel a queued job, or ask the worker of a running one to stop."""
         route = f"{routes.job(surrogate, id)}:cancel"
         return parse(wire.JobView, self._connection.send("POST", route), route)
 
@@ -79,7 +79,7 @@ class JobCalls:
         lease_seconds: float = 60.0,
         retries: Retries | None = None,
     ) -> bool:
-        """Keep a job, and store how far it is. Returns whether the worker is to stop.
+        """Renew the lease of a job, and store its progress. Returns whether the worker is to stop.
 
         Raises:
             LeaseExpired: the job has ended, or another worker has it.

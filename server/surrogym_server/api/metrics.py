@@ -36,8 +36,8 @@ router = APIRouter(tags=["service"], route_class=DoorRoute)
     responses={200: {"content": {"text/plain": {}}}, **documented(Code.UNAVAILABLE)},
 )
 def metrics(request: Request, use: Use) -> Response:
-    """Requests, steps, fits and expiries since the start of this process; samples, queries and fidelity from
-    storage."""
+    """Return metrics for Prometheus: requests, steps, fits and expiries since this process started, and samples,
+    queries and fidelity from the database."""
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_Reading(request.app.version, use, request.app.state.metrics))
     text = generate_latest(registry) + exposition(use.storage.surrogates.summaries())
@@ -56,15 +56,17 @@ class _Reading:
         yield InfoMetricFamily("surrogym_build", "Version of the server.", {"version": self._version})
         metrics, engine = self._metrics, self._use.engine.counts()
         yield _requests(metrics)
-        yield _durations("surrogym_step_seconds", "Of a request that steps a session, waiting included.", engine.steps)
-        yield _durations("surrogym_fit_seconds", "Of a fit with the choice of the next queries.", metrics.fits)
+        yield _durations(
+            "surrogym_step_seconds", "Duration of a request that steps a session, with its wait.", engine.steps
+        )
+        yield _durations("surrogym_fit_seconds", "Duration of a fit and its choice of queries.", metrics.fits)
         yield CounterMetricFamily("surrogym_lane_steps", "Virtual environment steps.", engine.lane_steps)
         yield CounterMetricFamily("surrogym_failed_fits", "Fits that failed.", metrics.failed_fits)
-        yield CounterMetricFamily("surrogym_expired_leases", "Leases that ended unanswered.", metrics.expired_leases)
-        yield CounterMetricFamily("surrogym_expired_sessions", "Sessions idle for too long.", engine.expired)
+        yield CounterMetricFamily("surrogym_expired_leases", "Leases that expired unanswered.", metrics.expired_leases)
+        yield CounterMetricFamily("surrogym_expired_sessions", "Sessions that expired idle.", engine.expired)
         yield GaugeMetricFamily("surrogym_sessions", "Open sessions.", sum(engine.sessions.values()))
         yield GaugeMetricFamily("surrogym_lanes", "Lanes of all open sessions.", engine.lanes)
-        yield GaugeMetricFamily("surrogym_session_requests", "Of sessions, at work or waiting.", engine.requests)
+        yield GaugeMetricFamily("surrogym_session_requests", "Requests running or waiting.", engine.requests)
 
 
 def _requests(metrics: ProcessMetrics) -> Metric:

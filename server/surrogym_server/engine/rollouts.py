@@ -25,7 +25,7 @@ OneStep = Callable[[Session, Floats], tuple[Session, StepResult]]  # by the mode
 
 
 def parts_of(run: PolicyRun) -> tuple[object, ...]:
-    """Parts of a request's fingerprint."""
+    """Return everything that distinguishes a policy's rollout from others, for the fingerprint of its request."""
     policy = run.policy
     arrays = (policy.mean, policy.deviation, policy.vector, policy.log_deviations, run.until)
     return (run.steps, policy.units, policy.activation, run.noise, *arrays)
