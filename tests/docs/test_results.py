@@ -28,6 +28,7 @@ def test_the_tables_are_those_of_the_rows(page, name, pictures):
         ("older", "before-prolonging"),
         ("older", "before-noise"),
         ("fresh-seeds", "fresh"),
+        ("fastppo", "fastppo-default"),
         ("fastppo", "fastppo"),
         ("fastppo", "fastppo-mountaincar"),
     ],

@@ -43,8 +43,8 @@ class StatePart(Protocol):
 class MujocoState(StatePart):
     """Positions, velocities, activations of actuators and mocap poses of a MuJoCo model.
 
-    A write restores the model's full integration state as it was at rest, so that nothing of earlier steps is left:
-    time, the solver's warm start, applied forces, active constraints.
+    ``rest_here`` records MuJoCo's full integration state. Each write first restores that record, and then sets the given
+    values. So no time, warm start of the solver, applied force or active constraint of earlier steps remains.
     """
 
     def __init__(self, model: Native, data: Native) -> None:

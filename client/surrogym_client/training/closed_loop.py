@@ -46,8 +46,9 @@ class LoopSettings:
 class ClosedLoop:
     """Learn a policy in rounds, with queries where it goes, until the model is certain there or the design is ready.
 
-    Each round submits the states that the policy visits from the declared starts. They are the occupancy of a
-    checkpoint of its own, so the same seeds choose the same queries. The rounds end once the confidence index over
+    Each round submits the states that the policy visits from the declared starts, as a checkpoint that no other
+    training shares. So the queries of a round depend on this training alone, and the same seeds choose the same
+    queries. The rounds end once the confidence index over
     these states reaches the target that the design has for the whole range. In the rounds, lanes move by the mean, so
     that a policy goes where the model predicts the highest return. The settings of the last training are ``chosen_for``
     the phase that the design then has. Only the last training may be prolonged, because a later round makes up for a

@@ -182,7 +182,18 @@ class Connection:
         return send_once
 
     def persist(self, attempt: Callable[[], T], *, repeatable: bool = True, retries: Retries | None = None) -> T:
-        """Call ``attempt`` until it succeeds, is refused, or the retry budget is spent. Raises as ``send``."""
+        """Call ``attempt`` until it succeeds, the server refuses it, or the pauses of ``retries`` are used up.
+
+        Args:
+            attempt: sends one request.
+            repeatable: whether the server may get the request twice. If not, it is repeated only if it certainly did
+                not arrive.
+            retries: pauses between attempts; None takes the connection's.
+
+        Raises:
+            ServerUnreachable, Unavailable: the last attempt failed.
+            ProblemError: the server refused the request.
+        """
         delays: Iterator[float] | None = None
         while True:
             try:

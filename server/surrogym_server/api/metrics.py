@@ -36,8 +36,11 @@ router = APIRouter(tags=["service"], route_class=DoorRoute)
     responses={200: {"content": {"text/plain": {}}}, **documented(Code.UNAVAILABLE)},
 )
 def metrics(request: Request, use: Use) -> Response:
-    """Return metrics for Prometheus: requests, steps, fits and expiries since this process started, and samples,
-    queries and fidelity from the database."""
+    """Return metrics for Prometheus.
+
+    Requests, steps, fits, expired leases and expired sessions are counted since this process started. Samples, queries
+    and fidelity come from the database.
+    """
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_Reading(request.app.version, use, request.app.state.metrics))
     text = generate_latest(registry) + exposition(use.storage.surrogates.summaries())

@@ -34,7 +34,8 @@ class Opening:
 
 @dataclass(frozen=True)
 class SampledRewards:
-    """Range of the rewards in a surrogate's samples, which limits virtual rewards."""
+    """Lowest and highest reward in a surrogate's samples, and the number of samples. Virtual rewards are limited to this
+    range, widened as in ``virtual.limits.reward_limits``."""
 
     low: float
     high: float

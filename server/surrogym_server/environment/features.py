@@ -50,7 +50,10 @@ class FeatureMap:
 
 
 def leading(definition: EnvironmentDefinition) -> tuple[int, ...]:
-    """Coordinates that saturate on both sides without a wall, such as limited speeds. They are predicted first."""
+    """Coordinates with two finite limits at which only they themselves stop, such as a limited speed.
+
+    They are predicted first, because their next value can be an input of other outputs.
+    """
     return tuple(
         i
         for i in definition.moving

@@ -37,8 +37,14 @@ LOOK_SECONDS = 1.0  # each poll costs the server a little of the trainer's time
 
 @dataclass(frozen=True)
 class Learned:
-    """A policy, with the steps and time of its training. ``confidence_index``, ``fidelity`` and ``phase`` are of the
-    surrogate, if any."""
+    """A trained policy and what it cost.
+
+    Attributes:
+        policy: its file.
+        real_queries: numbers of real steps: initial, adaptive, their total, unresolved, and those of audits.
+        seconds: duration of each phase, by its name.
+        confidence_index, fidelity, phase: state of the surrogate; None for a policy trained without a surrogate.
+    """
 
     policy: Path
     real_queries: dict[str, int]  # initial, adaptive, total of these, unresolved, and of audits

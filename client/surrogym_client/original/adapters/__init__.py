@@ -16,13 +16,20 @@ GYMNASIUM_ID = re.compile(r"(?:[A-Za-z_][\w.]*:)?[\w./-]+-v\d+")  # package:Id-v
 
 
 class Adapter(NamedTuple):
-    """Location of an adapter, the names that it opens, and the names that it opens for a server too: those of its
-    packages."""
+    """An adapter for one package of environments, such as dm_control.
+
+    Attributes:
+        module: Python module of the adapter, which is imported when it is needed.
+        names: pattern of the names of environments that the adapter opens.
+        trusted: pattern of the names that a client also opens when only a server gave the name. They can open nothing
+            but the package's own environments.
+        extra: extra of pip that installs the package.
+    """
 
     module: str
     names: re.Pattern[str]
     trusted: re.Pattern[str]
-    extra: str  # that installs the packages that it imports
+    extra: str
 
 
 NEVER = re.compile(r"(?!)")
