@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from support.programs import HANGS, NOTES_ITSELF, UNTERMINABLE, left_behind, program
 from support.scripted_server import problem, reply, scripted_server
 from surrogym_client.runtime.ways_out import EXTRAS
 from surrogym_shared import wire
@@ -104,3 +105,13 @@ def test_an_extra_that_is_not_installed_is_named(on_server, monkeypatch):
     monkeypatch.setitem(EXTRAS, "rare", ("no_such_module",))
     _, _, lacking = lines(on_server("doctor"))["packages"][1].partition("not installed: ")
     assert "surrogym[rare]" in lacking
+
+
+def test_a_program_that_hangs_is_not_left_behind(surrogym, tmp_path):
+    plant = program(tmp_path, NOTES_ITSELF, HANGS, UNTERMINABLE)
+    said = surrogym(
+        "doctor", "--server", "http://127.0.0.1:9", "--env", f"exec:{plant}", "--step-limit", "0.5", "--json"
+    )
+    assert "the program did not answer step within" in found(said)["step"]["said"]
+    assert (tmp_path / "pids").read_text()
+    assert left_behind(tmp_path) == []

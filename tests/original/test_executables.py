@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support.programs import left_behind
 from surrogym_client import original
 from surrogym_client.original.errors import StepFailed, StepTimedOut, UnknownEnvironment
 from surrogym_client.original.loading import is_known
@@ -74,6 +75,13 @@ def test_a_hanging_program_is_ended_and_started_anew():
         assert int(plant.step_from(np.zeros(4), np.zeros(1)).reward) != before
     finally:
         plant.close()
+
+
+def test_what_an_ended_program_has_started_is_ended_too(tmp_path):
+    plant = f"sh -c 'sleep 3600 >/dev/null & echo $! > {tmp_path}/pids; exit 3'"
+    with pytest.raises(UnknownEnvironment, match="got none"):
+        original.make(f"exec:{plant}")
+    assert left_behind(tmp_path) == []
 
 
 def test_a_newer_protocol_is_refused_with_the_way_out():

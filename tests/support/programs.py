@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import shlex
 import sys
+import time
 from pathlib import Path
 
 from support.moody import SPEC
+
+PATIENCE_SECONDS = 10.0
 
 SOURCE = f"""
 import json, os, random, sys, time
@@ -67,12 +70,40 @@ for line in sys.stdin:
 """
 
 
+NOTES_ITSELF = (
+    "x = last = 0.0",
+    "x = last = 0.0\nopen(os.path.dirname(__file__) + '/pids', 'a').write(f'{os.getpid()}\\n')",
+)
+HANGS = "    global last\n", "    time.sleep(3600)\n"
+UNTERMINABLE = "import json", "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)\nimport json"
+
+
 def program(folder: Path, *faults: tuple[str, str]) -> str:
     """Write a copy in which each fault's first text is replaced by its second; the command that runs it."""
     source = SOURCE
     for before, after in faults:
         assert before in source
         source = source.replace(before, after)
-    path = folder / "program.py"
+    path = folder / f"program-{len(list(folder.glob('program-*')))}.py"
     path.write_text(source)
     return shlex.join([sys.executable, "-I", "-S", str(path)])
+
+
+def left_behind(folder: Path) -> list[int]:
+    """The programs of a folder that still run, of those that note themselves (``NOTES_ITSELF``). A signal takes its
+    time to end one."""
+    deadline = time.monotonic() + PATIENCE_SECONDS
+    while True:
+        left = [pid for pid in map(int, (folder / "pids").read_text().split()) if is_running(pid)]
+        if not left or time.monotonic() > deadline:
+            return left
+        time.sleep(0.01)
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process exists. One that has ended but was not waited for does not count."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"

@@ -59,12 +59,12 @@ def command(
         with service.connect(context) as api:
             yield from findings_of(api)
         if env is not None:
-            from surrogym_client.original.loading import make
+            from surrogym_client.original.loading import isolated
 
             if given is None:
                 given, words = _described(env)
                 yield from words
-            yield from environment(partial(make, env, spec=given), step_limit)
+            yield from environment(partial(isolated, env, step_limit, given))
 
     found: list[Finding] = []
     for finding in findings():

@@ -13,8 +13,9 @@ import numpy as np
 
 from surrogym_client.original.episodes import draw
 from surrogym_client.original.errors import StepFailed
+from surrogym_client.original.executables import Executable
 from surrogym_client.original.isolated import IsolatedEnvironment
-from surrogym_client.original.protocol import Array, RealStep
+from surrogym_client.original.protocol import Array, OriginalEnvironment, RealStep
 from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 
 PLACES = 3  # number of states that are set, and of steps of an episode
@@ -79,7 +80,7 @@ class Access:
         return "snapshots (--access snapshot)" if self.can_restore else "reset only (--access reset)"
 
 
-def examine(environment: IsolatedEnvironment, spec: EnvironmentSpec) -> Access:
+def examine(environment: IsolatedEnvironment | Executable, spec: EnvironmentSpec) -> Access:
     """Take some real steps twice.
 
     Raises:
@@ -96,7 +97,7 @@ def examine(environment: IsolatedEnvironment, spec: EnvironmentSpec) -> Access:
 class _Looking:
     """The checks of one environment."""
 
-    def __init__(self, environment: IsolatedEnvironment, spec: EnvironmentSpec) -> None:
+    def __init__(self, environment: IsolatedEnvironment | Executable, spec: EnvironmentSpec) -> None:
         self._environment, self._spec = environment, spec
         self._rng = np.random.default_rng(0)
         self._steps = self._resets = 0
@@ -168,6 +169,7 @@ class _Looking:
 
     def _step_from(self, coordinates: Array, action: Array) -> RealStep:
         self._steps += 1
+        assert isinstance(self._environment, OriginalEnvironment)
         return self._environment.step_from(coordinates, action)
 
     def _is_inside(self, step: RealStep) -> bool:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import platform
 import statistics
 import time
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import entry_points, version
@@ -19,8 +19,9 @@ from surrogym_client.diagnosis.access import EXACT, Access, examine
 from surrogym_client.errors import ProblemError, ProtocolMismatch, Refused, ServerUnreachable, SurrogymClientError
 from surrogym_client.original.episodes import draw
 from surrogym_client.original.errors import OriginalError, StepFailed
+from surrogym_client.original.executables import Executable
 from surrogym_client.original.isolated import IsolatedEnvironment
-from surrogym_client.original.protocol import Array, Factory, RealStep
+from surrogym_client.original.protocol import Array, OriginalEnvironment, RealStep
 from surrogym_client.runtime.versions import versions
 from surrogym_client.runtime.ways_out import EXTRAS, GIVE_TOKEN, START_SERVER
 from surrogym_client.sampler.sample_conversion import sample_of
@@ -94,11 +95,11 @@ def service(api: Api) -> Iterator[Finding]:
     yield _round_trip(api)
 
 
-def environment(factory: Factory, step_limit: float) -> Iterator[Finding]:
-    """The original environment: whether it can be made, takes a step, and can be set to a state. The steps are real,
+def environment(opened: Callable[[], IsolatedEnvironment | Executable]) -> Iterator[Finding]:
+    """The original environment: whether it can be opened, takes a step, and can be set to a state. The steps are real,
     but they don't enter a ledger."""
     try:
-        with IsolatedEnvironment(factory, step_limit) as original:
+        with closing(opened()) as original:
             spec = original.spec()
             names = ", ".join(spec.coordinate_names)
             yield Finding("environment", f"coordinates ({names}), {spec.action.kind} action, {spec.query} queries")
@@ -110,7 +111,7 @@ def environment(factory: Factory, step_limit: float) -> Iterator[Finding]:
         yield Finding("environment", str(error), "see docs/how-to/own-environment.md for what an environment needs")
 
 
-def _access_of(original: IsolatedEnvironment, spec: EnvironmentSpec) -> Iterator[Finding]:
+def _access_of(original: IsolatedEnvironment | Executable, spec: EnvironmentSpec) -> Iterator[Finding]:
     """Exactness of the environment, and the recommended mode."""
     try:
         access = examine(original, spec)
@@ -175,7 +176,7 @@ def _timed(api: Api) -> float:
     return time.perf_counter() - started
 
 
-def _one_step(original: IsolatedEnvironment, spec: EnvironmentSpec) -> Finding:
+def _one_step(original: IsolatedEnvironment | Executable, spec: EnvironmentSpec) -> Finding:
     """A step from anywhere in the sampling range, or from a reset if the state can't be set."""
     start, action = draw(spec, np.random.default_rng(0), wide=True), _middle(spec)
     begun = time.perf_counter()
@@ -184,6 +185,7 @@ def _one_step(original: IsolatedEnvironment, spec: EnvironmentSpec) -> Finding:
             start = original.begin(0)
             step = original.act(action)
         else:
+            assert isinstance(original, OriginalEnvironment)
             step = original.step_from(start, action)
         seconds = time.perf_counter() - begun
         _check(step, start, action)

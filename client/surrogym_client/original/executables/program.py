@@ -150,16 +150,19 @@ class Program:
         self.end()
 
     def end(self) -> int | None:
-        """End the program by SIGTERM, then by SIGKILL, and return its exit code; None if there was no program."""
+        """End the program, and what it has started, by SIGTERM, then by SIGKILL.
+
+        Returns:
+            Its exit code; None if there was no program.
+        """
         process, self._process = self._process, None
         if process is None:
             return None
         for number in (signal.SIGTERM, signal.SIGKILL):
-            if process.poll() is None:
-                with suppress(ProcessLookupError, PermissionError):
-                    os.killpg(process.pid, number)
-                with suppress(subprocess.TimeoutExpired):
-                    process.wait(END_SECONDS)
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(process.pid, number)  # the group may outlive the program
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(END_SECONDS)
         for pipe in (process.stdin, process.stdout):
             if pipe is not None:
                 with suppress(OSError):
