@@ -15,7 +15,7 @@ PINS := pyproject.toml constraints.txt
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: demo install test audit test-all docs docs-serve format-check lint types imports unit chaos bench bench-memory acquisition audit-power compare format postgresql chromium screenshots clean help
+.PHONY: demo install test audit test-all docs docs-serve format-check lint types imports unit chaos bench bench-memory acquisition audit-power compare format postgresql chromium languages screenshots clean help
 
 demo: .venv/demo  ## Solve Pendulum with server, sampler and trainer on this machine (ARGS="--seed 1")
 	@exec $(BIN)/surrogym demo pendulum $(ARGS)
@@ -36,7 +36,7 @@ types: .venv/dev  ## Check the types
 imports: .venv/dev  ## Check which room imports which
 	$(BIN)/lint-imports
 
-unit: .venv/dev postgresql chromium  ## The tests alone (ARGS="-k pendulum")
+unit: .venv/dev postgresql chromium languages  ## The tests alone (ARGS="-k pendulum")
 	$(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
 
 test-all: test .venv-extras .venv-adapters  ## make test, every command of the docs, and trainers and trackers with packages of their own
@@ -91,6 +91,15 @@ chromium:
 	    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq chromium >/dev/null; \
 	else \
 	    echo "Chromium is not on this machine, so the tests of the page are skipped. To run them: apt-get install chromium"; \
+	fi
+
+languages:
+	@if command -v cc >/dev/null && command -v node >/dev/null; then \
+	    :; \
+	elif [ -n "$$CI" ] && [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq gcc libc6-dev nodejs >/dev/null; \
+	else \
+	    echo "cc or node is not on this machine, so the tests of their examples are skipped. To run them: apt-get install gcc libc6-dev nodejs"; \
 	fi
 
 screenshots: .venv/dev chromium  ## Pictures of the page for the docs, from a live Pendulum
