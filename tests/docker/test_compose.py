@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +19,10 @@ COMPOSE = ROOT / "docker" / "compose.yaml"
 DOCKERFILE = (ROOT / "docker" / "Dockerfile").read_text(encoding="utf-8")
 SERVICES: dict[str, dict[str, Any]] = yaml.safe_load(COMPOSE.read_text(encoding="utf-8"))["services"]
 BUILT = {name: service for name, service in SERVICES.items() if "build" in service}
-TEAM = {name: service for name, service in SERVICES.items() if "build" not in service}
+ADDED = {name: service for name, service in SERVICES.items() if "build" not in service}
+SEARCHED = f"{os.environ.get('PATH', '')}:/usr/sbin"  # where Debian has it
+CLIENTS = ("register", "sampler", "trainer")
+CLUSTER = ("ray-head", "ray-node", "front")
 DEFAULT = re.compile(r"\$\{\w+:-([^}]*)\}")
 
 
@@ -43,7 +49,7 @@ def last(target: str, instruction: str) -> str:
     return [line.partition(" ")[2] for line in whole(target) if line.startswith(f"{instruction} ")][-1]
 
 
-@pytest.mark.parametrize("target", ["server", "sampler", "trainer"])
+@pytest.mark.parametrize("target", ["server", "sampler", "trainer", "cluster"])
 def test_no_program_runs_as_root(target: str) -> None:
     user = last(target, "USER")
     assert any(f"useradd --uid 1000 --create-home {user}" in line for line in whole(target))
@@ -99,14 +105,16 @@ def test_a_service_is_built_from_a_target_of_the_dockerfile(name: str) -> None:
 
 @pytest.mark.parametrize("name", BUILT)
 def test_no_service_starts_without_a_token_of_ones_own(name: str) -> None:
-    assert SERVICES[name]["environment"]["SURROGYM_TOKEN"].startswith("${SURROGYM_TOKEN:?expected ")
+    tokens = {key: value for key, value in SERVICES[name]["environment"].items() if key.endswith("_TOKEN")}
+    assert tokens
+    assert all(value.startswith("${SURROGYM_TOKEN:?expected ") for value in tokens.values())
 
 
-@pytest.mark.parametrize("name", ["register", "sampler", "trainer"])
+@pytest.mark.parametrize("name", CLIENTS)
 def test_a_client_gives_a_known_command_and_waits_by_itself(name: str) -> None:
     values = parse([DEFAULT.sub(r"\1", word) for word in SERVICES[name]["command"]])
     assert values["wait"] >= 60
-    assert SERVICES[name]["environment"]["SURROGYM_URL"] == "http://server:8000"
+    assert SERVICES[name]["environment"]["SURROGYM_URL"] == "${SURROGYM_URL:-http://server:8000}"
 
 
 def test_the_server_is_reachable_from_this_machine_alone() -> None:
@@ -126,16 +134,44 @@ def test_samplers_can_be_scaled() -> None:
 
 
 def test_what_is_not_built_here_waits_for_its_profile_and_has_a_version() -> None:
-    assert set(TEAM) == {"postgresql", "prometheus", "grafana"}
-    for service in TEAM.values():
-        assert service["profiles"] == ["team"]
+    profiles = {name: service["profiles"] for name, service in SERVICES.items() if "profiles" in service}
+    assert profiles == {
+        "postgresql": ["team", "cluster"],
+        "prometheus": ["team"],
+        "grafana": ["team"],
+        "proxy": ["cluster"],
+        **{name: ["cluster"] for name in CLUSTER},
+    }
+    for service in ADDED.values():
         assert re.search(r":v?\d+[\d.]*}$", service["image"])
         assert all(port.startswith("127.0.0.1:") for port in service.get("ports", []))
-    assert not [name for name, service in BUILT.items() if "profiles" in service]
+
+
+def test_the_cluster_has_one_image_and_opens_no_port_but_the_proxys() -> None:
+    assert {SERVICES[name]["image"] for name in CLUSTER} == {"surrogym-cluster"}
+    assert {SERVICES[name]["build"]["target"] for name in CLUSTER} == {"cluster"}
+    assert [name for name in (*CLUSTER, "proxy") if "ports" in SERVICES[name]] == ["proxy"]
+    assert SERVICES["front"]["command"] == ["front.sh"]
+    assert "docker/front.sh /usr/local/bin/front.sh" in last("cluster", "COPY")
+
+
+@pytest.mark.skipif(shutil.which("haproxy", path=SEARCHED) is None, reason="HAProxy is not on this machine")
+def test_haproxy_understands_the_configuration_of_the_load_balancer() -> None:
+    program = shutil.which("haproxy", path=SEARCHED)
+    ended = subprocess.run(
+        [str(program), "-c", "-f", COMPOSE.parent / "haproxy.cfg"], capture_output=True, text=True, check=False
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+def test_the_script_of_a_front_server_can_run_and_joins_without_cpus() -> None:
+    script = COMPOSE.parent / "front.sh"
+    assert script.stat().st_mode & 0o111
+    assert "--num-cpus 0" in script.read_text(encoding="utf-8")
 
 
 def test_what_is_mounted_is_there() -> None:
-    mounts = [volume.split(":")[0] for service in TEAM.values() for volume in service["volumes"]]
+    mounts = [volume.split(":")[0] for service in ADDED.values() for volume in service["volumes"]]
     files = [mount for mount in mounts if mount.startswith("./")]
-    assert len(files) == 3
+    assert len(files) == 4
     assert all((COMPOSE.parent / file).exists() for file in files)
