@@ -68,7 +68,8 @@ def fit(
     """
     objective = _Objective(x, y, options, reflection)
     with _blas().limit(limits=1):
-        found = [_minimum(objective, start) for start in _starts(objective.default_start, warm, len(y))]
+        starts = [*_starts(objective.default_start, warm, len(y)), *objective.noisy_starts]
+        found = [_minimum(objective, start) for start in starts]
     value, theta = min(found, key=lambda pair: pair[0])
     return Fitted(condition(objective.hyper(theta), x, y), -value, theta)
 
@@ -163,6 +164,20 @@ class _Objective:
         self.default_start = self.prior[:, 0].copy()
         self.default_start[-1] = math.log(1e-4)
         self.constant = 0.5 * n * math.log(2 * math.pi) + float(np.log(self.prior[:, 1]).sum())
+
+    @property
+    def noisy_starts(self) -> list[Array]:
+        """A start with the noise of equal points, if their results differ. A search that has explained such results by
+        short length scales does not find the way to noise by itself."""
+        equal = ~self.squared[:, : len(self.rows)].any(0) & (self.rows != self.columns)
+        if not equal.any():
+            return []
+        noise = 0.5 * float(np.square(self.y[self.rows[equal]] - self.y[self.columns[equal]]).mean())
+        if noise <= self.options.noise_floor:
+            return []
+        start = self.default_start.copy()
+        start[-1] = math.log(noise)
+        return [start]
 
     def theta(self, hyper: Hyperparameters) -> Array:
         """The free parameters theta of hyperparameters, within the bounds; the inverse of ``hyper``."""

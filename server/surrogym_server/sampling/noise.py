@@ -1,7 +1,8 @@
 """Tell noise of the original environment from misfit of the model, by steps that are taken twice.
 
 A process that does not fit its samples explains the rest as noise. Only a repeat of the same step shows which it is: a
-deterministic environment gives the same result.
+deterministic environment gives the same result. Repeats are few, so each conclusion is a chi-squared test of the sum of
+their squared deviations, at the level ``LEVEL``. Steps are repeated until every doubtful output has a conclusion.
 """
 
 from __future__ import annotations
@@ -10,17 +11,20 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import scipy  # its parts are loaded on first use
 import torch
 from torch import Tensor
 
 from surrogym_server.environment.points import Points
-from surrogym_server.environment.samples import Samples, increments
-from surrogym_server.models.abilities import LearnedNoise, offers
+from surrogym_server.environment.samples import Samples, increments, saturated
+from surrogym_server.models.abilities import LearnedNoise, LeaveOneOut, offers
 from surrogym_server.models.port import DynamicsModel
 
 ENOUGH = 3  # degrees of freedom from repeated steps, before noise counts as established
+STAGES = (1, ENOUGH, 6, 9)  # degrees of freedom after which the repeats are tested
+LEVEL = 0.01  # of each test
+NEGLIGIBLE = 0.5  # of the tolerance: noise of this size is established in at most ``LEVEL`` of the cases
 AT_MOST = 3.0  # largest ratio of learned noise to measured deviation; the rest is misfit, even if there are few repeats
-REFUTED = 0.05  # share of the learned noise; if repeats differ by less, the learned noise is misfit
 SLACK = 1.25  # a leave-one-out error beyond the noise that few samples leave
 
 
@@ -50,25 +54,54 @@ def established_noise(model: DynamicsModel, samples: Samples, tolerances: Sequen
     found = repeats(model, samples)
     if found.degrees < ENOUGH:
         return torch.zeros_like(learned)
-    confirmed = (learned > limits) & (found.deviation > limits)
+    confirmed = (learned > limits) & _confirmed(found, limits)
     return torch.where(confirmed, learned.minimum(AT_MOST * found.deviation), 0.0)
 
 
 def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float]) -> Points | None:
     """Steps to take again, if a model has learned noise beyond a tolerance that no repeat has confirmed or refuted yet.
 
-    First one step, which refutes the noise in a deterministic environment, then ``ENOUGH`` of them. None if none is
-    needed.
+    First one step, which refutes the noise in a deterministic environment, then as many as the next of ``STAGES``
+    lacks. An output whose confirmed noise does not explain its leave-one-out error is doubtful again, because few
+    repeats may have found too little noise. None if none is needed. Steps that ended at a bound are not repeated,
+    because the bound hides their noise.
     """
     learned, limits = _learned(model, tolerances)
-    doubtful = learned > limits
     found = repeats(model, samples)
-    if not bool(doubtful.any()) or found.degrees >= ENOUGH:
+    doubtful = learned > limits
+    if found.degrees:
+        doubtful &= ~_refuted(found, learned)
+    if found.degrees >= ENOUGH:
+        noise = established_noise(model, samples, tolerances)
+        doubtful &= ~_confirmed(found, limits) | _unexplained(model, limits, noise)
+    following = next((stage for stage in STAGES if stage > found.degrees), None)
+    if following is None or not bool(doubtful.any()):
         return None
-    if found.degrees and bool((found.deviation <= REFUTED * learned)[doubtful].all()):
-        return None
-    which = model.definition.can_be_set(samples.q).nonzero()[found.degrees : ENOUGH if found.degrees else 1, 0]
+    definition = model.definition
+    free = definition.can_be_set(samples.q) & ~saturated(definition, samples.q_next)
+    which = free.nonzero()[found.degrees : following, 0]
     return Points(samples.q[which], samples.u[which]) if len(which) else None
+
+
+def _confirmed(found: Repeats, limits: Tensor) -> Tensor:
+    """Whether repeats show that the noise exceeds ``NEGLIGIBLE`` times the limits (O,), (O,) bool."""
+    bound = (NEGLIGIBLE * limits).square() * float(scipy.special.chdtri(found.degrees, LEVEL))
+    return found.degrees * found.deviation.square() > bound
+
+
+def _unexplained(model: DynamicsModel, limits: Tensor, noise: Tensor) -> Tensor:
+    """Whether leave-one-out errors are larger than tolerance (O,) and noise (O,) explain, (O,) bool."""
+    able = offers(model, LeaveOneOut)
+    if able is None:
+        return torch.zeros_like(noise, dtype=torch.bool)
+    errors = torch.tensor([one.error for one in able.leave_one_out()], dtype=noise.dtype)
+    return errors > SLACK * torch.hypot(limits, noise)
+
+
+def _refuted(found: Repeats, learned: Tensor) -> Tensor:
+    """Whether repeats show that most of the learned noise (O,) is misfit, (O,) bool."""
+    bound = (learned / AT_MOST).square() * float(scipy.special.chdtri(found.degrees, 1 - LEVEL))
+    return found.degrees * found.deviation.square() <= bound
 
 
 def widened(tolerances: Sequence[float], noise: Tensor) -> tuple[float, ...]:

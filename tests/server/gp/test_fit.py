@@ -160,3 +160,15 @@ def test_the_first_fit_of_a_process_limits_every_blas():
     """SciPy's own library is loaded on first use, and a controller knows only what was loaded before it."""
     ran = subprocess.run([sys.executable, "-c", LIMITED], capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == "set()"
+
+
+def test_results_of_equal_points_lead_a_warm_fit_to_the_noise(rng):
+    """A fit to points of one result each has explained the noise by short length scales."""
+    x = torch.from_numpy(rng.uniform(-1, 1, (28, 2)))
+    y = x[:, 0] + 0.3 * torch.from_numpy(rng.normal(size=28))
+    stuck = np.log(np.array([0.02, 0.02, 1.0, 1e-8, 1e-7]))
+    again = torch.cat([x, x[:3]]), torch.cat([y, y[:3] + 0.3 * torch.from_numpy(rng.normal(size=3))])
+    cold, warm = (fit(*again, FitOptions(), warm=start) for start in (None, stuck))
+    assert warm.score == pytest.approx(cold.score, abs=0.1)
+    assert math.sqrt(warm.posterior.hyper.noise_variance) == pytest.approx(0.3, rel=0.4)
+    assert fit(x[:27], y[:27], FitOptions(), warm=stuck).posterior.hyper.noise_variance < 1e-2, "without, it is stuck"

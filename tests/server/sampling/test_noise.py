@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+import scipy
 import torch
 
 from support.exact_models import ExactModel, exact_pendulum
@@ -13,7 +14,16 @@ from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.abilities import LearnedNoise
 from surrogym_server.sampling.design import DesignState, Request, advance
-from surrogym_server.sampling.noise import ENOUGH, established_noise, repeats, to_repeat, widened
+from surrogym_server.sampling.noise import (
+    ENOUGH,
+    LEVEL,
+    NEGLIGIBLE,
+    STAGES,
+    established_noise,
+    repeats,
+    to_repeat,
+    widened,
+)
 
 TOLERANCES = (0.01, 0.01, 0.01)
 
@@ -35,10 +45,10 @@ def model() -> ClaimsNoise:
     return ClaimsNoise(exact.definition, exact.move, exact.pay)
 
 
-def samples(model: ExactModel, again: int, noise: float = 0.0, count: int = 8) -> Samples:
-    """Steps from random states, the first of which was taken ``again`` times more."""
-    rng = np.random.default_rng(0)
-    which = [*range(count), *([0] * again)]
+def samples(model: ExactModel, again: int, noise: float = 0.0, count: int = 12, seed: int = 0) -> Samples:
+    """Steps from random states, the first ones of which were taken again, ``again`` times in all."""
+    rng = np.random.default_rng(seed)
+    which = [*range(count), *(i % count for i in range(again))]
     q, u = torch.tensor(rng.uniform(-1, 1, (count, 2)))[which], torch.tensor(rng.uniform(-1, 1, (count, 1)))[which]
     q_next = model.move(q, u)
     q_next[:, 0] += noise * torch.tensor(rng.normal(size=len(q)))
@@ -56,6 +66,31 @@ def test_deviations_of_repeated_steps_are_pooled(model: ClaimsNoise):
 def test_noise_counts_once_repeats_confirm_it(model: ClaimsNoise):
     assert established_noise(model, samples(model, again=ENOUGH - 1, noise=0.2), TOLERANCES).tolist() == [0, 0, 0]
     assert established_noise(model, samples(model, again=8, noise=0.2), TOLERANCES).tolist() == [0.2, 0, 0]
+
+
+def repeated(model: ClaimsNoise, noise: float, seed: int) -> tuple[float, int]:
+    """The established noise of the first output, and the number of repeats, once no more are asked for."""
+    again = 0
+    while (more := to_repeat(model, taken := samples(model, again, noise, seed=seed), TOLERANCES)) is not None:
+        again += len(more)
+    return float(established_noise(model, taken, TOLERANCES)[0]), again
+
+
+@pytest.mark.parametrize("claimed", [0.2, 0.015])
+def test_negligible_noise_is_seldom_established(model: ClaimsNoise, claimed: float):
+    """The model claims misfit of 20 tolerances as noise, or three times the noise that there is."""
+    tests, designs = sum(stage >= ENOUGH for stage in STAGES), 100
+    claims = replace(model, noise=(claimed, 0.0, 0.0))
+    found = [repeated(claims, NEGLIGIBLE * TOLERANCES[0], seed) for seed in range(designs)]
+    assert sum(noise > 0 for noise, _ in found) <= scipy.stats.binom.ppf(0.99, designs, tests * LEVEL)
+
+
+@pytest.mark.parametrize(("noise", "share"), [(0.04, 0.95), (0.02, 0.85)])
+def test_noise_beyond_the_tolerance_is_established(model: ClaimsNoise, noise: float, share: float):
+    claims = replace(model, noise=(noise, 0.0, 0.0))
+    found = [repeated(claims, noise, seed) for seed in range(50)]
+    assert sum(established > 0 for established, _ in found) >= share * len(found)
+    assert np.mean([again for _, again in found]) < STAGES[2], "few repeats suffice"
 
 
 def test_misfit_of_a_deterministic_environment_is_no_noise(model: ClaimsNoise):
