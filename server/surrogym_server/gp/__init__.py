@@ -15,7 +15,7 @@ beta      ``weights`` (n,)        (K + sigma_n^2 I)^-1 y
 ========  ======================  =========================================================
 """
 
-from surrogym_server.gp.fit import NOISE_FLOOR, FitOptions, Fitted, fit, refine
+from surrogym_server.gp.fit import NOISE_FLOOR, FitOptions, Fitted, fit, noisy_explanation, refine
 from surrogym_server.gp.hyperparameter_samples import hyperparameter_samples
 from surrogym_server.gp.joint import Joint
 from surrogym_server.gp.kernel import Hyperparameters, Reflection
@@ -43,6 +43,7 @@ __all__ = [
     "condition_sparse",
     "fit",
     "hyperparameter_samples",
+    "noisy_explanation",
     "refine",
     "spread",
 ]

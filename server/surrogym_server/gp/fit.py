@@ -21,9 +21,10 @@ from torch import Tensor
 
 from surrogym_server.gp.kernel import Hyperparameters, Polynomial, Reflection
 from surrogym_server.gp.posterior import Posterior, condition
-from surrogym_server.gp.subsets import SOME, spread
+from surrogym_server.gp.subsets import FEW, SOME, spread
 
 NOISE_FLOOR = 1e-8  # of the output's variance
+NOISY = 1e-2  # noise of a start from noise, of the output's variance
 MANY_POINTS = 24
 REFINEMENTS = ((1_000, 20), (2_000, 10))  # most points of further searches, and iterations: each begins near its end
 SHORTER = 0.5  # logarithm of the second start's length scales, below the first's
@@ -97,6 +98,22 @@ def refine(
                 objective = _Objective(x[rows], y[rows], replace(options, max_iterations=iterations), reflection)
                 found.append(_minimum(objective, found[-1])[1])
     return tuple(objective.hyper(theta) for theta in found)
+
+
+def noisy_explanation(posterior: Posterior, options: FitOptions) -> float:
+    """Variance of the noise in the likeliest explanation of a posterior's points that a search from noise finds. It is
+    the posterior's own if that explains them better.
+
+    A warm fit can stay for many rounds at an optimum without noise. With many points some of them are searched.
+    """
+    rows = spread(len(posterior.y), FEW)
+    objective = _Objective(posterior.x[rows], posterior.y[rows], options, posterior.hyper.reflection)
+    start = objective.default_start.copy()
+    start[-1] = math.log(NOISY)
+    with _blas().limit(limits=1):
+        value, theta = _minimum(objective, start)
+        own, _ = objective(objective.theta(posterior.hyper))
+    return float(np.exp(theta[-1])) if value <= own else posterior.hyper.noise_variance
 
 
 def _minimum(objective: _Objective, start: Array) -> tuple[float, Array]:

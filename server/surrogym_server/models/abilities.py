@@ -113,6 +113,12 @@ class LearnedNoise(ABC):
     def noise_deviations(self) -> tuple[float, ...]:
         """Standard deviation of each output's noise, in the output's unit, (O,)."""
 
+    @property
+    def possible_noise(self) -> tuple[float, ...]:
+        """Standard deviation of each output's noise in another explanation of the samples, if it is at least as likely,
+        (O,). Those that it has learned if the family looks for no other."""
+        return self.noise_deviations
+
 
 class OutputOutlook(ABC):
     """Forecast of one output's deviations at m candidates after some further queries, in the output's unit."""

@@ -59,7 +59,7 @@ def established_noise(model: DynamicsModel, samples: Samples, tolerances: Sequen
 
 
 def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float]) -> Points | None:
-    """Steps to take again, if a model has learned noise beyond a tolerance that no repeat has confirmed or refuted yet.
+    """Steps to take again, if noise beyond a tolerance explains the samples, and no repeat has confirmed or refuted it.
 
     First one step, which refutes the noise in a deterministic environment, then as many as the next of ``STAGES``
     lacks. An output whose confirmed noise does not explain its leave-one-out error is doubtful again, because few
@@ -68,6 +68,8 @@ def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float
     """
     learned, limits = _learned(model, tolerances)
     found = repeats(model, samples)
+    if not found.degrees and not bool((learned > limits).any()):
+        learned = _possible(model, limits)
     doubtful = learned > limits
     if found.degrees:
         doubtful &= ~_refuted(found, learned)
@@ -108,6 +110,12 @@ def widened(tolerances: Sequence[float], noise: Tensor) -> tuple[float, ...]:
     """Widen the tolerances (O,) by the established noise (O,), because a noisy output can't be known better than its
     noise."""
     return tuple(math.hypot(tolerance, float(one)) for tolerance, one in zip(tolerances, noise, strict=True))
+
+
+def _possible(model: DynamicsModel, limits: Tensor) -> Tensor:
+    """Noise that explains the samples at least as well as what a model has learned, (O,)."""
+    able = offers(model, LearnedNoise)
+    return torch.zeros_like(limits) if able is None else torch.tensor(able.possible_noise, dtype=limits.dtype)
 
 
 def _learned(model: DynamicsModel, tolerances: Sequence[float]) -> tuple[Tensor, Tensor]:

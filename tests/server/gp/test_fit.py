@@ -14,7 +14,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, WhiteKernel
 
-from surrogym_server.gp import FitOptions, Reflection, fit
+from surrogym_server.gp import FitOptions, Reflection, fit, noisy_explanation
 from surrogym_server.gp.fit import _Objective
 
 FLAT = (0.0, 1e4)  # a prior that says nothing
@@ -172,3 +172,12 @@ def test_results_of_equal_points_lead_a_warm_fit_to_the_noise(rng):
     assert warm.score == pytest.approx(cold.score, abs=0.1)
     assert math.sqrt(warm.posterior.hyper.noise_variance) == pytest.approx(0.3, rel=0.4)
     assert fit(x[:27], y[:27], FitOptions(), warm=stuck).posterior.hyper.noise_variance < 1e-2, "without, it is stuck"
+
+
+def test_a_stuck_fit_hides_no_noisy_explanation(rng):
+    x = torch.from_numpy(rng.uniform(-1, 1, (27, 2)))
+    y = x[:, 0] + 0.3 * torch.from_numpy(rng.normal(size=27))
+    stuck = np.log(np.array([0.02, 0.02, 1.0, 1e-8, 1e-7]))
+    assert math.sqrt(noisy_explanation(fit(x, y, FitOptions(), warm=stuck).posterior, FitOptions())) > 0.15
+    smooth = fit(x, x[:, 0] ** 2, FitOptions()).posterior
+    assert noisy_explanation(smooth, FitOptions()) < 1e-6, "an exact function has none"

@@ -144,6 +144,10 @@ class GaussianProcessModel(
     def noise_deviations(self) -> tuple[float, ...]:
         return tuple(output.noise_deviation for output in self.outputs)
 
+    @property
+    def possible_noise(self) -> tuple[float, ...]:
+        return tuple(output.possible_noise for output in self.outputs)
+
     def leave_one_out(self) -> tuple[LeaveOneOutErrors, ...]:
         return tuple(output.leave_one_out() for output in self.outputs)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from surrogym_server.environment.features import FeatureMap
-from surrogym_server.gp import NOISE_FLOOR, Posterior
+from surrogym_server.gp import NOISE_FLOOR, FitOptions, Posterior, noisy_explanation
 from surrogym_server.models.abilities import LeaveOneOutErrors
 from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE, Warp
 
@@ -63,9 +63,19 @@ class OutputModel:
     def noise_deviation(self) -> float:
         """Deviation of the learned noise, in the output's unit; that of a warped output at a value as large as its
         size."""
+        return 0.0 if self.posterior is None else self._of_noise(self.posterior.hyper.noise_variance)
+
+    @property
+    def possible_noise(self) -> float:
+        """The same deviation in an explanation by noise that is at least as likely, if a search finds one."""
         if self.posterior is None:
             return 0.0
-        noise = self.scale * math.sqrt(self.posterior.hyper.noise_variance)
+        hyper = self.posterior.hyper
+        options = FitOptions(hyper.linear_variance > 0, hyper.quadratic_variance > 0, noise_floor=self.noise_floor)
+        return max(self.noise_deviation, self._of_noise(noisy_explanation(self.posterior, options)))
+
+    def _of_noise(self, variance: float) -> float:
+        noise = self.scale * math.sqrt(variance)
         return noise if self.warp is None else noise * self.warp.size
 
     def leave_one_out(self) -> LeaveOneOutErrors:
