@@ -39,6 +39,11 @@ class WithPast(Rail):
         return with_history(SPEC, changes=2, actions=2, largest={"x": 0.1})
 
 
+class Moving(Rail):
+    def spec(self):
+        return with_history(SPEC, changes=2, largest={"x": 0.1}, at_start={"x": 0.05})
+
+
 class Clock:
     """A hand that turns by the action, and is read without whole turns being taken off."""
 
@@ -133,3 +138,26 @@ def test_a_history_where_any_state_can_be_set_is_refused():
     settable = SPEC.model_copy(update={"query": "step"})
     with pytest.raises(ValueError, match="lags need one that can only be reset"):
         with_history(settable, actions=1)
+
+
+def test_steps_whose_lags_are_unknown_are_counted():
+    environment = answering(Moving())
+    spec, counts = environment.spec(), [q[-1] for q in rolled(environment)]
+    assert counts == [0, 1, 2, 2]
+    assert [spec.known(q) for q in rolled(environment)] == [False, False, True, True]
+    assert spec.unknown_steps == 2
+
+
+def test_a_policy_does_not_observe_the_count():
+    assert Moving().spec().observation_names == ("x", "x.change1", "x.change2")
+
+
+def test_a_virtual_episode_starts_with_known_lags():
+    start = Moving().spec().start
+    assert (start["steps since reset"].value, start["x.change2"].high) == (2, 0.05)
+
+
+def test_a_design_that_would_learn_nothing_is_refused():
+    fields = Moving().spec().model_dump()
+    with pytest.raises(ValueError, match="expected initial of more than 3, got 3"):
+        EnvironmentSpec.model_validate(fields | {"design": {"initial": 3}})

@@ -94,7 +94,7 @@ def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, lear
     view = api.surrogate(surrogate)
     if view.fidelity is None or result.trace.coordinates.shape[1] != len(view.spec.coordinates):
         return None
-    steps = steps_of(result.traces)
+    steps = [step for step in steps_of(result.traces) if view.spec.known(step.coordinates)]
     differing = Differing(disagreements(steps, compared(api, view.spec, view, steps)), first_seed)
     samples = samples_of(differing.found, learn)
     if samples:

@@ -18,12 +18,13 @@ def read_names(spec: EnvironmentSpec) -> tuple[str, ...]:
 
 
 def begun(spec: EnvironmentSpec, read: Array) -> Array:
-    """Coordinates (C,) after a reset that read (R,). Each lag has the middle of its declared start.
+    """Coordinates (C,) after a reset that read (R,). No step has been taken, and each other lag has the middle of its
+    declared start.
 
     Examples:
         A policy on a machine observes ``surrogym_shared.terms.observe(spec, begun(spec, read)[None])[0]``.
     """
-    middle = [sum(limits(spec.start[c.name])) / 2 for c in spec.coordinates]
+    middle = [0.0 if c.counted else sum(limits(spec.start[c.name])) / 2 for c in spec.coordinates]
     return _placed(spec, read, np.array(middle))
 
 
@@ -37,6 +38,8 @@ def followed(spec: EnvironmentSpec, before: Array, action: Array, read: Array) -
                 continue
             case lag if lag.kind == "action":
                 after[i] = action[lag.entry or 0]
+            case lag if lag.kind == "steps":
+                after[i] = before[i] + 1
             case lag:
                 source = names.index(lag.of or "")
                 after[i] = before[source] if lag.kind == "value" else _change(spec, source, before, after)

@@ -128,7 +128,8 @@ def take(
     except BaseException:
         api.withdraw_audit(name, sorted(wanted))
         raise
-    samples = [sample for sample in api.samples(name) if sample.query_id in wanted]
+    answers = [sample for sample in api.samples(name) if sample.query_id in wanted]
+    samples = [sample for sample in answers if spec.known(sample.coordinates)]
     if not samples:
         return None
     wait_for_design(api, name, settings.patience_seconds, progress, after_round=view.round)
@@ -146,7 +147,8 @@ def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array) -> set
     """
     spec = subject.port.spec()
     if spec.query == "rollout":
-        _, actions = way_of(subject, 1, min(settings.steps, spec.max_rollout or settings.steps))
+        steps = settings.steps + spec.unknown_steps
+        _, actions = way_of(subject, 1, min(steps, spec.max_rollout or steps))
         queries = subject.api.add_queries(subject.name, rollouts=[actions.tolist()], audit=True)
         return {query.id for query in queries}
     chosen = places(spec, q, u, settings.steps, np.random.default_rng(settings.seed))

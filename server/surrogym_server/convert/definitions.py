@@ -155,8 +155,7 @@ def _coordinate(coordinate: wire.Coordinate, spec: wire.EnvironmentSpec) -> core
 def _lag(lag: wire.Lag, names: tuple[str, ...]) -> core.Lag:
     if lag.entry is not None:
         return core.Lag(lag.kind, lag.entry)
-    assert lag.of is not None
-    return core.Lag(lag.kind, names.index(lag.of))
+    return core.Lag(lag.kind, 0 if lag.of is None else names.index(lag.of))
 
 
 def _distribution(distribution: wire.Uniform | wire.Normal | wire.Fixed) -> distributions.Distribution:

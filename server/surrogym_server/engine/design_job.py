@@ -150,9 +150,15 @@ def _decide(job: DesignJob) -> tuple[Decision, Samples]:
 
 
 def _samples(job: DesignJob) -> Samples:
-    return Samples(
-        *(torch.from_numpy(a) for a in (job.coordinates, job.action, job.next_coordinates, job.reward, job.terminated))
-    )
+    """The samples to learn from: those with known lags."""
+    known = _known(job)
+    arrays = (job.coordinates, job.action, job.next_coordinates, job.reward, job.terminated)
+    return Samples(*(torch.from_numpy(a)[known] for a in arrays))
+
+
+def _known(job: DesignJob) -> torch.Tensor:
+    """Which samples (n,) begin where all lags are known."""
+    return job.definition.known(torch.from_numpy(job.coordinates))
 
 
 def _request(job: DesignJob) -> Request:
@@ -171,4 +177,5 @@ def _request(job: DesignJob) -> Request:
         states=None if job.occupancy is None else torch.from_numpy(job.occupancy),
         logged=job.logged,
         audited=job.audited,
+        unlearned=int((~_known(job)).sum()),
     )

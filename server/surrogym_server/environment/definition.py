@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -29,10 +30,10 @@ Kind = Literal["linear", "angle", "constant"]
 @dataclass(frozen=True)
 class Lag:
     """Past value that a coordinate repeats: the change of a coordinate in the step, or its value or an entry of the
-    action before it."""
+    action before it. Or the number of steps since the reset, up to the coordinate's upper bound."""
 
-    kind: Literal["change", "value", "action"]
-    source: int  # index of the coordinate, or entry of the action
+    kind: Literal["change", "value", "action", "steps"]
+    source: int = 0  # index of the coordinate, or entry of the action
 
 
 @dataclass(frozen=True)
@@ -183,6 +184,23 @@ class EnvironmentDefinition:
     def lags(self) -> tuple[int, ...]:
         """Indices of the coordinates that repeat the past."""
         return tuple(i for i, c in enumerate(self.coordinates) if c.lag is not None)
+
+    @cached_property
+    def counter(self) -> int | None:
+        """Index of the coordinate that counts the steps since a reset."""
+        counting = [i for i in self.lags if (lag := self.coordinates[i].lag) is not None and lag.kind == "steps"]
+        return counting[0] if counting else None
+
+    @property
+    def unknown_steps(self) -> int:
+        """Number of first steps of an episode that a model does not learn from, because lags are not known yet."""
+        return 0 if self.counter is None else math.ceil(self.coordinates[self.counter].high)
+
+    def known(self, q: Tensor) -> Tensor:
+        """Whether the lags of states q (..., C) are known, (...) bool."""
+        if self.counter is None:
+            return torch.ones(q.shape[:-1], dtype=torch.bool, device=q.device)
+        return q[..., self.counter] >= self.unknown_steps
 
     @cached
     def lag_columns(self) -> Tensor:

@@ -168,7 +168,7 @@ def _of_point(definition: EnvironmentDefinition, feature_map: FeatureMap) -> lis
     if feature_map.state == "observation":
         made += _of_observation(definition)
     else:
-        for index in range(len(definition.coordinates)):
+        for index in (i for i in range(len(definition.coordinates)) if i != definition.counter):
             made += _of_coordinate(definition, feature_map, index)
     for index, weights in zip(definition.angles, feature_map.drift, strict=False):
         turned = tuple(w + (i == index) for i, w in enumerate(weights))

@@ -69,6 +69,8 @@ def _repeated(definition: EnvironmentDefinition, index: int, q: Tensor, u: Tenso
             return u[:, lag.source].to(q.dtype)
         case "value":
             return q[:, lag.source]
+        case "steps":
+            return q[:, index] + 1
         case "change":
             change = q_next[:, lag.source] - q[:, lag.source]
             return wrap(change) if definition.coordinates[lag.source].kind == "angle" else change

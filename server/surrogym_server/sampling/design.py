@@ -72,11 +72,12 @@ class Request:
     pending_rollouts: tuple[Tensor, ...] = ()  # each (T, F)
     logged: int = 0  # of the samples, from a log
     audited: int = 0  # of the samples, steps of audits
+    unlearned: int = 0  # further real steps, whose lags were not known
 
     @property
     def free(self) -> int:
-        """Number of samples that don't count towards the budget."""
-        return self.logged + self.audited
+        """Number of samples that don't count towards the budget, less the real steps that are no samples."""
+        return self.logged + self.audited - self.unlearned
 
 
 @dataclass(frozen=True)

@@ -60,10 +60,10 @@ class Paths:
 
 def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random.Generator) -> list[Tensor]:
     """Random sequences of 1, 2, 3, ... actions, each (T, F), with ``steps`` actions in all. Each sequence holds its
-    actions for a different time, so that states spread."""
+    actions for a different time, so that states spread. Steps from which nothing is learned come in addition."""
     rollouts: list[Tensor] = []
-    while steps > 0:
-        length = min(len(rollouts) + 1, steps, definition.max_rollout or 1)
+    while steps > definition.unknown_steps:
+        length = min(len(rollouts) + 1 + definition.unknown_steps, steps, definition.max_rollout or 1)
         rollouts.append(torch.from_numpy(random_sequences(definition, 1, length, rng)[0]))
         steps -= length
     return rollouts
@@ -76,7 +76,7 @@ def plan_round(
     ones had already been answered."""
     rollouts: list[Tensor] = []
     done = list(pending)
-    while steps > 0:
+    while steps > model.definition.unknown_steps:
         for actions in done:
             model = as_if_done(model, actions, rng)
         done = [plan_rollout(model, replace(aim, longest=min(steps, aim.longest)), rng)]
@@ -103,16 +103,18 @@ def plan_rollout(model: DynamicsModel, aim: Aim, rng: np.random.Generator) -> Te
 def as_if_done(model: DynamicsModel, actions: Tensor, rng: np.random.Generator) -> DynamicsModel:
     """Condition the model on a sequence (T, F) along a predicted path: variances shrink, means stay."""
     path = predict_paths(model, start_points(model.definition, 1, rng), actions[None])
-    taken = path.running[0] > 0
+    taken = (path.running[0] > 0) & model.definition.known(path.q[0])
     return as_if_answered(model, PredictedSteps(path.q[0, taken], path.u[0, taken], path.q_next[0, taken]))
 
 
 def start_points(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> Tensor:
-    """Start states (count, C), stratified over the declared distribution."""
+    """States after a reset (count, C), stratified over the declared distribution."""
     columns = [
         c.start.quantile(torch.from_numpy((rng.permutation(count) + rng.random(count)) / count))
         for c in definition.coordinates
     ]
+    if definition.counter is not None:
+        columns[definition.counter] = torch.zeros(count, dtype=torch.float64)
     return torch.stack(columns, -1)
 
 
@@ -187,7 +189,7 @@ def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tenso
     low = torch.tensor([c.sampling.low for c in definition.coordinates], dtype=paths.q.dtype)
     high = torch.tensor([c.sampling.high for c in definition.coordinates], dtype=paths.q.dtype)
     inside = ((paths.q >= low) & (paths.q <= high)).all(-1)
-    weight = paths.running * inside * (-0.5 * paths.drift).exp()
+    weight = paths.running * inside * definition.known(paths.q) * (-0.5 * paths.drift).exp()
     if aim.states is None or not len(aim.states):
         return weight
     density = log_occupancy(definition, aim.states, paths.q.flatten(0, 1)).exp().reshape(weight.shape)

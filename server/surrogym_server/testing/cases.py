@@ -46,8 +46,10 @@ COST = {"kind": "declared", "terms": [{"shape": "square", "weight": -1, "of": [{
 LAGS: list[dict[str, Any]] = [
     {"name": "turned", "sampling": {"kind": "uniform", "low": -0.6, "high": 0.6}},
     {"name": "pushed", "sampling": {"kind": "uniform", "low": -2.0, "high": 2.0}},
+    {"name": "steps", "sampling": {"kind": "uniform", "low": 0.0, "high": 1.0}, "bounds": {"low": 0.0, "high": 1.0}},
 ]
 LAGS[0]["lag"], LAGS[1]["lag"] = {"kind": "change", "of": "angle"}, {"kind": "action", "entry": 0}
+LAGS[2]["lag"] = {"kind": "steps"}
 REST = {lag["name"]: {"kind": "fixed", "value": 0.0} for lag in LAGS}
 VARIATIONS: dict[str, dict[str, Any]] = {
     "learned reward": {},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -92,10 +93,12 @@ class Lag(Frozen):
     """Past value that a coordinate repeats. Its next value is known, so no process learns it.
 
     ``change``: how far coordinate ``of`` moved in the step, an angle by at most half a turn. ``value``: the value of
-    coordinate ``of`` before the step. ``action``: entry ``entry`` of the step's action.
+    coordinate ``of`` before the step. ``action``: entry ``entry`` of the step's action. ``steps``: the number of steps
+    since the reset, up to the coordinate's upper bound; below it the other lags are not known yet, and the model does
+    not learn from the step.
     """
 
-    kind: Literal["change", "value", "action"]
+    kind: Literal["change", "value", "action", "steps"]
     of: Name | None = None
     entry: Annotated[int, Field(ge=0, strict=True)] | None = None
 
@@ -103,6 +106,8 @@ class Lag(Frozen):
     def _sourced(self) -> Self:
         if self.kind == "action":
             require(self.entry is not None and self.of is None, "a lag of an action: expected an entry alone")
+        elif self.kind == "steps":
+            require(self.entry is None and self.of is None, "a lag of kind 'steps': expected no entry and no 'of'")
         else:
             require(self.of is not None and self.entry is None, f"a lag of kind {self.kind!r}: expected 'of' alone")
         return self
@@ -128,9 +133,18 @@ class Coordinate(Frozen):
         """Whether a model has to learn how the coordinate moves."""
         return self.kind != "constant" and self.lag is None
 
+    @property
+    def counted(self) -> int:
+        """Number of steps that a lag of kind ``steps`` counts up to; 0 for other coordinates."""
+        if self.lag is None or self.lag.kind != "steps" or self.bounds is None or self.bounds.high is None:
+            return 0
+        return math.ceil(self.bounds.high)
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         require(self.lag is None or self.kind == "linear", f"coordinate {self.name!r}: a lag must be linear")
+        if self.lag is not None and self.lag.kind == "steps":
+            require(self.counted > 0, f"coordinate {self.name!r}: a lag of kind 'steps' needs an upper bound above 0")
         if self.kind != "linear":
             require(self.bounds is None, f"coordinate {self.name!r}: only a linear coordinate can have bounds")
         if self.bounds is not None:

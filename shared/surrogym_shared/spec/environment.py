@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, StrictBool, StrictFloat, StrictInt, StrictStr, model_validator
@@ -133,6 +133,15 @@ class EnvironmentSpec(Frozen):
     def observation_names(self) -> tuple[str, ...]:
         return tuple(o.name for o in self.observation)
 
+    @property
+    def unknown_steps(self) -> int:
+        """Number of first steps of an episode that a model does not learn from, because lags are not known yet."""
+        return max(c.counted for c in self.coordinates)
+
+    def known(self, coordinates: Sequence[float]) -> bool:
+        """Whether the lags of coordinates (C,) are known, so that a model learns from a step that begins there."""
+        return all(q >= c.counted for c, q in zip(self.coordinates, coordinates, strict=True) if c.counted)
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         names = self.coordinate_names
@@ -207,7 +216,10 @@ class EnvironmentSpec(Frozen):
                     f"{where}: an environment that is set to a state has no past, so lags need one that can only be "
                     "reset: expected query 'rollout', got 'step'",
                 )
-                if c.lag.entry is not None:
+                if c.lag.kind == "steps":
+                    twice = any(k.counted for k in known.values())
+                    require(not twice, f"{where}: expected one coordinate of kind 'steps', got two")
+                elif c.lag.entry is not None:
                     size = self.action.size
                     require(c.lag.entry < size, f"{where}: expected an entry below {size}, got {c.lag.entry}")
                 else:
@@ -222,6 +234,12 @@ class EnvironmentSpec(Frozen):
                     f"{where}: looks {age[c.name]} steps back: expected fewer than an episode's {longest}",
                 )
             known[c.name] = c
+        for name, steps in (("budget", self.design.budget), ("initial", self.design.initial)):
+            require(
+                not self.unknown_steps or not steps or steps > self.unknown_steps + 1,
+                f"design: nothing is learned from the first {self.unknown_steps} steps of an episode: expected "
+                f"{name} of more than {self.unknown_steps + 1}, got {steps}",
+            )
 
     def _require_reward(self) -> None:
         if not isinstance(self.reward, DeclaredReward):

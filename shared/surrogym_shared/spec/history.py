@@ -6,13 +6,20 @@ from collections.abc import Iterable, Mapping
 
 from surrogym_shared.checks import require, require_known
 from surrogym_shared.spec.actions import BoxAction
-from surrogym_shared.spec.coordinates import Coordinate, Fixed, Lag, StartDistribution, Uniform
+from surrogym_shared.spec.coordinates import Bounds, Coordinate, Fixed, Lag, StartDistribution, Uniform
 from surrogym_shared.spec.environment import EnvironmentSpec
 from surrogym_shared.spec.terms import ObservationEntry, Term
 
+COUNTER = "steps since reset"
+
 
 def with_history(
-    spec: EnvironmentSpec, *, changes: int = 0, actions: int = 0, largest: Mapping[str, float] | None = None
+    spec: EnvironmentSpec,
+    *,
+    changes: int = 0,
+    actions: int = 0,
+    largest: Mapping[str, float] | None = None,
+    at_start: Mapping[str, float] | None = None,
 ) -> EnvironmentSpec:
     """Add lags to the coordinates and to what a policy observes.
 
@@ -22,6 +29,8 @@ def with_history(
         actions: number of earlier actions. An action that takes effect after a dead time of three steps needs three,
             and one more if the plant is sampled with a zero-order hold and has a lag of its own.
         largest: largest change of each moving coordinate in one step, in its unit; needed for ``changes``.
+        at_start: largest change of a coordinate in the step before a reset, if the environment may move already then.
+            As nobody knows this change, the first steps of each episode are not learned from.
 
     Raises:
         ValueError: the specification can be set to states, or ``largest`` does not fit the moving coordinates.
@@ -33,13 +42,20 @@ def with_history(
     moving = [c for c in spec.coordinates if c.moves]
     require(changes >= 0 and actions >= 0, f"history: expected 0 or more lags, got {changes} and {actions}")
     require_known("history: largest", largest, [c.name for c in moving])
+    at_start = dict(at_start or {}) if changes else {}
+    require_known("history: at_start", at_start, largest)
     lacking = [c.name for c in moving if c.name not in largest] if changes else []
     require(not lacking, f"history: expected the largest change in one step of {lacking}, got none")
     lags = [lag for c in moving for lag in _of_changes(c, changes, largest.get(c.name, 0.0))]
     lags += [lag for entry in range(spec.action.size) for lag in _of_actions(spec, entry, actions)]
     starts: dict[str, StartDistribution] = {lag.name: Fixed(value=_at_rest(lag)) for lag in lags}
-    own = {name: getattr(spec, name) for name in EnvironmentSpec.model_fields}
+    for name, most in at_start.items():
+        starts |= {f"{name}.change{age}": Uniform(low=-most, high=most) for age in range(1, changes + 1)}
     shown = tuple(ObservationEntry(name=lag.name, term=Term.linear(**{lag.name: 1.0})) for lag in lags)
+    if at_start:
+        lags.append(_counter(changes))
+        starts[COUNTER] = Fixed(value=float(changes))
+    own = {name: getattr(spec, name) for name in EnvironmentSpec.model_fields}
     return EnvironmentSpec(
         **own
         | {
@@ -75,7 +91,15 @@ def _of_actions(spec: EnvironmentSpec, entry: int, count: int) -> Iterable[Coord
         yield Coordinate(name=f"{name}{age}", sampling=Uniform(low=low, high=high), lag=lag)
 
 
+def _counter(steps: int) -> Coordinate:
+    """The number of steps since the reset, up to ``steps``."""
+    bounds = Bounds(low=0.0, high=float(steps))
+    return Coordinate(name=COUNTER, sampling=Uniform(low=0.0, high=float(steps)), bounds=bounds, lag=Lag(kind="steps"))
+
+
 def _at_rest(lag: Coordinate) -> float:
     """The value of a lag before the first step: nothing has changed, and the action was 0, or the nearest to it."""
+    if lag.name == COUNTER:
+        return lag.settable[1]
     low, high = lag.settable
     return min(max(0.0, low), high)

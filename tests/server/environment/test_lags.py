@@ -52,6 +52,40 @@ def test_each_kind_of_lag_repeats_its_source():
     assert not arrived[0, 2:].any()
 
 
+def test_steps_are_counted_to_the_bound():
+    definition = definition_from_spec(EnvironmentSpec.model_validate(counting(2.0)))
+    q, still = torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)
+    known = []
+    for _ in range(4):
+        known.append(bool(definition.known(q)))
+        q = with_lags(definition, q, still, q)
+    assert known == [False, False, True, True]
+    assert q[0, 2] == 2
+
+
+def counting(high: float | None) -> dict[str, Any]:
+    fields = described(steps={"kind": "steps"})
+    fields["coordinates"][2] |= {
+        "sampling": {"kind": "uniform", "low": 0.0, "high": 2.0},
+        "bounds": {"low": 0.0, "high": high},
+    }
+    fields["start"]["steps"] = {"kind": "fixed", "value": 2.0}
+    return fields
+
+
+def test_a_count_without_an_end_is_refused():
+    with pytest.raises(ValidationError, match="needs an upper bound above 0"):
+        EnvironmentSpec.model_validate(counting(None))
+
+
+def test_two_counts_are_refused():
+    fields = counting(2.0)
+    second = fields["coordinates"][2] | {"name": "again"}
+    fields |= {"coordinates": [*fields["coordinates"], second], "start": fields["start"] | {"again": WIDE}}
+    with pytest.raises(ValidationError, match="expected one coordinate of kind 'steps', got two"):
+        EnvironmentSpec.model_validate(fields)
+
+
 def test_a_lag_is_no_output_of_the_model():
     assert defined(**LAGS).outputs == ("angle", "level", "reward")
 
@@ -64,6 +98,7 @@ def test_a_lag_is_no_output_of_the_model():
         ({"kind": "action", "entry": 2}, "expected an entry below 2, got 2"),
         ({"kind": "action", "of": "level"}, "expected an entry alone"),
         ({"kind": "change"}, "expected 'of' alone"),
+        ({"kind": "steps", "of": "level"}, "expected no entry and no 'of'"),
     ],
 )
 def test_a_lag_without_a_source_is_refused(lag, message):

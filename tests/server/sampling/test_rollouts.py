@@ -13,6 +13,7 @@ from support.plane import drifting, plane
 from support.real_steps import join, roll
 from surrogym_client.original.classic import acrobot, cartpole, pendulum
 from surrogym_server.convert import default_budget, definition_from_spec
+from surrogym_server.engine.design_job import DesignJob, run_design_job
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
@@ -258,3 +259,46 @@ def test_a_rollout_is_no_longer_than_an_episode():
     assert definition_from_spec(only_resets(pendulum(), max_rollout=300)).max_rollout == 200
     assert definition_from_spec(only_resets(pendulum(), time_limit=None)).max_rollout == 200
     assert definition_from_spec(pendulum()).max_rollout is None
+
+
+def counted(spec: EnvironmentSpec, steps: int) -> EnvironmentSpec:
+    """The specification with a count of the first steps, from which nothing is learned."""
+    fields, past = spec.model_dump(), {"kind": "uniform", "low": 0.0, "high": float(steps)}
+    count = {"name": "steps", "sampling": past, "bounds": {"low": 0.0, "high": float(steps)}, "lag": {"kind": "steps"}}
+    start = {**fields["start"], "steps": {"kind": "fixed", "value": float(steps)}}
+    return EnvironmentSpec.model_validate(fields | {"coordinates": [*fields["coordinates"], count], "start": start})
+
+
+def test_first_rollouts_reach_beyond_steps_with_unknown_lags():
+    definition = definition_from_spec(counted(SPEC, 2))
+    assert [len(actions) for actions in first_rollouts(definition, 14, rng())] == [3, 4, 5]
+
+
+def test_a_plan_reaches_beyond_steps_with_unknown_lags():
+    definition = definition_from_spec(counted(SPEC, 2))
+    walked = roll(SPEC, random_sequences_of(8), 0)
+    known = torch.full((8, 1), 2.0, dtype=torch.float64)
+    samples = replace(walked, q=torch.cat([walked.q, known], 1), q_next=torch.cat([walked.q_next, known], 1))
+    model = learn(definition, samples).model
+    aim = Aim(ALL, [0.05 * float(scale) for scale in model.scales], longest=6)
+    paths = predict_paths(model, start_points(definition, 2, rng()), torch.zeros(2, 6, 1, dtype=torch.float64))
+    value = path_values(model, aim, paths)
+    assert not value[:, :2].any()
+    assert (value[:, 2] > 0).all()
+    assert all(len(actions) > 2 for actions in plan_round(model, aim, 8, (), rng()))
+
+
+def random_sequences_of(length: int) -> torch.Tensor:
+    return torch.from_numpy(random_sequences(definition_from_spec(SPEC), 1, length, rng())[0])
+
+
+def test_steps_with_unknown_lags_count_and_are_not_learned_from():
+    definition = definition_from_spec(counted(SPEC, 2))
+    walked = roll(SPEC, random_sequences_of(8), 0)
+    count = np.minimum(np.arange(9.0), 2.0)[:, None]
+    q, q_next = (np.hstack([a.numpy(), c]) for a, c in ((walked.q, count[:-1]), (walked.q_next, count[1:])))
+    others = (walked.u.numpy(), q_next, walked.reward.numpy(), walked.terminated.numpy())
+    job = DesignJob(definition, q, *others, state=DesignState().to_json(), budget=10, target=0.999)
+    result = run_design_job(job)
+    assert result.fidelity["samples"] == 6
+    assert 0 < sum(map(len, result.query_rollouts)) <= 2 or result.phase == "over_budget"

@@ -19,7 +19,7 @@ Ints = NDArray[np.int64]
 # Of each coordinate: ends of its reach, its bounds, the coordinate that they stop or -1, whether it is an angle, and
 # for a lag what it repeats, and of which row of coordinates and action; -1 otherwise.
 REACH_LOW, REACH_HIGH, LOW, HIGH, STOPS, ANGLE, LAG, SOURCE = range(8)
-CHANGE, TURN, REPEAT = range(3)  # of a coordinate, of an angle, or a row as it was before the step
+CHANGE, TURN, REPEAT, COUNT = range(4)  # of a coordinate, of an angle, a row as it was before the step, or one more
 
 
 def add_rules(tables: TablesBuilder, definition: EnvironmentDefinition) -> int:
@@ -29,15 +29,17 @@ def add_rules(tables: TablesBuilder, definition: EnvironmentDefinition) -> int:
         [
             (
                 *(low[i], high[i], c.low, c.high, -1 if c.stops is None else c.stops, c.kind == "angle"),
-                *((-1, -1) if c.lag is None else _lag(definition, c.lag)),
+                *((-1, -1) if c.lag is None else _lag(definition, i, c.lag)),
             )
             for i, c in enumerate(definition.coordinates)
         ]
     )
 
 
-def _lag(definition: EnvironmentDefinition, lag: Lag) -> tuple[int, int]:
+def _lag(definition: EnvironmentDefinition, index: int, lag: Lag) -> tuple[int, int]:
     match lag.kind:
+        case "steps":
+            return COUNT, index
         case "action":
             return REPEAT, len(definition.coordinates) + lag.source
         case "value":
@@ -88,7 +90,11 @@ def repeat(rules: Floats, raw: Floats, q: Floats) -> None:
         if lag < 0:
             continue
         for b in range(lanes):
-            value = raw[source, b] if lag == REPEAT else q[source, b] - raw[source, b]
+            value = raw[source, b]
+            if lag == COUNT:
+                value += 1.0
+            elif lag != REPEAT:
+                value = q[source, b] - value
             q[c, b] = clipped(rules, c, wrapped(value) if lag == TURN else value)
 
 
