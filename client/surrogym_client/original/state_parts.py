@@ -43,8 +43,8 @@ class StatePart(Protocol):
 class MujocoState(StatePart):
     """Positions, velocities, activations of actuators and mocap poses of a MuJoCo model.
 
-    ``rest_here`` records MuJoCo's full integration state. Each write first restores that record, and then sets the given
-    values. So no time, warm start of the solver, applied force or active constraint of earlier steps remains.
+    ``rest_here`` records MuJoCo's full integration state. Each write first restores that record, and then sets the
+    given values. So no time, warm start of the solver, applied force or active constraint of earlier steps remains.
     """
 
     def __init__(self, model: Native, data: Native) -> None:

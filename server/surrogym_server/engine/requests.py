@@ -34,8 +34,10 @@ class Opening:
 
 @dataclass(frozen=True)
 class SampledRewards:
-    """Lowest and highest reward in a surrogate's samples, and the number of samples. Virtual rewards are limited to this
-    range, widened as in ``virtual.limits.reward_limits``."""
+    """Lowest and highest reward in a surrogate's samples, and the number of samples.
+
+    Virtual rewards are limited to this range, widened as in ``virtual.limits.reward_limits``.
+    """
 
     low: float
     high: float
