@@ -31,12 +31,14 @@ class Program:
 
     Args:
         command: the program and its arguments, quoted as for a shell.
+        called: what errors call it.
 
     Raises:
         UnknownEnvironment: the command is empty, or its quotes don't match.
     """
 
-    def __init__(self, command: str) -> None:
+    def __init__(self, command: str, called: str = "the program") -> None:
+        self._called = called
         try:
             self._words = shlex.split(command)
         except ValueError as error:
@@ -196,7 +198,8 @@ class Program:
                 left = deadline - time.monotonic()
                 if left <= 0 or not selector.select(left):
                     raise StepTimedOut(
-                        f"the program did not answer {method} within {max(0.0, deadline - begun):.3g} s and was ended"
+                        f"{self._called} did not answer {method} within {max(0.0, deadline - begun):.3g} s and was "
+                        "ended"
                     )
                 if not (chunk := os.read(output, CHUNK)):
                     raise self._death(method)
@@ -209,4 +212,4 @@ class Program:
         self.wait(END_SECONDS)
         printed = self.surplus(0.0)
         after = f", after it printed {short(printed.strip())}" if printed else ""
-        return EnvironmentDied(f"the program ended with exit code {self.end()} during {method}{after}")
+        return EnvironmentDied(f"{self._called} ended with exit code {self.end()} during {method}{after}")
