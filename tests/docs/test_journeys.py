@@ -77,6 +77,7 @@ OTHERWISE = {
     "docs/how-to/plugins.md": "tests/plugins installs the package and compares its class with the page",
     "docs/how-to/logs.md": "tests/logs runs its commands",
     "docs/how-to/environments-by-name.md": "tests/original and tests/cli/test_describe.py run its commands",
+    "docs/how-to/fmus.md": "tests/original/test_fmus.py builds its FMUs, tests/examples runs its program",
     "docs/how-to/executables.md": "tests/original/test_executables.py runs its program",
     "docs/how-to/trust.md": "tests/training/test_handover.py audits beside a sampler that stays",
     "docs/how-to/work.md": "tests/work and tests/cli/test_jobs.py run its commands",

@@ -52,6 +52,16 @@ def test_the_robot_that_can_be_set_to_no_state_is_sampled(server: ServerProcess,
     assert 12 <= json.loads(report)["steps"] <= 14
 
 
+@pytest.mark.long
+def test_an_fmu_is_controlled_by_a_policy_from_its_surrogate(server: ServerProcess, tmp_path: Path) -> None:
+    pytest.importorskip("fmpy")
+    pytest.importorskip("pythonfmu")
+    program = [str(EXAMPLES / "fmus" / "control.py"), "TwoTanks", "--budget", "10", "--steps", "2048"]
+    said = run(server, tmp_path, *program, "--episodes", "2", "--baseline", "2048")
+    assert "after 10 real steps" in said
+    assert said.splitlines()[-1].startswith("from the surrogate")
+
+
 @pytest.mark.parametrize("name", ["bump:Bump", "noisy_mass:NoisyMass"])
 def test_environments_of_the_decisions_take_a_step(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)

@@ -19,7 +19,8 @@ def command(
     environment: Annotated[
         str,
         typer.Argument(
-            help="Environment: a Gymnasium id, package:Id-v0, dm_control:DOMAIN-TASK, pcgym:MODEL or pcgym:FILE.json."
+            help="Environment: a Gymnasium id, package:Id-v0, dm_control:DOMAIN-TASK, pcgym:MODEL, pcgym:FILE.json, "
+            "fmu:PLANT.fmu or fmu:PLANT.json."
         ),
     ],
     steps: Annotated[

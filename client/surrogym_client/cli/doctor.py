@@ -84,6 +84,7 @@ def _described(env: str) -> tuple[EnvironmentSpec | None, list[Finding]]:
     from surrogym_client.original.describing import describe
     from surrogym_client.original.errors import OriginalError
     from surrogym_client.original.loading import has_specification
+    from surrogym_shared.spec import DeclaredReward, RewardTerm
 
     if has_specification(env):
         return None, []
@@ -91,11 +92,17 @@ def _described(env: str) -> tuple[EnvironmentSpec | None, list[Finding]]:
         found = describe(env)
     except OriginalError:
         return None, []  # making it says the same
+    spec, lacking = found.spec, []
+    if not found.pays:
+        nothing = DeclaredReward(kind="declared", terms=(RewardTerm(weight=0.0, shape="one"),))
+        spec = spec.model_copy(update={"reward": nothing})
+        way_out = f"surrogym describe {env} > env.json; declare it in env.json, and give --spec env.json"
+        lacking = [Finding("reward", "the environment has none, so the specification has to declare it", way_out)]
     words = (
         f"no built-in specification; described by {found.steps} real steps and {found.resets} resets (surrogym "
         f"describe {env})"
     )
-    return found.spec, [Finding("spec", words)]
+    return spec, [Finding("spec", words), *lacking]
 
 
 def _line(finding: Finding) -> str:

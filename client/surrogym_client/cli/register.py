@@ -102,7 +102,7 @@ def command(
     environment: Annotated[
         str | None,
         typer.Argument(
-            help="Environment: a Gymnasium id, dm_control:DOMAIN-TASK, pcgym:MODEL, or your own "
+            help="Environment: a Gymnasium id, dm_control:DOMAIN-TASK, pcgym:MODEL, fmu:PLANT.fmu, or your own "
             "package.module:factory. With --env or FILE, this argument is the surrogate's name instead."
         ),
     ] = None,

@@ -36,7 +36,8 @@ if TYPE_CHECKING:
 Environment = Annotated[
     str | None,
     typer.Option(
-        help="Environment to take real steps in: a Gymnasium id or package.module:factory. [default: the surrogate's]"
+        help="Environment to take real steps in: a Gymnasium id, package.module:factory or fmu:PLANT.fmu. [default: "
+        "the surrogate's]"
     ),
 ]
 Command = Annotated[
@@ -182,7 +183,7 @@ def _environment(
     if env is None and not is_known(asked.environment):
         raise CommandError(
             f"the surrogate's environment {asked.environment!r} has no built-in adapter: "
-            "expected --env package.module:factory, or --exec COMMAND"
+            "expected --env package.module:factory, --env fmu:PLANT.fmu, or --exec COMMAND"
         )
     name = env or asked.environment
     own = is_own(name) and given is None

@@ -139,17 +139,17 @@ class SimulatedEpisode(Episode):
     Its observation is the environment's own if the built-in specification shows the same.
     """
 
-    parallel = True
-
     def __init__(self, environment: Simulated) -> None:
         super().__init__(environment.spec())
         self._environment = environment
+        self.parallel = runs_in_parallel(environment)
 
     def reset(self, seed: int) -> Moment:
-        observation = self._environment.simulator.reset(seed)
-        coordinates = self._environment.coordinates()
-        shown = observation if self._environment.shows_own else self._shown(coordinates)
-        return Moment(shown, 0.0, False, coordinates)
+        if self._environment.shows_own:
+            observation = self._environment.simulator.reset(seed)
+            return Moment(observation, 0.0, False, self._environment.coordinates())
+        coordinates = self._environment.begin(seed)
+        return Moment(self._shown(coordinates), 0.0, False, coordinates)
 
     def place(self, coordinates: Array) -> Moment:
         if not self._environment.simulator.settable:

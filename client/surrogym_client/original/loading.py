@@ -12,13 +12,12 @@ from typing import Any, Literal
 from surrogym_client.original.adapters import adapter_of, is_trusted, open_simulator
 from surrogym_client.original.classic import TASKS
 from surrogym_client.original.errors import UnknownEnvironment
-from surrogym_client.original.executables import Executable, is_executable, open_executable
+from surrogym_client.original.executables import is_executable, open_executable
 from surrogym_client.original.gymnasium import GymnasiumEnvironment, task_for
 from surrogym_client.original.isolated import IsolatedEnvironment
 from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
 from surrogym_client.original.protocol import LONGEST_EPISODE, Environment
 from surrogym_client.original.rollouts import answering
-from surrogym_client.original.simulator import Simulated
 from surrogym_shared.spec import Access, BoxAction, EnvironmentSpec
 
 Preset = Literal["default", "paper"]
@@ -52,7 +51,7 @@ def make(
     """Build an original environment.
 
     Args:
-        name: a Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL``, ``exec:COMMAND``, or
+        name: a Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL``, ``fmu:PLANT.fmu``, ``exec:COMMAND``, or
             ``package.module:factory``.
         spec: a specification that replaces the adapter's own; most names have none until ``describe`` writes one.
         preset, budget, initial, target, acquisition, seed: choices of the design; None keeps the specification's.
@@ -60,7 +59,8 @@ def make(
         access: where a query may begin: ``any`` state, a ``snapshot`` or a reset, or at a ``reset`` only. None keeps
             the specification's.
         max_rollout: the longest of them.
-        step_limit: seconds that one step of ``exec:COMMAND`` may take; ``isolated`` limits the others.
+        step_limit: seconds that one step of ``exec:COMMAND`` or ``fmu:PLANT.fmu`` may take; ``isolated`` limits the
+            others.
 
     Raises:
         UnknownEnvironment: no adapter knows the name, or its module or factory can't be found.
@@ -77,13 +77,15 @@ def make(
         return open_executable(name, spec, choose, step_limit)
     if is_own(name):
         return _own(load_factory(name)(), spec, choose)
-    return _known(name, spec, choose, preset or "default")
+    return _known(name, spec, choose, preset or "default", step_limit)
 
 
-def isolated(name: str, step_limit: float, spec: EnvironmentSpec | None = None) -> IsolatedEnvironment | Executable:
+def isolated(name: str, step_limit: float, spec: EnvironmentSpec | None = None) -> Environment | IsolatedEnvironment:
     """Build an original environment that runs in a process of its own, where a step has a time limit in seconds."""
     if is_executable(name):
         return open_executable(name, spec, step_limit=step_limit)
+    if (adapter := adapter_of(name)) is not None and adapter.separate:
+        return make(name, spec=spec, step_limit=step_limit)
     return IsolatedEnvironment(partial(make, name, spec=spec), step_limit)
 
 
@@ -119,7 +121,7 @@ def specification(name: str) -> EnvironmentSpec:
     if adapter_of(name) is None:
         raise UnknownEnvironment(
             f"no adapter knows the environment {name!r}: expected one of {known}, another Gymnasium id, "
-            "dm_control:DOMAIN-TASK, pcgym:MODEL, or package.module:factory"
+            "dm_control:DOMAIN-TASK, pcgym:MODEL, fmu:PLANT.fmu, or package.module:factory"
         )
     open_simulator(name).close()
     raise UnknownEnvironment(
@@ -178,7 +180,7 @@ def load_factory(name: str) -> Any:
     return factory
 
 
-def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str) -> Environment:
+def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str, step_limit: float) -> Environment:
     if spec is not None and spec.environment not in ("", name):
         raise UnknownEnvironment(f"expected a specification of {name}, got one of {spec.environment}")
     if name in TASKS:
@@ -187,7 +189,12 @@ def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str)
         return GymnasiumEnvironment(choose(base))
     base = choose(spec or specification(name))
     own = name in SPECIFICATIONS and SPECIFICATIONS[name]().observation == base.observation
-    return Simulated(open_simulator(name), base, shows_own=own)
+    simulator = open_simulator(name)
+    try:
+        return simulator.with_specification(base, shows_own=own, step_limit=step_limit)
+    except BaseException:
+        simulator.close()
+        raise
 
 
 class _Respecified:

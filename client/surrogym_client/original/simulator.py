@@ -58,19 +58,27 @@ class Simulator(ABC):
 
     Attributes:
         settable: whether its state can be written.
+        fixed: why it can't, and what follows; a part of a sentence.
         shows: whether ``observe`` reads the state as it is, and not what the last step or reset gave.
+        pays: whether steps have a reward; without one, the specification has to declare it.
         action: what can be done.
         variables: the state's numbers, (V,).
         rest: the state (V,) that a variable has where no coordinate says otherwise.
         time_limit: steps of an episode; None without a limit.
+        notes: findings that a description repeats, one sentence each.
+        questions: to a person who reads a description, one sentence each.
     """
 
     settable = True
+    fixed = "its state can't be read: the observation is used as its state, and it can only be reset"
     shows = True
+    pays = True
     action: Action
     variables: tuple[Variable, ...]
     rest: Array
     time_limit: int | None = None
+    notes: tuple[str, ...] = ()
+    questions: tuple[str, ...] = ()
 
     @abstractmethod
     def reset(self, seed: int | None) -> Array:
@@ -137,6 +145,12 @@ class Simulator(ABC):
         state = self.rest.copy()
         state[columns] = coordinates
         self.write(state)
+
+    def with_specification(self, spec: EnvironmentSpec, *, shows_own: bool, step_limit: float) -> Simulated:
+        """The original environment made from this simulator. ``step_limit`` (s) is for simulators with a process of
+        their own."""
+        del step_limit
+        return Simulated(self, spec, shows_own=shows_own)
 
 
 class Simulated:

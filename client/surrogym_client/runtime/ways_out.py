@@ -15,6 +15,7 @@ EXTRAS = {  # their packages
     "dm-control": ("dm_control",),
     "robotics": ("gymnasium_robotics",),
     "pcgym": ("pcgym",),
+    "fmu": ("fmpy",),
 }
 START_SERVER = "start one with surrogym serve, or give another address by --server or SURROGYM_URL"
 GIVE_TOKEN = "give a token of this server by SURROGYM_TOKEN or --token-file"

@@ -1,4 +1,5 @@
-"""Simulators by name: any Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL`` or ``pcgym:FILE.json``.
+"""Simulators by name: any Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL`` or ``pcgym:FILE.json``,
+``fmu:PLANT.fmu`` or ``fmu:PLANT.json``.
 
 Each adapter opens one kind of simulator. Its packages are an optional extra, imported when a name needs them.
 """
@@ -24,12 +25,14 @@ class Adapter(NamedTuple):
         trusted: pattern of the names that a client also opens when only a server gave the name. They can open nothing
             but the package's own environments.
         extra: extra of pip that installs the package.
+        separate: whether its simulators run in processes of their own.
     """
 
     module: str
     names: re.Pattern[str]
     trusted: re.Pattern[str]
     extra: str
+    separate: bool = False
 
 
 NEVER = re.compile(r"(?!)")
@@ -41,6 +44,7 @@ ADAPTERS = (
         "dm-control",
     ),
     Adapter("surrogym_client.original.adapters.pcgym", re.compile(r"pcgym:.*"), re.compile(r"pcgym:cstr"), "pcgym"),
+    Adapter("surrogym_client.original.adapters.fmu", re.compile(r"fmu:.*"), NEVER, "fmu", separate=True),
     Adapter(
         "surrogym_client.original.adapters.gymnasium_ids",
         re.compile(r"gymnasium_robotics:.*"),
@@ -72,7 +76,7 @@ def open_simulator(name: str) -> Simulator:
     if adapter is None:
         raise UnknownEnvironment(
             f"no adapter knows the environment {name!r}: expected a Gymnasium id such as Pendulum-v1, package:Id-v0, "
-            "dm_control:DOMAIN-TASK, pcgym:MODEL, or package.module:factory"
+            "dm_control:DOMAIN-TASK, pcgym:MODEL, fmu:PLANT.fmu, or package.module:factory"
         )
     try:
         opened: Simulator = import_module(adapter.module).open_simulator(name)

@@ -46,6 +46,7 @@ class Description:
     asked: tuple[str, ...]
     steps: int
     resets: int
+    pays: bool = True  # whether the environment has a reward of its own
 
     def words(self) -> list[str]:
         """Lines for the terminal: the real steps, the findings, and the questions to the reader."""
@@ -70,7 +71,7 @@ def describe(name: str, steps: int = STEPS, seed: int = 0) -> Description:
     """Describe an environment that an adapter opens.
 
     Args:
-        name: a Gymnasium id, ``dm_control:DOMAIN-TASK`` or ``pcgym:MODEL``.
+        name: a Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL`` or ``fmu:PLANT.fmu``.
         steps: real steps of the episodes. Some more steps check the findings.
         seed: of the random actions.
 
@@ -84,7 +85,8 @@ def describe(name: str, steps: int = STEPS, seed: int = 0) -> Description:
         probed = probe(counted, seen, rng) if simulator.settable else Probed(np.inf, 0.0, 0.0)
         drafted = _Draft(name, simulator, seen, probed)
         spec = drafted.spec(rng)
-        return Description(spec, drafted.found(spec, steps), drafted.asked(spec), counted.steps, counted.resets)
+        found, asked = drafted.found(spec, steps), drafted.asked(spec)
+        return Description(spec, found, asked, counted.steps, counted.resets, simulator.pays)
     finally:
         simulator.close()
 
@@ -129,7 +131,8 @@ class _Draft:
         kinds = {kind: [c.name for c in spec.coordinates if c.kind == kind] for kind in ("angle", "constant")}
         lines = [
             f"{len(kept)} coordinates describe the state; {steps} random steps and {RESETS} resets showed their ranges",
-            _words_of_access(probed),
+            _words_of_access(probed, self._simulator.fixed),
+            *self._simulator.notes,
         ]
         if probed.shifts:
             lines.append(f"a shift of {_listed(sorted(probed.shifts))} changes nothing, so it is left out")
@@ -181,9 +184,11 @@ class _Draft:
             "success: when does an episode count as solved? Without a criterion, evaluations report returns only"
         )
         lines.append(self._asked_of_reward())
-        return tuple(lines)
+        return (*lines, *self._simulator.questions)
 
     def _asked_of_reward(self) -> str:
+        if not self._simulator.pays:
+            return "reward: the environment has none. Declare one (kind 'declared') before you register it"
         values, counts = np.unique(self._seen.rewards, return_counts=True)
         usual, often = float(values[counts.argmax()]), int(counts.max())
         if often < MOSTLY * counts.sum():
@@ -302,9 +307,9 @@ def _raw(term: Term) -> set[str]:
     return {name for part in term.parts if part.function == "linear" for name in part.weights}
 
 
-def _words_of_access(probed: Probed) -> str:
+def _words_of_access(probed: Probed, fixed: str) -> str:
     if not np.isfinite(probed.set_error):
-        return "its state can't be read: the observation is used as its state, and it can only be reset"
+        return fixed
     if not probed.settable:
         return (
             f"a step from a set state differs from the same step within an episode by {probed.set_error:.2g} of "

@@ -1,0 +1,370 @@
+"""An FMU is set, stepped and saved bit for bit, and a fault of its native code costs one query."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.fmus import (
+    EXAMPLES,
+    MOODY,
+    OF_VERSION_3,
+    STATES,
+    STUBBORN,
+    bits,
+    build,
+    build_text,
+    changed,
+    mapping,
+    rewarded,
+    squared,
+)
+from surrogym_client import original
+from surrogym_client.original.adapters.fmu import Fmu, open_simulator
+from surrogym_client.original.describing import describe
+from surrogym_client.original.episodes import open_episode
+from surrogym_client.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_client.original.fmus.environment import FmuEnvironment
+from surrogym_client.original.loading import is_known, isolated
+from surrogym_shared.spec import (
+    BoxAction,
+    Coordinate,
+    DeclaredReward,
+    EnvironmentSpec,
+    Inequality,
+    ObservationEntry,
+    Term,
+    Uniform,
+)
+
+pytest.importorskip("fmpy")
+pytest.importorskip("pythonfmu")
+
+
+@pytest.fixture(scope="module")
+def tanks(tmp_path_factory) -> Path:
+    return build(EXAMPLES / "two_tanks.py", tmp_path_factory.mktemp("tanks"), *STATES)
+
+
+@pytest.fixture(scope="module")
+def pendulum(tmp_path_factory) -> Path:
+    return build(EXAMPLES / "inverted_pendulum.py", tmp_path_factory.mktemp("pendulum"), *STATES)
+
+
+@pytest.fixture(scope="module")
+def moody(tmp_path_factory) -> Path:
+    return build_text(MOODY, "moody", tmp_path_factory.mktemp("moody"))
+
+
+@pytest.fixture(scope="module")
+def heater(tmp_path_factory) -> Path:
+    pytest.importorskip("pythonfmu3")
+    return build_text(OF_VERSION_3, "heater", tmp_path_factory.mktemp("heater"), *STATES, builder="pythonfmu3")
+
+
+def opened(name: object) -> Fmu:
+    simulator = open_simulator(str(name))
+    assert isinstance(simulator, Fmu)
+    return simulator
+
+
+def states(fmu: Fmu, actions: np.ndarray) -> list[np.ndarray]:
+    """The states after each of some actions, (n, V)."""
+    reached = []
+    for action in actions:
+        fmu.step(action)
+        reached.append(fmu.read())
+    return reached
+
+
+def drawn(fmu: Fmu, number: int) -> np.ndarray:
+    """Random actions (number, F)."""
+    rng = np.random.default_rng(0)
+    return rng.uniform(fmu.action.low, fmu.action.high, (number, len(fmu.action.low)))  # type: ignore[union-attr]
+
+
+def moody_with_limits(moody: Path, folder: Path, step_limit: float = 30.0) -> FmuEnvironment:
+    name = mapping(folder, fmu=str(moody), step=0.5, actions={"push": [-5, 5]})
+    spec = EnvironmentSpec(
+        environment=name,
+        coordinates=(Coordinate(name="x", sampling=Uniform(low=-1, high=1)),),
+        observation=(ObservationEntry(name="x", term=Term.linear(x=1)),),
+        action=BoxAction(low=(-5,), high=(5,)),
+        start={"x": Uniform(low=-1, high=1)},
+        reward=DeclaredReward(kind="declared", terms=(squared("x"),)),
+    )
+    made = isolated(name, step_limit, spec)
+    assert isinstance(made, FmuEnvironment)
+    return made
+
+
+@pytest.mark.parametrize("which", ["tanks", "pendulum", "heater"])
+def test_episodes_and_restored_snapshots_replay_bit_for_bit(which: str, request) -> None:
+    fmu = opened(f"fmu:{request.getfixturevalue(which)}")
+    try:
+        actions = drawn(fmu, 40)
+        fmu.reset(None)
+        first = states(fmu, actions[:20])
+        snapshot = fmu.save()
+        later = states(fmu, actions[20:])
+        fmu.restore(snapshot)
+        assert bits(*states(fmu, actions[20:])) == bits(*later)
+        fmu.reset(None)
+        assert bits(*states(fmu, actions)) == bits(*first, *later)
+        assert len({row.tobytes() for row in first}) > 1
+    finally:
+        fmu.close()
+
+
+@pytest.mark.parametrize("which", ["tanks", "pendulum", "heater"])
+def test_any_state_is_set_and_steps_on_bit_for_bit(which: str, request) -> None:
+    fmu = opened(f"fmu:{request.getfixturevalue(which)}")
+    try:
+        (action, other) = drawn(fmu, 2)
+        fmu.reset(None)
+        fmu.step(other)
+        before = fmu.read()
+        fmu.step(action)
+        after = fmu.read()
+        fmu.write(before)
+        assert bits(fmu.read()) == bits(before)
+        fmu.step(action)
+        assert bits(fmu.read()) == bits(after)
+        assert bits(before) != bits(after)
+    finally:
+        fmu.close()
+
+
+def test_a_snapshot_outlives_the_process_that_made_it(tanks: Path) -> None:
+    one, other = opened(f"fmu:{tanks}"), opened(f"fmu:{tanks}")
+    try:
+        one.step(np.ones(1))
+        snapshot, at = one.save(), one.read()
+        other.restore(snapshot)
+        assert bits(other.read()) == bits(at)
+    finally:
+        one.close()
+        other.close()
+
+
+def test_a_snapshot_of_something_else_is_refused(tanks: Path, tmp_path: Path) -> None:
+    one = opened(f"fmu:{tanks}")
+    other = opened(mapping(tmp_path, fmu=str(tanks), start={"flow": 1e-4}))
+    try:
+        with pytest.raises(StepFailed, match="as it is now, got one of another file, step or start: delete"):
+            other.restore(one.save())
+        with pytest.raises(StepFailed, match=r"expected a snapshot of TwoTanks.fmu, got 5 other bytes"):
+            other.restore(b"hello")
+    finally:
+        one.close()
+        other.close()
+
+
+def test_states_kept_in_memory_are_lost_with_their_process(tanks: Path, tmp_path: Path) -> None:
+    quiet = changed(tanks, tmp_path / "quiet.fmu", {'canSerializeFMUstate="true"': 'canSerializeFMUstate="false"'})
+    one, other = opened(f"fmu:{quiet}"), opened(f"fmu:{quiet}")
+    try:
+        one.step(np.ones(1))
+        snapshot, at = one.save(), one.read()
+        one.step(np.ones(1))
+        one.restore(snapshot)
+        assert bits(one.read()) == bits(at)
+        with pytest.raises(StepFailed, match="no longer in memory"):
+            other.restore(snapshot)
+    finally:
+        one.close()
+        other.close()
+
+
+def test_parameters_and_start_values_come_from_a_file(tanks: Path, tmp_path: Path) -> None:
+    slow = opened(mapping(tmp_path, fmu=str(tanks), step=5.0, start={"flow": 0.0, "upper": 0.5, "lower": 0}))
+    try:
+        assert slow.time_limit == 200
+        assert slow.read().tolist() == [0.5, 0.0]
+        slow.step(np.ones(1))
+        assert slow.read()[0] < 0.5  # the pump has no flow
+    finally:
+        slow.close()
+
+
+def test_a_description_asks_for_the_reward_and_the_limits(moody: Path, tmp_path: Path) -> None:
+    found = describe(mapping(tmp_path, fmu=str(moody), step=0.5), steps=20)
+    asked = " ".join(found.asked)
+    assert "reward: the environment has none. Declare one" in asked
+    assert "push declares no min and max, so -1 to 1 is assumed" in asked
+    assert not found.pays
+    assert found.spec.query == "step"
+
+
+def test_an_angle_is_known_by_its_unit(pendulum: Path) -> None:
+    spec = describe(f"fmu:{pendulum}", steps=40).spec
+    assert [(c.name, c.kind) for c in spec.coordinates] == [("angle", "angle"), ("speed", "linear")]
+    assert spec.action.low == (-5.0,)  # type: ignore[union-attr]
+    assert spec.time_limit == 100
+
+
+def test_rewards_starts_and_ends_are_the_specifications(tanks: Path) -> None:
+    name = f"fmu:{tanks}"
+    full = Inequality(term=Term.linear(upper=1), relation=">", value=0.9)
+    spec = rewarded(name, squared("lower", wanted=0.4)).model_copy(
+        update={
+            "termination": ((full,),),
+            "start": {"upper": Uniform(low=0.95, high=1), "lower": Uniform(low=0, high=1)},
+        }
+    )
+    episode = open_episode(name, spec, lambda: original.make(name, spec=spec))
+    try:
+        starts = [episode.reset(seed).coordinates for seed in (0, 1, 0)]
+        assert bits(starts[0]) == bits(starts[2]) != bits(starts[1])
+        moment = episode.step(np.ones(1))
+        assert moment.terminated
+        assert moment.reward == pytest.approx(-((moment.coordinates[1] - 0.4) ** 2), abs=1e-15)
+    finally:
+        episode.close()
+
+
+def test_an_environment_without_a_declared_reward_is_refused(tanks: Path) -> None:
+    name = f"fmu:{tanks}"
+    spec = describe(name, steps=20).spec
+    with pytest.raises(UnknownEnvironment, match=r"expected a declared reward .* surrogym describe"):
+        original.make(name, spec=spec)
+
+
+def test_an_fmu_is_never_opened_for_a_server() -> None:
+    assert not is_known("fmu:plant.fmu")
+    assert not is_known("fmu:plant.json")
+
+
+@pytest.mark.parametrize(
+    ("push", "message"),
+    [
+        (1.5, r"the process of Moody.fmu ended with exit code -6 during step"),
+        (3.0, r"Moody.fmu: expected finite values of the FMU, but x is nan"),
+        (4.0, r"Moody.fmu: the FMU answered fmi2DoStep with status"),
+    ],
+)
+def test_a_fault_of_native_code_costs_one_step(moody: Path, tmp_path: Path, push: float, message: str) -> None:
+    plant = moody_with_limits(moody, tmp_path)
+    try:
+        good = plant.step_from(np.array([0.5]), np.array([-1.0]))
+        with pytest.raises(StepFailed, match=message):
+            plant.step_from(np.array([0.5]), np.array([push]))
+        with pytest.raises(StepFailed, match=r"at a state, got none"):
+            plant.act(np.zeros(1))
+        again = plant.step_from(np.array([0.5]), np.array([-1.0]))
+        assert bits(again.next_coordinates) == bits(good.next_coordinates)
+    finally:
+        plant.close()
+
+
+def test_a_hanging_fmu_is_ended_and_started_anew(moody: Path, tmp_path: Path) -> None:
+    plant = moody_with_limits(moody, tmp_path, step_limit=5.0)
+    try:
+        with pytest.raises(StepTimedOut, match=r"the process of Moody.fmu did not answer step"):
+            plant.step_from(np.array([0.5]), np.array([2.0]))
+        assert plant.step_from(np.array([0.5]), np.zeros(1)).reward == -0.25
+    finally:
+        plant.close()
+
+
+def test_a_crash_at_a_later_step_is_named(moody: Path, tmp_path: Path) -> None:
+    plant = moody_with_limits(moody, tmp_path)
+    try:
+        plant.begin(0)
+        with pytest.raises(EnvironmentDied):
+            plant.act(np.array([1.5]))
+        assert np.isfinite(plant.begin(0)).all()
+    finally:
+        plant.close()
+
+
+def test_a_state_that_does_not_read_back_can_only_be_reset(tmp_path: Path) -> None:
+    stubborn = build_text(STUBBORN, "stubborn", tmp_path)
+    fmu = opened(mapping(tmp_path, fmu=str(stubborn), step=1.0))
+    try:
+        assert not fmu.settable
+        assert fmu.fixed == "x was started at 0.35 and read back as 0.25, so it can only be reset"
+        with pytest.raises(UnknownEnvironment, match="can only be reset"):
+            fmu.write(np.ones(1))
+    finally:
+        fmu.close()
+
+
+def test_calculated_outputs_can_only_be_reset(tanks: Path, tmp_path: Path) -> None:
+    read_only = changed(tanks, tmp_path / "read.fmu", {' initial="exact"': "", ' start="0.1"': ""})
+    spec = rewarded(f"fmu:{read_only}", squared("lower", wanted=0.4))
+    assert spec.query == "rollout"
+    plant = original.make(f"fmu:{read_only}", spec=spec)
+    try:
+        start = plant.begin(0)  # type: ignore[union-attr]
+        assert np.asarray(start).tolist() == [0.1, 0.1]
+        assert plant.act(np.ones(1)).next_coordinates[0] > 0.1  # type: ignore[union-attr, index]
+    finally:
+        plant.close()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"<CoSimulation": "<ModelExchange"}, "for model exchange only, .*: export it for co-simulation"),
+        ({'fmiVersion="2.0"': 'fmiVersion="1.0"'}, r"can't be read|of FMI 2.0 or 3.0"),
+        ({'causality="input"': 'causality="parameter" variability="fixed"'}, "got no scalar input: declare one"),
+        ({' stepSize="10.0"': ""}, r'expected the seconds of one action, as \{"fmu": "copy.fmu", "step": 0.1\}'),
+        ({"</fmiModelDescription>": ""}, "modelDescription.xml of .* can't be read"),
+    ],
+)
+def test_a_description_that_does_not_fit_is_named(tanks: Path, tmp_path: Path, words, message: str) -> None:
+    with pytest.raises(UnknownEnvironment, match=message):
+        open_simulator(f"fmu:{changed(tanks, tmp_path / 'copy.fmu', words)}")
+
+
+def test_code_for_another_platform_is_named(tanks: Path, tmp_path: Path) -> None:
+    foreign = changed(tanks, tmp_path / "foreign.fmu", {}, moved="win32")
+    with pytest.raises(UnknownEnvironment, match=r"expected native code for \S+ in .*, got win32, win64: export it"):
+        open_simulator(f"fmu:{foreign}")
+    bare = changed(tanks, tmp_path / "bare.fmu", {}, left_out="modelDescription")
+    with pytest.raises(UnknownEnvironment, match=r"has no modelDescription.xml, so it is not an FMU"):
+        open_simulator(f"fmu:{bare}")
+
+
+def test_broken_files_are_named(tanks: Path, tmp_path: Path) -> None:
+    whole = tanks.read_bytes()
+    for content, message in ((b"hello", "is not a zip archive"), (whole[: len(whole) // 2], "is not a zip archive")):
+        (tmp_path / "broken.fmu").write_bytes(content)
+        with pytest.raises(UnknownEnvironment, match=message):
+            open_simulator(f"fmu:{tmp_path / 'broken.fmu'}")
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 0xFF
+    (tmp_path / "broken.fmu").write_bytes(flipped)
+    with pytest.raises(UnknownEnvironment, match="is damaged: copy or export"):
+        open_simulator(f"fmu:{tmp_path / 'broken.fmu'}")
+    with pytest.raises(UnknownEnvironment, match="got no file"):
+        open_simulator(f"fmu:{tmp_path / 'none.fmu'}")
+
+
+@pytest.mark.parametrize(
+    ("choices", "message"),
+    [
+        ({"start": {"flow": "much"}}, "expected a finite number for 'flow'"),
+        ({"start": {"depth": 1.0}}, "has no scalar variable 'depth': expected one of pump, upper, lower, flow"),
+        ({"actions": {"pump": [1, 0]}}, r"expected low < high, got \[1, 0\]"),
+        ({"actions": ["flow"]}, "expected some of the continuous inputs of .*, pump, got flow"),
+        ({"coordinates": []}, "expected continuous variables of .*, got none"),
+        ({"steps": 1.0}, "expected fmu, and optionally step, actions, coordinates and start"),
+        ({"step": -1.0}, "step: Input should be greater than 0"),
+    ],
+)
+def test_choices_that_do_not_fit_are_named(tanks: Path, tmp_path: Path, choices, message: str) -> None:
+    with pytest.raises(UnknownEnvironment, match=message):
+        open_simulator(mapping(tmp_path, fmu=str(tanks), **choices))
+
+
+def test_nothing_is_left_after_closing(tanks: Path, monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    fmu = opened(f"fmu:{tanks}")
+    assert os.listdir(tmp_path)
+    fmu.close()
+    assert os.listdir(tmp_path) == []
