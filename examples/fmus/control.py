@@ -103,6 +103,7 @@ def main() -> None:
     parser.add_argument("--budget", type=int, default=30, help="real steps of the design")
     parser.add_argument("--steps", type=int, default=None, help="virtual steps of the training")
     parser.add_argument("--baseline", type=int, default=0, help="real steps of a training in the plant itself")
+    parser.add_argument("--algorithm", default="FASTPPO", help="of that training, such as PPO")
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
@@ -127,7 +128,7 @@ def main() -> None:
 
         if options.baseline:
             port = OriginalPort(spec, lambda: open_episode("own", spec, lambda: Plant(options.plant, spec)))
-            settings = TrainSettings(total_steps=options.baseline, seed=options.seed)
+            settings = TrainSettings(options.algorithm, options.baseline, seed=options.seed)
             trained = train(port, Path(folder, "baseline.zip"), settings)
             print(f"policy from the plant itself: {trained.algorithm}, {port.steps} real steps")
             theirs = judged(Path(folder, "baseline.zip"), environment, spec, options.episodes)

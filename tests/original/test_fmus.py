@@ -28,7 +28,7 @@ from surrogym_client.original.describing import describe
 from surrogym_client.original.episodes import open_episode
 from surrogym_client.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
 from surrogym_client.original.fmus.environment import FmuEnvironment
-from surrogym_client.original.loading import is_known, isolated
+from surrogym_client.original.loading import fits, is_known, isolated
 from surrogym_shared.spec import (
     BoxAction,
     Coordinate,
@@ -368,3 +368,12 @@ def test_nothing_is_left_after_closing(tanks: Path, monkeypatch, tmp_path: Path)
     assert os.listdir(tmp_path)
     fmu.close()
     assert os.listdir(tmp_path) == []
+
+
+def test_a_specification_fits_the_same_file_in_another_folder(tanks: Path) -> None:
+    spec = rewarded(f"fmu:{tanks}", squared("lower"), steps=20).model_copy(update={"environment": "fmu:TwoTanks.fmu"})
+    original.make(f"fmu:{tanks}", spec=spec).close()
+    assert fits("fmu:TwoTanks.fmu", f"fmu:{tanks}")
+    assert not fits("fmu:Other.fmu", f"fmu:{tanks}")
+    with pytest.raises(UnknownEnvironment, match=r"expected a specification of .*, got one of fmu:Other.fmu"):
+        original.make(f"fmu:{tanks}", spec=spec.model_copy(update={"environment": "fmu:Other.fmu"}))

@@ -254,7 +254,7 @@ def opener_of(
     """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.original.episodes import open_episode
-    from surrogym_client.original.loading import is_known, is_own, make
+    from surrogym_client.original.loading import fits, is_known, is_own, make
 
     noted = card.spec
     name = env or (noted.environment if noted is not None else None)
@@ -263,19 +263,19 @@ def opener_of(
     if is_own(name):
         bins = _bins(noted) if given is None else None
         return lambda: open_episode(name, given, lambda: make(name, spec=given, bins=bins))
-    if given is None and noted is not None and noted.environment == name and is_known(name):
-        given = _limited(noted, quiet=quiet)
+    if given is None and noted is not None and fits(noted.environment, name):
+        given = _limited(noted, name, quiet=quiet)
     spec = given or make(name).spec()
     return lambda: open_episode(name, spec, lambda: make(name, spec=spec))
 
 
-def _limited(noted: EnvironmentSpec, *, quiet: bool) -> EnvironmentSpec:
+def _limited(noted: EnvironmentSpec, name: str, *, quiet: bool) -> EnvironmentSpec:
     """Shorten the environment's time limit to that of the card. A card can't lengthen it, as this would cost real
     steps."""
     from surrogym_client.original.loading import own_time_limit
     from surrogym_shared.terminal import say
 
-    own = own_time_limit(noted.environment)
+    own = own_time_limit(name)
     if noted.time_limit is not None and noted.time_limit <= own:
         return noted
     asked = "none" if noted.time_limit is None else f"{noted.time_limit} steps"

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Literal
 
-from surrogym_client.original.adapters import adapter_of, is_trusted, open_simulator
+from surrogym_client.original.adapters import adapter_of, is_same, is_trusted, open_simulator
 from surrogym_client.original.classic import TASKS
 from surrogym_client.original.errors import UnknownEnvironment
 from surrogym_client.original.executables import is_executable, open_executable
@@ -130,6 +130,12 @@ def specification(name: str) -> EnvironmentSpec:
     )
 
 
+def fits(noted: str, name: str) -> bool:
+    """Whether the specification noted for one environment may be used for another that an adapter opens: both are the
+    same, and known or without a specification of its own."""
+    return is_same(noted, name) and (is_known(name) or not has_specification(name))
+
+
 def own_time_limit(name: str) -> int:
     """Time limit of a known name in steps, from its registration; ``LONGEST_EPISODE`` if it has none."""
     import gymnasium
@@ -181,7 +187,7 @@ def load_factory(name: str) -> Any:
 
 
 def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str, step_limit: float) -> Environment:
-    if spec is not None and spec.environment not in ("", name):
+    if spec is not None and spec.environment and not is_same(spec.environment, name):
         raise UnknownEnvironment(f"expected a specification of {name}, got one of {spec.environment}")
     if name in TASKS:
         spec = spec and spec.model_copy(update={"environment": name})

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from importlib import import_module
+from pathlib import PurePath
 from typing import NamedTuple
 
 from surrogym_client.original.errors import UnknownEnvironment
@@ -35,6 +36,7 @@ class Adapter(NamedTuple):
     separate: bool = False
 
 
+FILES = (".fmu", ".json")  # of names that are files
 NEVER = re.compile(r"(?!)")
 ADAPTERS = (
     Adapter(
@@ -58,6 +60,13 @@ ADAPTERS = (
 def adapter_of(name: str) -> Adapter | None:
     """The adapter that opens a name; None for ``package.module:factory`` and for other texts."""
     return next((adapter for adapter in ADAPTERS if adapter.names.fullmatch(name)), None)
+
+
+def is_same(name: str, other: str) -> bool:
+    """Whether two names mean the same environment. A file may lie in another folder on another machine."""
+    files = [PurePath(one.partition(":")[2]) for one in (name, other)]
+    by_file = adapter_of(name) is adapter_of(other) and all(file.suffix in FILES for file in files)
+    return name == other or (by_file and files[0].name == files[1].name)
 
 
 def is_trusted(name: str) -> bool:
