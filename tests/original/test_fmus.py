@@ -108,9 +108,9 @@ def test_episodes_and_restored_snapshots_replay_bit_for_bit(which: str, request)
         actions = drawn(fmu, 40)
         fmu.reset(None)
         first = states(fmu, actions[:20])
-        snapshot = fmu.save()
+        snapshot = fmu.snapshot()
         later = states(fmu, actions[20:])
-        fmu.restore(snapshot)
+        fmu.go_back(snapshot)
         assert bits(*states(fmu, actions[20:])) == bits(*later)
         fmu.reset(None)
         assert bits(*states(fmu, actions)) == bits(*first, *later)
@@ -142,8 +142,8 @@ def test_a_snapshot_outlives_the_process_that_made_it(tanks: Path) -> None:
     one, other = opened(f"fmu:{tanks}"), opened(f"fmu:{tanks}")
     try:
         one.step(np.ones(1))
-        snapshot, at = one.save(), one.read()
-        other.restore(snapshot)
+        snapshot, at = one.snapshot(), one.read()
+        other.go_back(snapshot)
         assert bits(other.read()) == bits(at)
     finally:
         one.close()
@@ -155,9 +155,9 @@ def test_a_snapshot_of_something_else_is_refused(tanks: Path, tmp_path: Path) ->
     other = opened(mapping(tmp_path, fmu=str(tanks), start={"flow": 1e-4}))
     try:
         with pytest.raises(StepFailed, match="as it is now, got one of another file, step or start: delete"):
-            other.restore(one.save())
+            other.go_back(one.snapshot())
         with pytest.raises(StepFailed, match=r"expected a snapshot of TwoTanks.fmu, got 5 other bytes"):
-            other.restore(b"hello")
+            other.go_back(b"hello")
     finally:
         one.close()
         other.close()
@@ -168,12 +168,12 @@ def test_states_kept_in_memory_are_lost_with_their_process(tanks: Path, tmp_path
     one, other = opened(f"fmu:{quiet}"), opened(f"fmu:{quiet}")
     try:
         one.step(np.ones(1))
-        snapshot, at = one.save(), one.read()
+        snapshot, at = one.snapshot(), one.read()
         one.step(np.ones(1))
-        one.restore(snapshot)
+        one.go_back(snapshot)
         assert bits(one.read()) == bits(at)
         with pytest.raises(StepFailed, match="no longer in memory"):
-            other.restore(snapshot)
+            other.go_back(snapshot)
     finally:
         one.close()
         other.close()
@@ -281,6 +281,17 @@ def test_a_crash_at_a_later_step_is_named(moody: Path, tmp_path: Path) -> None:
         plant.close()
 
 
+def test_an_fmu_without_snapshots_saves_what_can_be_set(moody: Path, tmp_path: Path) -> None:
+    plant = moody_with_limits(moody, tmp_path)
+    try:
+        start = plant.begin(0)
+        snapshot = plant.save()
+        plant.act(np.array([-1.0]))
+        assert bits(plant.restore(snapshot)) == bits(start)
+    finally:
+        plant.close()
+
+
 def test_a_state_that_does_not_read_back_can_only_be_reset(tmp_path: Path) -> None:
     stubborn = build_text(STUBBORN, "stubborn", tmp_path)
     fmu = opened(mapping(tmp_path, fmu=str(stubborn), step=1.0))
@@ -293,15 +304,20 @@ def test_a_state_that_does_not_read_back_can_only_be_reset(tmp_path: Path) -> No
         fmu.close()
 
 
-def test_calculated_outputs_can_only_be_reset(tanks: Path, tmp_path: Path) -> None:
+def test_calculated_outputs_are_reset_or_restored(tanks: Path, tmp_path: Path) -> None:
     read_only = changed(tanks, tmp_path / "read.fmu", {' initial="exact"': "", ' start="0.1"': ""})
     spec = rewarded(f"fmu:{read_only}", squared("lower", wanted=0.4))
-    assert spec.query == "rollout"
+    assert spec.access == "snapshot"
     plant = original.make(f"fmu:{read_only}", spec=spec)
+    assert isinstance(plant, FmuEnvironment)
     try:
-        start = plant.begin(0)  # type: ignore[union-attr]
-        assert np.asarray(start).tolist() == [0.1, 0.1]
-        assert plant.act(np.ones(1)).next_coordinates[0] > 0.1  # type: ignore[union-attr, index]
+        assert plant.begin(0).tolist() == [0.1, 0.1]
+        there = plant.act(np.ones(1)).next_coordinates
+        assert np.asarray(there)[0] > 0.1
+        snapshot = plant.save()
+        after = plant.act(np.ones(1)).next_coordinates
+        assert bits(plant.restore(snapshot)) == bits(there)
+        assert bits(plant.act(np.ones(1)).next_coordinates) == bits(after)
     finally:
         plant.close()
 

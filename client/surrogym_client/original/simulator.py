@@ -80,6 +80,11 @@ class Simulator(ABC):
     notes: tuple[str, ...] = ()
     questions: tuple[str, ...] = ()
 
+    @property
+    def saves(self) -> bool:
+        """Whether it can return to a saved state."""
+        return self.settable
+
     @abstractmethod
     def reset(self, seed: int | None) -> Array:
         """Begin an episode; the observation (D,)."""
@@ -164,7 +169,8 @@ class Simulated:
         self.shows_own = shows_own
         self._spec = spec
         self._columns = simulator.columns(spec.coordinate_names)
-        if spec.access != "reset" and not simulator.settable:
+        able = {"any": simulator.settable, "snapshot": simulator.saves, "reset": True}
+        if not able[spec.access]:
             raise UnknownEnvironment(
                 f"{spec.environment} can't be set to a state, because its state can't be read: register it with "
                 "--access reset, or give a specification with query 'rollout' and no snapshots"

@@ -21,7 +21,7 @@ from surrogym_client.original.fmus.choices import (
     start_values,
     step_of,
 )
-from surrogym_client.original.fmus.environment import FmuEnvironment
+from surrogym_client.original.fmus.environment import FmuEnvironment, SavingSimulator
 from surrogym_client.original.fmus.process import Process
 from surrogym_client.original.protocol import Array
 from surrogym_client.original.simulator import Motion, Simulated, Simulator, Taken, Variable
@@ -45,7 +45,7 @@ def open_simulator(name: str) -> Simulator:
     return Fmu(name, read_archive(path), choices)
 
 
-class Fmu(Simulator):
+class Fmu(SavingSimulator):
     """One FMU for co-simulation. A reset always begins at its start values. Its observation is its outputs."""
 
     pays = False
@@ -60,6 +60,7 @@ class Fmu(Simulator):
             )
         outputs = archive.of_causality("output") or state
         self._state, self._size = state, len(state)
+        self.has_snapshots = archive.snapshots
         step = step_of(archive, choices)
         self._process = Process(archive, inputs, [*state, *outputs], step, start_values(archive, choices))
         try:
@@ -100,12 +101,10 @@ class Fmu(Simulator):
     def observe(self) -> Array:
         return self._process.values[self._size :].copy()
 
-    def save(self) -> bytes:
-        """The FMU's whole state."""
+    def snapshot(self) -> bytes:
         return self._process.save()
 
-    def restore(self, snapshot: bytes) -> None:
-        """Return to a saved state."""
+    def go_back(self, snapshot: bytes) -> None:
         self._process.restore(snapshot)
 
     def close(self) -> None:

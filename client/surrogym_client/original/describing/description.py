@@ -119,6 +119,7 @@ class _Draft:
             termination="learned" if self._seen.terminated.any() else (),
             time_limit=self._simulator.time_limit or UNKNOWN_LIMIT,
             query="step" if self._probed.settable else "rollout",
+            snapshots=self._simulator.saves and not self._simulator.settable,
             reward=Reward(timing="auto"),
         )
         observation = self._observation(frame, variables, rng)

@@ -6,13 +6,13 @@ Shapes: C coordinates, F action entries.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
 from surrogym_client.original.episodes import draw
-from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.errors import StepFailed, UnknownEnvironment
 from surrogym_client.original.protocol import Array, RealStep
 from surrogym_client.original.simulator import Simulated, Simulator
 from surrogym_shared.logs.rewards import declared_reward
@@ -20,16 +20,22 @@ from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.terms import terminates
 
 
-class Saving(Protocol):
-    """A simulator that can return to a saved state."""
+class SavingSimulator(Simulator):
+    """A simulator that may have snapshots of its own. ``has_snapshots``: whether this one can make them."""
 
-    def save(self) -> bytes:
-        """Its whole state."""
-        ...
+    has_snapshots: bool
 
-    def restore(self, snapshot: bytes) -> None:
-        """Return to a saved state."""
-        ...
+    @property
+    def saves(self) -> bool:
+        return self.settable or self.has_snapshots
+
+    @abstractmethod
+    def snapshot(self) -> bytes:
+        """The whole state, by the simulator's own calls."""
+
+    @abstractmethod
+    def go_back(self, snapshot: bytes) -> None:
+        """Return to a state that ``snapshot`` gave."""
 
 
 class FmuEnvironment(Simulated):
@@ -37,7 +43,7 @@ class FmuEnvironment(Simulated):
 
     parallel = False
 
-    def __init__(self, simulator: Simulator, spec: EnvironmentSpec) -> None:
+    def __init__(self, simulator: SavingSimulator, spec: EnvironmentSpec) -> None:
         if spec.reward.kind != "declared":
             raise UnknownEnvironment(
                 f"expected a declared reward for {spec.environment or 'an FMU'}, which has none of its own, got a "
@@ -50,6 +56,7 @@ class FmuEnvironment(Simulated):
                 f"FMU, got a {spec.action.kind} one of {spec.action.size}"
             )
         super().__init__(simulator, spec)
+        self._saving = simulator
 
     def begin(self, seed: int | None = None) -> Array:
         """Start where the specification says, if the state can be set, and at the FMU's own start otherwise; the
@@ -68,3 +75,18 @@ class FmuEnvironment(Simulated):
         ended = terminates(self._spec, after)
         paid = declared_reward(self._spec, before, taken, after, ended)
         return replace(step, reward=float(paid[0]), terminated=bool(ended[0]))
+
+    def save(self) -> bytes:
+        """The FMU's own state; without one, the state that can be set."""
+        if self._saving.has_snapshots:
+            return self._saving.snapshot()
+        if not self._saving.settable:
+            raise StepFailed("expected an FMU that can save its state or be set to one, got one that can only be reset")
+        return super().save()
+
+    def restore(self, snapshot: bytes) -> Array:
+        """Return to a saved state; its coordinates (C,)."""
+        if not self._saving.has_snapshots:
+            return super().restore(snapshot)
+        self._saving.go_back(snapshot)
+        return self.coordinates()
