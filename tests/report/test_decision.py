@@ -5,18 +5,25 @@ from __future__ import annotations
 import base64
 import re
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from html import unescape
 from typing import Any
 
+import numpy as np
 import pytest
 
 from support.server import ServerProcess
-from surrogym_client.report.decision import decision, share
+from surrogym_client.report.cost import cost
+from surrogym_client.report.decision import decision
 from surrogym_client.report.files import NoPdf, as_pdf
 from surrogym_client.report.known import Known, chosen_real, chosen_reference, chosen_without
+from surrogym_client.report.maps import Cut
+from surrogym_client.report.prediction import outcome
+from surrogym_client.report.wording import criterion, original, share
 from surrogym_client.transport import Api
 from surrogym_shared import wire
+from surrogym_shared.spec import Inequality, Success, Term
 
 SEED = 10_000
 Parts = dict[str, str]
@@ -91,9 +98,9 @@ def modelled(pendulum_server: ServerProcess) -> Known:
         return Known(view, api.models("pendulum"), [], "here")
 
 
-def told(known: Known) -> Parts:
+def told(known: Known, cuts: Sequence[Cut] = ()) -> Parts:
     """The text of each section by its heading; of what stands before the first one under ''."""
-    html = re.sub(r"<img[^>]*>", " [picture] ", decision(known, ()))
+    html = re.sub(r"<img[^>]*>", " [picture] ", decision(known, cuts))
     parts = re.split(r"<h2>(.*?)</h2>", html)
     text = [unescape(re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", part))).strip() for part in parts]
     return {"": text[0], **dict(zip(text[1::2], text[2::2], strict=True))}
@@ -101,22 +108,108 @@ def told(known: Known) -> Parts:
 
 def test_the_report_of_a_tested_policy_is_complete(modelled: Known):
     parts = told(replace(modelled, policy=policy(), real=evaluation(), without=without()))
-    assert parts[""] == (
+    assert parts[""].startswith(
         "In 100 real episodes the controller earned -143.2 (-160.0 to -127.0) on average. 97 of 100 (92 % to 99.0 %) "
-        "succeeded. Without it, from the same starts, the average was -1,280. Learning and checking it took 14 real "
-        "steps."
+        "succeeded. From the first 20 of these 100 starts, it earned -140.0 on average, and no controller (an action "
+        "of zero all the time) earned -1,280. Learning and checking it took 14 real steps, and testing took 24,000 "
+        "more."
     )
-    assert re.search(r"learning the model 6 .*audit\) 8 .*without it 24,000 all together 24,014", parts["What it cost"])
     assert "589,824 steps in the model" in parts["What it cost"]
     assert "-0.089 / -140.0 / -300.0" in parts["What it gives"]
     assert parts["What it gives"].count("[picture]") == 1
-    assert "From the same 20 starts, the average return was -140.0 with" in parts["With and without the controller"]
+    assert "From the first 20 of these 100 starts, the average return" in parts["With and without the controller"]
     assert "1,140 more with it" in parts["With and without the controller"]
     assert "Reality came out as predicted" in parts["Was it predicted?"]
     assert "Another unit of the machine" in parts["What was not tested"]
     assert "not every start succeeded" in parts["What to do next"]
     assert "surrogym evaluate policy.zip --reference module:Class" in parts["What to do next"]
     assert "What could not be read" not in parts
+
+
+def test_every_real_step_has_a_purpose_and_counts(modelled: Known):
+    wide = evaluation(4, declared=False, note="starts anywhere", steps=3_000)
+    older = policy(version=2, evaluations=[evaluation(5, steps=500)])
+    known = replace(modelled, policy=policy(evaluations=[evaluation(), without(), wide]), others=(older,))
+    counted = modelled.view.ledger.model_copy(update={"evaluation": 28_000})
+    known = replace(known, view=modelled.view.model_copy(update={"ledger": counted}))
+    lines = dict(re.findall(r"<tr><td>(.*?)</td><td>([0-9,]+)</td></tr>", cost(known)))
+    assert lines["100 episodes with the controller, starts anywhere"] == "3,000"
+    assert lines["episodes with 1 other version of the controller"] == "500"
+    assert lines["other real episodes, of which no result is stored"] == "500"
+    *parts, total = (int(count.replace(",", "")) for count in lines.values())
+    assert sum(parts) == total == 28_014
+
+
+def test_more_steps_than_planned_are_explained(modelled: Known):
+    ledger = wire.Ledger(initial=5, adaptive=55, total=60)
+    design = modelled.view.spec.design.model_copy(update={"budget": 24})
+    spec = modelled.view.spec.model_copy(update={"design": design})
+    changes = {"ledger": ledger, "spec": spec, "budget": 60, "phase": "over_budget"}
+    words = told(replace(modelled, view=modelled.view.model_copy(update=changes)))["What it cost"]
+    assert "24 real steps were planned at first. 36 more were allowed later" in words
+    assert "60 were taken. Then learning ended, although the model was not yet known well enough" in words
+
+
+def test_other_starts_that_were_tested_are_shown_with_their_results(modelled: Known):
+    wide = evaluation(4, declared=False, note="starts anywhere, from seed 10000", mean=-113.6)
+    tried = told(replace(modelled, policy=policy(evaluations=[evaluation(), wide]), real=evaluation()))
+    assert "starts anywhere 100 -113.6" in tried["What it gives"]
+    assert "Tested were: declared starts (100 episodes); starts anywhere (100 episodes)" in tried["What was not tested"]
+    assert "Starts outside the declared ones" not in tried["What was not tested"]
+    bare = told(replace(modelled, policy=policy(), real=evaluation()))
+    assert "Starts outside the declared ones" in bare["What was not tested"]
+
+
+@pytest.mark.parametrize(
+    ("mean", "low", "high", "verdict"),
+    [
+        (-150.0, -160.0, -140.0, "as predicted"),
+        (-133.999, -133.9995, -133.998, "as predicted"),
+        (-133.0, -140.0, -126.0, "as predicted"),
+        (-120.0, -126.0, -114.0, "better"),
+        (-170.0, -180.0, -160.0, "perhaps worse"),
+        (-250.0, -260.0, -240.0, "worse"),
+    ],
+)
+def test_only_a_difference_beyond_both_intervals_is_one(mean: float, low: float, high: float, verdict: str):
+    promise = wire.PolicyPromise(median=-151.9, low=-169.8, high=-134.0)
+    assert outcome(promise, evaluation(mean=mean, mean_interval=wire.Interval(low=low, high=high))).verdict == verdict
+
+
+def test_no_difference_between_controllers_is_claimed_within_the_interval(modelled: Known):
+    returns = [-140.0, -139.0] * 50
+    other = without(episodes=100, returns=returns)
+    real = evaluation(returns=[-139.0, -140.0] * 50)
+    beside = told(replace(modelled, policy=policy(), real=real, without=other))["With and without the controller"]
+    assert "No difference was shown: the controller's gain is 0 (95 %" in beside
+    assert " more with it" not in beside
+
+
+def test_starts_that_cannot_be_matched_are_not_called_the_same(modelled: Known):
+    few = without(returns=[], traces=[])
+    parts = told(replace(modelled, policy=policy(), real=evaluation(returns=[]), without=few))
+    assert "can't be compared one by one" in parts["With and without the controller"]
+    assert "same" not in parts[""]
+
+
+@pytest.mark.parametrize(
+    ("deviation", "words"), [(0.5, "show no region where the model is unsure"), (2.0, "show where: in up to 100 %")]
+)
+def test_the_sentence_about_maps_is_what_they_show(modelled: Known, deviation: float, words: str):
+    cut = Cut(0, 1, np.full((3, 3), deviation), np.ones((3, 3)), np.zeros((3, 3)))
+    assert words in told(modelled, [cut])["Where the model is unsure"]
+
+
+def test_success_and_reality_are_explained_by_the_specification(modelled: Known):
+    parts = told(replace(modelled, policy=policy(), real=evaluation()))
+    assert "which is the simulator Pendulum-v1 here. No machine was used." in parts[""]
+    assert "An episode succeeds if cos(theta) > 0.95 in each of its last 20 steps." in parts[""]
+    assert "Only the owner knows whether it drives the machine" in original("rail:Rail")
+    near = Inequality(term=2 * Term.linear(x=1, v=-1) + Term.constant(-1), relation="<=", value=0.1)
+    assert criterion(Success(hold=(near,), terminated=False, min_return=-5)) == (
+        "An episode succeeds if 2 (x - v) - 1 <= 0.1 at its end, and no rule of the specification ends it, and its "
+        "return is at least -5."
+    )
 
 
 def test_a_video_is_inside_the_report(modelled: Known):
@@ -132,16 +225,16 @@ def test_a_reference_controller_stands_beside_the_policy(modelled: Known):
     assert found is not None
     assert found.id == 3
     parts = told(replace(modelled, policy=listed, real=evaluation(), without=without(), reference=other))
-    assert "The reference controller earned -214.0 (-160.0 to -127.0) there." in parts[""]
+    assert "From the same starts, it earned -204.0 on average, and the reference controller earned -214.0." in parts[""]
     beside = parts["With and without the controller"]
-    assert "with the reference controller: 10.0 more with it (95 %: 10.0 to 10.0)" in beside
+    assert "-214.0 with the reference controller. That is 10.0 more with it (95 %: 10.0 to 10.0)" in beside
     assert beside.count("[picture]") == 1
     assert "A controller of reference" not in parts["What was not tested"]
     assert "--reference" not in parts["What to do next"]
 
 
 def test_a_broken_promise_comes_first_in_the_next_steps(modelled: Known):
-    worse = evaluation(mean=-250.0, promise_kept=False)
+    worse = evaluation(mean=-250.0, mean_interval=wire.Interval(low=-260.0, high=-240.0), promise_kept=False)
     parts = told(replace(modelled, policy=policy(evaluations=[worse]), real=worse))
     assert "worse than predicted, by 80.2 beyond" in parts["Was it predicted?"]
     assert parts["What to do next"].startswith("Don't use it yet")

@@ -77,7 +77,8 @@ def test_it_says_what_is_known(known: Both) -> None:
         assert f"{output.leave_one_out_error:.4g}" in read.texts
     assert "lengthscale" in read.texts
     assert models[0].data_hash[:12] in read.texts
-    assert f"{view.ledger.total} of {view.budget}" in read.texts
+    assert f"{view.ledger.total} taken, {view.budget} allowed" in read.texts
+    assert not {"over_budget", "from_log"} & set(re.findall(r"\w+", " ".join(read.texts)))
 
 
 def test_it_loads_nothing_and_its_policy_lets_nothing_load(known: Both) -> None:

@@ -3,9 +3,19 @@
 from __future__ import annotations
 
 from surrogym_client.report.known import PREFERRED, Known
+from surrogym_client.report.prediction import outcome_of
+from surrogym_client.report.wording import plural, starts_of
 from surrogym_client.surrogates.advice import advice
+from surrogym_shared.wire import PolicyView
 
 FEW = 30  # episodes; fewer give an unreliable average
+
+
+def tested(known: Known) -> str:
+    """The starts and machines with which the controller was tested, in a sentence; empty without real episodes."""
+    evaluations = [] if known.policy is None else known.policy.evaluations
+    own = [f"{starts_of(one)} ({plural(one.episodes, 'episode')})" for one in evaluations if one.controller == "policy"]
+    return f"Tested were: {'; '.join(dict.fromkeys(own))}. Not tested were:" if own else ""
 
 
 def untested(known: Known) -> list[str]:
@@ -19,7 +29,7 @@ def untested(known: Known) -> list[str]:
     if real.episodes < FEW:
         found.append(f"Many starts: {real.episodes} episodes say little of an average; {FEW} or more would.")
     own = [one for one in policy.evaluations if one.controller == "policy"]
-    if not any("anywhere" in one.note or "times as far" in one.note for one in own):
+    if not _other_starts(policy):
         found.append("Starts outside the declared ones.")
     if not any("changed by" in one.note for one in own):
         found.append("Another unit of the machine, or a worn one: masses, lengths and limits were as they are.")
@@ -48,7 +58,8 @@ def next_steps(known: Known) -> list[str]:
             "surrogym evaluate policy.zip --compare zero"
         )
         return found + _of_the_model(known)
-    if real.promise_kept is False or policy.trusted is False:
+    judged = outcome_of(known)
+    if policy.trusted is False or (judged is not None and judged.verdict == "worse"):
         found.append("Don't use it yet: the model was wrong, or not sure, where this controller goes.")
         found.append(f"Ask for real steps on its way, and train again: surrogym train {name} --improve 8")
     elif real.success_rate is not None and real.success_rate < 1:
@@ -61,11 +72,19 @@ def next_steps(known: Known) -> list[str]:
         found.append(
             "Compare it with the controller in use today: surrogym evaluate policy.zip --reference module:Class"
         )
+    if not _other_starts(policy):
+        found.append("See how it does from other starts: surrogym evaluate policy.zip --wide")
     if not any("changed by" in one.note for one in policy.evaluations):
         found.append("Find out how much change of the machine it stands: surrogym evaluate policy.zip --perturb 0.1")
     if real.promise_kept and PREFERRED not in policy.aliases:
         found.append(f"If that is good enough, name it: surrogym policy alias {name}@{policy.version} {PREFERRED}")
     return found + _of_the_model(known)
+
+
+def _other_starts(policy: PolicyView) -> bool:
+    """Whether the policy was tested from starts outside the declared ones."""
+    own = [one.note for one in policy.evaluations if one.controller == "policy"]
+    return any("anywhere" in note or "times as far" in note for note in own)
 
 
 def _of_the_model(known: Known) -> list[str]:

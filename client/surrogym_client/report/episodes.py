@@ -4,7 +4,7 @@ distinguished in black and white."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -15,6 +15,8 @@ from surrogym_shared.spec import Coordinate, EnvironmentSpec
 from surrogym_shared.wire import EpisodeTrace
 
 Array = NDArray[np.float64]
+Meet = Literal["start", "end"]
+TURN = 2 * np.pi
 
 
 class Stroke(NamedTuple):
@@ -37,8 +39,11 @@ class Range(NamedTuple):
     high: float | None
 
 
-def draw_episodes(spec: EnvironmentSpec, shown: Sequence[tuple[str, EpisodeTrace]]) -> Figure:
-    """Coordinates and actions over the steps, one line for each of at most three episodes."""
+def draw_episodes(spec: EnvironmentSpec, shown: Sequence[tuple[str, EpisodeTrace]], meet: Meet = "end") -> Figure:
+    """Coordinates and actions over the steps, one line for each of at most three episodes.
+
+    Full turns of an angle are counted. At the step ``meet`` the lines are as near to each other as full turns allow.
+    """
     actions = len(shown[0][1].action[0]) if shown[0][1].action else 0
     labels = [
         *map(with_unit, spec.coordinates),
@@ -46,9 +51,10 @@ def draw_episodes(spec: EnvironmentSpec, shown: Sequence[tuple[str, EpisodeTrace
     ]
     figure = Figure(figsize=(1.5 * WIDTH, 1.5 * len(labels) + 0.6), layout="constrained")
     grid = figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0]
+    first = shown[0][1].coordinates[_place(meet)]
     for (name, trace), stroke in zip(shown, STROKES, strict=False):
         states, given = np.array(trace.coordinates), np.array(trace.action).reshape(len(trace.action), -1)
-        lines = [_unbroken(c, states[:, i]) for i, c in enumerate(spec.coordinates)]
+        lines = [unbroken(c, states[:, i], meet, first[i]) for i, c in enumerate(spec.coordinates)]
         lines += [given[:, i] for i in range(actions)]
         for axes, line in zip(grid, lines, strict=True):
             axes.plot(line, color=stroke.colour, linestyle=stroke.style, linewidth=stroke.width, label=name)
@@ -60,6 +66,13 @@ def draw_episodes(spec: EnvironmentSpec, shown: Sequence[tuple[str, EpisodeTrace
     handles, names = grid[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper left", ncols=3, frameon=False)
     return figure
+
+
+def turns(spec: EnvironmentSpec) -> str:
+    """How angles are drawn, in a sentence; empty without an angle."""
+    if all(coordinate.kind != "angle" for coordinate in spec.coordinates):
+        return ""
+    return "Angles are drawn without a jump after a full turn: values that are 6.28 rad apart are the same position."
 
 
 def draw_ranges(ranges: Sequence[Range], label: str) -> Figure:
@@ -78,10 +91,16 @@ def draw_ranges(ranges: Sequence[Range], label: str) -> Figure:
     return figure
 
 
-def _unbroken(coordinate: Coordinate, values: Array) -> Array:
-    """An angle without the vertical line where it jumps from pi to -pi: the value after a jump is not drawn."""
+def unbroken(coordinate: Coordinate, values: Array, meet: Meet, to: float) -> Array:
+    """Values (n,) of a coordinate, for an angle without jumps from pi to -pi, and nearest to ``to`` where they meet."""
     if coordinate.kind != "angle":
         return values
-    shown = values.copy()
-    shown[1:][np.abs(np.diff(values)) > np.pi] = np.nan
+    turned = np.unwrap(values)
+    away = np.round((turned[_place(meet)] - to) / TURN)
+    shown: Array = turned - TURN * away
     return shown
+
+
+def _place(meet: Meet) -> int:
+    """Number of the step, as an index."""
+    return 0 if meet == "start" else -1

@@ -40,6 +40,7 @@ class Known:
         without: real episodes without the policy, from the same starts.
         reference: real episodes of a reference controller, from the same starts.
         video: its form and content, as a browser plays it; None: there is none.
+        others: the other versions of the surrogate's policies.
         missing: sentences about what could not be read.
     """
 
@@ -52,6 +53,7 @@ class Known:
     without: EvaluationDetail | None = None
     reference: EvaluationDetail | None = None
     video: tuple[str, bytes] | None = None
+    others: tuple[PolicyView, ...] = ()
     missing: tuple[str, ...] = ()
 
 
@@ -81,7 +83,10 @@ def collect(api: Api, name: str, which: str | None = None) -> Known:
         details.append(detail)
     video, lacks = _video(api, name, policy)
     missing += lacks
-    return Known(view, models, samples, server, policy, details[0], details[1], details[2], video, tuple(missing))
+    others = tuple(one for one in api.policies.list(name) if one.version != policy.version)
+    return Known(
+        view, models, samples, server, policy, details[0], details[1], details[2], video, others, tuple(missing)
+    )
 
 
 def _video(api: Api, name: str, policy: PolicyDetail) -> tuple[tuple[str, bytes] | None, list[str]]:

@@ -15,7 +15,8 @@ from surrogym_client.report.html import document, picture, rows, section, table
 from surrogym_client.report.known import Known
 from surrogym_client.report.maps import Cut
 from surrogym_client.runtime.versions import versions
-from surrogym_shared.wire import ModelView, SampleView, SurrogateView
+from surrogym_client.surrogates.phases import IN_WORDS
+from surrogym_shared.wire import ModelView, Phase, SampleView, SurrogateView
 
 FIDELITY = {
     "output": "name",
@@ -29,6 +30,13 @@ FIDELITY = {
     "noise": "noise",
 }
 LEDGER = ("initial", "adaptive", "manual", "total", "audit", "logged", "evaluation", "unresolved")
+
+PHASES: dict[Phase, str] = {
+    **IN_WORDS,
+    "collecting": "the first real steps are being taken",
+    "fitting": "the model is learning from new real steps",
+    "sampling": "further real steps are being taken where the model is unsure",
+}
 
 
 def page(known: Known, cuts: Sequence[Cut] = ()) -> str:
@@ -80,9 +88,9 @@ def _covered(view: SurrogateView, samples: Sequence[SampleView]) -> str:
 def _summary(view: SurrogateView) -> str:
     index = "no model yet" if view.confidence_index is None else f"{view.confidence_index:.4f}"
     facts = [
-        ("phase", f"{view.phase}, paused" if view.paused else view.phase),
+        ("phase", f"{PHASES[view.phase]}, paused" if view.paused else PHASES[view.phase]),
         ("confidence index", f"{index}, target {view.target:g}"),
-        ("real steps", f"{view.ledger.total} of {view.budget}"),
+        ("real steps", f"{view.ledger.total} taken, {view.budget} allowed"),
         ("model", view.model_version),
         ("queries", ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in view.queries)),
         *([("last error", view.error)] if view.error else []),

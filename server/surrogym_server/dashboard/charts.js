@@ -1,5 +1,6 @@
 // Lines over samples and over steps, by uPlot. Colours come from the style sheet.
 
+import { unbroken } from "/page/angles.js";
 import { css, h } from "/page/dom.js";
 import { nines, number, percent } from "/page/format.js";
 
@@ -118,7 +119,6 @@ export function episodeCharts(coordinates) {
   const names = [...coordinates.map((coordinate) => coordinate.name), "reward"];
   const charts = names.map((name) => chart(`Imagined ${name} against steps: the mean and drawn episodes`));
   const place = h("div", { class: "episodes" }, names.map((name, at) => h("div", {}, h("h4", {}, name), charts[at].place)));
-  const jumps = (values, kind) => (kind !== "angle" ? values : values.map((value, at) => (at && Math.abs(value - values[at - 1]) > Math.PI ? null : value)));
   const filled = (values, length) => [...values, ...Array(length - values.length).fill(null)];
   return {
     place,
@@ -127,7 +127,8 @@ export function episodeCharts(coordinates) {
       const length = Math.max(...all.map((episode) => episode.coordinates.length));
       charts.forEach((part, which) => {
         const reward = which === coordinates.length;
-        const rows = all.map((episode) => filled(reward ? [null, ...episode.reward] : jumps(episode.coordinates.map((q) => q[which]), coordinates[which].kind), length));
+        const values = all.map((episode) => (reward ? [null, ...episode.reward] : episode.coordinates.map((q) => q[which])));
+        const rows = (coordinates[which]?.kind === "angle" ? unbroken(values, 0) : values).map((row) => filled(row, length));
         part.draw(() => ({
           height: 130,
           legend: { show: false },

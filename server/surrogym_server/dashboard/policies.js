@@ -1,5 +1,6 @@
 // The policies of a surrogate: promise beside real return, aliases, episodes, files.
 
+import { unbroken } from "/page/angles.js";
 import { call, download, surrogate } from "/page/api.js";
 import { lines } from "/page/charts.js";
 import { h, keyed, shown } from "/page/dom.js";
@@ -105,12 +106,14 @@ export function policyList(name, spec, { role, refresh }) {
     inside.append(h("h4", {}, "Best, median and worst real episode: half of all went at least as well as the median"));
     const grid = h("div", { class: "episodes" });
     inside.append(grid);
+    if (spec.coordinates.some(({ kind }) => kind === "angle")) inside.append(h("p", { class: "note" }, "Angles are drawn without a jump after a full turn: values that are 6.28 rad apart are the same position."));
     spec.coordinates.forEach(({ name: label, unit, kind }, at) => {
       const chart = lines(`${label} over the steps of the best, the median and the worst real episode`, 130);
       charts.add(chart);
       grid.append(h("div", {}, h("h4", {}, unit ? `${label} (${unit})` : label), chart.place));
-      const jumps = (values) => (kind === "angle" ? values.map((value, i) => (i && Math.abs(value - values[i - 1]) > Math.PI ? null : value)) : values);
-      chart.show([[...Array(length).keys()], ...ranked.map((trace) => filled(jumps(trace.coordinates.map((q) => q[at]))))], ranked.map((trace) => trace.rank));
+      const values = ranked.map((trace) => trace.coordinates.map((q) => q[at]));
+      const rows = (kind === "angle" ? unbroken(values, -1) : values).map(filled);
+      chart.show([[...Array(length).keys()], ...rows], ranked.map((trace) => trace.rank));
     });
   }
 

@@ -225,7 +225,7 @@ def _summary(episodes: Episodes) -> JSON:
         "steps": sum(episodes.lengths),
         "mean": statistics.fmean(returns),
         "mean_interval": None if interval is None else interval._asdict(),
-        "median": statistics.median(returns),
+        "median": statistics.median_low(returns),  # the return of an episode, which is shown as the median one
         "least": min(returns),
         "most": max(returns),
         "success_rate": None if not success else sum(success) / len(success),

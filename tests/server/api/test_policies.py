@@ -111,6 +111,12 @@ def test_an_evaluation_has_intervals_and_says_whether_the_promise_was_kept(api: 
     assert [one.id for one in policy.evaluations] == [said.id, worse.id, wide.id]
 
 
+def test_the_median_is_the_return_of_an_episode(api: Api, surrogate: str, tmp_path: Path):
+    api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))
+    even = api.policies.evaluate(surrogate, 1, episodes(returns=[-1.0, -2.0, -4.0, -9.0], lengths=[200] * 4))
+    assert even.median == -4.0
+
+
 def test_an_alias_moves_and_a_deleted_policy_is_unknown(api: Api, surrogate: str, tmp_path: Path):
     for seed in range(2):
         api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path, seed))

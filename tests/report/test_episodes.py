@@ -1,0 +1,29 @@
+"""Pictures of episodes draw an angle as a line without jumps, so that equal positions look equal."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surrogym_client.original.classic import pendulum
+from surrogym_client.report.episodes import Meet, draw_episodes
+from surrogym_shared.wire import EpisodeTrace
+
+ONE = [[3.0, 0.0], [-3.0, 0.0], [3.1, 0.0], [-3.1, 0.0]]
+OTHER = [[-2.8, 0.0], [-3.1, 0.0], [3.0, 0.0], [2.9, 0.0]]
+
+
+def trace(coordinates: list[list[float]]) -> EpisodeTrace:
+    steps = len(coordinates) - 1
+    return EpisodeTrace(rank="best", seed=0, coordinates=coordinates, action=[[0.0]] * steps, reward=[0.0] * steps)
+
+
+@pytest.mark.parametrize(("meet", "at"), [("start", 0), ("end", -1)])
+def test_angles_are_drawn_without_a_jump_and_meet_where_asked(meet: Meet, at: int):
+    figure = draw_episodes(pendulum(), [("one", trace(ONE)), ("other", trace(OTHER))], meet)
+    drawn = [np.asarray(line.get_ydata()) for line in figure.axes[0].get_lines()]
+    for values, given in zip(drawn, (ONE, OTHER), strict=True):
+        assert np.abs(np.diff(values)).max() < 0.7
+        assert np.exp(1j * values) == pytest.approx(np.exp(1j * np.array(given)[:, 0]))
+    assert drawn[0][at] == ONE[at][0]
+    assert abs(drawn[1][at] - drawn[0][at]) <= np.pi
