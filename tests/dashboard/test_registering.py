@@ -129,8 +129,12 @@ def test_a_log_with_other_columns_is_stored_by_a_mapping(url: str, open_page: Op
         part.get_by_label("Log as CSV").set_input_files(file)
         part.get_by_role("button", name="Check the log").click()
         expect(part.get_by_role("alert")).to_contain_text("expected a column of the action")
-        mapping = {"state": {"theta": "angle", "speed": "rate"}, "action": ["motor"], "reward": "profit"}
-        part.get_by_label("Mapping as JSON").fill(json.dumps(mapping))
+        chosen = {"angle": "state theta", "rate": "state speed", "motor": "action", "profit": "reward"}
+        for column, role in chosen.items():
+            part.get_by_label(column, exact=True).select_option(role)
+        mapping = {"state": {"theta": "angle", "speed": "rate"}, "action": {"0": "motor"}, "reward": "profit"}
+        text = part.get_by_label("mapping as JSON")
+        assert json.loads(text.input_value()) == mapping
         part.get_by_role("button", name="Check the log").click()
         expect(part.get_by_role("region", name="Rows that can't be used")).to_contain_text("rate: expected a value in")
         assert serious(page) == []
@@ -139,3 +143,29 @@ def test_a_log_with_other_columns_is_stored_by_a_mapping(url: str, open_page: Op
         expect(part.get_by_role("status")).to_contain_text("1 new logged step")
         assert api.surrogate("plant").ledger.logged == 1
         api.delete_surrogate("plant")
+
+
+def test_selects_and_text_of_a_mapping_follow_each_other(url: str, open_page: Open, tmp_path: Path):
+    file = tmp_path / "plant.csv"
+    file.write_text('batch;"LT;101";LT-next;valve\n1;0.1;0.2;0.5\n1;0.2;0.3;0.5\n')
+    page = open_page(f"{url}/#/register")
+    page.get_by_text("Start from a log instead").click()
+    page.get_by_label("Log as CSV").set_input_files(file)
+    page.get_by_text("The columns have other names").click()
+    text = page.get_by_label("mapping as JSON")
+    text.fill(json.dumps({"state": {"level": "LT;101"}, "action": {"opening": "valve"}, "limits": {"level": [0, 1]}}))
+    assert page.get_by_label("LT;101", exact=True).input_value() == "state"
+    assert page.get_by_label("valve", exact=True).input_value() == "action:0"
+    page.get_by_label("LT-next", exact=True).select_option("next state of LT;101")
+    page.get_by_label("batch", exact=True).select_option("reward")
+    page.get_by_label("batch", exact=True).select_option("number of the episode")
+    assert json.loads(text.input_value()) == {
+        "state": {"level": "LT;101"},
+        "action": {"opening": "valve"},
+        "limits": {"level": [0, 1]},
+        "next": {"level": "LT-next"},
+        "episode": "batch",
+    }
+    text.fill("{")
+    assert page.get_by_label("batch", exact=True).input_value() == "episode"
+    assert serious(page) == []

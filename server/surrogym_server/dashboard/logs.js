@@ -1,11 +1,13 @@
 // Logs of real steps: chosen, checked row by row, and then stored or drafted into a specification.
 
 import { call, save, surrogate } from "/page/api.js";
+import { columnPicks, headingOf } from "/page/columns.js";
 import { h } from "/page/dom.js";
 import { count, plural } from "/page/format.js";
 import { section, table } from "/page/parts.js";
 
 const MOST_BYTES = 4 * 1024 * 1024; // of the server's route
+const MOST_ACTIONS = 4; // entries that the selects of a draft offer; the text takes more
 const SHOWN = 100; // rejected rows
 const PATIENCE_MS = 120_000; // 45,000 steps are stored in 7 s
 const ROLES = ["sample", "admin"];
@@ -36,12 +38,17 @@ function reportParts(report) {
   ];
 }
 
-/** Fields for a log and a mapping, and a button that has it looked at. `look(log)` gives the report; `found(report, log)` what follows it. */
-function logForm(id, { look, found }) {
+/**
+ * Fields for a log and the roles of its columns, and a button that has it looked at. `known` is what `columnPicks` needs;
+ * `look(log)` gives the report; `found(report, log)` what follows it.
+ */
+function logForm(id, known, { look, found }) {
   const file = h("input", { id: `${id}-file`, type: "file", accept: ".csv,.tsv,.txt,text/csv", required: true });
   const mapping = h("textarea", { id: `${id}-mapping`, rows: 5, spellcheck: "false" });
+  const picks = columnPicks(id, mapping, known);
   const details = h("details", { class: "model" }, h("summary", {}, "The columns have other names"),
-    h("label", { for: mapping.id }, "Mapping as JSON; empty: by the names of the columns"), mapping,
+    h("p", { class: "note" }, "Choose a log, and then what each of its columns is. If nothing is chosen, the names of the columns decide."), picks.element,
+    h("label", { for: mapping.id }, "The same as text: mapping as JSON"), mapping,
     h("p", { class: "note" }, "Such as ", h("code", {}, '{"state": {"level": "LT-101"}, "action": ["FV-101"], "reward": "profit", "episode": "batch"}')));
   const answer = h("div", { "aria-live": "polite" });
   const go = h("button", {}, "Check the log");
@@ -67,6 +74,7 @@ function logForm(id, { look, found }) {
       const log = await chosen();
       const report = await look(log, file.files[0]);
       if (!mapping.value.trim()) mapping.value = mappingText(report.mapping);
+      picks.follow();
       answer.replaceChildren(...reportParts(report), ...[found(report, log, fail)].flat());
     } catch (error) {
       details.open = details.open || Boolean(file.files.length);
@@ -74,6 +82,10 @@ function logForm(id, { look, found }) {
     } finally {
       go.disabled = false;
     }
+  });
+  file.addEventListener("change", async () => {
+    mapping.value = "";
+    picks.show(file.files.length ? await headingOf(file.files[0]) : []);
   });
   for (const input of [file, mapping]) input.addEventListener("input", () => answer.replaceChildren());
   return [form, answer];
@@ -83,9 +95,9 @@ function logForm(id, { look, found }) {
 export const storeLog = (name, log) => call("POST", `${surrogate(name)}/logs`, log, undefined, PATIENCE_MS);
 
 /** The part of a surrogate's page that takes logs. */
-export function logUpload(name, { role, refresh }) {
+export function logUpload(name, spec, { role, refresh }) {
   const forbidden = h("p", { class: "note" });
-  const form = h("div", {}, logForm("log", {
+  const form = h("div", {}, logForm("log", { coordinates: spec.coordinates.map((one) => one.name), actions: (spec.action.low ?? spec.action.nvec ?? [0]).length }, {
     look: (log) => call("POST", `${surrogate(name)}/logs`, { ...log, check_only: true }, undefined, PATIENCE_MS),
     found: ({ steps }, log, fail) => {
       const said = h("p", { class: "good", role: "status" });
@@ -115,7 +127,7 @@ export function logUpload(name, { role, refresh }) {
 }
 
 /** A form that drafts a specification from a log; `ondraft(drafted, log)` takes it. */
-export const logDraft = (ondraft) => logForm("draft", {
+export const logDraft = (ondraft) => logForm("draft", { coordinates: null, actions: MOST_ACTIONS }, {
   look: (log, file) => call("POST", "/v1/logs:draft", { ...log, environment: file.name.replace(/\.[^.]*$/, "").slice(0, 256) }, undefined, PATIENCE_MS),
   found: (report, log) => {
     ondraft(report, log);

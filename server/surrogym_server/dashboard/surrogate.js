@@ -83,7 +83,7 @@ function build(main, name, spec, context) {
   const controls = pointControls(spec, () => { map.moved(); probing.moved(); });
   const map = maps(name, spec, controls);
   const steer = actions(name, context);
-  const log = logUpload(name, context);
+  const log = logUpload(name, spec, context);
   const files = downloads(name);
   const settable = spec.max_rollout === undefined || spec.max_rollout === null;
   const probing = probe(name, spec, controls, { onepisodes: map.paths, ask: settable && ((point) => steer.ask(point)) });
