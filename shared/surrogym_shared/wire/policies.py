@@ -195,7 +195,9 @@ class EvaluationView(Reply):
     mean_interval: Interval | None = Field(
         description="interval of the mean return over new starts; null for a single episode"
     )
-    median: float = Field(description="return of the median episode; of an even number, the lower of the two middle ones")
+    median: float = Field(
+        description="return of the median episode; of an even number, the lower of the two middle ones"
+    )
     least: float = Field(description="lowest return")
     most: float = Field(description="highest return")
     success_rate: float | None = Field(
