@@ -16,6 +16,7 @@ from surrogym_client.original.errors import StepFailed
 from surrogym_client.original.executables import Executable
 from surrogym_client.original.isolated import IsolatedEnvironment
 from surrogym_client.original.protocol import Array, OriginalEnvironment, RealStep
+from surrogym_client.original.simulator import Simulated
 from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 
 PLACES = 3  # number of states that are set, and of steps of an episode
@@ -80,7 +81,7 @@ class Access:
         return "snapshots (--access snapshot)" if self.can_restore else "reset only (--access reset)"
 
 
-def examine(environment: IsolatedEnvironment | Executable, spec: EnvironmentSpec) -> Access:
+def examine(environment: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec) -> Access:
     """Take some real steps twice.
 
     Raises:
@@ -97,7 +98,7 @@ def examine(environment: IsolatedEnvironment | Executable, spec: EnvironmentSpec
 class _Looking:
     """The checks of one environment."""
 
-    def __init__(self, environment: IsolatedEnvironment | Executable, spec: EnvironmentSpec) -> None:
+    def __init__(self, environment: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec) -> None:
         self._environment, self._spec = environment, spec
         self._rng = np.random.default_rng(0)
         self._steps = self._resets = 0

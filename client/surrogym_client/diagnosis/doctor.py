@@ -22,6 +22,7 @@ from surrogym_client.original.errors import OriginalError, StepFailed
 from surrogym_client.original.executables import Executable
 from surrogym_client.original.isolated import IsolatedEnvironment
 from surrogym_client.original.protocol import Array, OriginalEnvironment, RealStep
+from surrogym_client.original.simulator import Simulated
 from surrogym_client.runtime.versions import versions
 from surrogym_client.runtime.ways_out import EXTRAS, GIVE_TOKEN, START_SERVER
 from surrogym_client.sampler.sample_conversion import sample_of
@@ -95,7 +96,7 @@ def service(api: Api) -> Iterator[Finding]:
     yield _round_trip(api)
 
 
-def environment(opened: Callable[[], IsolatedEnvironment | Executable]) -> Iterator[Finding]:
+def environment(opened: Callable[[], IsolatedEnvironment | Executable | Simulated]) -> Iterator[Finding]:
     """The original environment: whether it can be opened, takes a step, and can be set to a state. The steps are real,
     but they don't enter a ledger."""
     try:
@@ -111,7 +112,7 @@ def environment(opened: Callable[[], IsolatedEnvironment | Executable]) -> Itera
         yield Finding("environment", str(error), "see docs/how-to/own-environment.md for what an environment needs")
 
 
-def _access_of(original: IsolatedEnvironment | Executable, spec: EnvironmentSpec) -> Iterator[Finding]:
+def _access_of(original: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec) -> Iterator[Finding]:
     """Exactness of the environment, and the recommended mode."""
     try:
         access = examine(original, spec)
@@ -176,7 +177,7 @@ def _timed(api: Api) -> float:
     return time.perf_counter() - started
 
 
-def _one_step(original: IsolatedEnvironment | Executable, spec: EnvironmentSpec) -> Finding:
+def _one_step(original: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec) -> Finding:
     """A step from anywhere in the sampling range, or from a reset if the state can't be set."""
     start, action = draw(spec, np.random.default_rng(0), wide=True), _middle(spec)
     begun = time.perf_counter()

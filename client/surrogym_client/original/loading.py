@@ -12,12 +12,13 @@ from typing import Any, Literal
 from surrogym_client.original.adapters import adapter_of, is_same, is_trusted, open_simulator
 from surrogym_client.original.classic import TASKS
 from surrogym_client.original.errors import UnknownEnvironment
-from surrogym_client.original.executables import is_executable, open_executable
+from surrogym_client.original.executables import Executable, is_executable, open_executable
 from surrogym_client.original.gymnasium import GymnasiumEnvironment, task_for
 from surrogym_client.original.isolated import IsolatedEnvironment
 from surrogym_client.original.mujoco_tasks import SPECIFICATIONS
 from surrogym_client.original.protocol import LONGEST_EPISODE, Environment
 from surrogym_client.original.rollouts import answering
+from surrogym_client.original.simulator import Simulated
 from surrogym_shared.spec import Access, BoxAction, EnvironmentSpec
 
 Preset = Literal["default", "paper"]
@@ -80,12 +81,16 @@ def make(
     return _known(name, spec, choose, preset or "default", step_limit)
 
 
-def isolated(name: str, step_limit: float, spec: EnvironmentSpec | None = None) -> Environment | IsolatedEnvironment:
+def isolated(
+    name: str, step_limit: float, spec: EnvironmentSpec | None = None
+) -> IsolatedEnvironment | Executable | Simulated:
     """Build an original environment that runs in a process of its own, where a step has a time limit in seconds."""
     if is_executable(name):
         return open_executable(name, spec, step_limit=step_limit)
     if (adapter := adapter_of(name)) is not None and adapter.separate:
-        return make(name, spec=spec, step_limit=step_limit)
+        made = make(name, spec=spec, step_limit=step_limit)
+        assert isinstance(made, Simulated)
+        return made
     return IsolatedEnvironment(partial(make, name, spec=spec), step_limit)
 
 
