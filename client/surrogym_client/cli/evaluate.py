@@ -146,13 +146,11 @@ def command(
     if stored:
         version = push_or_say(service.server, service.token_for(context), policy, ledger, quiet=output.quiet)
     promise = card.promise if settings.declared and settings.episodes >= FEWEST_TO_JUDGE else None
-    found = differences.between(
-        ledger, service.server, service.token_for(context), result, settings, promise, quiet=output.quiet
-    )
+    token = service.token_for(context)
+    found = differences.between(ledger, service.server, token, result, settings, promise, quiet=output.quiet)
     judged = {"promise_kept": _kept(promise, result), "version": version, "disagreements": found and found.as_json()}
-    summary = {"policy": str(policy), **_settings(settings), **_summary(reports, beside.reference), **judged}
-    if filmed is not None:
-        summary["video"] = str(filmed)
+    drawn = {} if filmed is None else {"video": str(filmed)}
+    summary = {"policy": str(policy), **_settings(settings), **_summary(reports, beside.reference), **judged, **drawn}
     more = [] if found is None else found.in_words(card.spec)
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
 
