@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 import shlex
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from support.programs import left_behind
+from support.noting import until
+from support.programs import NOTES_ITSELF, left_behind, program
 from surrogym_client import original
 from surrogym_client.original.errors import StepFailed, StepTimedOut, UnknownEnvironment
 from surrogym_client.original.loading import is_known
@@ -91,3 +94,27 @@ def test_a_newer_protocol_is_refused_with_the_way_out():
 
 def test_a_server_never_starts_a_program():
     assert not is_known("exec:./plant")
+
+
+def test_a_late_answer_is_never_taken_for_another_request(tmp_path):
+    late = ("    [u] = ", "    [u] = [0.0] if request['action'] == [1.0] and not time.sleep(1.0) else ")
+    plant = original.make(f"exec:{program(tmp_path, late)}", step_limit=0.5)
+    try:
+        with pytest.raises(StepTimedOut):
+            plant.step_from(np.array([0.7]), np.ones(1))
+        time.sleep(1.0)
+        assert plant.step_from(np.array([0.2]), np.zeros(1)).reward == -0.2
+    finally:
+        plant.close()
+
+
+def test_a_program_ends_with_a_client_that_is_killed(tmp_path):
+    name = f"exec:{program(tmp_path, NOTES_ITSELF)}"
+    client = f"import time; from surrogym_client import original; plant = original.make({name!r}); time.sleep(3600)"
+    process = subprocess.Popen([sys.executable, "-c", client])
+    try:
+        assert until(lambda: (tmp_path / "pids").exists() and (tmp_path / "pids").read_text())
+    finally:
+        process.kill()
+        process.wait()
+    assert left_behind(tmp_path) == []
