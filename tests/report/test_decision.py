@@ -200,6 +200,18 @@ def test_the_sentence_about_maps_is_what_they_show(modelled: Known, deviation: f
     assert words in told(modelled, [cut])["Where the model is unsure"]
 
 
+def test_an_environment_of_ones_own_gets_commands_that_run(modelled: Known):
+    spec = modelled.view.spec.model_copy(update={"success": None, "environment": "rail"})
+    view = modelled.view.model_copy(update={"spec": spec, "environment": "rail"})
+    bare = evaluation(success_rate=None, success_interval=None)
+    parts = told(replace(modelled, view=view, policy=policy(), real=bare))
+    assert "can't tell how many episodes failed" in parts[""]
+    assert "no success was declared" in parts["What to do next"]
+    assert "surrogym policy get pendulum@3 --out policy.zip" in parts["What to do next"]
+    assert "surrogym evaluate policy.zip --env package.module:factory --wide" in parts["What to do next"]
+    assert "--perturb" not in parts["What to do next"]
+
+
 def test_success_and_reality_are_explained_by_the_specification(modelled: Known):
     parts = told(replace(modelled, policy=policy(), real=evaluation()))
     assert "which is the simulator Pendulum-v1 here. No machine was used." in parts[""]

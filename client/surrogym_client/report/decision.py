@@ -20,6 +20,7 @@ from surrogym_client.report.wording import criterion, mean, number, original, sh
 from surrogym_client.surrogates.advice import verdict
 from surrogym_shared.wire import EvaluationDetail, OutputFidelity
 
+NO_CRITERION = "Nobody declared what a success is, so this report can't tell how many episodes failed."
 RETURN = "The return of an episode is the sum of its rewards. Higher is better."
 
 
@@ -64,8 +65,7 @@ def _meanings(known: Known) -> list[str]:
     """The words of the summary that a reader may not know, each in a sentence."""
     success = known.view.spec.success
     said = [original(known.view.environment), RETURN]
-    if success is not None:
-        said.append(criterion(success))
+    said.append(NO_CRITERION if success is None else criterion(success))
     said.append("In brackets: the interval that contains the true value with 95 % certainty.")
     return said
 

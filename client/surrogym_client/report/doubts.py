@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from surrogym_client.original.loading import is_known
 from surrogym_client.report.known import PREFERRED, Known
 from surrogym_client.report.prediction import outcome_of
 from surrogym_client.report.wording import plural, starts_of
 from surrogym_client.surrogates.advice import advice
-from surrogym_shared.wire import PolicyView
+from surrogym_shared.wire import EvaluationView, PolicyView
 
 FEW = 30  # episodes; fewer give an unreliable average
 
@@ -14,8 +15,12 @@ FEW = 30  # episodes; fewer give an unreliable average
 def tested(known: Known) -> str:
     """The starts and machines with which the controller was tested, in a sentence; empty without real episodes."""
     evaluations = [] if known.policy is None else known.policy.evaluations
-    own = [f"{starts_of(one)} ({plural(one.episodes, 'episode')})" for one in evaluations if one.controller == "policy"]
-    return f"Tested were: {'; '.join(dict.fromkeys(own))}. Not tested were:" if own else ""
+    most: dict[str, int] = {}
+    for one in evaluations:
+        if one.controller == "policy":
+            most[starts_of(one)] = max(most.get(starts_of(one), 0), one.episodes)
+    own = [f"{starts} ({plural(episodes, 'episode')})" for starts, episodes in most.items()]
+    return f"Tested were: {'; '.join(own)}. Not tested were:" if own else ""
 
 
 def untested(known: Known) -> list[str]:
@@ -51,34 +56,46 @@ def next_steps(known: Known) -> list[str]:
     if policy is None:
         first = f"Train a controller: surrogym train {name}"
         return [first if known.models else f"Let a sampler answer the first queries: surrogym sample {name}"]
-    found = []
+    run = f"surrogym evaluate policy.zip{_where(known)}"
+    fetch = f"Fetch its file for the next commands: surrogym policy get {name}@{policy.version} --out policy.zip"
     if real is None:
-        found.append(
-            f"Test it in reality: surrogym policy get {name}@{policy.version} --out policy.zip, and then "
-            "surrogym evaluate policy.zip --compare zero"
-        )
-        return found + _of_the_model(known)
+        return [fetch, f"Test it in reality: {run} --compare zero", *_of_the_model(known)]
+    found = []
     judged = outcome_of(known)
     if policy.trusted is False or (judged is not None and judged.verdict == "worse"):
         found.append("Don't use it yet: the model was wrong, or not sure, where this controller goes.")
         found.append(f"Ask for real steps on its way, and train again: surrogym train {name} --improve 8")
     elif real.success_rate is not None and real.success_rate < 1:
         found.append("Look at the worst episode above before it is used: not every start succeeded.")
-    if real.episodes < FEW:
-        found.append(f"Run more episodes: surrogym evaluate policy.zip --episodes {FEW}")
-    if known.without is None:
-        found.append("Run the same starts without it: surrogym evaluate policy.zip --compare random")
-    if not any(one.controller == "reference" for one in policy.evaluations):
-        found.append(
-            "Compare it with the controller in use today: surrogym evaluate policy.zip --reference module:Class"
-        )
-    if not _other_starts(policy):
-        found.append("See how it does from other starts: surrogym evaluate policy.zip --wide")
-    if not any("changed by" in one.note for one in policy.evaluations):
-        found.append("Find out how much change of the machine it stands: surrogym evaluate policy.zip --perturb 0.1")
+    elif real.success_rate is None:
+        found.append("Look at the worst episode above, and decide whether it is good enough: no success was declared.")
+    tests = _tests(known, policy, real, run)
+    found += [fetch, *tests] if tests else []
     if real.promise_kept and PREFERRED not in policy.aliases:
         found.append(f"If that is good enough, name it: surrogym policy alias {name}@{policy.version} {PREFERRED}")
     return found + _of_the_model(known)
+
+
+def _where(known: Known) -> str:
+    """The option that names the environment, where the policy's card can't."""
+    return "" if is_known(known.view.environment) else " --env package.module:factory"
+
+
+def _tests(known: Known, policy: PolicyView, real: EvaluationView, run: str) -> list[str]:
+    """Tests in reality that are still missing; ``run`` is the command of an evaluation."""
+    found = []
+    if real.episodes < FEW:
+        found.append(f"Run more episodes: {run} --episodes {FEW}")
+    if known.without is None:
+        found.append(f"Run the same starts without it: {run} --compare random")
+    if not any(one.controller == "reference" for one in policy.evaluations):
+        found.append(f"Compare it with the controller in use today: {run} --reference module:Class")
+    if not _other_starts(policy):
+        found.append(f"See how it does from other starts: {run} --wide")
+    if not any("changed by" in one.note for one in policy.evaluations):
+        changed = f": {run} --perturb 0.1" if is_known(known.view.environment) else ", in a machine that you changed"
+        found.append(f"Find out how much change of the machine it stands{changed}")
+    return found
 
 
 def _other_starts(policy: PolicyView) -> bool:
