@@ -128,6 +128,30 @@ def test_an_evaluation_is_started_and_its_result_shown(api: Api, open_page: Open
     expect(row).to_contain_text(re.compile(f"done.*version {version}: No promise; real mean return .* in 3 episodes"))
 
 
+def test_a_reference_controller_and_a_video_are_offered_and_asked_for(api: Api, open_page: Open):
+    version = api.policies.push(NAME, wire.PushedCard(algorithm="CMAES"), [], "zip", network_file(seed=9)).version
+    api.jobs.claim(NAME, "plain", most_episodes=50)
+    page = open_page(f"{api.url}/#/s/{NAME}")
+    here = part(page)
+    expect(here).to_contain_text("plain (evaluates in up to 50 real episodes)")
+    expect(here.get_by_label("worker's reference controller")).to_be_hidden()
+    api.jobs.claim(NAME, "able", most_episodes=50, reference=True)
+    expect(here).to_contain_text("able (evaluates in up to 50 real episodes, has a reference controller)")
+    here.get_by_label("Policy", exact=True).select_option(f"version {version}")
+    here.get_by_label("worker's reference controller").check()
+    here.get_by_label("Draw a video").check()
+    here.get_by_label("Real episodes").fill("4")
+    expect(here).to_contain_text("8 episodes of the original environment: up to 1 600 real steps.")
+    assert serious(page) == []
+    here.get_by_role("button", name="Evaluate").click()
+    words = f"evaluate version {version} in 4 real episodes, compared with the reference controller, with a video"
+    expect(here.locator(".job")).to_contain_text(words)
+    job = api.jobs.list(NAME).jobs[0]
+    api.jobs.cancel(NAME, job.id)
+    asked = wire.EvaluateTask(kind="evaluate", policy=str(version), episodes=4, reference=True, video=True)
+    assert job.task == asked
+
+
 def test_a_token_that_only_reads_sees_jobs_and_starts_none(api: Api, open_page: Open):
     id = api.jobs.add(NAME, wire.TrainTask(kind="train")).id
     page = open_page("about:blank")

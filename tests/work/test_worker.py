@@ -9,12 +9,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from support.policies import left_alone, network_file
 from support.server import ServerProcess
+from surrogym_client.evaluation.reference import Reference
 from surrogym_client.original.classic import pendulum
 from surrogym_client.original.episodes import GymnasiumEpisode
 from surrogym_client.policies import load_policy
@@ -100,6 +102,27 @@ def test_an_evaluation_counts_its_real_steps_and_stores_its_episodes(api: Api, r
     stored = api.policies.get(NAME, version).evaluations
     assert [(one.controller, one.episodes) for one in stored] == [("policy", 2), ("zero", 2)]
     assert job.evaluation == stored[0].id
+
+
+def test_an_evaluation_takes_a_reference_controller_and_draws_a_video(api: Api, run_one, tmp_path: Path):
+    version = api.policies.push(NAME, wire.PushedCard(algorithm="CMAES"), [], "zip", network_file(seed=11)).version
+    asked = wire.EvaluateTask(kind="evaluate", policy=str(version), episodes=1, reference=True, video=True)
+    made: list[Reference] = []
+
+    def load() -> Reference:
+        made.append(Reference(lambda: lambda observation: [-observation[1]]))
+        return made[-1]
+
+    able = replace(evaluating(), name="Pendulum-v1", reference=load)
+    job = run_one(asked, able)
+    assert (job.status, job.error, len(made)) == ("done", None, 1)
+    stored = api.policies.get(NAME, version)
+    assert [one.controller for one in stored.evaluations] == ["policy", "reference"]
+    (video,) = [file for file in stored.files if file.form in ("mp4", "gif")]
+    assert video.stored
+    job = run_one(asked, replace(able, spec=pendulum().model_copy(update={"environment": ""}), name=""))
+    assert job.status == "done"
+    assert (job.error or "").startswith("no video: ")
 
 
 def test_a_job_that_fails_says_why_and_the_worker_goes_on(api: Api, run_one):

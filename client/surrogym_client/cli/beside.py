@@ -53,7 +53,7 @@ class Beside:
         if compare is not None:
             found[compare] = lambda: _baseline(opener, compare)
         if self.reference is not None:
-            reference = _reference(self.reference, reading)
+            reference = reference_of(self.reference, reading)
             found["reference"] = lambda: reference
         return found
 
@@ -71,7 +71,12 @@ def _baseline(opener: Callable[[], Episode], compare: Compare) -> Predict:
         episode.close()
 
 
-def _reference(given: str, reading: PolicyReading) -> Acting:
+def reference_of(given: str, reading: PolicyReading) -> Acting:
+    """Load a reference controller: a policy file, or ``package.module:name``.
+
+    Raises:
+        CommandError, OriginalError, UnusablePolicy: there is none of this name, or it can't be used.
+    """
     from surrogym_client.cli.errors import CommandError
     from surrogym_client.evaluation.reference import load_reference
     from surrogym_client.policies.card import read_card

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -40,6 +40,13 @@ def command(
         int,
         typer.Option(min=0, max=1_000, help="Most real episodes of one evaluation. 0: the worker only trains."),
     ] = 100,
+    reference: Annotated[
+        str | None,
+        typer.Option(
+            help="Reference controller that evaluations may be compared with: a policy file, or package.module:name, "
+            "as for surrogym evaluate. The module's code is run."
+        ),
+    ] = None,
     folder: Annotated[Path, typer.Option(help="Folder for policies, and for results that wait for the server.")] = Path(
         "work"
     ),
@@ -72,6 +79,7 @@ def command(
     with service.connect(context, wait, quiet=output.quiet) as api:
         asked = awaited_surrogate(api, surrogate, wait, quiet=output.quiet).spec
         environment = _environment(surrogate, env, read_spec(spec), asked, most_episodes, quiet=output.quiet)
+        environment = _with_reference(environment, reference)
         with progress("work", quiet=output.quiet) as update:
             tell = partial(say, quiet=output.quiet)
             token = service.token_for(context)
@@ -106,9 +114,28 @@ def _environment(
     episode = opener()
     try:
         check_environment(surrogate, asked, episode.spec)
-        return Environment(episode.spec, opener, most_episodes)
+        return Environment(episode.spec, opener, most_episodes, env or asked.environment)
     finally:
         episode.close()
+
+
+def _with_reference(environment: Environment | None, reference: str | None) -> Environment | None:
+    """Return the environment with the loader of a reference controller, which is loaded once to check it.
+
+    Raises:
+        CommandError, OriginalError, UnusablePolicy: there is no such controller, or no environment for it.
+    """
+    from surrogym_client.cli.beside import reference_of
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.cli.groups import PolicyReading
+
+    if reference is None:
+        return environment
+    if environment is None:
+        raise CommandError("--reference: expected a worker that evaluates, got one that only trains")
+    load = partial(reference_of, reference, PolicyReading())
+    load()
+    return replace(environment, reference=load)
 
 
 def _showing(update: Update) -> Callable[[Stand], None]:

@@ -55,6 +55,7 @@ class JobCalls:
         worker: str,
         *,
         most_episodes: int = 0,
+        reference: bool = False,
         wait_seconds: float = 0.0,
         lease_seconds: float = 60.0,
     ) -> wire.LeasedJob | None:
@@ -63,7 +64,11 @@ class JobCalls:
         A claim whose reply is lost is not sent again. Its lease expires, and the job returns to the queue.
         """
         body = wire.ClaimJob(
-            worker=worker, most_episodes=most_episodes, wait_seconds=wait_seconds, lease_seconds=lease_seconds
+            worker=worker,
+            most_episodes=most_episodes,
+            reference=reference,
+            wait_seconds=wait_seconds,
+            lease_seconds=lease_seconds,
         )
         timeout = self._connection.timeouts.request + wait_seconds
         route = f"{routes.surrogate(surrogate)}/jobs:claim"

@@ -22,6 +22,7 @@ REFUSED = ".refused.json"
 MAX_BYTES = 64 * 1024 * 1024
 AWAY = (ServerUnreachable, Unavailable)
 FILE_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,199}$"  # in the same folder
+VIDEO_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,195}\.(mp4|gif)$"
 
 
 class Waiting(BaseModel):
@@ -36,6 +37,7 @@ class Waiting(BaseModel):
     error: str | None = None
     policy: Annotated[str, Field(pattern=FILE_NAME)] | None = None  # file of a trained policy, in the same folder
     version: int | None = None  # of an evaluated policy
+    video: Annotated[str, Field(pattern=VIDEO_NAME)] | None = None  # file of its video, in the same folder
     evaluations: tuple[wire.AddEvaluation, ...] = ()
     steps: tuple[wire.ReportSteps, ...] = ()  # real steps for the ledger
 
@@ -100,6 +102,7 @@ class Outbox:
             if waiting.policy is not None:
                 version = push(api, self._folder / waiting.policy, name).policy.version
             number = _evaluated(api, name, version, waiting.evaluations)
+            self._send_video(api, waiting)
         except AWAY:
             raise
         except (SurrogymClientError, OSError) as refused:  # the job has to end all the same
@@ -112,6 +115,13 @@ class Outbox:
         except LeaseExpired:
             return f"job {waiting.job}: the server gave it to another worker meanwhile{_stored(name, version)}"
         return f"job {waiting.job} {status}{f': {error}' if error else ''}{_stored(name, version)}"
+
+    def _send_video(self, api: Api, waiting: Waiting) -> None:
+        """Send the video of an evaluation. It takes the place of an older one of its form."""
+        if waiting.video is not None and waiting.version is not None:
+            path = self._folder / waiting.video
+            form: wire.PolicyForm = "mp4" if path.suffix == ".mp4" else "gif"
+            api.policies.put_file(waiting.surrogate, waiting.version, form, path.read_bytes())
 
 
 def _evaluated(api: Api, name: str, version: int | None, evaluations: tuple[wire.AddEvaluation, ...]) -> int | None:

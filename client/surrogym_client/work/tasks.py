@@ -8,13 +8,14 @@ from pathlib import Path
 from uuid import uuid4
 
 from surrogym_client.evaluation.evaluator import Evaluation, EvaluationInterrupted, EvaluationSettings, evaluate
-from surrogym_client.evaluation.reporting import as_reported, paired_start
+from surrogym_client.evaluation.reporting import as_reported, paired_start, words_of
 from surrogym_client.evaluation.uncontrolled import baseline
+from surrogym_client.evaluation.videos import record
 from surrogym_client.original.episodes import Episode
-from surrogym_client.original.errors import EvaluationFailed
+from surrogym_client.original.errors import EvaluationFailed, NotRenderable
 from surrogym_client.policies.card import write_card
 from surrogym_client.policies.files import load_policy
-from surrogym_client.policies.predict import Predict
+from surrogym_client.policies.predict import Acting, Predict
 from surrogym_client.training.audited import AuditedTraining
 from surrogym_client.training.cards import card_of
 from surrogym_client.training.handover import AuditSettings, Handover
@@ -37,11 +38,15 @@ class Environment:
         spec: its specification.
         opener: opens an episode in it.
         most_episodes: real episodes of one job at most.
+        name: name by which its states are drawn; empty without pictures.
+        reference: loads the reference controller of one job; None: there is none.
     """
 
     spec: EnvironmentSpec
     opener: Callable[[], Episode]
     most_episodes: int
+    name: str = ""
+    reference: Callable[[], Acting] | None = None
 
 
 @dataclass
@@ -50,6 +55,8 @@ class Gathered:
 
     policy: Path | None = None
     version: int | None = None
+    video: Path | None = None
+    lacks: str | None = None  # why there is no video that was asked for
     evaluations: list[wire.AddEvaluation] = field(default_factory=list)
     steps: list[wire.ReportSteps] = field(default_factory=list)
 
@@ -107,12 +114,12 @@ def run_episodes(
     reporter: Reporter,
     gathered: Gathered,
 ) -> None:
-    """Run real episodes of a stored policy, and those of its comparison.
+    """Run real episodes of a stored policy, and those of its comparisons. Then draw a video, if the task asks for one.
 
     The real steps are in ``gathered`` even if the episodes fail or are stopped.
 
     Raises:
-        ValueError: the task has more episodes than the worker takes.
+        ValueError: the task has more episodes than the worker takes, or asks for a reference controller that it lacks.
         UnusablePolicy: the file can't be read without running code in it.
         KeyboardInterrupt: the evaluation was stopped.
         EvaluationFailed: the environment or the policy raised an error after real steps.
@@ -122,9 +129,7 @@ def run_episodes(
     found = api.policies.get(surrogate, task.policy)
     gathered.version = found.version
     settings = EvaluationSettings(task.episodes, task.first_seed, task.wide)
-    controllers: dict[wire.Controller, Predict] = {"policy": _loaded(api, surrogate, found, folder)}
-    if task.compare is not None:
-        controllers[task.compare] = baseline(environment.spec, task.compare)
+    controllers = _controllers(task, environment, _loaded(api, surrogate, found, folder))
     results: dict[wire.Controller, Evaluation] = {}
     for done, (controller, predict) in enumerate(controllers.items()):
 
@@ -137,10 +142,40 @@ def run_episodes(
         as_reported(result, settings, uuid4().hex, controller=controller, paired=paired)
         for controller, result in results.items()
     ]
+    if task.video:
+        path = folder / f"{surrogate}-{found.version}-{uuid4().hex[:8]}"
+        gathered.video, gathered.lacks = _filmed(environment, results["policy"], settings, path)
+
+
+def _controllers(task: wire.EvaluateTask, environment: Environment, policy: Predict) -> dict[wire.Controller, Acting]:
+    """What chooses the actions, the policy first."""
+    controllers: dict[wire.Controller, Acting] = {"policy": policy}
+    if task.compare is not None:
+        controllers[task.compare] = baseline(environment.spec, task.compare)
+    if task.reference:
+        if environment.reference is None:
+            raise ValueError("this worker has no reference controller: start it with --reference")
+        controllers["reference"] = environment.reference()
+    return controllers
+
+
+def _filmed(
+    environment: Environment, result: Evaluation, settings: EvaluationSettings, path: Path
+) -> tuple[Path | None, str | None]:
+    """Write a video, and return its file, or the reason why there is none: it must not spoil an evaluation."""
+    try:
+        video = record(environment.spec, environment.name, result, words_of(settings))
+    except NotRenderable as error:
+        return None, f"no video: {error}"
+    except Exception as error:  # one's own environment may raise anything when it is drawn
+        return None, f"no video: {type(error).__name__}: {error}"
+    file = path.with_name(f"{path.name}.{video.form}")
+    file.write_bytes(video.content)
+    return file, None
 
 
 def _counted(
-    predict: Predict,
+    predict: Acting,
     environment: Environment,
     settings: EvaluationSettings,
     controller: wire.Controller,
@@ -151,7 +186,8 @@ def _counted(
 
     def note(steps: int, episodes: int, what: str) -> None:
         if steps:
-            said = what if controller == "policy" else f"{what}, {controller} actions"
+            acting = "the reference controller" if controller == "reference" else f"{controller} actions"
+            said = what if controller == "policy" else f"{what}, {acting}"
             gathered.steps.append(
                 wire.ReportSteps(steps=steps, episodes=episodes, note=said, idempotency_key=uuid4().hex)
             )

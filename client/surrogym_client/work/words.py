@@ -11,5 +11,10 @@ def words_of_task(task: wire.Task) -> str:
         steps = "" if task.steps is None else f", {task.steps} virtual steps"
         by = "" if task.algorithm is None else f" by {task.algorithm}"
         return f"train{by}, seed {task.seed}{steps}{', quick' if task.preset == 'quick' else ''}"
-    beside = "" if task.compare is None else f", compared with {task.compare} actions"
-    return f"evaluate version {task.policy} in {task.episodes} real episodes{beside}"
+    others = [
+        *([] if task.compare is None else [f"{task.compare} actions"]),
+        *(["the reference controller"] if task.reference else []),
+    ]
+    beside = f", compared with {' and '.join(others)}" if others else ""
+    video = ", with a video" if task.video else ""
+    return f"evaluate version {task.policy} in {task.episodes} real episodes{beside}{video}"

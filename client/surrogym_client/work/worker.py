@@ -114,6 +114,7 @@ class Worker:
             self._surrogate,
             s.name,
             most_episodes=0 if self._environment is None else self._environment.most_episodes,
+            reference=self._environment is not None and self._environment.reference is not None,
             wait_seconds=s.wait_seconds,
             lease_seconds=s.lease_seconds,
         )
@@ -168,9 +169,10 @@ class Worker:
                 job=job.id,
                 lease_token=job.lease_token,
                 status=status,
-                error=error,
+                error=error or gathered.lacks,
                 policy=None if gathered.policy is None or reporter.taken else gathered.policy.name,
                 version=gathered.version,
+                video=None if gathered.video is None else gathered.video.name,
                 evaluations=tuple(gathered.evaluations),
                 steps=tuple(gathered.steps),
             )

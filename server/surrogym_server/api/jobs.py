@@ -13,6 +13,7 @@ from surrogym_server.api.body import example
 from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
+from surrogym_server.services.activity import Offer
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
     AddJob,
@@ -93,7 +94,12 @@ async def claim(
     """Lease the oldest queued job to this worker only. If there is none, the reply waits for one, up to
     ``wait_seconds``."""
     job = await use.jobs.claim(
-        name, body.worker, body.most_episodes, body.lease_seconds, body.wait_seconds, request.is_disconnected
+        name,
+        body.worker,
+        Offer(body.most_episodes, body.reference),
+        body.lease_seconds,
+        body.wait_seconds,
+        request.is_disconnected,
     )
     return convert.claimed_job(job, body.lease_seconds)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from surrogym_server.convert.stored import read_stored
@@ -38,8 +39,11 @@ def job_detail(record: JobRecord) -> wire.JobDetail:
     return read_stored(wire.JobDetail, JOB, {**_fields(record), "curve": record.curve})
 
 
-def job_list(records: list[JobRecord], workers: dict[str, int]) -> wire.JobList:
-    named = [wire.WorkerView(name=name, most_episodes=most) for name, most in workers.items()]
+def job_list(records: list[JobRecord], workers: Mapping[str, tuple[int, bool]]) -> wire.JobList:
+    named = [
+        wire.WorkerView(name=name, most_episodes=most, reference=reference)
+        for name, (most, reference) in workers.items()
+    ]
     return wire.JobList(jobs=[job_view(record) for record in records], workers=named)
 
 

@@ -21,7 +21,8 @@ export function asked({ task }) {
     const steps = task.preset === "quick" ? ", a quick look" : task.steps === null ? "" : `, ${count(task.steps)} virtual steps`;
     return `train${task.algorithm ? ` by ${task.algorithm}` : ""}, seed ${task.seed}${steps}`;
   }
-  const beside = { zero: ", compared with an action of zero", random: ", compared with random actions" }[task.compare] ?? "";
+  const others = [{ zero: "an action of zero", random: "random actions" }[task.compare], task.reference && "the reference controller"].filter(Boolean);
+  const beside = (others.length ? `, compared with ${others.join(" and ")}` : "") + (task.video ? ", with a video" : "");
   const starts = task.wide ? " from anywhere in the sampling range" : "";
   return `evaluate version ${task.policy} in ${count(task.episodes)} real episodes${starts}${beside}`;
 }
@@ -113,7 +114,7 @@ export function work(name, { role, refresh }) {
     const evaluates = all.some(({ most_episodes: most }) => most > 0);
     return [
       all.length
-        ? h("p", {}, `Connected: ${all.map((one) => `${one.name} (${one.most_episodes ? `evaluates in up to ${count(one.most_episodes)} real episodes` : "only trains"})`).join(", ")}.`)
+        ? h("p", {}, `Connected: ${all.map((one) => `${one.name} (${one.most_episodes ? `evaluates in up to ${count(one.most_episodes)} real episodes${one.reference ? ", has a reference controller" : ""}` : "only trains"})`).join(", ")}.`)
         : lack(`surrogym work ${name}${SERVER}`, "No worker is connected, so nothing can be started here. To start one: "),
       all.length && !evaluates && lack(`surrogym work ${name} --env package.module:factory${SERVER}`, "No worker evaluates. One that is started with the environment does: "),
       !model && h("p", {}, "There is no model yet. A training needs one."),
@@ -149,7 +150,7 @@ export function work(name, { role, refresh }) {
     const most = Math.max(0, ...there.map(({ most_episodes: episodes }) => episodes));
     forms.hidden = !may();
     training.show({ ready: there.length > 0 && known.model });
-    evaluation.show({ ready: most > 0 && policies.length > 0, most, policies, limit: known.limit });
+    evaluation.show({ ready: most > 0 && policies.length > 0, most, policies, limit: known.limit, reference: there.some((one) => one.reference) });
     const over = jobs.filter(({ status }) => !OPEN.includes(status));
     const few = all ? over : over.slice(0, FEW);
     past({ jobs: few, more: over.length - few.length, policies: policies.map(({ version, promise, evaluations }) => [version, promise, evaluations.length]) });

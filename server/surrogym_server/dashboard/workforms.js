@@ -55,28 +55,34 @@ export function evaluationForm(start) {
   const policy = h("select", {});
   const episodes = whole({ min: 1, value: EPISODES, required: true });
   const compare = select([["", "nothing"], ["zero", "an action of zero"], ["random", "random actions"]]);
+  const reference = h("input", { type: "checkbox" });
+  const controlled = h("label", { class: "check", hidden: true }, reference, h("span", {}, "Also run the same starts with the worker's reference controller"));
+  const video = h("input", { type: "checkbox" });
   const starts = select([["", "as declared"], ["wide", "anywhere in the sampling range"]]);
   const cost = h("p", { class: "note" });
   let now = { most: 0, limit: null };
   const adapt = () => {
-    const times = compare.value ? 2 : 1;
+    const times = 1 + Boolean(compare.value) + reference.checked;
     episodes.max = Math.max(1, Math.floor(now.most / times));
     const all = times * (numberOf(episodes) ?? 0);
     cost.textContent = now.limit === null ? `${count(all)} episodes of the original environment.` : `${count(all)} episodes of the original environment: up to ${count(all * now.limit)} real steps.`;
   };
-  for (const input of [episodes, compare]) input.addEventListener("input", adapt);
-  const parts = form("Evaluate a policy", [field("Policy", policy), field("Real episodes", episodes), field("Starts", starts), field("Compare with", compare), cost],
+  for (const input of [episodes, compare, reference]) input.addEventListener("input", adapt);
+  const parts = form("Evaluate a policy", [field("Policy", policy), field("Real episodes", episodes), field("Starts", starts), field("Compare with", compare), controlled,
+    h("label", { class: "check" }, video, h("span", {}, "Draw a video of the best, the median and the worst episode, if the environment can be drawn")), cost],
     h("button", { class: "main" }, "Evaluate"), () => start({
       kind: "evaluate",
       policy: policy.value,
       episodes: numberOf(episodes),
       wide: starts.value === "wide",
       compare: compare.value || null,
+      ...(reference.checked && { reference: true }),
+      ...(video.checked && { video: true }),
     }));
   let listed = null;
   return {
     element: parts.element,
-    show({ ready, most, policies, limit }) {
+    show({ ready, most, policies, limit, reference: offered }) {
       const names = policies.map(({ version, aliases }) => [String(version), [`version ${version}`, ...aliases].join(", ")]);
       if (JSON.stringify(names) !== listed) {
         listed = JSON.stringify(names);
@@ -86,6 +92,8 @@ export function evaluationForm(start) {
       }
       if (most && !now.most) episodes.value = Math.min(EPISODES, most);
       now = { most, limit };
+      controlled.hidden = !offered;
+      if (!offered) reference.checked = false;
       adapt();
       parts.enable(ready);
     },

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 Clock = Callable[[], float]
 T = TypeVar("T")
@@ -45,15 +45,22 @@ class Samplers(_Alive[None]):
         return alive
 
 
-class Workers(_Alive[int]):
-    """When each trainer worker was last heard of, and the largest number of real episodes that it takes."""
+class Offer(NamedTuple):
+    """The largest number of real episodes that a trainer worker takes, and whether it has a reference controller."""
 
-    def heard(self, surrogate: str, worker: str, most_episodes: int | None = None) -> None:
-        """Note that a worker claimed or reported. None keeps what it reported before."""
-        if most_episodes is None:
-            _, most_episodes = self._heard.get((surrogate, worker), (0.0, 0))
-        self._note(surrogate, worker, most_episodes)
+    most_episodes: int = 0
+    reference: bool = False
 
-    def of(self, surrogate: str) -> dict[str, int]:
-        """The largest number of real episodes of each worker heard of within the last minute, by its name."""
-        return {worker: most for owner, worker, most in self._alive() if owner == surrogate}
+
+class Workers(_Alive[Offer]):
+    """When each trainer worker was last heard of, and its offer."""
+
+    def heard(self, surrogate: str, worker: str, offer: Offer | None = None) -> None:
+        """Note that a worker claimed or reported. None keeps the offer that it made before."""
+        if offer is None:
+            _, offer = self._heard.get((surrogate, worker), (0.0, Offer()))
+        self._note(surrogate, worker, offer)
+
+    def of(self, surrogate: str) -> dict[str, Offer]:
+        """The offer of each worker heard of within the last minute, by its name."""
+        return {worker: offer for owner, worker, offer in self._alive() if owner == surrogate}

@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections.abc import Awaitable, Callable
 
-from surrogym_server.services.activity import Workers
+from surrogym_server.services.activity import Offer, Workers
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.queries import POLL_SECONDS
 from surrogym_server.storage.jobs import JobProgress, JobRecord, JobResult, LeasedJob, NewJob
@@ -46,7 +46,7 @@ class JobService:
         self,
         name: str,
         worker: str,
-        most_episodes: int,
+        offer: Offer,
         lease_seconds: float,
         wait_seconds: float,
         gone: Callable[[], Awaitable[bool]] | None = None,
@@ -61,8 +61,9 @@ class JobService:
         deadline = time.monotonic() + wait_seconds
 
         def claim() -> LeasedJob | None:
-            self._workers.heard(name, worker, most_episodes)
-            return self._storage.jobs.claim(name, worker, most_episodes, lease_seconds)
+            self._workers.heard(name, worker, offer)
+            most, reference = offer
+            return self._storage.jobs.claim(name, worker, most, lease_seconds, reference=reference)
 
         with self._notices.listen(name) as listener:
             job = await asyncio.to_thread(claim)
@@ -101,8 +102,8 @@ class JobService:
         """Return a job. Raises ``UnknownJob``."""
         return self._storage.jobs.get(name, id)
 
-    def list(self, name: str) -> tuple[list[JobRecord], dict[str, int]]:
-        """Return all jobs, newest first, and for each connected worker the most real episodes that it takes."""
+    def list(self, name: str) -> tuple[list[JobRecord], dict[str, Offer]]:
+        """Return all jobs, newest first, and the offer of each connected worker."""
         return self._storage.jobs.list(name), self._workers.of(name)
 
     def _add(self, name: str, new: NewJob, key: str | None) -> JobRecord:

@@ -101,8 +101,12 @@ class Jobs(ABC):
         """
 
     @abstractmethod
-    def claim(self, name: str, worker: str, most_episodes: int, seconds: float) -> LeasedJob | None:
+    def claim(
+        self, name: str, worker: str, most_episodes: int, seconds: float, *, reference: bool = False
+    ) -> LeasedJob | None:
         """Lease the oldest queued job of at most ``most_episodes`` real episodes to one caller. None if there is none.
+
+        Jobs that ask for a reference controller are leased only to a worker that has one.
 
         Expired leases are ended first. A new lease clears the progress of the one before.
         """

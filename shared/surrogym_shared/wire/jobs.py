@@ -75,6 +75,16 @@ class EvaluateTask(Request):
         description="also run the same starts without the policy, with an action of zero or with random actions; "
         "null: don't",
     )
+    reference: bool = Field(
+        default=False,
+        exclude_if=lambda asked: not asked,  # older workers don't know it
+        description="also run the same starts with the reference controller that the worker was started with",
+    )
+    video: bool = Field(
+        default=False,
+        exclude_if=lambda asked: not asked,
+        description="draw the best, the median and the worst episode into a video of the policy",
+    )
 
     @model_validator(mode="after")
     def _within_limit(self) -> EvaluateTask:
@@ -86,8 +96,8 @@ class EvaluateTask(Request):
 
     @property
     def real_episodes(self) -> int:
-        """Number of real episodes, of the policy and of the comparison together."""
-        return self.episodes * (1 if self.compare is None else 2)
+        """Number of real episodes, of the policy and of its comparisons together."""
+        return self.episodes * (1 + (self.compare is not None) + self.reference)
 
 
 Task = Annotated[TrainTask | EvaluateTask, Field(discriminator="kind")]
@@ -107,6 +117,11 @@ class ClaimJob(Request):
     most_episodes: Annotated[int, Field(ge=0, le=MAX_JOB_EPISODES)] = Field(
         default=0,
         description="most real episodes that an evaluation for this worker may have; 0: it takes only trainings",
+    )
+    reference: bool = Field(
+        default=False,
+        exclude_if=lambda offered: not offered,  # older servers don't know it
+        description="whether the worker has a reference controller; evaluations that ask for one go to no other",
     )
     wait_seconds: Annotated[float, Field(ge=0, le=60)] = Field(
         default=0.0, description="seconds that the reply may wait for a job; 0: reply at once"
@@ -227,6 +242,7 @@ class WorkerView(Reply):
     most_episodes: int = Field(
         description="most real episodes that an evaluation for this worker may have; 0: it takes only trainings"
     )
+    reference: bool = Field(default=False, description="whether it has a reference controller")
 
 
 class JobList(Reply):

@@ -52,6 +52,19 @@ def test_a_worker_gets_no_more_real_episodes_than_it_takes(storage: Storage, mak
     assert (second.id, second.task) == (evaluation, EVALUATE.task)
 
 
+def test_a_job_with_a_reference_controller_waits_for_its_worker(storage: Storage, make: Make) -> None:
+    name = make()
+    asked = NewJob("evaluate", {**EVALUATE.task, "reference": True}, EVALUATE.episodes)
+    first, training = storage.jobs.add(name, asked), storage.jobs.add(name, TRAIN)
+    without = storage.jobs.claim(name, "a", 10, LONG)
+    assert without is not None
+    assert without.id == training
+    assert storage.jobs.claim(name, "a", 10, LONG) is None
+    found = storage.jobs.claim(name, "b", 10, LONG, reference=True)
+    assert found is not None
+    assert found.id == first
+
+
 def test_a_report_keeps_the_lease_and_replaces_the_progress(storage: Storage, make: Make) -> None:
     name = make()
     storage.jobs.add(name, TRAIN)

@@ -58,7 +58,9 @@ class SqlJobs(port.Jobs):
             remember(connection, held, "job", key, body, id)
             return id
 
-    def claim(self, name: str, worker: str, most_episodes: int, seconds: float) -> LeasedJob | None:
+    def claim(
+        self, name: str, worker: str, most_episodes: int, seconds: float, *, reference: bool = False
+    ) -> LeasedJob | None:
         with self._database.read() as connection:  # waiting workers don't block writers
             own = jobs.c.surrogate_id == find(connection, name)
             waiting = (jobs.c.status == "queued") | expiry.has_ended(connection, jobs, RUNNING)
@@ -68,7 +70,8 @@ class SqlJobs(port.Jobs):
             held = hold(connection, name)
             _sweep(connection, held)
             fits = (jobs.c.surrogate_id == held.id) & (jobs.c.status == "queued") & (jobs.c.episodes <= most_episodes)
-            row = connection.execute(sa.select(*SHOWN).where(fits).order_by(jobs.c.id).limit(1)).one_or_none()
+            rows = connection.execute(sa.select(*SHOWN).where(fits).order_by(jobs.c.id)).all()
+            row = next((one for one in rows if reference or not one.task.get("reference")), None)
             if row is None:
                 return None
             token = secrets.token_urlsafe(16)
