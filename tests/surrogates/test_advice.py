@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from surrogym_client.original.classic import pendulum
-from surrogym_client.surrogates.advice import advice, verdict
+from surrogym_client.surrogates.advice import advice, noise_in_words, verdict
 from surrogym_shared.wire import Fidelity, Ledger, ModelView, OutputFidelity, QueryCounts, SurrogateView
 
 TARGET = 0.999
@@ -68,11 +68,11 @@ def models(indices: list[float], error: float = 0.01) -> list[ModelView]:
     ("outputs", "phase", "words"),
     [
         ((output("x", 1.0), output("r", 1.0)), "ready", "ready"),
-        ((output("x", 1.0), output("r", 0.98)), "over_budget", "ready except for r (confidence 0.98 of 0.999)"),
+        ((output("x", 1.0), output("r", 0.98)), "over_budget", "ready but for r (confidence 0.98 of 0.999)"),
         (
             (output("x", 1.0, error=0.2), output("r", 1.0)),
             "over_budget",
-            "ready except for x (leave-one-out error 0.2, tolerance 0.05)",
+            "ready but for x (leave-one-out error 0.2, tolerance 0.05)",
         ),
         (
             (output("x", 0.99), output("r", 0.98)),
@@ -91,7 +91,13 @@ def test_the_verdict_names_what_is_in_doubt(outputs: tuple[OutputFidelity, ...],
 
 
 def test_established_noise_allows_for_a_larger_error() -> None:
-    assert verdict(view(output("x", 1.0, error=0.06, noise=0.05), output("r", 0.9))).startswith("ready except for r")
+    assert verdict(view(output("x", 1.0, error=0.06, noise=0.05), output("r", 0.9))).startswith("ready but for r")
+
+
+def test_noise_is_given_as_a_share_of_the_squared_error() -> None:
+    said = noise_in_words(view(output("x", 1.0, error=0.05, noise=0.04), output("v", 1.0, error=0.1, noise=0.2)))
+    assert said == "x 0.04 (64 % of its squared error), v 0.2 (100 % of its squared error)"
+    assert noise_in_words(view(output("x", 1.0))) == noise_in_words(view()) == ""
 
 
 def test_without_a_model_there_is_nothing_to_say() -> None:

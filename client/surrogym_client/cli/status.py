@@ -118,7 +118,7 @@ def _row(seen: SurrogateSummary) -> tuple[str | float | None, ...]:
 
 def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
     from surrogym_client.cli.columns import columns
-    from surrogym_client.surrogates.advice import advice, verdict
+    from surrogym_client.surrogates.advice import advice, noise_in_words, verdict
 
     ledger = view.ledger
     lines = [
@@ -142,6 +142,8 @@ def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
             columns([FIDELITY, *(_judged(output) for output in view.fidelity.outputs)]),
             f"verdict: {verdict(view)}",
         ]
+    if noise := noise_in_words(view):
+        lines.append(f"noise of a single step, confirmed by repeats: {noise}")
     if following := advice(view, models):
         lines.append(f"next: {following}")
     return "\n".join(lines)

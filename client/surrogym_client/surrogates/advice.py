@@ -28,7 +28,7 @@ def verdict(view: SurrogateView) -> str:
         return "certain of its model, which adaptive queries have not tested yet"
     named = ", ".join(_named(output, view.target) for output in doubtful)
     if len(doubtful) == 1 and len(outputs) > 1:
-        return f"ready except for {named}"
+        return f"ready but for {named}"
     nearly = all(output.confidence_index >= NEARLY * view.target for output in doubtful)
     return f"{'nearly ready' if nearly else 'not ready'}: {named}"
 
@@ -67,6 +67,19 @@ def advice(view: SurrogateView, models: Sequence[ModelView]) -> str:
         f"more real steps hardly help {worst.name}; it would be ready with a tolerance of {reached} (now "
         f"{worst.tolerance:.2g}): surrogym change {view.name} --tolerance {worst.name}={reached}"
     )
+
+
+def noise_in_words(view: SurrogateView) -> str:
+    """Describe how much of each output's squared leave-one-out error is confirmed noise. Empty without noise."""
+    outputs = [] if view.fidelity is None else view.fidelity.outputs
+    return ", ".join(_noise_of(output) for output in outputs if output.noise)
+
+
+def _noise_of(output: OutputFidelity) -> str:
+    if not output.leave_one_out_error:
+        return f"{output.name} {output.noise:.2g}"
+    share = min(1.0, (output.noise / output.leave_one_out_error) ** 2)
+    return f"{output.name} {output.noise:.2g} ({100 * share:.0f} % of its squared error)"
 
 
 def _doubtful(view: SurrogateView) -> list[OutputFidelity]:
