@@ -25,7 +25,7 @@ class Pendulum:
         pass
 """
 EVERYTHING = {"python", "packages", "server", "ready", "token", "round trip", "environment", "step"} | {
-    *("state", "resets", "memory", "mode")
+    *("state", "resets", "memory", "snapshots", "mode")
 }
 
 

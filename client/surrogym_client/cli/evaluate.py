@@ -135,7 +135,8 @@ def command(
     differences.check(settings)
     opener = opener_of(env, read_spec(spec), card, quiet=output.quiet)
     ledger = _ledger(surrogate, service.server, card, card_path(policy), quiet=output.quiet)
-    enter = partial(_enter, ledger, service.server, service.token_for(context), quiet=output.quiet)
+    token = service.token_for(context)
+    enter = partial(_enter, ledger, service.server, token, quiet=output.quiet)
     run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
     reports = _reports(beside.controllers(policy, card, reading, opener), run, enter, settings, policy)
     result = reports[0][1]
@@ -144,13 +145,12 @@ def command(
         _keep(policy, reports, settings, quiet=output.quiet)
     filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if video else None
     if stored:
-        version = push_or_say(service.server, service.token_for(context), policy, ledger, quiet=output.quiet)
+        version = push_or_say(service.server, token, policy, ledger, quiet=output.quiet)
     promise = card.promise if settings.declared and settings.episodes >= FEWEST_TO_JUDGE else None
-    token = service.token_for(context)
     found = differences.between(ledger, service.server, token, result, settings, promise, quiet=output.quiet)
     judged = {"promise_kept": _kept(promise, result), "version": version, "disagreements": found and found.as_json()}
-    drawn = {} if filmed is None else {"video": str(filmed)}
-    summary = {"policy": str(policy), **_settings(settings), **_summary(reports, beside.reference), **judged, **drawn}
+    summary = {"policy": str(policy), **_settings(settings), **_summary(reports, beside.reference), **judged}
+    summary |= {} if filmed is None else {"video": str(filmed)}
     more = [] if found is None else found.in_words(card.spec)
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
 

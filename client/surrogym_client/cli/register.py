@@ -131,11 +131,13 @@ def command(
 
     Example: surrogym register Pendulum-v1 --name pendulum --budget 30
     """
+    from surrogym_client.original.adapters import open_simulator
     from surrogym_client.original.loading import has_specification
 
     environment, name, spec = _sorted_out(environment, file, env, name, spec)
     given, steps = read_spec(spec), 0
     if given is None and environment is not None and not has_specification(environment):
+        open_simulator(environment).close()  # a name that can't be opened is an error without a server too
         if not print_spec:
             with service.connect(context, wait, quiet=output.quiet) as api:
                 _require_free(api, name or default_name(environment))

@@ -20,6 +20,15 @@ if TYPE_CHECKING:
     from surrogym_shared.terminal import Update
 
 
+Reference = Annotated[
+    str | None,
+    typer.Option(
+        help="Reference controller that evaluations may be compared with: a policy file, or package.module:name, as "
+        "for surrogym evaluate. The module's code is run."
+    ),
+]
+
+
 def register(app: typer.Typer) -> None:
     """Add ``surrogym work`` to the app."""
     add(app, "work", command)
@@ -40,13 +49,7 @@ def command(
         int,
         typer.Option(min=0, max=1_000, help="Most real episodes of one evaluation. 0: the worker only trains."),
     ] = 100,
-    reference: Annotated[
-        str | None,
-        typer.Option(
-            help="Reference controller that evaluations may be compared with: a policy file, or package.module:name, "
-            "as for surrogym evaluate. The module's code is run."
-        ),
-    ] = None,
+    reference: Reference = None,
     folder: Annotated[Path, typer.Option(help="Folder for policies, and for results that wait for the server.")] = Path(
         "work"
     ),
