@@ -140,17 +140,16 @@ def command(
     run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
     reports = _reports(beside.controllers(policy, card, reading, opener), run, enter, settings, policy)
     result = reports[0][1]
-    version, stored = None, push and ledger is not None
-    if stored:
+    if stored := push and ledger is not None:
         _keep(policy, reports, settings, quiet=output.quiet)
     filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if video else None
-    if stored:
-        version = push_or_say(service.server, token, policy, ledger, quiet=output.quiet)
+    version = push_or_say(service.server, token, policy, ledger, quiet=output.quiet) if stored else None
     promise = card.promise if settings.declared and settings.episodes >= FEWEST_TO_JUDGE else None
     found = differences.between(ledger, service.server, token, result, settings, promise, quiet=output.quiet)
-    judged = {"promise_kept": _kept(promise, result), "version": version, "disagreements": found and found.as_json()}
-    summary = {"policy": str(policy), **_settings(settings), **_summary(reports, beside.reference), **judged}
-    summary |= {} if filmed is None else {"video": str(filmed)}
+    summary = {"policy": str(policy), **_settings(settings), **_summary(reports, beside.reference)}
+    summary |= {"promise_kept": _kept(promise, result), "version": version, "disagreements": found and found.as_json()}
+    if filmed is not None:
+        summary["video"] = str(filmed)
     more = [] if found is None else found.in_words(card.spec)
     give(summary, lambda: "\n".join([_words(reports, promise), *more]), as_json=output.as_json)  # with --quiet too
 
