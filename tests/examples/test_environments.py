@@ -10,7 +10,9 @@ import pytest
 
 from support.examples import EXAMPLES, cells, run, surrogym
 from support.server import ServerProcess
+from surrogym import Design
 from surrogym_client.original import OriginalEnvironment, make
+from surrogym_client.original.protocol import RolloutEnvironment
 from surrogym_client.transport import Api
 
 ENVIRONMENT_LINES = 60  # of one's own environment, without blank ones
@@ -72,6 +74,20 @@ def test_environments_of_the_decisions_take_a_step(name: str, monkeypatch: pytes
     first, second = (np.asarray(environment.step_from(q, u).next_coordinates) for _ in range(2))
     assert np.abs(first - q).max() > 0.02
     assert (first == second).all() == (name == "bump:Bump"), "noise alone differs"
+
+
+@pytest.mark.parametrize(("name", "history"), [("dead_time:Vessel", 4), ("hidden_speed:AngleAlone", 1)])
+def test_environments_with_a_past_are_learned(name: str, history: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    machine = make(name)
+    assert isinstance(machine, RolloutEnvironment)
+    design = Design(machine.spec(), budget=60)
+    while (query := design.ask()) is not None:
+        machine.begin(seed=query.id)
+        design.tell(query, [machine.act(np.array(action)) for action in query.actions])
+    assert design.phase == "ready"
+    (moved,) = design.surrogate().model.transitions
+    assert moved.feature_map.history in (None, history), "None: all that are declared"
 
 
 def test_the_notebook_runs_from_its_first_cell_to_its_last(server: ServerProcess, tmp_path: Path) -> None:

@@ -186,6 +186,17 @@ class EnvironmentDefinition:
         return tuple(i for i, c in enumerate(self.coordinates) if c.lag is not None)
 
     @cached_property
+    def ages(self) -> tuple[int, ...]:
+        """How many steps each coordinate looks back, (C,); 0 for those that are no lags."""
+        ages: list[int] = []
+        for c in self.coordinates:
+            if c.lag is None or c.lag.kind == "steps":
+                ages.append(0)
+            else:
+                ages.append(1 + (ages[c.lag.source] if c.lag.kind == "value" else 0))
+        return tuple(ages)
+
+    @cached_property
     def counter(self) -> int | None:
         """Index of the coordinate that counts the steps since a reset."""
         counting = [i for i in self.lags if (lag := self.coordinates[i].lag) is not None and lag.kind == "steps"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Literal, NamedTuple
@@ -33,6 +33,7 @@ class FeatureMap:
             from it (an angle from its speed) has no kink.
         after: encode the state after the step instead of the one before it; for the reward alone.
         drift: weights (C,) of q for each angle; cos and sin of the angle that they predict are inputs too.
+        history: only lags that look back at most this many steps are inputs; None: all lags.
         parity: how the output changes if every coordinate and the action change their sign: without a rule, its sign
             changes too (odd), or it stays (even).
     """
@@ -43,9 +44,11 @@ class FeatureMap:
     after: bool = False
     drift: Drift = ()
     parity: Parity = ""
+    history: int | None = None
 
     def __str__(self) -> str:
         extras = [name for name in ("lead", "after", "drift") if getattr(self, name)]
+        extras += [] if self.history is None else [f"history {self.history}"]
         return ", ".join([self.state, f"action {self.action}", *extras, *([self.parity] if self.parity else [])])
 
 
@@ -168,7 +171,7 @@ def _of_point(definition: EnvironmentDefinition, feature_map: FeatureMap) -> lis
     if feature_map.state == "observation":
         made += _of_observation(definition)
     else:
-        for index in (i for i in range(len(definition.coordinates)) if i != definition.counter):
+        for index in _read(definition, feature_map):
             made += _of_coordinate(definition, feature_map, index)
     for index, weights in zip(definition.angles, feature_map.drift, strict=False):
         turned = tuple(w + (i == index) for i, w in enumerate(weights))
@@ -176,6 +179,13 @@ def _of_point(definition: EnvironmentDefinition, feature_map: FeatureMap) -> lis
     for entry in range(definition.action.size if feature_map.action != "none" else 0):
         made += _of_action(definition, feature_map, entry)
     return made
+
+
+def _read(definition: EnvironmentDefinition, feature_map: FeatureMap) -> Iterator[int]:
+    """Indices of the coordinates that a map reads."""
+    for index, age in enumerate(definition.ages):
+        if index != definition.counter and (feature_map.history is None or age <= feature_map.history):
+            yield index
 
 
 def _of_observation(definition: EnvironmentDefinition) -> list[Feature]:

@@ -32,7 +32,7 @@ def candidates(
     """Candidate maps of one output.
 
     ``follows`` says that it may read the lead, ``drift`` is the learned motion of angles, and ``parity`` is the
-    output's parity if the environment is its own mirror image.
+    output's parity if the environment is its own mirror image. With lags, each map comes with every shorter history.
     """
     if definition.moves_observation:
         return (FeatureMap(state="observation"),)
@@ -47,7 +47,9 @@ def candidates(
     maps += tuple(replace(m, drift=drift) for m in maps if drift and m.state == "cos_sin")
     maps += (FeatureMap("none", lead=True),) if any(leads) else ()
     mirrored = (replace(m, parity=parity) for m in maps)
-    return maps + tuple(m for m in mirrored if reflection(definition, m) is not None)
+    maps += tuple(m for m in mirrored if reflection(definition, m) is not None)
+    shorter = range(max(definition.ages))
+    return maps + tuple(replace(m, history=steps) for m in maps if m.state != "none" for steps in shorter)
 
 
 def reflection(definition: EnvironmentDefinition, feature_map: FeatureMap) -> Reflection | None:

@@ -78,7 +78,8 @@ def read_output(
     """Build the output of a header's entry. Raises ``LookupError``, ``TypeError`` or ``ValueError`` if it is
     malformed."""
     feature_map = _feature_map(entry["feature_map"])
-    if replace(feature_map, drift=()) not in KNOWN_MAPS:
+    shorter = (None, *range(max(definition.ages)))
+    if replace(feature_map, drift=(), history=None) not in KNOWN_MAPS or feature_map.history not in shorter:
         raise ValueError(f"unknown feature map {feature_map}")
     mirror = reflection(definition, feature_map)
     if feature_map.parity and mirror is None:

@@ -46,14 +46,22 @@ class OutputLearner:
         """Fit one output's targets (n,) with each of the feature maps ``inputs`` (n, d), and return the best.
 
         ``keep`` (n,) marks the samples that count. Maps that read the lead may use more, ``keep_lead``. All are
-        compared on the same points.
+        compared on the same points. The maps with all lags are compared first, and then the histories of the best one.
         """
         centre, scale = float(target[keep].mean()), float(target[keep].std(correction=0))
         if scale <= max(CONSTANT * abs(centre), SMALLEST):
             return OutputModel(name, next(iter(inputs)), None, centre, 1.0, int((~keep).sum()))
         around = {m: 0.0 if m.parity == "odd" else centre for m in inputs}
-        fits = {m: self._fit(name, m, x[keep], (target[keep] - around[m]) / scale) for m, x in inputs.items()}
-        best = max(fits, key=lambda m: fits[m].score + _odds(m))
+        fits: dict[FeatureMap, Fitted] = {}
+
+        def better(*maps: FeatureMap) -> FeatureMap:
+            """The best of the maps, and of those fitted before."""
+            fits.update({m: self._fit(name, m, inputs[m][keep], (target[keep] - around[m]) / scale) for m in maps})
+            return max(fits, key=lambda m: fits[m].score + _odds(m))
+
+        whole = _with_whole_history(inputs)
+        best = better(*whole)
+        best = better(*(m for m in inputs if m not in whole and replace(m, history=best.history) == best))
         chosen, centre = fits[best], around[best]
         y = (target - centre) / scale
         more = bool(best.lead) and bool((keep_lead & ~keep).any())
@@ -89,6 +97,11 @@ class OutputLearner:
         if self.settings.kernel == "squared_exponential":
             options = FitOptions(linear=False)
         return replace(options, noise_floor=PEAK_NOISE) if name == PEAK else options
+
+
+def _with_whole_history(inputs: Mapping[FeatureMap, Tensor]) -> list[FeatureMap]:
+    """The maps that read all lags, or if there is none, the only history that is given."""
+    return [m for m in inputs if m.history is None] or list(inputs)
 
 
 def _odds(feature_map: FeatureMap) -> float:
