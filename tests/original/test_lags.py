@@ -10,7 +10,7 @@ import pytest
 from support.rail import SPEC, Rail
 from surrogym_client.original.errors import StepFailed
 from surrogym_client.original.protocol import RolloutEnvironment
-from surrogym_client.original.rollouts import answering
+from surrogym_client.original.rollouts import FromReset, answering
 from surrogym_shared.spec import (
     BoxAction,
     Coordinate,
@@ -47,6 +47,8 @@ class Moving(Rail):
 class Clock:
     """A hand that turns by the action, and is read without whole turns being taken off."""
 
+    hand = 0.0
+
     def spec(self):
         return with_history(HAND, changes=1, actions=1, largest={"hand": 4.0})
 
@@ -60,6 +62,13 @@ class Clock:
 
     def coordinates(self, observation):
         return [observation]
+
+    def save(self):
+        return str(self.hand).encode()
+
+    def restore(self, snapshot):
+        self.hand = float(snapshot)
+        return self.hand
 
     def close(self):
         pass
@@ -161,3 +170,24 @@ def test_a_design_that_would_learn_nothing_is_refused():
     fields = Moving().spec().model_dump()
     with pytest.raises(ValueError, match="expected initial of more than 3, got 3"):
         EnvironmentSpec.model_validate(fields | {"design": {"initial": 3}})
+
+
+def test_a_snapshot_keeps_the_past():
+    environment = answering(Clock())
+    assert isinstance(environment, FromReset)
+    environment.begin()
+    environment.act(np.array([1.5]))
+    saved = environment.save()
+    one = environment.act(np.array([2.0]))
+    np.testing.assert_array_equal(environment.restore(saved), one.coordinates)
+    two = environment.act(np.array([2.0]))
+    np.testing.assert_array_equal(two.coordinates, one.coordinates)
+    np.testing.assert_array_equal(two.next_coordinates, one.next_coordinates)
+
+
+def test_a_snapshot_that_is_too_short_is_refused():
+    environment = answering(Clock())
+    with pytest.raises(StepFailed, match="at least 24 bytes, got 3"):
+        environment.restore(b"3.0")
+    with pytest.raises(StepFailed, match="running episode to save with its lags, got none"):
+        environment.save()

@@ -25,12 +25,12 @@ def begun(spec: EnvironmentSpec, read: Array) -> Array:
         A policy on a machine observes ``surrogym_shared.terms.observe(spec, begun(spec, read)[None])[0]``.
     """
     middle = [0.0 if c.counted else sum(limits(spec.start[c.name])) / 2 for c in spec.coordinates]
-    return _placed(spec, read, np.array(middle))
+    return placed(spec, read, np.array(middle))
 
 
 def followed(spec: EnvironmentSpec, before: Array, action: Array, read: Array) -> Array:
     """Coordinates (C,) after a step from coordinates ``before`` (C,) under action (F,) that read (R,)."""
-    after = _placed(spec, read, before)
+    after = placed(spec, read, before)
     names = spec.coordinate_names
     for i, coordinate in enumerate(spec.coordinates):
         match coordinate.lag:
@@ -46,7 +46,7 @@ def followed(spec: EnvironmentSpec, before: Array, action: Array, read: Array) -
     return wrapped(spec, after)
 
 
-def _placed(spec: EnvironmentSpec, read: Array, lags: Array) -> Array:
+def placed(spec: EnvironmentSpec, read: Array, lags: Array) -> Array:
     """Coordinates (C,) of what was read (R,), and of lags (C,)."""
     placed = lags.copy()
     placed[[c.lag is None for c in spec.coordinates]] = read

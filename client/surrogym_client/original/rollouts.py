@@ -8,7 +8,7 @@ import numpy as np
 
 from surrogym_client.original.errors import StepFailed, UnknownEnvironment
 from surrogym_client.original.gymnasium import native_action
-from surrogym_client.original.lags import begun, followed, read_names
+from surrogym_client.original.lags import begun, followed, placed, read_names
 from surrogym_client.original.protocol import (
     Array,
     Environment,
@@ -32,6 +32,8 @@ class FromReset:
         self._environment = environment
         self._spec = environment.spec()
         self._at: Array | None = None
+        size = len(self._spec.coordinates)
+        self._prefix = 8 * size if size > len(read_names(self._spec)) else 0  # bytes of coordinates in a snapshot
         self.parallel = runs_in_parallel(environment)
 
     def spec(self) -> EnvironmentSpec:
@@ -75,16 +77,32 @@ class FromReset:
         )
 
     def save(self) -> bytes:
-        """The whole state, in the environment's own form. Raises ``StepFailed`` if it is not bytes."""
+        """The whole state, in the environment's own form. With lags, which it does not know, coordinates come first.
+
+        Raises:
+            StepFailed: the environment's form is not bytes, or with lags no episode is running.
+        """
         snapshot: Any = _saving(self._environment).save()
         if not isinstance(snapshot, bytes):
             raise StepFailed(f"expected bytes from save, got a {type(snapshot).__name__}")
-        return snapshot
+        if not self._prefix:
+            return snapshot
+        if self._at is None:
+            raise StepFailed("expected a running episode to save with its lags, got none")
+        return self._at.astype("<f8").tobytes() + snapshot
 
     def restore(self, snapshot: bytes) -> Array:
-        """Return to the state of a snapshot; the coordinates (C,) there."""
+        """Return to the state of a snapshot; the coordinates (C,) there.
+
+        Raises:
+            StepFailed: the snapshot is too short for its lags, or ``coordinates`` gives no (R,).
+        """
         self._at = None
-        self._at = self._read(_saving(self._environment).restore(snapshot))
+        if len(snapshot) < self._prefix:
+            raise StepFailed(f"expected a snapshot of at least {self._prefix} bytes, got {len(snapshot)}")
+        read = self._read(_saving(self._environment).restore(snapshot[self._prefix :]))
+        before = np.frombuffer(snapshot[: self._prefix], dtype="<f8") if self._prefix else np.zeros(len(read))
+        self._at = placed(self._spec, read, before)
         return self._at
 
     def close(self) -> None:
