@@ -35,6 +35,14 @@ def command(
     ] = None,
     spec: SpecFile = None,
     step_limit: StepLimit = 30.0,
+    history: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Take this many further real steps, to find out whether the environment needs earlier changes and "
+            "actions as lags. 40 to 60 are enough for most.",
+        ),
+    ] = 0,
     *,
     service: Service,
     output: Output,
@@ -64,7 +72,7 @@ def command(
             if given is None:
                 given, words = _described(env)
                 yield from words
-            yield from environment(partial(isolated, env, step_limit, given))
+            yield from environment(partial(isolated, env, step_limit, given), history)
 
     found: list[Finding] = []
     for finding in findings():

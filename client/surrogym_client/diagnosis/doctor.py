@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from surrogym_client.diagnosis.access import EXACT, Access, examine
+from surrogym_client.diagnosis.history import declared, look_back
 from surrogym_client.errors import ProblemError, ProtocolMismatch, Refused, ServerUnreachable, SurrogymClientError
 from surrogym_client.original.episodes import draw
 from surrogym_client.original.errors import OriginalError, StepFailed
@@ -96,9 +97,16 @@ def service(api: Api) -> Iterator[Finding]:
     yield _round_trip(api)
 
 
-def environment(opened: Callable[[], IsolatedEnvironment | Executable | Simulated]) -> Iterator[Finding]:
+def environment(
+    opened: Callable[[], IsolatedEnvironment | Executable | Simulated], history: int = 0
+) -> Iterator[Finding]:
     """The original environment: whether it can be opened, takes a step, and can be set to a state. The steps are real,
-    but they don't enter a ledger."""
+    but they don't enter a ledger.
+
+    Args:
+        opened: opens it.
+        history: further real steps, to find how far one has to look back to tell what happens next; 0 takes none.
+    """
     try:
         with closing(opened()) as original:
             spec = original.spec()
@@ -108,6 +116,8 @@ def environment(opened: Callable[[], IsolatedEnvironment | Executable | Simulate
             yield step
             if step.way_out is None:
                 yield from _access_of(original, spec)
+                if history:
+                    yield _history_of(original, spec, history)
     except OriginalError as error:
         yield Finding("environment", str(error), "see docs/how-to/own-environment.md for what an environment needs")
 
@@ -133,6 +143,30 @@ def _access_of(original: IsolatedEnvironment | Executable | Simulated, spec: Env
         )
     taken = f"{access.mode}; this took {access.steps + 1} real steps and {access.resets + 1} resets at most"
     yield Finding("mode", taken, _way_out(spec, access))
+
+
+def _history_of(original: IsolatedEnvironment, spec: EnvironmentSpec, steps: int) -> Finding:
+    """How far one has to look back, beside the declared lags."""
+    if spec.query != "rollout":
+        return Finding("history", "not looked for: an environment that is set to a state has no past")
+    try:
+        found = look_back(original, spec, steps)
+    except StepFailed as error:
+        return Finding("history", str(error), "a sampler would fail in the same way: mend the environment first")
+    if found is None:
+        return Finding("history", f"{steps} real steps of episodes this short don't tell", "give --history more steps")
+    took = f"this took {found.steps} real steps"
+    if not found.told:
+        return Finding("history", f"a linear regression does not show how far one has to look back; {took}")
+    has = declared(spec)
+    if found.changes <= has[0] and found.actions <= has[1]:
+        return Finding("history", f"what is declared tells what happens next; {took}")
+    needed = (
+        f"the next change of a coordinate depends on {found.changes} earlier changes and {found.actions} earlier "
+        f"actions: errors of {100 * found.error:.2g} % of its deviation, and of {100 * found.error_without:.2g} % "
+        f"without them; {took}"
+    )
+    return Finding("history", needed, f"declare {found.call}, see docs/how-to/history.md")
 
 
 def _way_out(spec: EnvironmentSpec, access: Access) -> str | None:
