@@ -145,7 +145,7 @@ def _access_of(original: IsolatedEnvironment | Executable | Simulated, spec: Env
     yield Finding("mode", taken, _way_out(spec, access))
 
 
-def _history_of(original: IsolatedEnvironment, spec: EnvironmentSpec, steps: int) -> Finding:
+def _history_of(original: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec, steps: int) -> Finding:
     """How far one has to look back, beside the declared lags."""
     if spec.query != "rollout":
         return Finding("history", "not looked for: an environment that is set to a state has no past")
