@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from surrogym_client.diagnosis.doctor import environment
 from surrogym_client.diagnosis.history import declared, look_back
 from surrogym_client.original import make
+from surrogym_client.original.isolated import IsolatedEnvironment
 from surrogym_client.original.rollouts import answering
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform, with_history
 
@@ -75,7 +77,7 @@ class Short(Joint):
 
 def said(factory) -> tuple[str, str | None]:
     """The finding on the history, and its way out."""
-    (finding,) = [f for f in environment(factory, 30.0, STEPS) if f.name == "history"]
+    (finding,) = [f for f in environment(partial(IsolatedEnvironment, factory, 30.0), STEPS) if f.name == "history"]
     return finding.said, finding.way_out
 
 
