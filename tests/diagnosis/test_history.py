@@ -110,6 +110,7 @@ def test_the_doctor_says_what_to_declare():
     assert "this took 60 real steps" in words
     assert way_out is not None
     assert 'declare with_history(spec, changes=1, actions=2, largest={"angle": ' in way_out
+    assert "with at_start if a reset leaves it moving" in way_out
 
 
 @pytest.mark.parametrize(

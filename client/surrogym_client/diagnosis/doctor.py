@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from surrogym_client.diagnosis.access import EXACT, Access, examine
-from surrogym_client.diagnosis.history import declared, look_back
+from surrogym_client.diagnosis.history import History, declared, look_back
 from surrogym_client.errors import ProblemError, ProtocolMismatch, Refused, ServerUnreachable, SurrogymClientError
 from surrogym_client.original.episodes import draw
 from surrogym_client.original.errors import OriginalError, StepFailed
@@ -166,7 +166,13 @@ def _history_of(original: IsolatedEnvironment | Executable | Simulated, spec: En
         f"actions: errors of {100 * found.error:.2g} % of its deviation, and of {100 * found.error_without:.2g} % "
         f"without them; {took}"
     )
-    return Finding("history", needed, f"declare {found.call}, see docs/how-to/history.md")
+    return Finding("history", needed, _declaring(found))
+
+
+def _declaring(found: History) -> str:
+    """What to declare."""
+    moving = ", with at_start if a reset leaves it moving" if found.changes else ""
+    return f"declare {found.call}{moving}; see docs/how-to/history.md"
 
 
 def _way_out(spec: EnvironmentSpec, access: Access) -> str | None:
