@@ -45,12 +45,14 @@ class QueriesOpen(RuntimeError):
 
 @dataclass(frozen=True)
 class Query:
-    """A query: one step from ``coordinates``, or several ``actions`` from a reset if no state can be set."""
+    """A query: one step from ``coordinates``, or several ``actions`` from a snapshot or a reset if not any state can be
+    set."""
 
     id: int
     purpose: Literal["initial", "adaptive"]
     coordinates: tuple[float, ...]  # (C,); empty for a rollout
     actions: tuple[tuple[float, ...], ...]  # (T, F); T is 1 for a step
+    snapshot: str | None = None  # name of the snapshot to begin at; None: at a reset
     design: str = field(default="", repr=False)  # identifies the design: equal specifications begin with equal queries
 
     @property
@@ -102,7 +104,8 @@ class Design:
         self._result: DesignResult | None = None
         self._settled = 0  # number of samples and abandoned queries at the last fit
         self._state, q, u, rollouts = initial_queries(self._definition, self.budget)
-        self._queue = deque(self._queries("initial", q, u, rollouts))
+        self._snapshots: dict[str, tuple[float, ...]] = {}  # coordinates (C,) by name
+        self._queue = deque(self._queries("initial", q, u, rollouts, ()))
 
     @property
     def phase(self) -> Phase:
@@ -146,12 +149,16 @@ class Design:
         self._open[query.id] = query
         return query
 
-    def tell(self, query: Query | None, steps: RealStep | Sequence[RealStep]) -> None:
+    def tell(
+        self, query: Query | None, steps: RealStep | Sequence[RealStep], snapshots: Sequence[str | None] = ()
+    ) -> None:
         """Answer a query with its real step, or with the steps of its rollout in order.
 
         Args:
             query: a query from ``ask``; None for steps of your own, such as those of a log.
             steps: the real steps, with the coordinates and the actions that were actually achieved.
+            snapshots: for each step, the name under which you saved the state after it, or None. Later queries may
+                begin there.
 
         Raises:
             InvalidInput: the query is not open; or a step has the wrong shape, is not finite, is absurdly far from the
@@ -162,18 +169,26 @@ class Design:
             self._require_open(query)
         if not taken or (query is not None and len(taken) > len(query.actions)):
             raise InvalidInput(f"expected {_count_of(query)}, got {len(taken)}")
-        self._samples += [checks.real_step(self._definition, step) for step in taken]
+        if snapshots and len(snapshots) != len(taken):
+            raise InvalidInput(f"snapshots: expected one entry for each of {len(taken)} steps, got {len(snapshots)}")
+        told = [checks.real_step(self._definition, step) for step in taken]
+        self._samples += told
+        for name, step in zip(snapshots, told, strict=False):
+            if name is not None:
+                self._snapshots[name] = tuple(np.asarray(step.next_coordinates, dtype=np.float64).tolist())
         if query is not None:
             self._answered.append(self._open.pop(query.id))
 
     def give_up(self, query: Query) -> None:
-        """Leave a query unanswered. It counts towards the budget, and similar queries are avoided.
+        """Leave a query unanswered. It counts towards the budget, and similar queries are avoided. If it begins at a
+        snapshot, no other query begins there.
 
         Raises:
             InvalidInput: the query is not open.
         """
         self._require_open(query)
         self._given_up.append(self._open.pop(query.id))
+        self._snapshots.pop(query.snapshot or "", None)
 
     def improve(self, steps: int, visited: Floats | None = None) -> None:
         """Add real steps to the next round within the budget, even if the design is ready.
@@ -276,7 +291,13 @@ class Design:
         self._state, self._result, self._extra = result.state, result, 0
         self._settled = len(self._samples) + len(self._given_up)
         self._queue.extend(
-            self._queries("adaptive", result.query_coordinates, result.query_action, result.query_rollouts)
+            self._queries(
+                "adaptive",
+                result.query_coordinates,
+                result.query_action,
+                result.query_rollouts,
+                result.query_snapshots,
+            )
         )
         self._phase = result.phase
 
@@ -297,6 +318,8 @@ class Design:
             pending_coordinates=np.array([query.coordinates for query in steps]) if steps else None,
             pending_action=np.array([query.action for query in steps]) if steps else None,
             pending_rollouts=tuple(np.array(query.actions) for query in rollouts),
+            pending_snapshots=tuple(query.snapshot for query in rollouts),
+            snapshots=dict(self._snapshots),
             extra_queries=self._extra,
             occupancy=self._visited,
             threads=self._threads,
@@ -310,13 +333,19 @@ class Design:
         return rows("coordinates"), rows("action"), rows("next_coordinates"), rows("reward"), ended
 
     def _queries(
-        self, purpose: Literal["initial", "adaptive"], q: Floats, u: Floats, rollouts: Sequence[Floats]
+        self,
+        purpose: Literal["initial", "adaptive"],
+        q: Floats,
+        u: Floats,
+        rollouts: Sequence[Floats],
+        snapshots: Sequence[str | None],
     ) -> list[Query]:
-        asked: list[tuple[tuple[float, ...], tuple[tuple[float, ...], ...]]] = [
-            (tuple(row), (tuple(action),)) for row, action in zip(q.tolist(), u.tolist(), strict=True)
+        asked: list[tuple[tuple[float, ...], tuple[tuple[float, ...], ...], str | None]] = [
+            (tuple(row), (tuple(action),), None) for row, action in zip(q.tolist(), u.tolist(), strict=True)
         ]
-        asked += [((), tuple(map(tuple, actions.tolist()))) for actions in rollouts]
-        return [Query(next(self._ids), purpose, at, actions, self._name) for at, actions in asked]
+        begun = snapshots or (None,) * len(rollouts)
+        asked += [((), tuple(map(tuple, u.tolist())), at) for u, at in zip(rollouts, begun, strict=True)]
+        return [Query(next(self._ids), purpose, at, actions, start, self._name) for at, actions, start in asked]
 
     def _require_open(self, query: Query) -> None:
         if not isinstance(query, Query):

@@ -6,7 +6,8 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -25,7 +26,7 @@ from surrogym_client.cli.sampling_on_ray import RayOptions
 
 if TYPE_CHECKING:
     from surrogym_client.sampler.on_ray import Line, SamplerPlan
-    from surrogym_client.sampler.worker import Outcome, SamplerReport
+    from surrogym_client.sampler.worker import Outcome, SamplerReport, SamplerSettings
     from surrogym_client.transport.api import Api
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import Query
@@ -55,6 +56,21 @@ TimeLimit = Annotated[
 ]
 
 
+@dataclass(frozen=True)
+class SnapshotOptions:
+    """What the sampler keeps of the states that it visits."""
+
+    snapshots: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder that keeps snapshots for the next sampler; several samplers may share it. [default: they end "
+            "with the sampler]"
+        ),
+    ] = None
+    most_snapshots: Annotated[int, typer.Option(min=1, help="Largest number of snapshots to keep.")] = 1_000
+    most_bytes: Annotated[int, typer.Option(min=1, help="Largest size of all snapshots to keep, in bytes.")] = 1 << 30
+
+
 def register(app: typer.Typer) -> None:
     """Add ``surrogym sample`` to the app."""
     add(app, "sample", command)
@@ -76,6 +92,7 @@ def command(
     wait: Wait = 0.0,
     exit_with_parent: ExitWithParent = False,
     *,
+    keeping: SnapshotOptions,
     cluster: RayOptions,
     service: Service,
     output: Output,
@@ -83,7 +100,8 @@ def command(
     """Take the real steps that the server asks for.
 
     For each query, the sampler sets the original environment to a state, takes one real step and reports the sample. If
-    the environment can't be set to a state, the sampler resets it and takes a sequence of actions. Ctrl-C ends the
+    the environment can't be set to any state, the sampler resets it, or returns to a snapshot, and takes a sequence of
+    actions. Ctrl-C ends the
     command.
 
     Example: surrogym sample pendulum --until-done
@@ -92,6 +110,7 @@ def command(
     """
     from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
     from surrogym_client.sampler.on_ray import SamplerPlan
+    from surrogym_client.sampler.snapshots import Bounds
     from surrogym_client.sampler.worker import SamplerSettings, worker_name
 
     cluster.require_fit(worker_limits=once or max_queries is not None)
@@ -104,6 +123,8 @@ def command(
         until_done=until_done,
         max_queries=max_queries,
         time_limit=time_limit,
+        snapshots=keeping.snapshots,
+        bounds=Bounds(keeping.most_snapshots, keeping.most_bytes),
     )
     with service.connect(context, wait, quiet=output.quiet) as api:
         asked = awaited_surrogate(api, surrogate, wait, quiet=output.quiet).spec
@@ -113,6 +134,7 @@ def command(
         if cluster.on_ray is None:
             _sample_here(api, plan, output)
         else:
+            _require_shared(asked, settings)
             _sample_on_ray(api, plan, cluster, output)
 
 
@@ -140,6 +162,14 @@ def _sample_here(api: Api, plan: SamplerPlan, output: Output) -> None:
     output.give(asdict(result), lambda: _words(plan.surrogate, result))
     if result.phase == "failed":
         raise typer.Exit(1)
+
+
+def _require_shared(asked: EnvironmentSpec, settings: SamplerSettings) -> None:
+    """Refuse several samplers that can't return to each other's snapshots."""
+    from surrogym_client.cli.errors import CommandError
+
+    if asked.snapshots and settings.snapshots is None:
+        raise CommandError("expected --snapshots FOLDER that all samplers see, got several samplers without one")
 
 
 def _sample_on_ray(api: Api, plan: SamplerPlan, cluster: RayOptions, output: Output) -> None:
@@ -229,7 +259,7 @@ def _restarts(count: int) -> str:
 def _words(surrogate: str, report: SamplerReport) -> str:
     from surrogym_client.surrogates.phases import COMPLETED, IN_WORDS
 
-    others = {"failed": report.failed, "dropped": report.dropped, "refused": report.refused}
+    others = {name: getattr(report, name) for name in ("failed", "dropped", "refused", "impossible")}
     apart = "".join(f", {count} {outcome}" for outcome, count in others.items() if count)
     said = f"{report.answered} queries answered with {report.steps} real steps{apart} in {report.seconds:.1f} s"
     if report.phase in IN_WORDS:

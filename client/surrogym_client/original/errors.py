@@ -8,6 +8,7 @@ OriginalError
 ├── NotParallel             one instance is open, and the environment does not say that another may be
 ├── PolicyMisfit            the policy gives actions that the environment does not have
 ├── QueryRefused            a query asks for what the environment does not allow; nothing was sent to it
+├── SnapshotGone            a query begins at a snapshot that can't be used; the design chooses another query
 ├── MachineFails            the environment failed at several different queries in a row; the worker stops
 ├── EvaluationFailed        the environment or the policy failed after real steps had been taken
 └── StepFailed              the environment did not give a step; the query fails, the worker continues
@@ -52,6 +53,10 @@ class PolicyMisfit(OriginalError, ValueError):
 
 class QueryRefused(OriginalError):
     """A query lies outside the environment's own specification; nothing was sent to the environment."""
+
+
+class SnapshotGone(OriginalError):
+    """A snapshot was dropped, is damaged, or can't be restored; no real step was taken."""
 
 
 class MachineFails(OriginalError):

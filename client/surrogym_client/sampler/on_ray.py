@@ -23,7 +23,7 @@ from surrogym_shared.wire import Query
 IDLE_SECONDS = 5.0  # of one claim: a sampler that is to stop ends after it
 LOOK_SECONDS = 1.0  # between two looks at the samplers
 STOP_SECONDS = 15.0  # in addition to the limit of a step, for samplers that were told to stop
-NOTHING = SamplerReport(answered=0, failed=0, dropped=0, refused=0, steps=0, seconds=0.0, phase=None)
+NOTHING = SamplerReport(answered=0, failed=0, dropped=0, refused=0, impossible=0, steps=0, seconds=0.0, phase=None)
 
 
 @dataclass(frozen=True)
@@ -224,6 +224,7 @@ class RaySamplers:
             failed=sum(report.failed for report in all_reports),
             dropped=sum(report.dropped for report in all_reports),
             refused=sum(report.refused for report in all_reports),
+            impossible=sum(report.impossible for report in all_reports),
             steps=sum(report.steps for report in all_reports),
             seconds=max((report.seconds for report in all_reports), default=0.0),
             phase=phases[-1] if phases else None,

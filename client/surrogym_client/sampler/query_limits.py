@@ -47,6 +47,8 @@ def check_query(own: EnvironmentSpec, query: Query) -> None:
         _check_values("coordinates", names, query.coordinates, _coordinate_ranges(own))
         _check_action(own, query.action)
         return
+    if query.snapshot is not None and not own.snapshots:
+        raise QueryRefused("expected a query that begins at a reset, got one that begins at a snapshot")
     longest = own.max_rollout or own.time_limit or MAX_ROLLOUT_QUERY
     if not 1 <= len(query.actions) <= longest:
         raise QueryRefused(f"expected a rollout of 1 to {longest} actions, got {len(query.actions)}")

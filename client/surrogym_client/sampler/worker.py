@@ -4,22 +4,32 @@ from __future__ import annotations
 
 import os
 import socket
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Literal, TypeVar
+from pathlib import Path
+from typing import Literal, TypeVar, get_args
 
 import numpy as np
 
 from surrogym_client.errors import InvalidInput, LeaseExpired, NotThere
-from surrogym_client.original.errors import QueryRefused, StepFailed
-from surrogym_client.original.protocol import Environment, OriginalEnvironment, RolloutEnvironment
+from surrogym_client.original.errors import QueryRefused, SnapshotGone, StepFailed
+from surrogym_client.original.protocol import (
+    Environment,
+    OriginalEnvironment,
+    RolloutEnvironment,
+    SnapshotEnvironment,
+)
 from surrogym_client.original.rollouts import answering
 from surrogym_client.sampler.failures import Failures
 from surrogym_client.sampler.leases import AWAY, LeaseEnded, Leases
 from surrogym_client.sampler.query_limits import check_environment, check_query
+from surrogym_client.sampler.returning import Returning
 from surrogym_client.sampler.sample_conversion import reset_seed, sample_of
+from surrogym_client.sampler.snapshots import Bounds, SnapshotFolder
 from surrogym_client.surrogates.phases import ENDED
 from surrogym_client.transport.api import Api
 from surrogym_client.transport.connection import Retries
@@ -31,10 +41,11 @@ LOOK_SECONDS = 0.1  # how often a waiting sampler checks whether it was stopped
 LAST_SECONDS = 5.0  # how long a stopped sampler retries to send its last real step
 END_SECONDS = 2.0  # longest time until a waiting sampler notices that the design had ended before its claim
 AGAIN_SECONDS = 1.0  # pause after a claim in which no query could begin
+MOST_GONE = 1_000  # snapshots that one request reports as gone
 STOPPED = "the sampler was stopped"
 
 T = TypeVar("T")
-Outcome = Literal["answered", "failed", "dropped", "refused"]
+Outcome = Literal["answered", "failed", "dropped", "refused", "impossible"]
 
 
 def worker_name() -> str:
@@ -48,7 +59,8 @@ class SamplerSettings:
 
     ``batch``: queries to claim at once. ``until_done``: stop when the design is ready or over its budget. ``once``:
     stop after the first claim that returns queries. ``max_queries`` and ``time_limit`` (seconds): begin no query beyond
-    either of them.
+    either of them. ``snapshots``: folder that keeps the surrogate's snapshots; None: they end with the sampler.
+    ``bounds``: of their number and size.
     """
 
     name: str = field(default_factory=worker_name)
@@ -59,6 +71,8 @@ class SamplerSettings:
     until_done: bool = False
     max_queries: int | None = None
     time_limit: float | None = None
+    snapshots: Path | None = None
+    bounds: Bounds = field(default_factory=Bounds)
 
 
 @dataclass(frozen=True)
@@ -66,13 +80,15 @@ class SamplerReport:
     """Result of a sampler's run.
 
     ``dropped`` counts queries whose lease ended before a real step, ``refused`` those that the environment's own
-    specification does not allow. ``phase`` is the design's last known phase.
+    specification does not allow, ``impossible`` those whose snapshot can't be used. ``phase`` is the
+    design's last known phase.
     """
 
     answered: int
     failed: int
     dropped: int
     refused: int
+    impossible: int
     steps: int  # real steps that were sent
     seconds: float
     phase: Phase | None
@@ -118,10 +134,11 @@ class Sampler:
         self._environment = environment
         self._settings = settings or SamplerSettings()
         self._report = report
-        self._counts: dict[Outcome, int] = {"answered": 0, "failed": 0, "dropped": 0, "refused": 0}
+        self._counts: dict[Outcome, int] = dict.fromkeys(get_args(Outcome), 0)
         self._refused: set[int] = set()  # ids of refused queries, which the server offers again
         self._failures = Failures()
         self._steps = 0
+        self._returning: Returning | None = None  # None: no query begins at a snapshot
         self._phase: Phase | None = None
         self._spec: EnvironmentSpec
         self._own: EnvironmentSpec
@@ -148,7 +165,9 @@ class Sampler:
         """
         self._started = time.monotonic()
         self._check()
-        with Leases(self._api, self._surrogate, self._settings.lease_seconds) as self._leases:
+        leases = Leases(self._api, self._surrogate, self._settings.lease_seconds)
+        with self._snapshots() as self._returning, leases as self._leases:
+            self._report_gone()
             while not self._stopped() and (limit := self._limit()) > 0:
                 try:
                     claimed, since = self._patiently(partial(self._claim, limit))
@@ -174,6 +193,19 @@ class Sampler:
         self._environment = answering(self._environment)
         self._spec, self._own = self._api.surrogate(self._surrogate).spec, self._environment.spec()
         check_environment(self._surrogate, self._spec, self._own)
+
+    @contextmanager
+    def _snapshots(self) -> Iterator[Returning | None]:
+        """Open the folder of snapshots, if queries begin there."""
+        if not self._spec.snapshots:
+            yield None
+            return
+        assert isinstance(self._environment, SnapshotEnvironment)
+        known = [one.name for one in self._api.snapshots(self._surrogate)]
+        with tempfile.TemporaryDirectory(prefix="surrogym-snapshots-") as ended:
+            folder = Path(ended) if self._settings.snapshots is None else self._settings.snapshots
+            kept = SnapshotFolder(folder / self._surrogate, self._own, self._settings.bounds)
+            yield Returning(self._environment, kept, known)
 
     def _claim(self, limit: int) -> tuple[ClaimedQueries, float]:
         """Claim queries. Returns them with the time of the claim on the leases' clock."""
@@ -218,6 +250,8 @@ class Sampler:
             outcome, error = "refused", str(refused)
         except LeaseEnded as ended:
             outcome, error = "dropped", str(ended)
+        except SnapshotGone as gone:
+            outcome, error = "impossible", str(gone)
         except StepFailed as failed:
             error = str(failed) or "no reason given"
         except Exception as raised:  # an environment that is not isolated may raise anything
@@ -232,6 +266,7 @@ class Sampler:
         if not taken:
             begun = bool(error) and outcome == "failed"
             self._patiently(lambda: self._give_back(query, error or STOPPED, begun=begun), LAST_SECONDS)
+        self._report_gone()
         self._count(query, "answered" if taken else outcome, error)
 
     def _take(self, query: Query, taken: list[NewSample]) -> None:
@@ -245,7 +280,11 @@ class Sampler:
             return
         assert isinstance(environment, RolloutEnvironment)
         self._leases.check(query)
-        environment.begin(reset_seed(query, self._spec.design.seed))
+        if query.snapshot is None:
+            environment.begin(reset_seed(query, self._spec.design.seed))
+        else:
+            assert self._returning is not None  # see check_query
+            self._returning.begin(query.snapshot)
         for number, action in enumerate(query.actions):
             if self._stopped():
                 return
@@ -254,6 +293,15 @@ class Sampler:
             taken.append(sample_of(query, step, size, number))
             if step.terminated or step.truncated:
                 return
+            if self._returning is not None:
+                snapshot = self._returning.save(taken[-1].next_coordinates)
+                taken[-1] = taken[-1].model_copy(update={"snapshot": snapshot})
+
+    def _report_gone(self) -> None:
+        """Tell the server which of its snapshots are gone, so that the design chooses other queries."""
+        while self._returning is not None and (some := self._returning.gone[:MOST_GONE]):
+            self._patiently(partial(self._api.drop_snapshots, self._surrogate, some), LAST_SECONDS)
+            del self._returning.gone[:MOST_GONE]
 
     def _hand_in(self, samples: list[NewSample]) -> None:
         if samples:

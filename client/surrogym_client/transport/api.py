@@ -258,6 +258,15 @@ class Api:
 
     # Samples and the ledger
 
+    def snapshots(self, name: str) -> list[wire.SnapshotView]:
+        """Return the snapshots that samplers hold, oldest first."""
+        return self._get(wire.SnapshotList, f"{routes.surrogate(name)}/snapshots").snapshots
+
+    def drop_snapshots(self, name: str, snapshots: Sequence[str]) -> int:
+        """Report snapshots that no sampler holds any more, and return how many were known."""
+        body = wire.DropSnapshots(snapshots=list(snapshots))
+        return self._post(wire.DroppedSnapshots, f"{routes.surrogate(name)}/snapshots:drop", body).dropped
+
     def add_samples(
         self,
         name: str,

@@ -48,6 +48,7 @@ PATCH: Example = {"paused": True}
 CLAIM: Example = {"sampler": "bench-1", "max_queries": 1, "wait_seconds": 20, "lease_seconds": 60}
 RENEW: Example = {"lease_token": "the token of the claim", "lease_seconds": 60}
 FAIL: Example = {"lease_token": "the token of the claim", "error": "the motor did not answer"}
+DROP_SNAPSHOTS: Example = {"snapshots": ["4f1c09aa-17"]}
 WITHDRAW: Example = {"query_ids": [7, 8]}
 ADD_QUERIES: Example = {"coordinates": [[0.1, 0.0]], "action": [[1.5]], "idempotency_key": "by-hand-1"}
 ADD_SAMPLE: Example = {

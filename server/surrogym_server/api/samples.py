@@ -16,7 +16,16 @@ from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.api.tables import CSV, NPZ, as_csv, as_npz
 from surrogym_shared.codes import Code
-from surrogym_shared.wire import AddedSamples, AddSamples, Ledger, ReportSteps, SamplePage
+from surrogym_shared.wire import (
+    AddedSamples,
+    AddSamples,
+    DroppedSnapshots,
+    DropSnapshots,
+    Ledger,
+    ReportSteps,
+    SamplePage,
+    SnapshotList,
+)
 
 router = APIRouter(prefix="/v1/surrogates/{name}", tags=["samples"], route_class=DoorRoute)
 
@@ -69,6 +78,30 @@ def samples(
     write, media_type = (as_csv, CSV) if format == "csv" else (as_npz, NPZ)
     content = write(use.samples.coordinate_names(name), use.samples.all(name))
     return Response(content, media_type=media_type, headers=_attachment(f"{name}.{format}"))
+
+
+@router.get(
+    "/snapshots",
+    summary="Snapshots that samplers hold",
+    dependencies=[READ],
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
+)
+def snapshots(name: str, use: Use) -> SnapshotList:
+    """List the saved states to which a sampler can return, oldest first. ``add_sample`` adds to them."""
+    return convert.snapshot_list(use.samples.snapshots(name))
+
+
+@router.post(
+    "/snapshots:drop",
+    summary="Report that snapshots are gone",
+    dependencies=[SAMPLE],
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
+)
+def drop_snapshots(
+    name: str, body: Annotated[DropSnapshots, example(examples.DROP_SNAPSHOTS)], use: Use
+) -> DroppedSnapshots:
+    """Forget snapshots. Queries that begin there are withdrawn, and the design chooses anew."""
+    return DroppedSnapshots(dropped=use.samples.drop_snapshots(name, body.snapshots))
 
 
 @router.post(

@@ -57,6 +57,7 @@ def stored_definition(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
         learns_termination=spec.termination == "learned",
         declared_reward=_declared_reward(spec),
         max_rollout=_max_rollout(spec) if spec.query == "rollout" else None,
+        snapshots=spec.snapshots,
         starts=spec.starts,
         outside_reward=spec.outside_reward,
     )
@@ -87,7 +88,7 @@ def _design(spec: wire.EnvironmentSpec) -> core.DesignDefinition:
     elif spec.query == "step":
         initial = max(4, len(spec.coordinates) + spec.action.size)
     else:
-        initial = 4 * (len(spec.coordinates) + spec.action.size)
+        initial = (2 if spec.snapshots else 4) * (len(spec.coordinates) + spec.action.size)
     if design.initial is not None:
         initial = design.initial
     if design.budget:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -122,7 +122,7 @@ def _leased(query: LeasedQuery, lease_seconds: float) -> replies.Query:
         "lease_seconds": lease_seconds,
     }
     if query.kind == "rollout":
-        return replies.RolloutQuery(**common, actions=query.actions.tolist())
+        return replies.RolloutQuery(**common, actions=query.actions.tolist(), snapshot=query.snapshot)
     return replies.StepQuery(**common, coordinates=list(query.coordinates), action=list(query.action))
 
 
@@ -139,6 +139,7 @@ def query_view(record: QueryRecord) -> replies.QueryView:
         kind=record.kind,
         coordinates=list(record.coordinates) or None,
         actions=record.actions.tolist(),
+        snapshot=record.snapshot,
         attempts=record.attempts,
         sampler=record.sampler,
         error=record.error,
@@ -152,6 +153,11 @@ def new_sample(sample: replies.NewSample) -> NewSample:
 
 def added_samples(added: Added) -> replies.AddedSamples:
     return replies.AddedSamples(sample_ids=list(added.ids), duplicates=added.duplicates, ledger=ledger(added.ledger))
+
+
+def snapshot_list(known: Mapping[str, Sequence[float]]) -> replies.SnapshotList:
+    views = [replies.SnapshotView(name=name, coordinates=list(at)) for name, at in known.items()]
+    return replies.SnapshotList(snapshots=views)
 
 
 def sample_view(record: SampleRecord) -> replies.SampleView:

@@ -30,6 +30,7 @@ from surrogym_server.sampling.design import (
     initial_rollouts,
     judge_model,
 )
+from surrogym_server.sampling.rollouts import Rollout
 from surrogym_server.sampling.tolerances import usual_tolerances
 
 Array = NDArray[np.float64]
@@ -52,6 +53,8 @@ class DesignJob:
     pending_coordinates: Array | None = None  # (p, C) unanswered queries: open, or set aside
     pending_action: Array | None = None  # (p, F)
     pending_rollouts: tuple[Array, ...] = ()  # unanswered rollouts, each (T, F)
+    pending_snapshots: tuple[str | None, ...] = ()  # where each of them begins; None, or a name not known: a reset
+    snapshots: dict[str, tuple[float, ...]] = field(default_factory=dict)  # coordinates (C,) of each, by name
     extra_queries: int = 0  # real steps requested with improve, chosen even if the design has ended
     occupancy: Array | None = None  # (m, C) states that policies visited
     threads: int = 1
@@ -73,6 +76,7 @@ class DesignResult:
     query_coordinates: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (m, C)
     query_action: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (m, F)
     query_rollouts: tuple[Array, ...] = ()  # each (T, F)
+    query_snapshots: tuple[str | None, ...] = ()  # where each of them begins; None: at a reset
 
     @property
     def phase(self) -> Literal["sampling", "ready", "over_budget", "from_log"]:
@@ -106,6 +110,7 @@ def run_design_job(job: DesignJob) -> DesignResult:
         decision, samples = _decide(job)
     with plugin_calls(job.definition):
         stored = to_bytes(decision.model)
+    names = list(job.snapshots)
     return DesignResult(
         model=stored,
         description=json.loads(json.dumps(decision.model.description)),  # plain data, whatever a family returns
@@ -116,7 +121,8 @@ def run_design_job(job: DesignJob) -> DesignResult:
         seconds=time.perf_counter() - started,
         query_coordinates=decision.q.numpy(),
         query_action=decision.u.numpy(),
-        query_rollouts=tuple(actions.numpy() for actions in decision.rollouts),
+        query_rollouts=tuple(rollout.actions.numpy() for rollout in decision.rollouts),
+        query_snapshots=tuple(None if r.snapshot is None else names[r.snapshot] for r in decision.rollouts),
     )
 
 
@@ -172,10 +178,20 @@ def _request(job: DesignJob) -> Request:
             rows(job.pending_coordinates, len(job.definition.coordinates)),
             rows(job.pending_action, job.definition.action.size),
         ),
-        pending_rollouts=tuple(torch.from_numpy(actions) for actions in job.pending_rollouts),
+        pending_rollouts=_pending(job),
+        snapshots=rows(np.array(list(job.snapshots.values())), 0) if job.snapshots else None,
         extra=job.extra_queries,
         states=None if job.occupancy is None else torch.from_numpy(job.occupancy),
         logged=job.logged,
         audited=job.audited,
         unlearned=int((~_known(job)).sum()),
+    )
+
+
+def _pending(job: DesignJob) -> tuple[Rollout, ...]:
+    places = {name: number for number, name in enumerate(job.snapshots)}
+    snapshots = job.pending_snapshots or (None,) * len(job.pending_rollouts)
+    return tuple(
+        Rollout(torch.from_numpy(actions), places.get(snapshot or ""))
+        for actions, snapshot in zip(job.pending_rollouts, snapshots, strict=True)
     )

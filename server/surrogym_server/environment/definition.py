@@ -148,7 +148,8 @@ class EnvironmentDefinition:
     design: DesignDefinition
     learns_termination: bool = False  # from samples; no groups are declared then
     declared_reward: DeclaredReward | None = None
-    max_rollout: int | None = None  # longest action sequence from a reset; None where any state can be set
+    max_rollout: int | None = None  # longest action sequence of a query; None where any state can be set
+    snapshots: bool = False  # whether such a sequence may begin at a saved state
     starts: tuple[tuple[float, ...], ...] = ()  # states at which episodes start; empty: the coordinates' distributions
     outside_reward: float | None = None  # for each step that an episode misses after it left the sampling range
     device: torch.device = CPU  # of its tensors, and of the states and actions that it is given

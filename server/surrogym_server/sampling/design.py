@@ -19,13 +19,13 @@ from surrogym_server.models.guard import learn, plugin_calls, require_deviations
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.batch import choose
-from surrogym_server.sampling.candidates import Candidates, candidates_of, with_more
+from surrogym_server.sampling.candidates import Candidates, candidates_of, reference_of, with_more
 from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
 from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
 from surrogym_server.sampling.noise import SLACK, established_noise, to_repeat, widened
 from surrogym_server.sampling.peaks import highest
-from surrogym_server.sampling.rollouts import Aim, first_rollouts, plan_round
+from surrogym_server.sampling.rollouts import Aim, Rollout, first_rollouts, plan_round
 from surrogym_server.sampling.tolerances import Usual, frozen_tolerances
 
 Verdict = Literal["continue", "ready", "over_budget", "from_log"]
@@ -69,7 +69,8 @@ class Request:
     pending: Points  # p
     extra: int = 0  # real steps to choose even if the design has ended
     states: Tensor | None = None  # (v, C) visited by policies
-    pending_rollouts: tuple[Tensor, ...] = ()  # each (T, F)
+    pending_rollouts: tuple[Rollout, ...] = ()
+    snapshots: Tensor | None = None  # (s, C) states to which the environment can return
     logged: int = 0  # of the samples, from a log
     audited: int = 0  # of the samples, steps of audits
     unlearned: int = 0  # further real steps, whose lags were not known
@@ -89,7 +90,7 @@ class Decision:
     verdict: Verdict
     q: Tensor  # (m, C) next queries
     u: Tensor  # (m, F)
-    rollouts: tuple[Tensor, ...] = ()  # next rollouts if the environment can't be set to a state, each (T, F)
+    rollouts: tuple[Rollout, ...] = ()  # next rollouts if the environment can't be set to any state
 
 
 def initial_design(definition: EnvironmentDefinition, budget: int) -> tuple[Tensor, Tensor]:
@@ -132,14 +133,16 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     if verdict == "continue" and now == state.ended_with:
         verdict = "over_budget"  # only audits and logs have come since it ended, and they need no further real step
     candidates, reserved = judged.candidates, judged.reserved
-    chosen, rollouts = candidates.points[:0], tuple[Tensor, ...]()
+    chosen, rollouts = candidates.points[:0], tuple[Rollout, ...]()
     if definition.max_rollout is None:
         chosen = _repeated(learned.model, samples, usual, verdict, request)
         if not len(chosen):
             chosen = _choose(learned.model, samples, candidates, confidences, tolerances, verdict, request, reserved)
     else:
         rng = _rng(definition, f"rollouts {state.round}")
-        rollouts = _plan(learned.model, samples, confidences, tolerances, verdict, request, rng, reserved is not None)
+        rollouts = _plan(
+            learned.model, samples, candidates, confidences, tolerances, verdict, request, rng, reserved is not None
+        )
     if verdict == "continue" and not len(chosen) and not rollouts:
         verdict = "over_budget"  # the rest of the budget is pending, or no distinct query is left
     ended = now if verdict != "continue" and not len(chosen) and not rollouts else ()
@@ -265,25 +268,29 @@ def _choose(
 def _plan(
     model: DynamicsModel,
     samples: Samples,
+    candidates: Candidates,
     confidences: tuple[OutputConfidence, ...],
     tolerances: tuple[float, ...],
     verdict: Verdict,
     request: Request,
     rng: np.random.Generator,
     ending: bool,
-) -> tuple[Tensor, ...]:
+) -> tuple[Rollout, ...]:
     """Plan rollouts for the outputs below their target, with a quarter as many real steps as there are samples.
 
-    So plans become longer as the model sees more, and fits are few.
+    So plans become longer as the model sees more, and fits are few. With snapshots, which need no way from a reset, a
+    round has half as many steps, and at least one for each of these outputs, as with single steps.
     """
-    steps = request.extra
+    steps, below = request.extra, _below(confidences, request.target)
     if verdict == "continue":
-        pending = sum(len(actions) for actions in request.pending_rollouts)
+        pending = sum(map(len, request.pending_rollouts))
         room = request.budget + request.free - len(samples) - pending
-        steps = min(room, max(SHORTEST_ROUND, len(samples) // 4))
+        usual = max(SHORTEST_ROUND, len(samples) // 4)
+        steps = min(room, max(len(below), len(samples) // 8) if model.definition.snapshots else usual)
     longest = model.definition.max_rollout or 1
     ended = bool(samples.terminated.any())
-    aim = Aim(_below(confidences, request.target), tolerances, longest, request.states, ending, ended)
+    reference = reference_of(model, candidates) if model.definition.snapshots else None
+    aim = Aim(below, tolerances, longest, reference, request.snapshots, request.states, ending, ended)
     return tuple(plan_round(model, aim, steps, request.pending_rollouts, rng))
 
 

@@ -1,4 +1,6 @@
-"""Action sequences for an environment that can't be set to a state: first random ones, then planned in the model.
+"""Action sequences for an environment that can't be set to any state: first random ones, then planned in the model.
+
+A sequence begins at a reset, or at a snapshot: a state to which the environment can return.
 
 The value of a sequence is the acquisition's value per real step: for most acquisitions, the information that a path
 gives about each output (``PathOutlook.information``). A step has weight 0 outside the sampling range and after the end
@@ -18,7 +20,7 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.distributions import scaling
-from surrogym_server.models.abilities import PathOutlook, PredictedSteps
+from surrogym_server.models.abilities import PathOutlook, PredictedSteps, Reference
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.acquisition import PathView, path_value_of
 from surrogym_server.sampling.endings import edge_in_doubt, in_doubt
@@ -41,9 +43,22 @@ class Aim:
     columns: Sequence[int]  # numbers of the outputs to learn
     tolerances: Sequence[float]  # of every output
     longest: int  # actions in a sequence
+    reference: Reference | None = None  # where the outputs shall become known; None: along the paths alone
+    snapshots: Tensor | None = None  # (s, C) states at which a sequence may begin, besides a reset
     states: Tensor | None = None  # (v, C) visited by policies: information is weighted by their density
     ending: bool = False  # look first for an end of the episode, or an edge of the reward, if one is within reach
     ended: bool = False  # an end was seen, so a declared one need not be looked for
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """An action sequence, and where it begins."""
+
+    actions: Tensor  # (T, F)
+    snapshot: int | None = None  # number of the snapshot; None: a reset
+
+    def __len__(self) -> int:
+        return len(self.actions)
 
 
 @dataclass(frozen=True)
@@ -70,15 +85,15 @@ def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random
 
 
 def plan_round(
-    model: DynamicsModel, aim: Aim, steps: int, pending: Sequence[Tensor], rng: np.random.Generator
-) -> list[Tensor]:
+    model: DynamicsModel, aim: Aim, steps: int, pending: Sequence[Rollout], rng: np.random.Generator
+) -> list[Rollout]:
     """Plan action sequences with ``steps`` real steps in all. Each one is planned as if the earlier and the pending
     ones had already been answered."""
-    rollouts: list[Tensor] = []
+    rollouts: list[Rollout] = []
     done = list(pending)
     while steps > model.definition.unknown_steps:
-        for actions in done:
-            model = as_if_done(model, actions, rng)
+        for rollout in done:
+            model = as_if_done(model, rollout, aim.snapshots, rng)
         done = [plan_rollout(model, replace(aim, longest=min(steps, aim.longest)), rng)]
         rollouts += done
         steps -= len(done[0])
@@ -86,23 +101,45 @@ def plan_round(
     return rollouts
 
 
-def plan_rollout(model: DynamicsModel, aim: Aim, rng: np.random.Generator) -> Tensor:
-    """The sequence (T, F), 1 <= T <= ``aim.longest``, with the highest value per expected real step, found by random
-    shooting and by varying the best sequences."""
-    starts = start_points(model.definition, STARTS, rng)
-    population = random_sequences(model.definition, POPULATION, aim.longest, rng)
-    value, length = _worth(model, aim, starts, population)
+def plan_rollout(model: DynamicsModel, aim: Aim, rng: np.random.Generator) -> Rollout:
+    """The sequence (T, F), 1 <= T <= ``aim.longest``, with the highest value per expected real step, from a reset or
+    from the best snapshot. It is found by random shooting and by varying the best sequences."""
+    best, value = _search(model, aim, start_points(model.definition, STARTS, rng)[None], POPULATION, rng)
+    if aim.snapshots is None or not len(aim.snapshots):
+        return best
+    returned, known = _search(model, aim, aim.snapshots[:, None], POPULATION * STARTS, rng)
+    return best if value >= known else returned
+
+
+def _search(
+    model: DynamicsModel, aim: Aim, origins: Tensor, population: int, rng: np.random.Generator
+) -> tuple[Rollout, float]:
+    """The best sequence from one of k origins, each of several equally likely states (k, s, C), and its value. The
+    number of the origin is the rollout's snapshot if there is one state each."""
+    sequences = random_sequences(model.definition, population, aim.longest, rng)
+    places = np.resize(rng.permutation(len(origins)), population)
+    elite = population * ELITE // POPULATION
+    value, length = _worth(model, aim, origins[places], sequences)
     for _ in range(GENERATIONS - 1):
-        elite = population[value.argsort(descending=True)[:ELITE].numpy()]
-        population = np.concatenate([elite, _varied(model.definition, elite, POPULATION - ELITE, rng)])
-        value, length = _worth(model, aim, starts, population)
+        kept = value.argsort(descending=True)[:elite].numpy()
+        parents = np.concatenate([kept, kept[rng.integers(elite, size=population - elite)]])
+        sequences, places = sequences[parents], places[parents]
+        _vary(model.definition, sequences[elite:], rng)
+        value, length = _worth(model, aim, origins[places], sequences)
     best = int(value.argmax())
-    return torch.from_numpy(population[best, : int(length[best])])
+    snapshot = int(places[best]) if origins.shape[1] == 1 else None
+    return Rollout(torch.from_numpy(sequences[best, : int(length[best])]), snapshot), float(value[best])
 
 
-def as_if_done(model: DynamicsModel, actions: Tensor, rng: np.random.Generator) -> DynamicsModel:
-    """Condition the model on a sequence (T, F) along a predicted path: variances shrink, means stay."""
-    path = predict_paths(model, start_points(model.definition, 1, rng), actions[None])
+def as_if_done(
+    model: DynamicsModel, rollout: Rollout, snapshots: Tensor | None, rng: np.random.Generator
+) -> DynamicsModel:
+    """Condition the model on a rollout along a predicted path: variances shrink, means stay. ``snapshots`` (s, C) are
+    those that rollouts may begin at."""
+    start = start_points(model.definition, 1, rng)
+    if rollout.snapshot is not None and snapshots is not None:
+        start = snapshots[rollout.snapshot][None]
+    path = predict_paths(model, start, rollout.actions[None])
     taken = (path.running[0] > 0) & model.definition.known(path.q[0])
     return as_if_answered(model, PredictedSteps(path.q[0, taken], path.u[0, taken], path.q_next[0, taken]))
 
@@ -152,21 +189,28 @@ def path_values(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
     steps = PredictedSteps(paths.q, paths.u, paths.q_next)
     for column in aim.columns:
         if (output := path_outlook(model, steps, column)) is not None:
-            total += path_value_of(acquisition, _view(output, weight * output.learns, aim.tolerances[column]))
+            total += path_value_of(acquisition, _view(output, weight * output.learns, aim, column))
     return total
 
 
-def _view(output: PathOutlook, weight: Tensor, tolerance: float) -> PathView:
+def _view(output: PathOutlook, weight: Tensor, aim: Aim, column: int) -> PathView:
     """Build an acquisition's view of one output along paths, whose steps have the weights (b, T)."""
-    return PathView(tolerance, weight, lambda: output.deviation, lambda: output.information(weight, tolerance))
+    tolerance, reference = aim.tolerances[column], aim.reference
+    return PathView(
+        tolerance,
+        weight,
+        lambda: output.deviation,
+        lambda: output.information(weight, tolerance),
+        lambda: None if reference is None else output.insight(weight, tolerance, reference),
+    )
 
 
 def _worth(model: DynamicsModel, aim: Aim, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:
-    """Information per expected real step of the best beginning of each sequence (k, T, F), and the length of that
-    beginning, (k,)."""
-    count, lanes = len(sequences), len(starts)
+    """Information per expected real step of the best beginning of each sequence (k, T, F) from its states (k, s, C),
+    and the length of that beginning, (k,)."""
+    count, lanes = starts.shape[:2]
     actions = torch.from_numpy(sequences).repeat_interleave(lanes, 0)
-    paths = predict_paths(model, starts.repeat(count, 1), actions)
+    paths = predict_paths(model, starts.flatten(0, 1), actions)
     gain = _endings(model, aim, paths) if aim.ending else paths.ended.new_zeros(1)
     if not bool((gain > DOUBTFUL).any()):
         gain = path_values(model, aim, paths)
@@ -196,13 +240,11 @@ def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tenso
     return weight * (density / density.max()).sqrt()
 
 
-def _varied(definition: EnvironmentDefinition, elite: Sequences, count: int, rng: np.random.Generator) -> Sequences:
-    """Sequences of the elite (e, T, F), each with one stretch held at another action: (count, T, F)."""
-    varied = elite[rng.integers(len(elite), size=count)]
-    for sequence in varied:
+def _vary(definition: EnvironmentDefinition, sequences: Sequences, rng: np.random.Generator) -> None:
+    """Hold one stretch of each sequence (k, T, F) at another action, in place."""
+    for sequence in sequences:
         first, last = sorted(rng.integers(sequence.shape[0] + 1, size=2))
         sequence[first : last + 1] = _random_actions(definition, 1, rng)
-    return varied
 
 
 def _random_actions(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> Sequences:

@@ -265,8 +265,9 @@ class Designer:
         spoken = len(samples.reward) - logged - audited + sum(query.steps for query in pending)
         steps = [query for query in pending if query.kind == "step"]
         visited = None if lease.checkpoint is None else self._storage.occupancy.get(name, lease.checkpoint)
+        definition = self._definitions.for_design(name).with_tolerances(record.tolerances)
         return DesignJob(
-            definition=self._definitions.for_design(name).with_tolerances(record.tolerances),
+            definition=definition,
             coordinates=samples.coordinates,
             action=samples.action,
             next_coordinates=samples.next_coordinates,
@@ -278,6 +279,8 @@ class Designer:
             pending_coordinates=np.array([query.coordinates for query in steps]) if steps else None,
             pending_action=np.array([query.action for query in steps]) if steps else None,
             pending_rollouts=tuple(query.actions for query in pending if query.kind == "rollout"),
+            pending_snapshots=tuple(query.snapshot for query in pending if query.kind == "rollout"),
+            snapshots=self._storage.snapshots.all(name) if definition.snapshots else {},
             extra_queries=min(lease.extra_queries, max(0, record.budget - spoken)),  # it may be lower by now
             occupancy=None if visited is None else visited.states,
             threads=self._threads,
@@ -301,6 +304,7 @@ class Designer:
             query_coordinates=result.query_coordinates,
             query_action=result.query_action,
             query_rollouts=result.query_rollouts,
+            query_snapshots=result.query_snapshots,
             extra=result.verdict != "continue",
         )
         surrogate = self._storage.surrogates.get(lease.surrogate).id

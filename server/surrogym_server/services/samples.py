@@ -15,7 +15,7 @@ from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions, check_coordinates
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.records import LedgerRecord, NewSample, SampleRecord
+from surrogym_server.storage.records import LedgerRecord, NewSample, SampleRecord, Vector
 
 PAGE = 10_000
 BATCH = 500  # steps of a log in one transaction
@@ -109,6 +109,17 @@ class SampleService:
         """Up to ``limit`` samples with an id above ``after``."""
         self._storage.surrogates.get(name)
         return self._storage.samples.page(name, after, limit)
+
+    def snapshots(self, name: str) -> dict[str, Vector]:
+        """The coordinates (C,) of the snapshots that samplers hold, by name."""
+        return self._storage.snapshots.all(name)
+
+    def drop_snapshots(self, name: str, snapshots: Sequence[str]) -> int:
+        """Forget snapshots that no sampler holds any more, and return how many were known. Queries that begin there
+        are chosen anew."""
+        dropped = self._storage.snapshots.drop(name, snapshots)
+        self._notices.post(name)
+        return dropped
 
     def all(self, name: str) -> list[SampleRecord]:
         """All samples, in order of arrival."""

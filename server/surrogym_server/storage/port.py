@@ -47,6 +47,7 @@ from surrogym_server.storage.records import (
     SavedSession,
     SurrogateRecord,
     SurrogateSummary,
+    Vector,
 )
 
 MAX_ATTEMPTS = 3
@@ -319,6 +320,22 @@ class Samples(ABC):
         """Return the smallest and the largest reward; None without samples."""
 
 
+class Snapshots(ABC):
+    """Snapshots that samplers hold, by name. ``Samples.add`` makes one known, unless the name is there."""
+
+    @abstractmethod
+    def all(self, name: str) -> dict[str, Vector]:
+        """Return the coordinates (C,) of each snapshot, by its name, oldest first."""
+
+    @abstractmethod
+    def drop(self, name: str, snapshots: Sequence[str]) -> int:
+        """Forget snapshots, and return how many were there. Names that are not there are skipped.
+
+        Pending queries that begin there are removed, and a fit becomes due, which chooses anew. Those of them that a
+        sampler has begun are set aside.
+        """
+
+
 class Ledger(ABC):
     """Counts of real steps by purpose."""
 
@@ -412,6 +429,7 @@ class Storage(ABC):
     designs: Designs
     queries: Queries
     samples: Samples
+    snapshots: Snapshots
     ledger: Ledger
     models: Models
     occupancy: Occupancy

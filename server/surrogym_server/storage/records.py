@@ -125,7 +125,8 @@ class NewDesign:
     phase: Phase
     query_coordinates: Array = field(default_factory=no_rows)  # (m, C)
     query_action: Array = field(default_factory=no_rows)  # (m, F)
-    query_rollouts: tuple[Array, ...] = ()  # action sequences from a reset, each (T, F)
+    query_rollouts: tuple[Array, ...] = ()  # action sequences, each (T, F)
+    query_snapshots: tuple[str | None, ...] = ()  # where each of them begins instead of a reset; empty: none
     extra: bool = False  # the queries come from ``Designs.improve``, and the design itself would not have chosen them
 
 
@@ -135,12 +136,13 @@ class NewDesign:
 @dataclass(frozen=True)
 class Asked:
     """Content of a stored query, without its state and lease: one real step from given coordinates, or an action
-    sequence from a reset."""
+    sequence from a snapshot or a reset."""
 
     kind: QueryKind
     coordinates: Vector  # (C,) of a step; () of a rollout
     action: Vector  # (F,) of a step; (T * F,) of a rollout, action after action
     steps: int  # T: largest number of its real steps; 1 for a step
+    snapshot: str | None  # where a rollout begins; None: at a reset
 
     @property
     def actions(self) -> Array:
@@ -197,6 +199,7 @@ class NewSample:
     query_id: int | None = None
     lease_token: str | None = None
     step: int = 0  # place in the rollout that it is part of
+    snapshot: str | None = None  # name of the snapshot that the sampler made after the step
 
 
 @dataclass(frozen=True)

@@ -64,13 +64,15 @@ class StepQuery(LeasedQuery):
 
 
 class RolloutQuery(LeasedQuery):
-    """Query of a rollout: reset the original environment, apply ``actions`` in order, and report a sample of each step.
+    """Query of a rollout: reset the original environment, or return to a snapshot, apply ``actions`` in order, and
+    report a sample of each step.
 
     There are fewer samples if the episode ends, or the environment fails, before the last action.
     """
 
     kind: Literal["rollout"] = "rollout"
-    actions: list[list[float]] = Field(description="(T, F) actions to apply after a reset, in this order")
+    actions: list[list[float]] = Field(description="(T, F) actions to apply from there, in this order")
+    snapshot: str | None = Field(default=None, description="name of the snapshot to begin at; null: begin at a reset")
 
 
 Query = Annotated[StepQuery | RolloutQuery, Field(discriminator="kind")]
@@ -115,9 +117,12 @@ class QueryView(Reply):
         description="pending, leased by a sampler, answered, or set aside after its last attempt"
     )
     round: int = Field(description="number of fits before the query was made")
-    kind: QueryKind = Field(description="one step, or a rollout from a reset")
+    kind: QueryKind = Field(description="one step, or a rollout from a reset or a snapshot")
     coordinates: list[float] | None = Field(description="(C,) state to set for a step; null for a rollout")
     actions: list[list[float]] = Field(description="(T, F) actions; T = 1 for a step")
+    snapshot: str | None = Field(
+        default=None, description="name of the snapshot at which a rollout begins; null for a step, and for a reset"
+    )
     attempts: int = Field(description="number of leases so far")
     sampler: str | None = Field(description="name of the last sampler that claimed it")
     error: str | None = Field(description="error of the last attempt that failed")
@@ -195,6 +200,10 @@ class NewSample(Request):
         default=None, description="(D,) the environment's own observation before the step; stored with the sample"
     )
     next_observation: Vector | None = Field(default=None, description="(D,) the same after the step")
+    snapshot: Key | None = Field(
+        default=None,
+        description="name under which the sampler saved the state after the step; queries may begin there",
+    )
 
 
 class AddSamples(Request):
@@ -223,6 +232,33 @@ class AddedSamples(Reply):
     sample_ids: list[int] = Field(description="id of each sample, in the order of the request")
     duplicates: int = Field(description="number of samples that were stored before")
     ledger: Ledger = Field(description="real steps so far")
+
+
+class SnapshotView(Reply):
+    """A snapshot that a sampler holds."""
+
+    name: str = Field(description="name that the sampler gave it")
+    coordinates: list[float] = Field(description="(C,) state to which it returns")
+
+
+class SnapshotList(Reply):
+    """Snapshots that samplers hold."""
+
+    snapshots: list[SnapshotView] = Field(description="every snapshot that is known, oldest first")
+
+
+class DropSnapshots(Request):
+    """Names of snapshots that no sampler holds any more."""
+
+    snapshots: Annotated[list[Key], Field(min_length=1, max_length=4_096)] = Field(
+        description="name of each snapshot that is gone"
+    )
+
+
+class DroppedSnapshots(Reply):
+    """Reply after the snapshots were forgotten."""
+
+    dropped: int = Field(description="number of them that were known")
 
 
 class SampleView(Reply):

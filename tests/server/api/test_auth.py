@@ -25,7 +25,7 @@ ALLOWED = {
         POST /v1/surrogates/{name}/predict, POST /v1/surrogates/{name}/imagine, GET /v1/surrogates/{name}/policies,
         GET /v1/surrogates/{name}/policies/{which}, GET /v1/surrogates/{name}/policies/{which}/files/{form},
         GET /v1/surrogates/{name}/policies/{which}/evaluations/{id}, GET /v1/surrogates/{name}/jobs,
-        GET /v1/surrogates/{name}/jobs/{job_id}""",
+        GET /v1/surrogates/{name}/jobs/{job_id}, GET /v1/surrogates/{name}/snapshots""",
     "train": """
         POST /v1/surrogates/{name}/sessions, POST /v1/surrogates/{name}/improve, GET /v1/sessions/{id},
         DELETE /v1/sessions/{id}, POST /v1/sessions/{id}/occupancy, POST /v1/sessions/{id}/reset,
@@ -38,7 +38,8 @@ ALLOWED = {
     "sample": """
         POST /v1/surrogates/{name}/queries, POST /v1/surrogates/{name}/queries:claim,
         POST /v1/surrogates/{name}/queries/{query_id}:renew, POST /v1/surrogates/{name}/queries/{query_id}:fail,
-        POST /v1/surrogates/{name}/add_sample, POST /v1/surrogates/{name}/logs""",
+        POST /v1/surrogates/{name}/add_sample, POST /v1/surrogates/{name}/logs,
+        POST /v1/surrogates/{name}/snapshots:drop""",
     "train sample": "POST /v1/surrogates/{name}/ledger",
     "": """
         POST /v1/surrogates, POST /v1/surrogates:check, POST /v1/logs:draft,

@@ -19,6 +19,7 @@ EXAMPLES = {
     "FAIL": wire.FailQuery,
     "ADD_QUERIES": wire.AddQueries,
     "WITHDRAW": wire.WithdrawQueries,
+    "DROP_SNAPSHOTS": wire.DropSnapshots,
     "ADD_SAMPLE": wire.AddSamples,
     "DRAFT_LOG": wire.DraftLog,
     "ADD_LOG": wire.AddLog,

@@ -14,7 +14,7 @@ from surrogym_server.sampling.candidates import Candidates
 from surrogym_server.sampling.confidence import confidences_of, deviations
 from surrogym_server.sampling.endings import edge_in_doubt
 from surrogym_server.sampling.outlook import as_if_answered, outlook_of, path_outlook
-from surrogym_server.sampling.rollouts import Aim, plan_round
+from surrogym_server.sampling.rollouts import Aim, Rollout, plan_round
 
 TOLERANCES = [0.1, 0.1, 0.1]
 
@@ -79,7 +79,7 @@ def test_steps_of_a_path_count_one_by_one(plain, candidates):
 
 def test_rollouts_are_planned_all_the_same(plain):
     aim = Aim([0, 1], TOLERANCES, longest=5)
-    rollouts = plan_round(plain, aim, 8, [torch.zeros(3, 1, dtype=torch.float64)], np.random.default_rng(0))
+    rollouts = plan_round(plain, aim, 8, [Rollout(torch.zeros(3, 1, dtype=torch.float64))], np.random.default_rng(0))
     assert sum(map(len, rollouts)) == 8
 
 

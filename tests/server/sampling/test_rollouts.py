@@ -17,13 +17,14 @@ from surrogym_server.engine.design_job import DesignJob, run_design_job
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.abilities import PredictedSteps
+from surrogym_server.models.abilities import PredictedSteps, Reference
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.lookahead import process_inputs
 from surrogym_server.sampling.confidence import deviations
 from surrogym_server.sampling.design import DesignState, Request, advance, initial_rollouts
 from surrogym_server.sampling.rollouts import (
     Aim,
+    Rollout,
     as_if_done,
     first_rollouts,
     path_values,
@@ -163,7 +164,7 @@ def test_a_planned_rollout_gives_more_per_step_than_random_ones():
     rollouts = first_rollouts(definition, 12, rng())
     model = learn(definition, join(*(roll(spec, actions, seed) for seed, actions in enumerate(rollouts)))).model
     aim = Aim((0, 1, 2, 3), [0.05 * output.scale for output in model.transitions], longest=12)
-    actions = plan_rollout(model, aim, rng())
+    actions = plan_rollout(model, aim, rng()).actions
     assert 1 <= len(actions) <= aim.longest
     starts = start_points(definition, 32, rng(7))
 
@@ -177,12 +178,12 @@ def test_a_planned_rollout_gives_more_per_step_than_random_ones():
 
 
 def test_the_same_plan_again_for_the_same_seed(model: GaussianProcessModel, aim: Aim):
-    torch.testing.assert_close(plan_rollout(model, aim, rng(3)), plan_rollout(model, aim, rng(3)))
+    torch.testing.assert_close(plan_rollout(model, aim, rng(3)).actions, plan_rollout(model, aim, rng(3)).actions)
 
 
 def test_a_rollout_that_is_pending_leaves_less_to_learn(model: GaussianProcessModel, aim: Aim):
     actions = torch.full((6, 1), 2.0, dtype=torch.float64)
-    done = as_if_done(model, actions, rng())
+    done = as_if_done(model, Rollout(actions), None, rng())
     paths = predict_paths(model, start_points(model.definition, 1, rng()), actions[None])
     again, first = (float(path_values(m, aim, paths)[0, -1]) for m in (done, model))
     assert again < 0.1 * first
@@ -193,7 +194,7 @@ def test_a_rollout_that_is_pending_leaves_less_to_learn(model: GaussianProcessMo
 
 
 def test_a_round_takes_its_steps_and_no_more(model: GaussianProcessModel, aim: Aim):
-    rollouts = plan_round(model, replace(aim, longest=3), 7, [torch.ones(2, 1, dtype=torch.float64)], rng())
+    rollouts = plan_round(model, replace(aim, longest=3), 7, [Rollout(torch.ones(2, 1, dtype=torch.float64))], rng())
     assert sum(len(actions) for actions in rollouts) == 7
     assert max(len(actions) for actions in rollouts) <= 3
 
@@ -211,9 +212,9 @@ def test_an_end_of_the_episode_is_looked_for_until_one_was_seen():
     def ends(sequence: torch.Tensor) -> float:
         return float(predict_paths(learned, starts, sequence.expand(16, -1, -1)).ended[:, -1].mean())
 
-    assert ends(plan_rollout(learned, aim, rng())) > 0.75
-    assert ends(plan_rollout(learned, replace(aim, ending=False), rng())) < 0.5
-    assert ends(plan_rollout(learned, replace(aim, ended=True), rng())) < 0.5, "one was seen"
+    assert ends(plan_rollout(learned, aim, rng()).actions) > 0.75
+    assert ends(plan_rollout(learned, replace(aim, ending=False), rng()).actions) < 0.5
+    assert ends(plan_rollout(learned, replace(aim, ended=True), rng()).actions) < 0.5, "one was seen"
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -225,7 +226,7 @@ def test_a_rewards_edge_in_doubt_is_driven_to(side: int):
     learned = learn(definition, samples).model
     assert learned.jumps
     aim = Aim((1,), [0.05] * 3, longest=8, ending=True, ended=True)
-    driven = plan_rollout(learned, aim, rng())
+    driven = plan_rollout(learned, aim, rng()).actions
     assert side * float(driven.mean()) > 0.5
 
 
@@ -238,7 +239,7 @@ def test_a_design_without_teleport_spends_its_budget_in_real_steps(swinging: Env
 
     assert sum(ask()) == 4, "a round is a quarter of the samples, four at least"
     assert sum(ask(budget=len(begun) + 2)) == 2
-    pending = (torch.ones(7, 1, dtype=torch.float64),)
+    pending = (Rollout(torch.ones(7, 1, dtype=torch.float64)),)
     assert sum(ask(pending_rollouts=pending)) == 2, "its seven steps are spoken for"
     assert sum(ask(budget=len(begun), extra=5)) == 5
     assert ask(budget=len(begun)) == []
@@ -302,3 +303,63 @@ def test_steps_with_unknown_lags_count_and_are_not_learned_from():
     result = run_design_job(job)
     assert result.fidelity["samples"] == 6
     assert 0 < sum(map(len, result.query_rollouts)) <= 2 or result.phase == "over_budget"
+
+
+def test_insight_is_what_a_path_says_of_the_reference(model: GaussianProcessModel, aim: Aim):
+    """Against conditioning the joint covariance of path and reference on the path, step by step."""
+    paths = predict_paths(model, start_points(model.definition, 1, rng()), torch.ones(1, 4, 1, dtype=torch.float64))
+    q, u = start_points(model.definition, 5, rng(1)), torch.zeros(5, 1, dtype=torch.float64)
+    there = PredictedSteps(q, u, model.transition(q, u).q_next)
+    shares = torch.tensor([0.5, 0.2, 0.1, 0.1, 0.1], dtype=torch.float64)
+    posterior, tolerance = model.reward.posterior, aim.tolerances[2] / model.reward.scale
+    assert posterior is not None
+    along = PredictedSteps(paths.q[0], paths.u[0], paths.q_next[0])
+    x = torch.cat([process_inputs(model.definition, model.reward, steps) for steps in (along, there)])
+    joint, expected = posterior.joint_covariance(x[None])[0], []
+    for t in range(1, 5):
+        told = torch.linalg.solve(joint[:t, :t] + tolerance**2 * torch.eye(t), joint[:t, 4:])
+        left = joint[4:, 4:].diagonal() - (joint[:t, 4:] * told).sum(0)
+        before = joint[4:, 4:].diagonal()
+        expected.append(float(shares @ (0.5 * ((before + tolerance**2) / (left + tolerance**2)).log())))
+    output = model.along(PredictedSteps(paths.q, paths.u, paths.q_next), 2)
+    assert output is not None
+    got = output.insight(torch.ones(1, 4, dtype=torch.float64), aim.tolerances[2], Reference(there, shares))
+    torch.testing.assert_close(got[0], torch.tensor(expected, dtype=torch.float64), rtol=1e-6, atol=1e-9)
+
+
+def test_a_plan_begins_at_the_snapshot_from_where_it_learns_more(model: GaussianProcessModel, aim: Aim):
+    """Far from what is known, beside the states that a reset leads to."""
+    known = torch.zeros(3, 2, dtype=torch.float64)
+    fast = torch.tensor([[2.0, 7.0]], dtype=torch.float64)
+    plan = plan_rollout(model, replace(aim, snapshots=torch.cat([known, fast])), rng())
+    assert plan.snapshot == 3
+    reset = plan_rollout(model, aim, rng())
+    assert reset.snapshot is None
+
+
+def test_no_snapshot_so_far_means_a_plan_from_a_reset(model: GaussianProcessModel, aim: Aim):
+    plan = plan_rollout(model, replace(aim, snapshots=torch.zeros(0, 2, dtype=torch.float64)), rng())
+    assert plan.snapshot is None
+    torch.testing.assert_close(plan.actions, plan_rollout(model, aim, rng()).actions)
+
+
+def test_a_pending_query_from_a_snapshot_is_done_there(model: GaussianProcessModel):
+    snapshots = torch.tensor([[2.0, 6.0]], dtype=torch.float64)
+    actions = torch.full((1, 1), 2.0, dtype=torch.float64)
+    done = as_if_done(model, Rollout(actions, 0), snapshots, rng())
+    before, after = (deviations(m, snapshots, actions)[0, 1] for m in (model, done))
+    assert after < 0.2 * before
+
+
+def test_a_design_with_snapshots_takes_shorter_rounds_of_known_states():
+    spec = only_resets(pendulum(), snapshots=True)
+    definition = definition_from_spec(spec)
+    first = initial_rollouts(definition, 60)
+    assert sum(map(len, first)) == 6, "half of the twelve that resets alone need"
+    samples = join(*(roll(spec, actions, seed) for seed, actions in enumerate(first)))
+    request = Request(budget=60, target=1 - 1e-12, pending=NOTHING, snapshots=samples.q_next)
+    decision = advance(definition, samples, DesignState(), request)
+    below = sum(output.confidence_index < request.target for output in decision.confidences)
+    assert sum(map(len, decision.rollouts)) == max(1, below), "one step for each output below its target"
+    assert any(rollout.snapshot is not None for rollout in decision.rollouts)
+    assert all(rollout.snapshot is None or rollout.snapshot < len(samples) for rollout in decision.rollouts)

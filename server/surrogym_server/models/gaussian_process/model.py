@@ -170,7 +170,9 @@ class GaussianProcessModel(
             return None
         flat, shape = steps.flat, steps.q.shape[:-1]
         x = process_inputs(self.definition, output, flat)
-        return ProcessAlongPaths(output, x.reshape(*shape, -1), self._learns(column, flat.q_next).reshape(shape))
+        return ProcessAlongPaths(
+            self.definition, output, x.reshape(*shape, -1), self._learns(column, flat.q_next).reshape(shape)
+        )
 
     def as_if_answered(self, steps: PredictedSteps) -> GaussianProcessModel:
         outputs = [

@@ -100,7 +100,7 @@ class SqlDesigns(port.Designs):
             held = _hold_right(connection, lease)
             version = insert_model(connection, held, design.model)
             _finish(connection, held, lease, design)
-            chosen = (design.query_coordinates, design.query_action, design.query_rollouts)
+            chosen = (design.query_coordinates, design.query_action, design.query_rollouts, design.query_snapshots)
             insert_queries(connection, held, "adaptive", held.round + 1, *chosen, extra=design.extra)
             append_event(connection, held, "phase", phase=design.phase, error=None)
             return version

@@ -35,6 +35,7 @@ def begin(
             coordinates=row.coordinates,
             action=row.action,
             steps=row.steps,
+            snapshot=row.snapshot,
             number=row.number,
             attempt=row.attempts + 1,
             token=secrets.token_urlsafe(16),

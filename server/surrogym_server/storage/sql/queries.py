@@ -29,7 +29,7 @@ from surrogym_server.storage.sql.tables import leases, queries, surrogates
 COLUMNS = [
     getattr(queries.c, name)
     for name in (
-        *("id", "purpose", "status", "round", "kind", "coordinates", "action", "steps"),
+        *("id", "purpose", "status", "round", "kind", "coordinates", "action", "steps", "snapshot"),
         *("attempts", "sampler", "error"),
     )
 ]

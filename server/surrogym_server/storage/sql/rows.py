@@ -96,10 +96,13 @@ def insert_queries(
     coordinates: Array,
     action: Array,
     rollouts: Sequence[Array] = (),
+    snapshots: Sequence[str | None] = (),
     *,
     extra: bool = False,
 ) -> list[int]:
     """Queue coordinates (m, C) with action (m, F), then action sequences, each (T, F). Returns the ids in order.
+
+    ``snapshots`` says where each action sequence begins: at a snapshot, or None at a reset. Empty: all at a reset.
 
     Raises:
         InvalidInput: the numbers of coordinates and actions differ.
@@ -109,12 +112,12 @@ def insert_queries(
             f"expected one action for each query, got {len(coordinates)} queries and {len(action)} actions"
         )
     asked = [
-        {"kind": "step", "coordinates": q, "action": u, "steps": 1}
+        {"kind": "step", "coordinates": q, "action": u, "steps": 1, "snapshot": None}
         for q, u in zip(np.asarray(coordinates), np.asarray(action), strict=True)
     ]
     asked += [
-        {"kind": "rollout", "coordinates": (), "action": np.ravel(actions), "steps": len(actions)}
-        for actions in rollouts
+        {"kind": "rollout", "coordinates": (), "action": np.ravel(u), "steps": len(u), "snapshot": snapshot}
+        for u, snapshot in zip(rollouts, snapshots or (None,) * len(rollouts), strict=True)
     ]
     if not asked:
         return []

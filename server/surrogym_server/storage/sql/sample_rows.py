@@ -15,8 +15,9 @@ from surrogym_server.storage.sql.tables import samples
 
 
 def body_of(sample: NewSample) -> dict[str, Any]:
-    """The content that a repeat must have. The step is compared separately, because fingerprints are older than it."""
-    return {name: value for name, value in asdict(sample).items() if name != "step"}
+    """The content that a repeat must have. The step is compared separately, because fingerprints are older than it, as
+    than snapshots, which are not compared."""
+    return {name: value for name, value in asdict(sample).items() if name not in ("step", "snapshot")}
 
 
 def insert_samples(connection: Connection, held: Row[Any], sampler: str, rows: list[dict[str, Any]]) -> list[int]:

@@ -17,6 +17,7 @@ from surrogym_server.storage.records import (
     NewSample,
     SampleArrays,
     SampleRecord,
+    Vector,
     fingerprint,
     no_rows,
 )
@@ -25,6 +26,7 @@ from surrogym_server.storage.sql.database import Database
 from surrogym_server.storage.sql.logged import complete_log, store_logged
 from surrogym_server.storage.sql.rows import find, hold, recall, remember, touch
 from surrogym_server.storage.sql.sample_rows import body_of, insert_samples, row_of
+from surrogym_server.storage.sql.snapshots import insert_snapshots
 from surrogym_server.storage.sql.tables import queries, samples
 
 COLUMNS = [
@@ -125,6 +127,7 @@ def _store(
     ids: dict[Identity, int] = {identity: sample.sample_id for identity, sample in known.items()}
     prints: dict[Identity, str] = {identity: sample.fingerprint for identity, sample in known.items()}
     new: dict[Identity, dict[str, Any]] = {}
+    made: dict[str, Vector] = {}
     for identity, sample, lease in zip(identities, batch, answered, strict=True):
         row = row_of(held, sampler, sample, lease)
         if prints.setdefault(identity, row["fingerprint"]) != row["fingerprint"]:
@@ -133,7 +136,9 @@ def _store(
             )
         if identity not in ids:
             new.setdefault(identity, row)
+            made |= {} if sample.snapshot is None else {sample.snapshot: sample.next_coordinates}
     ids |= dict(zip(new, insert_samples(connection, held, sampler, list(new.values())), strict=True))
+    insert_snapshots(connection, held, made)
     if new:
         touch(connection, held)
     settle(connection, [lease for lease in answered if lease and not lease.reported])

@@ -26,6 +26,7 @@ from surrogym_server.storage.sql.policies import SqlPolicies
 from surrogym_server.storage.sql.queries import SqlQueries
 from surrogym_server.storage.sql.readiness import Readiness
 from surrogym_server.storage.sql.samples import SqlSamples
+from surrogym_server.storage.sql.snapshots import SqlSnapshots
 from surrogym_server.storage.sql.surrogates import SqlSurrogates
 
 
@@ -39,6 +40,7 @@ class SqlStorage(Storage):
         self.designs = SqlDesigns(database)
         self.queries = SqlQueries(database)
         self.samples = SqlSamples(database)
+        self.snapshots = SqlSnapshots(database)
         self.ledger = SqlLedger(database)
         self.models = SqlModels(database)
         self.occupancy = SqlOccupancy(database)

@@ -181,6 +181,7 @@ queries = sa.Table(
     sa.Column("coordinates", Floats, nullable=False),  # empty for a rollout
     sa.Column("action", Floats, nullable=False),  # for a rollout one after the other
     sa.Column("steps", sa.Integer, nullable=False, server_default="1"),
+    sa.Column("snapshot", sa.Text),  # where a rollout begins; NULL: at a reset
     sa.Column("extra", sa.Boolean, nullable=False, server_default=sa.false()),  # asked for, whatever the verdict
     sa.Column("attempts", sa.Integer, nullable=False),
     sa.Column("sampler", sa.Text),
@@ -238,6 +239,17 @@ samples = sa.Table(
     sa.UniqueConstraint("lease_id", "step"),
     sa.Index(None, "surrogate_id", "id"),
     sa.Index(None, "surrogate_id", "fingerprint"),
+    sqlite_autoincrement=True,
+)
+
+snapshots = sa.Table(  # that samplers hold
+    "snapshots",
+    metadata,
+    _id(),
+    _owner(),
+    sa.Column("name", sa.Text, nullable=False),
+    sa.Column("coordinates", Floats, nullable=False),
+    sa.UniqueConstraint("surrogate_id", "name"),
     sqlite_autoincrement=True,
 )
 

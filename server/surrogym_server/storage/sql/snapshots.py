@@ -1,0 +1,67 @@
+"""Snapshots that samplers hold."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection, Row
+
+from surrogym_server.storage import port
+from surrogym_server.storage.records import Vector
+from surrogym_server.storage.sql import leases as leasing
+from surrogym_server.storage.sql.database import Database, conflict_insert
+from surrogym_server.storage.sql.rows import append_event, find, hold, touch
+from surrogym_server.storage.sql.tables import queries, snapshots, surrogates
+
+GONE = "its snapshot is gone"
+
+
+class SqlSnapshots(port.Snapshots):
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def all(self, name: str) -> dict[str, Vector]:
+        with self._database.read() as connection:
+            own = snapshots.c.surrogate_id == find(connection, name)
+            wanted = sa.select(snapshots.c.name, snapshots.c.coordinates).where(own).order_by(snapshots.c.id)
+            return {row.name: row.coordinates for row in connection.execute(wanted)}
+
+    def drop(self, name: str, snapshots: Sequence[str]) -> int:
+        with self._database.write() as connection:
+            held = hold(connection, name)
+            gone = _forget(connection, held, snapshots)
+            _give_up_queries(connection, held, snapshots)
+            return gone
+
+
+def insert_snapshots(connection: Connection, held: Row[Any], made: dict[str, Vector]) -> None:
+    """Make snapshots known, by name with their coordinates (C,). A name that is there stays as it is."""
+    if made:
+        rows = [{"surrogate_id": held.id, "name": name, "coordinates": at} for name, at in made.items()]
+        insert = conflict_insert(connection, snapshots).on_conflict_do_nothing()
+        connection.execute(insert, rows)
+
+
+def _forget(connection: Connection, held: Row[Any], names: Sequence[str]) -> int:
+    own = (snapshots.c.surrogate_id == held.id) & snapshots.c.name.in_(names)
+    return len(connection.execute(sa.delete(snapshots).where(own).returning(snapshots.c.id)).all())
+
+
+def _give_up_queries(connection: Connection, held: Row[Any], names: Sequence[str]) -> None:
+    """Remove the pending queries that begin at a snapshot that is gone, or set them aside if steps may have been taken.
+    What ``improve`` asked for is asked for again."""
+    from_there = queries.c.snapshot.in_(names)
+    unbegun = leasing.is_unbegun(held.id) & from_there
+    removed = connection.execute(sa.delete(queries).where(unbegun).returning(queries.c.steps, queries.c.extra)).all()
+    waiting = (queries.c.surrogate_id == held.id) & (queries.c.status == "pending") & from_there
+    aside = sa.update(queries).where(waiting).values(status="set_aside", error=GONE).returning(queries.c.id)
+    begun = sorted(connection.execute(aside).scalars())
+    if removed:
+        append_event(connection, held, "queries", withdrawn=len(removed), round=held.round)
+    for query_id in begun:
+        append_event(connection, held, "set_aside", query_id=query_id, error=GONE)
+    if removed or begun:
+        again = sum(row.steps for row in removed if row.extra)
+        touch(connection, held, extra_queries=surrogates.c.extra_queries + again)

@@ -1,0 +1,96 @@
+"""Snapshots: known with the sample that made them, forgotten with the queries that begin there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from surrogym_server.errors import UnknownSurrogate
+from surrogym_server.storage.port import Storage
+from surrogym_server.storage.records import LeasedQuery, NewDesign, NewSample, QueryCounts
+
+LONG = 60.0
+FIRST = (np.array([[0.5], [-0.5], [1 / 3]]),)
+ACTIONS = (np.array([[0.5], [0.25]]), np.array([[2.0]]), np.array([[1.0]]))
+Answer = Callable[..., NewSample]
+
+
+@pytest.fixture
+def name(make: Callable[..., str]) -> str:
+    return make(queries=0, query_rollouts=FIRST)
+
+
+@pytest.fixture
+def first(storage: Storage, name: str) -> LeasedQuery:
+    return storage.queries.claim(name, "a", 1, LONG)[0]
+
+
+@pytest.fixture
+def known(storage: Storage, name: str, first: LeasedQuery, answer: Answer) -> list[NewSample]:
+    """A rollout of three samples; the states after the first two were saved."""
+    samples = [answer(first, step=i, snapshot=snapshot) for i, snapshot in enumerate(("one", "two", None))]
+    storage.samples.add(name, "a", samples)
+    return samples
+
+
+@pytest.fixture
+def chosen(storage: Storage, name: str, known: list[NewSample], design: Callable[..., NewDesign]) -> list[LeasedQuery]:
+    """Three queries of the design: two begin at a snapshot, the last one at a reset. No sampler has begun them."""
+    del known
+    lease = storage.designs.begin(name, "server", LONG)
+    assert lease is not None
+    storage.designs.commit(lease, design(query_rollouts=ACTIONS, query_snapshots=("one", "two", None)))
+    queries = storage.queries.claim(name, "a", 3, LONG)
+    for query in queries:
+        storage.queries.fail(name, query.id, query.token, "later", begun=False)
+    return queries
+
+
+def test_a_snapshot_is_known_with_the_state_after_its_step(storage: Storage, name: str, known: list[NewSample]) -> None:
+    expected = {"one": known[0].next_coordinates, "two": known[1].next_coordinates}
+    assert storage.snapshots.all(name) == expected
+    storage.samples.add(name, "a", known)
+    assert storage.snapshots.all(name) == expected, "a repeat changes nothing"
+
+
+def test_a_query_says_where_it_begins(storage: Storage, name: str, chosen: list[LeasedQuery]) -> None:
+    assert [query.snapshot for query in chosen] == ["one", "two", None]
+    assert [query.snapshot for query in storage.queries.list(name)] == [None, "one", "two", None]
+
+
+def test_a_dropped_snapshot_takes_its_queries_along_and_a_fit_is_due(
+    storage: Storage, name: str, chosen: list[LeasedQuery]
+) -> None:
+    storage.queries.withdraw(name, [query.id for query in chosen[1:]])
+    assert storage.designs.due() == []
+    assert storage.snapshots.drop(name, ["one", "never"]) == 1
+    assert list(storage.snapshots.all(name)) == ["two"]
+    assert storage.queries.counts(name) == QueryCounts(answered=1)
+    assert storage.designs.due() == [name]
+    assert storage.snapshots.drop(name, ["one"]) == 0, "a repeat is harmless"
+
+
+def test_a_repeated_sample_does_not_bring_a_dropped_snapshot_back(
+    storage: Storage, name: str, known: list[NewSample]
+) -> None:
+    storage.snapshots.drop(name, ["one"])
+    storage.samples.add(name, "a", known)
+    assert list(storage.snapshots.all(name)) == ["two"]
+
+
+def test_a_query_that_may_have_been_begun_is_set_aside(storage: Storage, name: str, chosen: list[LeasedQuery]) -> None:
+    again = storage.queries.claim(name, "a", 1, LONG)[0]
+    storage.queries.fail(name, again.id, again.token, "it shook")
+    storage.snapshots.drop(name, ["one"])
+    query = storage.queries.get(name, chosen[0].id)
+    assert (query.status, query.error) == ("set_aside", "its snapshot is gone")
+    assert storage.ledger.read(name).unresolved == 2, "its two steps may have been taken"
+
+
+def test_a_deleted_surrogate_takes_its_snapshots_along(storage: Storage, name: str, known: list[NewSample]) -> None:
+    storage.surrogates.delete(name)
+    for call in (lambda: storage.snapshots.all(name), lambda: storage.snapshots.drop(name, ["one"])):
+        with pytest.raises(UnknownSurrogate):
+            call()
