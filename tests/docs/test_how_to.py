@@ -99,6 +99,12 @@ def test_the_cart_that_can_only_be_reset_is_registered_and_sampled(server: Serve
     assert 12 <= report["steps"] <= 14
 
 
+def test_a_design_returns_to_saved_states_in_one_process(tmp_path: Path) -> None:
+    (program,) = programs("snapshots.md")
+    steps, phase = run(tmp_path, "-c", program).split()
+    assert (int(steps) <= 100, phase) == (True, "ready")
+
+
 def test_the_rail_is_registered_and_sampled(server: ServerProcess, tmp_path: Path) -> None:
     (program,) = programs("own-environment.md")
     (tmp_path / "rail.py").write_text(program, encoding="utf-8")

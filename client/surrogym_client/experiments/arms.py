@@ -20,7 +20,7 @@ class Arm:
 
     ``closed_loop``: queries near the visited states, between trainings; without it the design spends the whole budget
     before training. ``start_box``: share of virtual episodes that start anywhere in the range. ``original``: no
-    surrogate; the policy search runs in the original environment.
+    surrogate; the policy search runs in the original environment. ``access``: where queries may begin.
     """
 
     words: str
@@ -30,6 +30,7 @@ class Arm:
     start_box: float | None = None  # None: the default of a training
     original: bool = False
     symmetry: Literal["auto", "none"] = "auto"
+    access: Literal["snapshot", "reset"] | None = None  # None: as the specification declares
 
     def design(self, budget: int, dimensions: int) -> dict[str, Any]:
         """Fields of the specification's design.
@@ -60,6 +61,8 @@ ARMS = {
     "no_loop": Arm("the whole budget by the design, before training"),
     "variance": Arm("no_loop, each query where the deviation is largest", acquisition="variance"),
     "latin_hypercube": Arm("no_loop, all queries from one Latin hypercube", acquisition="latin_hypercube"),
+    "snapshot": Arm("default, queries begin at saved states or resets", closed_loop=True, access="snapshot"),
+    "reset": Arm("default, queries begin at resets", closed_loop=True, access="reset"),
     "paper": Arm("the paper's representation, index, reward penalty and initial share", preset="paper"),
     "paper_hypercube": Arm(
         "paper, all queries from one Latin hypercube", preset="paper", acquisition="latin_hypercube"

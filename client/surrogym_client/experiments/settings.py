@@ -68,7 +68,7 @@ class DemoSettings:
         plain = make(self.demo_task.environment, preset=self.way.preset, seed=self.seed).spec()
         budget = design_budget(self.real_steps) if self.way.closed_loop else self.real_steps
         design = self.way.design(budget, len(plain.observation) + plain.action.size)
-        return with_choices(plain, design, None)
+        return with_choices(plain, design, access=self.way.access)
 
     def judged_by(self) -> EnvironmentSpec:
         """The original environment as every arm is judged by it, also one that learns another form of it."""

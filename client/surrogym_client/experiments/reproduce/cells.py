@@ -108,7 +108,7 @@ def study(tasks: Sequence[str], seeds: Sequence[int], **chosen: Any) -> Iterator
     """The efficiency study of the documentation: the default on every task, a hypercube and the paper's preset on the
     tasks of ``COMPARED``, and there the other arms with the first half of the seeds. ``chosen`` as for ``cells``."""
     compared = [task for task in tasks if task in COMPARED]
-    others = [arm for arm in ARMS if arm not in ("default", *EVERY_SEED)]
+    others = [name for name, arm in ARMS.items() if name not in ("default", *EVERY_SEED) and arm.access is None]
     for place, seed in enumerate(seeds):
         yield from cells(tasks, ["default"], [seed], **chosen)
         yield from cells(compared, [*EVERY_SEED, *(others if 2 * place < len(seeds) else ())], [seed], **chosen)

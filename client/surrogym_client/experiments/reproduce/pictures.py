@@ -17,7 +17,10 @@ from surrogym_client.experiments.reproduce.rows import Row
 from surrogym_client.experiments.reproduce.statistics import bootstrap_interval
 from surrogym_client.experiments.reproduce.table import Group, column, grouped, tasks_with_results
 
-OF_ARMS = ("#dd8452", "#da8bc3", "#64b5cd", "#4c72b0", "#55a868", "#8172b3", "#937860", "#c9a66b", "#555555")
+OF_ARMS = (
+    *("#dd8452", "#da8bc3", "#64b5cd", "#4c72b0", "#55a868", "#8172b3"),
+    *("#ccb974", "#8c8c8c", "#937860", "#c9a66b", "#555555"),
+)
 COLOURS = dict(zip(ARMS, OF_ARMS, strict=True))
 SIZE = (6.0, 3.6)  # inches
 BESIDE = 0.05  # distance of the dots of single seeds from their arm, as a share of its real steps
