@@ -133,3 +133,40 @@ def test_a_design_without_samples_is_hopeless_once_all_its_queries_are_set_aside
     storage.surrogates.change(hopeless, paused=True)
     assert storage.designs.hopeless() == []
     assert storage.queries.counts(waiting).pending == 1
+
+
+def test_a_second_list_shows_what_came_since_the_first(
+    storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
+) -> None:
+    """Some numbers are kept in memory. Each kind of change that could leave them behind comes between two lists."""
+    name = make(name="watched")
+
+    def require_fresh() -> None:
+        [summary] = storage.surrogates.summaries()
+        assert summary.ledger == storage.ledger.read(name)
+        assert summary.queries == storage.queries.counts(name)
+
+    require_fresh()
+    first, second, third = storage.queries.claim(name, "a", 3, LONG)
+    require_fresh()
+    storage.samples.add(name, "a", [answer(first)])
+    require_fresh()
+    storage.queries.fail(name, second.id, second.token, "unreachable")
+    require_fresh()
+    logged = [answer(third, query_id=None, lease_token=None, reward=float(reward)) for reward in range(3)]
+    for batch in logged:
+        storage.samples.add(name, "log", [batch], logged=True, complete=False)
+        require_fresh()
+    storage.samples.add(name, "a", [answer(third)])
+    require_fresh()
+    storage.surrogates.delete(name)
+    make(name=name)
+    require_fresh()
+
+
+def test_a_second_list_counts_no_answers_again(storage: Storage, worked: list[str]) -> None:
+    before = storage.surrogates.summaries()
+    with statements() as sent:
+        assert storage.surrogates.summaries() == before
+    counted = [statement for statement in sent if "count(*)" in statement and "GROUP BY" in statement]
+    assert counted == []

@@ -29,7 +29,9 @@ from surrogym_server.storage.sql.tables import queries, samples, surrogates
 # conditions on a row of surrogates
 OWN_QUERIES = sa.select(queries.c.id).where(queries.c.surrogate_id == surrogates.c.id)
 OWN_SAMPLES = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogates.c.id)
-OPEN_QUERY = sa.exists(OWN_QUERIES.where(queries.c.status.in_(OPEN_STATUSES)))
+# Constants in the statement: once PostgreSQL plans for any status, it reads all queries, because most are answered.
+OPEN = sa.bindparam("open_statuses", OPEN_STATUSES, sa.Text(), expanding=True, literal_execute=True)
+OPEN_QUERY = sa.exists(OWN_QUERIES.where(queries.c.status.in_(OPEN)))
 
 
 class SqlDesigns(port.Designs):

@@ -18,7 +18,8 @@ from surrogym_server.storage.sql.rows import append_event, hold, touch, unknown_
 from surrogym_server.storage.sql.tables import leases, queries, surrogates
 
 EXPIRED = "no answer before the lease ended"
-IS_OPEN = leases.c.outcome == "open"
+# A constant in the statement: PostgreSQL takes the index of open leases for no parameter, once it plans for any value.
+IS_OPEN = leases.c.outcome == sa.literal("open", sa.Text(), literal_execute=True)
 
 
 def begin(

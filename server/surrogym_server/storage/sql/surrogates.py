@@ -13,7 +13,7 @@ from surrogym_server.storage.records import FREE, NewSurrogate, Phase, Surrogate
 from surrogym_server.storage.sql.database import Database, clock, conflict_insert
 from surrogym_server.storage.sql.leases import is_unbegun, requeue_set_aside
 from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, touch, unknown_surrogate
-from surrogym_server.storage.sql.summaries import read_summaries
+from surrogym_server.storage.sql.summaries import Counted, read_summaries
 from surrogym_server.storage.sql.tables import queries, samples, surrogates
 
 NO_RIGHT = {"fit_token": None, "fit_owner": None, "fit_expires": None, "fit_seconds": None}
@@ -29,6 +29,7 @@ COLUMNS = [
 class SqlSurrogates(port.Surrogates):
     def __init__(self, database: Database) -> None:
         self._database = database
+        self._counted = Counted()
 
     def create(self, new: NewSurrogate) -> tuple[SurrogateRecord, bool]:
         with self._database.write() as connection:
@@ -52,14 +53,14 @@ class SqlSurrogates(port.Surrogates):
 
     def summary(self, name: str) -> SurrogateSummary:
         with self._database.read() as connection:
-            found = read_summaries(connection, surrogates.c.name == name, limit=1)
+            found = read_summaries(connection, surrogates.c.name == name, 1, self._counted)
         if not found:
             raise unknown_surrogate(name)
         return found[0]
 
     def summaries(self, after: int = 0, limit: int | None = None) -> list[SurrogateSummary]:
         with self._database.read() as connection:
-            return read_summaries(connection, surrogates.c.id > after, limit)
+            return read_summaries(connection, surrogates.c.id > after, limit, self._counted)
 
     def change(
         self,
