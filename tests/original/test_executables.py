@@ -16,6 +16,7 @@ from support.noting import until
 from support.programs import NOTES_ITSELF, left_behind, program
 from surrogym_client import original
 from surrogym_client.original.errors import StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_client.original.executables.program import Program
 from surrogym_client.original.loading import is_known
 
 SHELL = Path(__file__).parents[2] / "examples" / "executables" / "rail.sh"
@@ -27,6 +28,10 @@ for line in sys.stdin:
     result = {"state": asked.get("state", [0, 0, 0, 0])}
     if asked["method"] == "spec":
         result = {"protocol": VERSION, "spec": cartpole().model_dump(mode="json")}
+    if asked["method"] == "save":
+        result = {"snapshot": "s" * 2**20}
+    if asked["method"] == "restore":
+        result = {"state": [len(asked["snapshot"]), 0, 0, 0]}
     if asked["method"] == "step":
         MOOD
         result |= {"reward": os.getpid(), "terminated": False, "truncated": False}
@@ -85,6 +90,47 @@ def test_what_an_ended_program_has_started_is_ended_too(tmp_path):
     with pytest.raises(UnknownEnvironment, match="got none"):
         original.make(f"exec:{plant}")
     assert left_behind(tmp_path) == []
+
+
+def test_the_last_line_of_standard_error_is_in_the_error(capfd: pytest.CaptureFixture[str]):
+    plant = moody("print('no licence\\x1b[2J\\n', file=sys.stderr, flush=True); os.abort()")
+    try:
+        with pytest.raises(StepFailed, match=r"exit code -6 during step; .* standard error: no licence\[2J$"):
+            plant.step_from(np.zeros(4), np.ones(1))
+    finally:
+        plant.close()
+    assert "no licence" in capfd.readouterr().err
+
+
+def test_a_flood_on_standard_error_does_not_stop_the_program(monkeypatch: pytest.MonkeyPatch):
+    """This process's own standard error is a pipe that nobody reads."""
+    reading, writing = os.pipe()
+    monkeypatch.setattr("surrogym_client.original.executables.standard_error.OWN", writing)
+    plant = moody("[print('x' * 10**6, file=sys.stderr) for _ in range(30)]")
+    try:
+        assert plant.step_from(np.zeros(4), np.ones(1)).reward > 0
+        assert len(plant._program._standard_error._tail) <= 4096
+    finally:
+        plant.close()
+        os.close(reading)
+        os.close(writing)
+
+
+def test_a_large_snapshot_is_restored():
+    plant = moody("pass")
+    try:
+        plant.begin()
+        assert plant.restore(plant.save())[0] == 2**20
+    finally:
+        plant.close()
+
+
+def test_a_program_that_does_not_read_a_large_request_is_ended():
+    sleeper = Program("sleep 3600")
+    sleeper.start()
+    with pytest.raises(StepTimedOut, match=r"read \d+ of 1048576 bytes of restore within 0.2 s and was ended"):
+        sleeper.exchange(b"s" * 2**20, "restore", time.monotonic() + 0.2)
+    assert not sleeper.running
 
 
 def test_a_newer_protocol_is_refused_with_the_way_out():

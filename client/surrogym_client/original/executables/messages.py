@@ -18,7 +18,7 @@ from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.spec.actions import Action
 
 PROTOCOL = 1
-LONGEST_LINE = 1 << 20  # bytes, without the end of the line
+LONGEST_LINE = 1 << 24  # bytes, without the end of the line
 SHOWN = 80  # characters of a line that an error repeats
 
 Reply = dict[str, Any]

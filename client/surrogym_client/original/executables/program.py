@@ -18,6 +18,7 @@ from surrogym_client.original.errors import (
     UnknownEnvironment,
 )
 from surrogym_client.original.executables.messages import LONGEST_LINE, Reply, decode, encode, short
+from surrogym_client.original.executables.standard_error import StandardError
 
 END_SECONDS = 2.0  # after the request to close, and again after SIGTERM
 CHUNK = 1 << 16  # bytes
@@ -26,8 +27,8 @@ CHUNK = 1 << 16  # bytes
 class Program:
     """A program that is started without a shell, in a session of its own, so that Ctrl-C does not reach it.
 
-    Its standard error is that of this process. After a time-out, an end or a line that is no answer, the program is
-    ended, and ``start`` starts it anew.
+    Its standard error is passed on to that of this process. After a time-out, an end or a line that is no answer, the
+    program is ended, and ``start`` starts it anew.
 
     Args:
         command: the program and its arguments, quoted as for a shell.
@@ -50,6 +51,7 @@ class Program:
         if os.name == "nt":
             raise UnknownEnvironment("expected Linux or macOS to start a program, got Windows")
         self._process: subprocess.Popen[bytes] | None = None
+        self._standard_error: StandardError | None = None
         self._unread = b""
         self._number = 0  # of the last request
 
@@ -67,7 +69,12 @@ class Program:
         self.end()
         try:
             self._process = subprocess.Popen(
-                self._words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0, start_new_session=True
+                self._words,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                bufsize=0,
+                start_new_session=True,
             )
         except OSError as error:
             raise UnknownEnvironment(
@@ -75,7 +82,9 @@ class Program:
             ) from error
         self._unread = b""
         assert self._process.stdin is not None
+        assert self._process.stderr is not None
         os.set_blocking(self._process.stdin.fileno(), False)
+        self._standard_error = StandardError(self._process.stderr)
 
     def ask(self, method: str, deadline: float, **fields: object) -> Reply:
         """Send one request, and return the result.
@@ -111,7 +120,7 @@ class Program:
             StepFailed: the program died, hung or printed too long a line; it was ended.
         """
         try:
-            self._write(line, what)
+            self._write(line, what, deadline)
             return self._read(what, deadline)
         except StepFailed:
             self.end()
@@ -145,7 +154,7 @@ class Program:
         if process is not None and self.running:
             assert process.stdin is not None
             with suppress(OSError, StepFailed):
-                self._write(encode(self._number + 1, "close"), "close")
+                self._write(encode(self._number + 1, "close"), "close", time.monotonic() + END_SECONDS)
                 process.stdin.close()
             with suppress(subprocess.TimeoutExpired):
                 process.wait(END_SECONDS)
@@ -169,20 +178,29 @@ class Program:
             if pipe is not None:
                 with suppress(OSError):
                     pipe.close()
+        if self._standard_error is not None:
+            self._standard_error.finish()
         return process.wait()
 
-    def _write(self, line: bytes, method: str) -> None:
+    def _write(self, line: bytes, method: str, deadline: float) -> None:
         process = self._process
         if process is None or process.stdin is None:
             raise EnvironmentDied(f"expected a running program for {method}, got none")
-        try:
-            written = os.write(process.stdin.fileno(), line)
-        except BlockingIOError:
-            written = 0
-        except OSError as error:
-            raise self._death(method) from error
-        if written < len(line):
-            raise StepFailed(f"expected the program to read a request of {len(line)} bytes, got {written} of them read")
+        begun, left = time.monotonic(), memoryview(line)
+        with selectors.DefaultSelector() as selector:
+            selector.register(process.stdin.fileno(), selectors.EVENT_WRITE)
+            while left:
+                if not selector.select(max(0.0, deadline - time.monotonic())):
+                    raise StepTimedOut(
+                        f"{self._called} read {len(line) - len(left)} of {len(line)} bytes of {method} within "
+                        f"{max(0.0, deadline - begun):.3g} s and was ended{self._complaint()}"
+                    )
+                try:
+                    left = left[os.write(process.stdin.fileno(), left) :]
+                except BlockingIOError:
+                    continue
+                except OSError as error:
+                    raise self._death(method) from error
 
     def _read(self, method: str, deadline: float) -> bytes:
         assert self._process is not None
@@ -199,7 +217,7 @@ class Program:
                 if left <= 0 or not selector.select(left):
                     raise StepTimedOut(
                         f"{self._called} did not answer {method} within {max(0.0, deadline - begun):.3g} s and was "
-                        "ended"
+                        f"ended{self._complaint()}"
                     )
                 if not (chunk := os.read(output, CHUNK)):
                     raise self._death(method)
@@ -212,4 +230,10 @@ class Program:
         self.wait(END_SECONDS)
         printed = self.surplus(0.0)
         after = f", after it printed {short(printed.strip())}" if printed else ""
-        return EnvironmentDied(f"{self._called} ended with exit code {self.end()} during {method}{after}")
+        code = self.end()
+        return EnvironmentDied(f"{self._called} ended with exit code {code} during {method}{after}{self._complaint()}")
+
+    def _complaint(self) -> str:
+        """What an error says of the program's standard error."""
+        last = "" if self._standard_error is None else self._standard_error.last_line()
+        return f"; the last line of its standard error: {last}" if last else ""
