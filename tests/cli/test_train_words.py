@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
+from surrogym_client.original.loading import env_option
 from surrogym_client.training import TrainProgress, TrainResult
 from surrogym_client.training.words import words_of, words_of_interruption, words_of_result
 
@@ -20,6 +23,26 @@ def test_a_training_without_rounds_says_nothing_of_them():
 def test_a_server_that_was_given_is_given_to_the_evaluation_too():
     said = words_of_result(RESULT, server="http://other:8000")
     assert said.endswith("; next: surrogym evaluate p.zip --server http://other:8000")
+
+
+def test_an_evaluation_of_ones_own_class_names_the_file_and_the_environment():
+    said = words_of_result(replace(RESULT, path=Path("my tank.zip")), env_option=env_option("tank:Tank"))
+    assert said.endswith("; next: surrogym evaluate 'my tank.zip' --env tank:Tank")
+
+
+@pytest.mark.parametrize(
+    ("name", "option"),
+    [
+        ("Pendulum-v1", ""),
+        ("", " --env YOUR.MODULE:CLASS"),
+        ("tank", " --env YOUR.MODULE:CLASS"),
+        ("tank:Tank", " --env tank:Tank"),
+        ("exec:rm -rf x", " --env exec:COMMAND"),
+        ("a:b; ls", " --env 'a:b; ls'"),
+    ],
+)
+def test_a_suggested_command_names_an_environment_that_is_not_known(name: str, option: str):
+    assert env_option(name) == option
 
 
 def test_the_closed_loop_says_how_well_the_policys_region_is_known():

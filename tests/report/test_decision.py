@@ -208,7 +208,7 @@ def test_an_environment_of_ones_own_gets_commands_that_run(modelled: Known):
     assert "can't tell how many episodes failed" in parts[""]
     assert "no success was declared" in parts["What to do next"]
     assert "surrogym policy get pendulum@3 --out policy.zip" in parts["What to do next"]
-    assert "surrogym evaluate policy.zip --env package.module:factory --wide" in parts["What to do next"]
+    assert "surrogym evaluate policy.zip --env YOUR.MODULE:CLASS --wide" in parts["What to do next"]
     assert "--perturb" not in parts["What to do next"]
 
 

@@ -67,6 +67,7 @@ def command(
 
     Example: surrogym train pendulum --out policy.zip --seed 0
     """
+    from surrogym_client.original.loading import env_option
     from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
     from surrogym_client.surrogates.budget import words_of_rounds
     from surrogym_client.training.search import with_algorithm
@@ -92,7 +93,10 @@ def command(
     if log.push:
         summary["version"] = push_or_say(url, token, result.path, surrogate, quiet=output.quiet)
     named = service.server if given_here(context, "server") else None
-    output.give(summary, lambda: words_of_result(result, handover, closed_loop=loop.improve > 0, server=named))
+    shown = partial(
+        words_of_result, closed_loop=loop.improve > 0, server=named, env_option=env_option(spec.environment)
+    )
+    output.give(summary, lambda: shown(result, handover))
 
 
 def _settings(search: SearchOptions, session: SessionOptions, start: StartOptions, log: LogOptions) -> TrainSettings:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import shlex
 import sys
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -28,6 +29,7 @@ ACCESS: dict[Access, dict[str, Any]] = {  # fields of a specification
     "snapshot": {"query": "rollout", "snapshots": True},
     "reset": {"query": "rollout", "snapshots": False},
 }
+PLACEHOLDER = "YOUR.MODULE:CLASS"  # for an environment whose name nobody noted
 ATTRIBUTES = (
     *("step_from", "reset", "step", "coordinates", "begin", "act", "save", "restore"),
     *("picture", "close", "parallel"),
@@ -107,6 +109,20 @@ def is_known(name: str) -> bool:
     entry = gymnasium.registry.get(name)
     its_own = entry is not None and str(entry.entry_point).startswith("gymnasium.envs.mujoco.")
     return name in TASKS or its_own or is_trusted(name)
+
+
+def env_option(name: str) -> str:
+    """Return the option ``--env`` that a suggested command needs, with a space before it. Empty if the environment may
+    be opened by its name alone.
+
+    A program's command is never repeated, because the name may come from a server.
+    """
+    if is_known(name):
+        return ""
+    if is_executable(name):
+        return " --env exec:COMMAND"
+    opens = ":" in name or adapter_of(name) is not None
+    return f" --env {shlex.quote(name) if opens else PLACEHOLDER}"
 
 
 def has_specification(name: str) -> bool:

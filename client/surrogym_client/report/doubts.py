@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from surrogym_client.original.loading import is_known
+from surrogym_client.original.loading import env_option, is_known
 from surrogym_client.report.known import PREFERRED, Known
 from surrogym_client.report.prediction import outcome_of
 from surrogym_client.report.wording import plural, starts_of
@@ -78,7 +78,7 @@ def next_steps(known: Known) -> list[str]:
 
 def _where(known: Known) -> str:
     """The option that names the environment, where the policy's card can't."""
-    return "" if is_known(known.view.environment) else " --env package.module:factory"
+    return env_option(known.view.environment)
 
 
 def _tests(known: Known, policy: PolicyView, real: EvaluationView, run: str) -> list[str]:

@@ -12,16 +12,29 @@ if TYPE_CHECKING:
 
 
 def words_of_result(
-    result: TrainResult, handover: Handover | None = None, *, closed_loop: bool = False, server: str | None = None
+    result: TrainResult,
+    handover: Handover | None = None,
+    *,
+    closed_loop: bool = False,
+    server: str | None = None,
+    env_option: str = "",
 ) -> str:
-    """Describe the result of a training and the next command, which needs ``server`` if that is given."""
-    on_server = "" if server is None else f" --server {shlex.quote(server)}"
-    lost = result.lost_episodes
+    """Describe the result of a training and the next command.
+
+    Args:
+        result: what was trained.
+        handover: its promise and whether to trust it.
+        closed_loop: whether ``--improve`` was given.
+        server: address that the next command needs; None if it needs none.
+        env_option: option of the next command that names the environment, with a space before it.
+    """
+    options = env_option + ("" if server is None else f" --server {shlex.quote(server)}")
+    path, lost = shlex.quote(str(result.path)), result.lost_episodes
     cut = f"; {lost} episode{'s' * (lost > 1)} cut short, because the server lost its sessions" if lost else ""
     return (
         f"{result.path}: {result.virtual_steps} virtual steps in {result.seconds:.1f} s"
         f"{_imagined(result.imagined_return)}{cut}{_loop(result.visited_confidence) if closed_loop else ''}"
-        f"{_given_up(result.networks - 1)}{_gaining(result)}; next: surrogym evaluate {result.path}{on_server}"
+        f"{_given_up(result.networks - 1)}{_gaining(result)}; next: surrogym evaluate {path}{options}"
         f"{'' if handover is None else chr(10) + words_of_handover(handover)}"
     )
 

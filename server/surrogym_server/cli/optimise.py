@@ -72,9 +72,10 @@ def optimise(
             raise typer.Exit(1) from None
     card = _write_card(out, surrogate.spec(), settings, found, time.perf_counter() - started)
     result = {"policy": str(out), **{name: card[name] for name in card if name != "spec"}}
+    env = "" if surrogate.spec().environment else " --env YOUR.MODULE:CLASS"
     words = (
         f"{out}: {found.virtual_steps} virtual steps in {card['seconds']:.1f} s, imagined return "
-        f"{found.imagined_return:.1f} (in the model); next: surrogym evaluate {out}"
+        f"{found.imagined_return:.1f} (in the model); next: surrogym evaluate {out}{env}"
     )
     give(result, lambda: words, as_json=as_json, quiet=quiet)
     if not found.whole:
