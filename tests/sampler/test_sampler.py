@@ -21,15 +21,16 @@ ONE_ROUND = SamplerSettings(name="worker", max_queries=6, wait_seconds=5.0, time
 
 
 def test_every_query_is_answered_and_the_worker_stops_when_the_design_is_done(api, line):
-    told = []
+    told, ended = [], []
     settings = SamplerSettings(until_done=True, time_limit=90.0)
-    report = Sampler(api, line, Line(), settings, lambda *seen: told.append(seen)).run()
+    report = Sampler(api, line, Line(), settings, lambda *seen: told.append(seen), ended.append).run()
     view = api.surrogate(line)
     assert (report.answered, report.failed) == (6, 0)
     assert view.ledger.total == 6
     assert report.phase == view.phase
     assert view.phase in ("ready", "over_budget")
     assert [outcome for _, outcome, _ in told] == ["answered"] * 6
+    assert ended == [view.phase]
 
 
 class StorageAway(Api):

@@ -8,6 +8,7 @@ import pytest
 
 from surrogym_client.original.classic import pendulum
 from surrogym_client.surrogates.advice import advice, noise_in_words, verdict
+from surrogym_client.surrogates.waiting import words_of_uncertainty, words_of_waiting
 from surrogym_shared.wire import Fidelity, Ledger, ModelView, OutputFidelity, QueryCounts, SurrogateView
 
 TARGET = 0.999
@@ -133,3 +134,16 @@ def test_an_output_that_never_varied_is_to_be_declared() -> None:
 @pytest.mark.parametrize("phase", ["ready", "sampling", "from_log"])
 def test_a_running_or_ready_design_gets_no_advice(phase: str) -> None:
     assert advice(view(output("x", 0.7), phase=phase), []) == ""
+
+
+def test_waiting_asks_for_a_sampler_only_if_none_runs() -> None:
+    idle = view(output("x", 0.7))
+    assert words_of_waiting(idle).startswith("waiting for a sampler (surrogym sample rig): 0 of 40 real steps")
+    running = idle.model_copy(update={"samplers": ["beside"]})
+    assert words_of_waiting(running).startswith("waiting for the sampler's answers: 0 of 40 real steps")
+
+
+def test_an_uncertain_end_names_index_and_target() -> None:
+    assert words_of_uncertainty(view(output("x", 0.7))) == (
+        "the design has ended without being certain of its model: confidence index 0.7000, target 0.999"
+    )

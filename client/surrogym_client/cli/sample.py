@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from surrogym_client.sampler.worker import Outcome, SamplerReport, SamplerSettings
     from surrogym_client.transport.api import Api
     from surrogym_shared.spec import EnvironmentSpec
-    from surrogym_shared.wire import Query
+    from surrogym_shared.wire import Phase, Query
 
     Tell = Callable[[Line], None]
 
@@ -143,7 +143,7 @@ def _sample_here(api: Api, plan: SamplerPlan, output: Output) -> None:
     from surrogym_client.runtime.lifetime import terminations
     from surrogym_client.sampler.on_ray import Line, line_of
     from surrogym_client.sampler.worker import Sampler
-    from surrogym_shared.terminal import on_interrupt
+    from surrogym_shared.terminal import on_interrupt, say
 
     with (
         closing(isolated(plan.environment, plan.step_limit, plan.spec)) as environment,
@@ -154,7 +154,11 @@ def _sample_here(api: Api, plan: SamplerPlan, output: Output) -> None:
             if tell is not None:
                 tell(Line(line_of(query, outcome, error), bool(error)))
 
-        sampler = Sampler(api, plan.surrogate, environment, plan.settings, report)
+        def ended(phase: Phase) -> None:
+            if not plan.settings.until_done:  # otherwise the result follows at once
+                say(_words_of_end(plan.surrogate, phase), quiet=output.quiet)
+
+        sampler = Sampler(api, plan.surrogate, environment, plan.settings, report, ended)
         for number in terminations():
             signal.signal(number, lambda *_: sampler.stop())
         with on_interrupt(lambda: _words_of_interruption(sampler.summary())):
@@ -243,6 +247,16 @@ def _telling(api: Api, surrogate: str, *, quiet: bool) -> Iterator[Tell | None]:
         view = api.surrogate(surrogate)
         update(share_of_design(view), words_of_design(view))
         yield tell
+
+
+def _words_of_end(surrogate: str, phase: Phase) -> str:
+    """Describe the end of a design while the sampler waits for further queries, such as those of an audit."""
+    from surrogym_client.surrogates.phases import COMPLETED, IN_WORDS
+
+    following = (
+        f"; next: surrogym train {surrogate}" if phase in COMPLETED else f": surrogym status {surrogate} says why"
+    )
+    return f"{IN_WORDS[phase]}{following}; this sampler waits for further queries, Ctrl-C ends it"
 
 
 def _words_of_interruption(report: SamplerReport) -> str:

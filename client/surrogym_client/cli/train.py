@@ -164,9 +164,10 @@ def _trainable(
         share_of_design,
         wait_for_design,
         words_of_design,
+        words_of_uncertainty,
     )
     from surrogym_client.training.search import SEARCHES, name_of
-    from surrogym_shared.terminal import on_interrupt, progress
+    from surrogym_shared.terminal import on_interrupt, progress, say
 
     with connect(server, token, wait, quiet=quiet) as api:
         view = awaited_surrogate(api, surrogate, wait, quiet=quiet)
@@ -183,6 +184,8 @@ def _trainable(
                 f"{surrogate!r} has no model yet, its phase is {view.phase}: "
                 f"run {learn} {surrogate}, or give --wait SECONDS"
             )
+        if view.phase == "over_budget":
+            say(words_of_uncertainty(view), quiet=quiet)
         if view.phase not in COMPLETED and not view.paused:
             typer.echo(
                 f"the design of {surrogate!r} continues; training starts with model {view.model_version}", err=True
@@ -251,9 +254,9 @@ def _train(
 
 def _waiting(update: Update) -> Callable[[SurrogateView], None]:
     """Show a round's real steps while a sampler takes them. The progress bar keeps the training's position."""
-    from surrogym_client.surrogates.waiting import words_of_design
+    from surrogym_client.surrogates.waiting import words_of_waiting
 
-    return lambda view: update(None, f"waiting for a sampler (surrogym sample {view.name}): {words_of_design(view)}")
+    return lambda view: update(None, words_of_waiting(view))
 
 
 def _write_card(

@@ -115,6 +115,7 @@ class Sampler:
         environment: the original environment; wrap it in ``IsolatedEnvironment`` if it may hang or crash.
         settings: when to stop, and how many queries to claim.
         report: called after every query with the query, its outcome, and the error if there was one.
+        ended: called with the phase whenever a claim shows that the design has ended, once for each end.
 
     Examples:
         >>> with Api("http://127.0.0.1:8000") as api:
@@ -128,12 +129,14 @@ class Sampler:
         environment: Environment,
         settings: SamplerSettings | None = None,
         report: Callable[[Query, Outcome, str], None] | None = None,
+        ended: Callable[[Phase], None] | None = None,
     ) -> None:
         self._api = api
         self._surrogate = surrogate
         self._environment = environment
         self._settings = settings or SamplerSettings()
         self._report = report
+        self._ended = ended
         self._counts: dict[Outcome, int] = dict.fromkeys(get_args(Outcome), 0)
         self._refused: set[int] = set()  # ids of refused queries, which the server offers again
         self._failures = Failures()
@@ -175,7 +178,7 @@ class Sampler:
                     if self._stopped():
                         break
                     raise
-                self._phase = claimed.phase
+                self._enter(claimed.phase)
                 self._work(claimed.queries, since)
                 if self._enough(claimed):
                     break
@@ -187,6 +190,11 @@ class Sampler:
         """Return the report of the work so far."""
         seconds = time.monotonic() - self._started
         return SamplerReport(**self._counts, steps=self._steps, seconds=seconds, phase=self._phase)
+
+    def _enter(self, phase: Phase) -> None:
+        before, self._phase = self._phase, phase
+        if self._ended is not None and phase in ENDED and phase != before:
+            self._ended(phase)
 
     def _check(self) -> None:
         """Refuse an environment that does not fit the surrogate."""

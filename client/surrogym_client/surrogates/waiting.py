@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 
 from surrogym_client.errors import ServerUnreachable, SurrogymClientError, UnknownSurrogate
-from surrogym_client.surrogates.phases import COMPLETED
+from surrogym_client.surrogates.phases import COMPLETED, IN_WORDS
 from surrogym_client.transport.api import Api
 from surrogym_shared.wire import SurrogateView
 
@@ -28,6 +28,18 @@ def words_of_design(view: SurrogateView) -> str:
     if not ledger.logged:
         return f"{taken}{fidelity}"
     return f"{taken}, {logged}{fidelity}" if view.budget else f"{logged}{fidelity}"
+
+
+def words_of_waiting(view: SurrogateView) -> str:
+    """Describe for what a training waits: for a sampler to be started, or for the answers of one that runs."""
+    awaited = "the sampler's answers" if view.samplers else f"a sampler (surrogym sample {view.name})"
+    return f"waiting for {awaited}: {words_of_design(view)}"
+
+
+def words_of_uncertainty(view: SurrogateView) -> str:
+    """Describe the end of a design that has spent its budget."""
+    index = "" if view.fidelity is None else f"confidence index {view.fidelity.confidence_index:.4f}, "
+    return f"{IN_WORDS['over_budget']}: {index}target {view.target:g}"
 
 
 class DesignUnfinished(SurrogymClientError):
