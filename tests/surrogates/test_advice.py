@@ -121,6 +121,15 @@ def test_without_progress_a_tolerance_within_reach_is_named(indices: list[float]
     assert said.endswith("surrogym change rig --tolerance x=0.29")
 
 
+def test_an_error_that_falls_too_slowly_is_not_called_hopeless() -> None:
+    falling = [models([0.7] * 8, error=error)[i] for i, error in enumerate([9, 9, 9, 9, 1.74, 1.5, 1.2, 1.05])]
+    said = advice(view(output("x", 0.7, error=1.05)), falling)
+    assert said.startswith(
+        "the last 30 real steps lowered the leave-one-out error of x from 1.74 to 1.05, but its target"
+    )
+    assert "hardly" not in said
+
+
 def test_few_rounds_show_no_rate_and_more_steps_are_the_advice() -> None:
     said = advice(view(output("x", 0.7, error=0.2)), models([0.7, 0.7]))
     assert said.endswith("as many real steps again: surrogym improve rig --queries 40")

@@ -11,6 +11,7 @@ from surrogym_shared.wire import ModelView, OutputFidelity, SurrogateView
 
 NEARLY = 0.9  # share of the target that counts as nearly reached
 MOST_STEPS = 10.0  # longest forecast, as a multiple of the present samples
+NOTICEABLE = 0.9  # factor on the leave-one-out error: a smaller one shows that real steps helped
 FEWEST_MODELS = 4  # fewest models from which to estimate a rate
 NOISY_SLACK = 1.25  # factor on the allowed leave-one-out error once noise is confirmed
 TOLERABLE = 1e-6  # share of the leave-one-out error: a smaller tolerance comes from samples that were all alike
@@ -64,7 +65,7 @@ def advice(view: SurrogateView, models: Sequence[ModelView]) -> str:
         return f"about {steps} more real steps at the present rate: surrogym improve {view.name} --queries {steps}"
     reached = f"{_within_reach(view, worst):.2g}"
     return (
-        f"more real steps hardly help {worst.name}; it would be ready with a tolerance of {reached} (now "
+        f"{_too_slow(worst, models)}; it would be ready with a tolerance of {reached} (now "
         f"{worst.tolerance:.2g}): surrogym change {view.name} --tolerance {worst.name}={reached}"
     )
 
@@ -124,6 +125,23 @@ def _steps_to_go(view: SurrogateView, worst: OutputFidelity, models: Sequence[Mo
         return None
     steps = ceil(max(one for one in needed if one is not None))
     return max(steps, 1) if steps <= MOST_STEPS * view.samples else None
+
+
+def _too_slow(worst: OutputFidelity, models: Sequence[ModelView]) -> str:
+    """Describe why no number of real steps is advised, by the leave-one-out error over the last half of the fits."""
+    seen = [
+        (model.samples, output.leave_one_out_error)
+        for model in models[len(models) // 2 :]
+        for output in model.fidelity.outputs
+        if output.name == worst.name and output.leave_one_out_error is not None
+    ]
+    if not seen or seen[-1][1] > NOTICEABLE * seen[0][1]:
+        return f"more real steps hardly help {worst.name}"
+    (first, before), (last, after) = seen[0], seen[-1]
+    return (
+        f"the last {last - first} real steps lowered the leave-one-out error of {worst.name} from {before:.3g} to "
+        f"{after:.3g}, but its target is out of reach at the present rate"
+    )
 
 
 def _forecast(samples: Sequence[float], values: Sequence[float], limit: float) -> float | None:
