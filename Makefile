@@ -21,6 +21,7 @@ demo: .venv/demo  ## Solve Pendulum with server, sampler and trainer on this mac
 	@exec $(BIN)/surrogym demo pendulum $(ARGS)
 
 install: .venv/all  ## Everything a user may want into .venv: MuJoCo, pictures and exports as well
+	@echo "next: . .venv/bin/activate"
 
 test: format-check lint types imports audit unit  ## Everything that guards the project
 

@@ -39,7 +39,8 @@ def register(app: typer.Typer) -> None:
     """Add ``surrogym policy`` and its subcommands to the app."""
     parts = typer.Typer(
         cls=PolicyGroup,
-        help="Show, store, download, name or delete a policy.\n\nExample: surrogym policy pendulum@3",
+        help="Show, store, download, name or delete a policy. surrogym policies lists all of them.\n\n"
+        "Example: surrogym policy pendulum@3",
         no_args_is_help=True,
         rich_markup_mode=None,
     )
