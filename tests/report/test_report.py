@@ -81,6 +81,15 @@ def test_it_says_what_is_known(known: Both) -> None:
     assert not {"over_budget", "from_log"} & set(re.findall(r"\w+", " ".join(read.texts)))
 
 
+def test_the_encoding_of_angles_is_shown_only_where_there_are_angles(known: Both) -> None:
+    about, shown = known
+    straight = tuple(one.model_copy(update={"kind": "linear"}) for one in about.view.spec.coordinates)
+    view = about.view.model_copy(update={"spec": about.view.spec.model_copy(update={"coordinates": straight})})
+    encoding = re.compile("cos[_ ]sin")
+    assert encoding.search(page(about, shown))
+    assert not encoding.search(page(replace(about, view=view), shown))
+
+
 def test_it_loads_nothing_and_its_policy_lets_nothing_load(known: Both) -> None:
     text = page(*known)
     read = Page(text)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from html import escape
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from surrogym_client.report.known import Known
 from surrogym_client.report.maps import Cut
 from surrogym_client.runtime.versions import versions
 from surrogym_client.surrogates.phases import IN_WORDS
+from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import ModelView, Phase, SampleView, SurrogateView
 
 FIDELITY = {
@@ -68,7 +70,7 @@ def _details(known: Known, cuts: Sequence[Cut]) -> list[str]:
     if cuts:
         sections.append(_maps(view, cuts))
     if models:
-        sections += [_structure(models[-1]), _history(models)]
+        sections += [_structure(models[-1], view.spec), _history(models)]
     specification = escape(view.spec.model_dump_json(indent=2))
     sections.append(section("Specification", f"<details><summary>JSON</summary><pre>{specification}</pre></details>"))
     return sections
@@ -118,13 +120,23 @@ def _maps(view: SurrogateView, cuts: Sequence[Cut]) -> str:
     return section("Maps", picture(svg(draw_maps(view, cuts)), alt) + note)
 
 
-def _structure(model: ModelView) -> str:
-    described = dict(model.description)
+def _structure(model: ModelView, spec: EnvironmentSpec) -> str:
+    angles = any(coordinate.kind == "angle" for coordinate in spec.coordinates)
+    described = dict(model.description if angles else _without_angles(model.description))
     parts = [
         f"<h3>{escape(str(output.get('name')))}</h3>{rows((k, v) for k, v in output.items() if k != 'name')}"
         for output in described.pop("outputs", [])
     ]
     return section(f"Structure and hyperparameters of model {model.version}", "".join(parts) + rows(described.items()))
+
+
+def _without_angles(described: Any) -> Any:
+    """Replace the encoding of angles in the names of input maps, for an environment that has none."""
+    if isinstance(described, str):
+        return described.replace("cos_sin", "coordinates")
+    if isinstance(described, dict):
+        return {_without_angles(key): _without_angles(value) for key, value in described.items()}
+    return [_without_angles(one) for one in described] if isinstance(described, list) else described
 
 
 def _history(models: Sequence[ModelView]) -> str:
