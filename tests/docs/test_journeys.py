@@ -80,6 +80,7 @@ OTHERWISE = {
     "docs/how-to/fmus.md": "tests/original/test_fmus.py builds its FMUs, tests/examples runs its program",
     "docs/how-to/executables.md": "tests/original/test_executables.py runs its program",
     "docs/how-to/history.md": "tests/docs/test_how_to.py runs its programs",
+    "docs/how-to/snapshots.md": "tests/docs/test_how_to.py runs its program",
     "docs/how-to/ray.md": "tests/cli/test_sampling_on_ray.py reads such a runtime environment",
     "docs/how-to/trust.md": "tests/training/test_handover.py audits beside a sampler that stays",
     "docs/how-to/work.md": "tests/work and tests/cli/test_jobs.py run its commands",
