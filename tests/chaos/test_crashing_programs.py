@@ -25,7 +25,7 @@ from surrogym_client.transport import Api
 from surrogym_shared.spec import EnvironmentSpec
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "executables"
-PROBABILITY = 0.3  # of a fault at a step
+PROBABILITY = 0.5  # of a fault at a step
 HANGS = 1  # in a design
 STEP_LIMIT = 2.0  # s, of a hang
 BROKEN = "different queries in a row"  # the documented end of a sampler
