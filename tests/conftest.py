@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 
+os.environ.setdefault("RAY_AUTH_MODE", "disabled")  # a token in the home folder would change it between two clusters
 if "DISPLAY" not in os.environ:
     os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported, so before everything else
 

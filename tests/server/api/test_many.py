@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,21 +33,24 @@ def statements(folder: Path, count: int, path: str) -> int:
     settings = Settings(database=str(database), host="testserver", insecure=True, sweep_seconds=NEVER)
     sa.event.listen(sa.Engine, "before_cursor_execute", note)
     try:
-        text = asyncio.run(answered(create_app(settings), path))
+        text = asyncio.run(answered(create_app(settings), path, sent.clear))
     finally:
         sa.event.remove(sa.Engine, "before_cursor_execute", note)
     assert text.count("finished") >= count / 2
     return len(sent)
 
 
-async def answered(app: FastAPI, path: str) -> str:
-    """The body of one request to an app in this process."""
+async def answered(app: FastAPI, path: str, first_ended: Callable[[], None]) -> str:
+    """The body of the second of two requests to an app in this process. The first counts samples and queries, unless
+    the server has counted them already."""
     async with app.router.lifespan_context(app) as state:
 
         async def served(scope: Any, receive: Any, send: Any) -> None:
             await app({**scope, "state": dict(state or {})}, receive, send)
 
         async with httpx.AsyncClient(transport=httpx.ASGITransport(served), base_url="http://testserver") as client:
+            (await client.get(path)).raise_for_status()
+            first_ended()
             return (await client.get(path)).raise_for_status().text
 
 
