@@ -54,7 +54,7 @@ export const MEANING = {
   fitting: "the model is learning from new real steps",
   sampling: "the design queries real steps where the model is uncertain",
   ready: "the model has reached its target",
-  over_budget: "the budget is spent and the target is not reached; the model can be used all the same",
+  over_budget: "the design has ended below its target; the model can be used all the same",
   from_log: "the model is fitted to the log, and the design requests no real steps",
   failed: "the design stopped with an error",
 };
