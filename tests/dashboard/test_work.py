@@ -118,7 +118,9 @@ def test_an_evaluation_is_started_and_its_result_shown(api: Api, open_page: Open
     page = open_page(f"{api.url}/#/s/{NAME}")
     here = part(page)
     expect(here).to_contain_text("trainer-1")
-    here.get_by_label("Policy", exact=True).select_option(f"version {version}")
+    expect(here.get_by_label("Policy", exact=True)).to_have_value(str(version))
+    version = api.policies.push(NAME, wire.PushedCard(algorithm="CMAES"), [], "zip", network_file(seed=10)).version
+    expect(here.get_by_label("Policy", exact=True)).to_have_value(str(version))  # the newest, as before
     here.get_by_label("Real episodes").fill("3")
     here.get_by_label("Compare with").select_option("an action of zero")
     expect(here).to_contain_text("6 episodes of the original environment: up to 1 200 real steps.")

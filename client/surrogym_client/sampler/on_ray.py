@@ -233,14 +233,7 @@ class RaySamplers:
     def _heard(self, member: _Member) -> Sequence[Line]:
         owed, member.asked = member.asked, member.actor.look.remote()
         with suppress(self._ray.exceptions.RayError):  # one that has died owes no look
-            look: Look = self._ray.get(owed)
-            lines = list(look.lines)
-            if look.start not in member.reports:
-                again = bool(member.reports)
-                begun = "was started again" if again else "runs"
-                lines.insert(0, Line(f"{member.name} {begun} on {look.host}, process {look.process}", again))
-            member.reports[look.start] = look.report
-            return lines
+            return _noted(member, self._ray.get(owed))
         return ()
 
     def _ended(self, member: _Member) -> Sequence[Line]:
@@ -251,11 +244,22 @@ class RaySamplers:
             said = (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()
             self.errors.append(f"{member.name}: {said}")
             return (Line(self.errors[-1], True),)
-        member.reports[ended.look.start] = ended.look.report
+        lines = _noted(member, ended.look)
         if ended.error is None:
-            return ended.look.lines
+            return lines
         self.errors.append(f"{member.name} on {ended.look.host}: {ended.error}")
-        return (*ended.look.lines, Line(self.errors[-1], True))
+        return [*lines, Line(self.errors[-1], True)]
+
+
+def _noted(member: _Member, look: Look) -> list[Line]:
+    """Keep the report of a look, and return its lines. The first look at a process also says where it runs."""
+    lines = list(look.lines)
+    if look.start not in member.reports:
+        again = bool(member.reports)
+        begun = "was started again" if again else "runs"
+        lines.insert(0, Line(f"{member.name} {begun} on {look.host}, process {look.process}", again))
+    member.reports[look.start] = look.report
+    return lines
 
 
 def _options(resources: Mapping[str, float]) -> dict[str, Any]:

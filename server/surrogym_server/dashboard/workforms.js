@@ -80,13 +80,15 @@ export function evaluationForm(start) {
       ...(video.checked && { video: true }),
     }));
   let listed = null;
+  let newest = "";
   return {
     element: parts.element,
     show({ ready, most, policies, limit, reference: offered }) {
       const names = policies.map(({ version, aliases }) => [String(version), [`version ${version}`, ...aliases].join(", ")]);
       if (JSON.stringify(names) !== listed) {
         listed = JSON.stringify(names);
-        const kept = policy.value;
+        const kept = policy.value === newest ? names[0]?.[0] ?? "" : policy.value; // whoever had the newest gets the newest
+        newest = names[0]?.[0] ?? "";
         policy.replaceChildren(...names.map(([value, text]) => h("option", { value }, text)));
         if (names.some(([value]) => value === kept)) policy.value = kept;
       }
