@@ -16,10 +16,12 @@ from surrogym_client.cli.sampling_on_ray import run_samplers
 from surrogym_client.sampler import SamplerSettings
 from surrogym_client.sampler.on_ray import RaySamplers, SamplerActor, SamplerPlan
 from surrogym_client.transport import Api
+from surrogym_shared.spec import Design
 
 ray = pytest.importorskip("ray")
 
 PATIENCE = 120.0
+LONG = 20  # real steps of half a second
 TESTS = Path(__file__).parents[1]
 ONE_CPU = {"CPU": 1.0}
 
@@ -45,6 +47,10 @@ def plan(api: Api, line: str) -> SamplerPlan:
 
 
 def test_samplers_share_a_design_and_one_that_is_killed_starts_again(cluster: None, api: Api, plan: SamplerPlan):
+    """The design takes ten seconds of the other sampler, so it lasts until the killed one is back."""
+    name = f"{plan.surrogate}-long"
+    api.create_surrogate(name, SPEC.model_copy(update={"design": Design(initial=LONG, budget=LONG)}))
+    plan = replace(plan, surrogate=name)
     samplers = RaySamplers(plan, 2, ONE_CPU)
     killed: list[int] = []
     texts: list[str] = []
@@ -57,7 +63,7 @@ def test_samplers_share_a_design_and_one_that_is_killed_starts_again(cluster: No
 
     run_samplers(samplers, PATIENCE, tell, texts.append)
     report, view = samplers.report(), api.surrogate(plan.surrogate)
-    assert view.ledger.total == SPEC.design.budget
+    assert view.ledger.total == LONG
     assert (report.failed, samplers.errors) == (0, [])
     assert samplers.restarts == 1
     assert sum("was started again" in text for text in texts) == 1
