@@ -280,7 +280,7 @@ def test_a_network_that_learns_too_slowly_is_replaced(surrogate, tmp_path: Path,
 
 def earning(each: float) -> Imagined:
     """Every episode earns the same."""
-    return Imagined(float(each), float(each))
+    return Imagined(float(each), float(each), float(each))
 
 
 def test_ctrl_c_while_the_next_network_is_made_keeps_what_was_learned(surrogate, tmp_path: Path, made, monkeypatch):

@@ -11,11 +11,11 @@ from surrogym_client.training.verdicts import Imagined, Verdicts
 
 def after(untrained: float, earned: Sequence[float], checks: Sequence[float]) -> Verdicts:
     """Verdicts after episodes of the training, and checks."""
-    verdicts = Verdicts(planned=1_000, untrained=Imagined(untrained, untrained))
+    verdicts = Verdicts(planned=1_000, untrained=Imagined(untrained, untrained, untrained))
     verdicts.saw(earned)
     for number, imagined in enumerate(checks):
         verdicts.at(100 * (number + 1))
-        verdicts.check(Imagined(imagined, imagined))
+        verdicts.check(Imagined(imagined, imagined, imagined))
     return verdicts
 
 
@@ -36,3 +36,12 @@ def test_training_is_over_once_three_checks_earn_the_most_there_is():
 )
 def test_training_continues_while_more_may_be_earned(untrained: float, earned: list[float], checks: list[float]):
     assert not after(untrained, earned, checks).saturated
+
+
+def test_training_continues_while_episodes_of_a_check_differ():
+    """Long episodes end rarely: a policy soon earns more in checks than any finished episode of the training."""
+    verdicts = after(0.0, [10.0], [])
+    for number, mean in enumerate([53.0, 51.0, 50.0]):
+        verdicts.at(100 * (number + 1))
+        verdicts.check(Imagined(mean=mean, many=80.0, most=820.0))
+    assert not verdicts.saturated

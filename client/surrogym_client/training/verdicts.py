@@ -27,6 +27,7 @@ class Imagined(NamedTuple):
 
     mean: float
     many: float  # lowest return in the best quarter of the episodes
+    most: float  # highest return of an episode
 
 
 class Verdicts:
@@ -53,7 +54,8 @@ class Verdicts:
         self.floor = untrained.mean
         self._half_way = self.floor if saved is None else (self.floor + saved.mean) / 2
         self._few = self._many = untrained.many  # return of many episodes: of an untrained network, and the best so far
-        self._seen = self.floor  # largest return of an episode so far, from any start
+        self._seen = self.floor  # largest return of an episode of the training so far, from any start
+        self._most = untrained.most  # largest return of an episode of a check so far
         self._spent = 0  # steps of earlier networks
         self._now = 0  # steps of this network
         self._rollouts = 0  # rollouts of this network
@@ -94,7 +96,7 @@ class Verdicts:
     @property
     def saturated(self) -> bool:
         """Whether no further gain is possible: in the last checks, each episode's return equalled the best one so
-        far."""
+        far, of the training and of all checks."""
         return self._full >= SATURATED
 
     def prolong(self) -> bool:
@@ -128,11 +130,13 @@ class Verdicts:
         """Record a check of the present policy. Returns whether it is the best so far."""
         self._checked = int(self.steps * CHECKS / self._planned)
         imagined, self._many = measured.mean, max(self._many, measured.many)
+        self._most = max(self._most, measured.most)
         self.latest = imagined
         best = self.best is None or imagined >= self.best
         self.best = imagined if self.best is None else max(self.best, imagined)
         self._bests.append((self.steps, self.best))
-        self._full = self._full + 1 if imagined >= self._seen and imagined > self._nothing else 0
+        full = imagined >= max(self._seen, self._most) and imagined > self._nothing
+        self._full = self._full + 1 if full else 0
         return best
 
     def judge(self) -> None:
@@ -169,4 +173,4 @@ class Verdicts:
 def checked(port: SurrogatePort, predict: Predict, settings: TrainSettings) -> Imagined:
     """Measure the present policy's returns, on the same starts at every check."""
     returns = imagined_returns(port, predict, CHECK_EPISODES, settings.seed, **settings.judging)
-    return Imagined(float(returns.mean()), float(np.quantile(returns, 1 - MANY)))
+    return Imagined(float(returns.mean()), float(np.quantile(returns, 1 - MANY)), float(returns.max()))
