@@ -2,10 +2,21 @@
 
 import pytest
 
+from support.simulators import installed
 from surrogym_client.experiments.arms import ARMS
 from surrogym_client.experiments.demo.learning import later_imports
 from surrogym_client.experiments.settings import DemoSettings
-from surrogym_client.experiments.tasks import ROUNDS, TASKS, Outcome, Target, design_budget, queries_a_round
+from surrogym_client.experiments.tasks import (
+    BY_NAME,
+    EVERY_TASK,
+    ROUNDS,
+    TASKS,
+    DemoTask,
+    Outcome,
+    Target,
+    design_budget,
+    queries_a_round,
+)
 from surrogym_client.original.loading import is_known
 
 KNOWN = [name for name, task in TASKS.items() if is_known(task.environment)]
@@ -84,3 +95,20 @@ def test_a_task_is_solved_by_whole_episodes():
 def test_a_demo_imports_torch_early_only_where_its_policy_needs_it():
     assert later_imports(DemoSettings(pictures=False)) == ()
     assert later_imports(DemoSettings(algorithm="ppo", pictures=False)) == ("stable_baselines3",)
+
+
+@installed("mujoco")
+def test_an_environment_by_name_is_described_and_its_steps_are_counted(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(EVERY_TASK, "crawler", DemoTask("Swimmer-v5", 40, Target("mean 100", mean=100)))
+    settings = DemoSettings("crawler", seed=2)
+    spec, judged = settings.spec(), settings.judged_by()
+    assert (spec.design.budget, spec.design.seed, judged.design.seed) == (design_budget(40), 2, 0)
+    assert spec.coordinates == judged.coordinates
+    assert settings.description_steps >= 400
+    assert spec.coordinates != DemoSettings("crawler", seed=3).spec().coordinates, "a description for each seed"
+    assert DemoSettings("pendulum").description_steps == 0
+
+
+def test_tasks_by_name_are_no_tasks_of_the_study():
+    assert not set(BY_NAME) & set(TASKS)
+    assert set(BY_NAME) < set(EVERY_TASK)

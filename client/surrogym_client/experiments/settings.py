@@ -5,15 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass
-from typing import Any
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 from surrogym_client.experiments.arms import ARMS, Arm
 from surrogym_client.experiments.tasks import EVERY_TASK, DemoTask, design_budget, queries_a_round
 from surrogym_client.original import make
-from surrogym_client.original.loading import with_choices
+from surrogym_client.original.loading import has_specification, with_choices
 from surrogym_client.training.search import FAST, REFERENCE, SEARCHES
 from surrogym_client.training.settings import SUGGESTED_STEPS, TrainSettings, prolongs
 from surrogym_shared.spec import EnvironmentSpec
+
+if TYPE_CHECKING:
+    from surrogym_client.original.describing import Description
 
 
 @dataclass(frozen=True)
@@ -65,14 +69,26 @@ class DemoSettings:
 
     def spec(self) -> EnvironmentSpec:
         """The environment's specification with the design of this arm."""
-        plain = make(self.demo_task.environment, preset=self.way.preset, seed=self.seed).spec()
+        plain = self._specified(preset=self.way.preset, seed=self.seed)
         budget = design_budget(self.real_steps) if self.way.closed_loop else self.real_steps
         design = self.way.design(budget, len(plain.observation) + plain.action.size)
         return with_choices(plain, design, access=self.way.access)
 
     def judged_by(self) -> EnvironmentSpec:
         """The original environment as every arm is judged by it, also one that learns another form of it."""
-        return make(self.demo_task.environment).spec()
+        return self._specified()
+
+    @property
+    def description_steps(self) -> int:
+        """Real steps that the description of the environment took; 0 with a specification of its own."""
+        name = self.demo_task.environment
+        return 0 if has_specification(name) else _described(name, self.seed).steps
+
+    def _specified(self, **design: Any) -> EnvironmentSpec:
+        """The environment's own specification, or the one that ``surrogym describe`` drafts, with these choices."""
+        name = self.demo_task.environment
+        drafted = None if has_specification(name) else _described(name, self.seed).spec
+        return make(name, spec=drafted, **design).spec()
 
     def asked(self) -> dict[str, Any]:
         """Everything that a result depends on and that is known before the run, without the seed; JSON-able."""
@@ -83,6 +99,13 @@ class DemoSettings:
         names = ["task", "real_steps", "virtual_steps", "prolong", "episodes"]
         search = {} if self.search == REFERENCE else {"algorithm": self.search.lower()}
         return {"spec": spec, "arm": self.way.fields(), **{name: getattr(self, name) for name in names}, **search}
+
+
+@cache
+def _described(name: str, seed: int) -> Description:
+    from surrogym_client.original.describing import describe
+
+    return describe(name, seed=seed)
 
 
 def fingerprint(content: Any) -> str:

@@ -132,6 +132,8 @@ class SurrogateRun:
     def _employ_sampler(self) -> None:
         say(f"live server, with a page to look at: {self._api.url}  (run folder: {self._folder})", quiet=self._quiet)
         self._api.create_surrogate(self._settings.task, self._settings.spec())
+        if steps := self._settings.description_steps:
+            self._api.report_steps(self._settings.task, steps, note="description")
         named = self._settings.demo_task.environment
         own = ["--env", named] if ":" in named else []  # the sampler does not import a module that only a server names
         self._children.start("sampler", "surrogym_client", ["sample", *self._common, *own])

@@ -36,6 +36,7 @@ def metrics_of(
         "budget": settings.real_steps,
         "environment": settings.demo_task.environment,
         "real_queries": learned.real_queries,
+        "description_steps": settings.description_steps,
         "evaluation_steps": judgement.steps,
         "confidence_index": learned.confidence_index,
         "fidelity": learned.fidelity,
@@ -73,6 +74,7 @@ def table(metrics: dict[str, Any], folder: Path) -> str:
     rows = [
         ("task", f"{metrics['task']} ({metrics['environment']}), seed {metrics['seed']}{arm}"),
         ("real queries", f"{real['total']}: {real['initial']} initial, {real['adaptive']} adaptive"),
+        *([("real steps of description", str(metrics["description_steps"]))] if metrics["description_steps"] else []),
         ("real steps of evaluation", str(metrics["evaluation_steps"])),
         (
             "confidence index",
