@@ -13,13 +13,17 @@ from surrogym_client.original.adapters import open_simulator
 from surrogym_client.original.describing.exploring import RESETS, STEPS, Counted, Seen, explore
 from surrogym_client.original.describing.expressing import express, names_in, shown_by_itself
 from surrogym_client.original.describing.probing import EXACT, Probed, probe
+from surrogym_client.original.describing.rewarding import ENOUGH, Paid, coefficients, may_be_quadratic, quadratic_reward
 from surrogym_client.original.errors import UnknownEnvironment
+from surrogym_client.original.gymnasium import wrapped
 from surrogym_client.original.protocol import Array
 from surrogym_client.original.simulator import Simulator, Variable
 from surrogym_client.original.state_parts import VELOCITY
 from surrogym_shared.spec import (
     MAX_DIMENSIONS,
+    BoxAction,
     Coordinate,
+    DeclaredReward,
     EnvironmentSpec,
     Fixed,
     ObservationEntry,
@@ -85,6 +89,8 @@ def describe(name: str, steps: int = STEPS, seed: int = 0) -> Description:
         probed = probe(counted, seen, rng) if simulator.settable else Probed(np.inf, 0.0, 0.0)
         drafted = _Draft(name, simulator, seen, probed)
         spec = drafted.spec(rng)
+        if (reward := drafted.known_reward(counted, spec, rng)) is not None:
+            spec = spec.model_copy(update={"reward": reward})
         found, asked = drafted.found(spec, steps), drafted.asked(spec)
         return Description(spec, found, asked, counted.steps, counted.resets, simulator.pays)
     finally:
@@ -125,6 +131,41 @@ class _Draft:
         observation = self._observation(frame, variables, rng)
         return EnvironmentSpec.model_validate({**frame.model_dump(), "observation": observation})
 
+    def known_reward(self, counted: Counted, spec: EnvironmentSpec, rng: np.random.Generator) -> DeclaredReward | None:
+        """A reward that a quadratic function explains exactly, or None.
+
+        If most of the explored steps allow one, further steps from random states decide, because explored states may
+        vary too little, and an episode may follow a schedule. Half of the further steps are kept for the check.
+        """
+        seen, simulator = self._seen, self._simulator
+        explored = Paid(
+            wrapped(spec, seen.states[:, self._kept]),
+            seen.actions,
+            wrapped(spec, seen.next_states[:, self._kept]),
+            seen.rewards,
+        ).at(~seen.terminated)
+        usable = simulator.pays and self._probed.settable and not self._probed.noisy
+        if not (usable and may_be_quadratic(spec, explored)):
+            return None
+        taken = self._steps_anywhere(counted, spec, 2 * math.ceil(ENOUGH * coefficients(spec)), rng)
+        half = len(taken) // 2
+        return quadratic_reward(spec, taken.at(slice(half)), taken.at(slice(half, None)))
+
+    def _steps_anywhere(self, counted: Counted, spec: EnvironmentSpec, count: int, rng: np.random.Generator) -> Paid:
+        """Steps from random states of the sampling ranges, with random actions; those that end an episode are left
+        out."""
+        ranges, action = np.array([limits(c.sampling) for c in spec.coordinates]), spec.action
+        assert isinstance(action, BoxAction)
+        rows = []
+        for place in rng.uniform(ranges[:, 0], ranges[:, 1], (count, len(ranges))):
+            self._simulator.place(self._kept, place)
+            before, u = self._simulator.read()[self._kept], rng.uniform(action.low, action.high)
+            step = counted.step(u)
+            if not step.terminated:
+                rows.append((before, u, self._simulator.read()[self._kept], step.reward))
+        q, u, q_next, reward = (np.array(column) for column in zip(*rows, strict=True))
+        return Paid(wrapped(spec, q), u, wrapped(spec, q_next), reward)
+
     def found(self, spec: EnvironmentSpec, steps: int) -> tuple[str, ...]:
         """Findings, one sentence each."""
         probed, kept = self._probed, set(spec.coordinate_names)
@@ -143,6 +184,11 @@ class _Draft:
             )
         if kinds["constant"]:
             lines.append(f"{_listed(kinds['constant'])}: constant within an episode, and drawn again at each reset")
+        if isinstance(spec.reward, DeclaredReward):
+            lines.append(
+                "a quadratic function of coordinates and actions explains every reward, so it is declared: no query is "
+                "spent on it"
+            )
         if still:
             lines.append(f"left out, because it never moved or repeats another variable: {_listed(still)}")
         if self._left_out:
@@ -184,7 +230,8 @@ class _Draft:
         lines.append(
             "success: when does an episode count as solved? Without a criterion, evaluations report returns only"
         )
-        lines.append(self._asked_of_reward())
+        if not isinstance(spec.reward, DeclaredReward):
+            lines.append(self._asked_of_reward())
         return (*lines, *self._simulator.questions)
 
     def _asked_of_reward(self) -> str:
