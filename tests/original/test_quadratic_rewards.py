@@ -20,6 +20,7 @@ from surrogym_shared.spec import (
     Reward,
     Term,
     Uniform,
+    limits,
 )
 
 RANGES = {"level": (0.7, 1.0), "heat": (300.0, 350.0), "turn": (-np.pi, np.pi)}
@@ -117,5 +118,7 @@ def test_a_spiral_with_another_reward_keeps_it_to_be_learned(registered: Registe
 @installed("pcgym")
 @pytest.mark.filterwarnings("ignore")
 def test_the_stirred_tanks_setpoint_is_found():
-    [term] = describe("pcgym:cstr").spec.reward.terms
+    found = describe("pcgym:cstr")
+    [term] = found.spec.reward.terms
     assert (term.shape, term.weight) == ("square", pytest.approx(-1))
+    assert limits(found.spec.coordinates[1].sampling)[1] < 345, "hotter, the reaction runs away"

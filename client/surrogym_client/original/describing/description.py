@@ -184,6 +184,11 @@ class _Draft:
             )
         if kinds["constant"]:
             lines.append(f"{_listed(kinds['constant'])}: constant within an episode, and drawn again at each reset")
+        if not probed.stays:
+            lines.append(
+                f"{probed.leaving:.0%} of the steps from random states within the declared limits led far outside: the "
+                "sampling ranges are those that random actions reached, with a margin"
+            )
         if isinstance(spec.reward, DeclaredReward):
             lines.append(
                 "a quadratic function of coordinates and actions explains every reward, so it is declared: no query is "
@@ -203,7 +208,7 @@ class _Draft:
         guessed = [
             c.name
             for i, c in zip(self._kept, spec.coordinates, strict=True)
-            if c.kind == "linear" and not self._simulator.variables[i].limited
+            if c.kind == "linear" and not (self._simulator.variables[i].limited and self._probed.stays)
         ]
         ended, lines = int(self._seen.terminated.sum()), list[str]()
         if guessed:
@@ -292,7 +297,8 @@ class _Draft:
             fastest = FASTER * max(abs(low), abs(high)) or UNKNOWN_SPEED
             return -fastest, fastest
         pushed = variable.motion == "slide" and not variable.driven  # its limits may be far away
-        if variable.low is not None and variable.high is not None and not pushed:
+        trusted = not pushed and (self._probed.stays or constant)
+        if variable.low is not None and variable.high is not None and trusted:
             return min(low, variable.low), max(high, variable.high)
         if pushed and variable.limited:
             near = self._seen.starts[:, index]

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from surrogym_client.original.describing.exploring import RESETS, Counted, Seen
+from surrogym_client.original.errors import StepFailed
 from surrogym_client.original.protocol import Array
 
 PLACES = 4  # number of states for each question
@@ -17,6 +18,7 @@ EXACT = 1e-6  # of a variable's observed range
 SETTABLE = 1e-3  # of the same range: the largest error of a state that can be set
 FEW = 3.0  # factor for noise that was estimated from few steps
 FARTHEST = 3.0  # largest shift of a position
+ANYWHERE = 32  # states within the limits from which a step is taken
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,8 @@ class Probed:
         replay_error: between two episodes from one seed under the same actions.
         shifts: positions whose shift changes nothing.
         turns: angles whose whole turn changes nothing.
+        leaving: share of the steps from random states within declared limits that lead outside by more than the width
+            of the limits; 0 if it was not asked.
     """
 
     set_error: float
@@ -36,6 +40,12 @@ class Probed:
     replay_error: float
     shifts: frozenset[str] = frozenset()
     turns: frozenset[str] = frozenset()
+    leaving: float = 0.0
+
+    @property
+    def stays(self) -> bool:
+        """Whether the environment stays near its declared limits if it begins within them."""
+        return self.leaving == 0
 
     @property
     def noisy(self) -> bool:
@@ -89,7 +99,32 @@ def probe(counted: Counted, seen: Seen, rng: np.random.Generator) -> Probed:
             shifts.add(variable.name)
         if variable.motion == "turn" and changes_nothing(i, 2 * np.pi, seen_in_observation=False):
             turns.add(variable.name)
-    return Probed(set_error, repeat_error, replay_error, frozenset(shifts), frozenset(turns))
+    leaving = _leaving(counted, seen, rng)
+    return Probed(set_error, repeat_error, replay_error, frozenset(shifts), frozenset(turns), leaving)
+
+
+def _leaving(counted: Counted, seen: Seen, rng: np.random.Generator) -> float:
+    """Share of the steps from random states within declared limits that lead far outside of them.
+
+    Mechanical variables are not asked: their limits are those of joints.
+    """
+    simulator = counted.simulator
+    limited = [i for i, v in enumerate(simulator.variables) if v.motion == "other" and v.limited]
+    mechanical = any(v.motion in ("slide", "turn", "speed") for v in simulator.variables)
+    if mechanical or not limited:
+        return 0.0
+    low, high = np.array([(simulator.variables[i].low, simulator.variables[i].high) for i in limited], float).T
+    outside = 0
+    for _ in range(ANYWHERE):
+        state = seen.states[rng.integers(len(seen.states))].copy()
+        state[limited] = rng.uniform(low, high)
+        try:
+            reached, _ = counted.step_from(state, seen.actions[rng.integers(len(seen.actions))])
+        except StepFailed:
+            reached = np.full(len(state), np.inf)
+        inside = (reached[limited] >= 2 * low - high) & (reached[limited] <= 2 * high - low)
+        outside += not inside.all()
+    return outside / ANYWHERE
 
 
 def _replayed(counted: Counted, seen: Seen, scale: Array) -> float:

@@ -1,0 +1,65 @@
+"""Declared limits are the sampling range only if the environment stays near them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from surrogym_client.original.describing.exploring import Counted, explore
+from surrogym_client.original.describing.probing import ANYWHERE, Probed, probe
+from surrogym_client.original.simulator import Simulator, Taken, Variable
+from surrogym_shared.spec import BoxAction
+
+
+class Kettle(Simulator):
+    """A temperature that follows the heating, and runs away from where it is hotter than 0.8 of its limit."""
+
+    def __init__(self, faster: float, **kind: object) -> None:
+        self.variables = (Variable("heat", low=0.0, high=1.0, **kind),)  # type: ignore[arg-type]
+        self.action = BoxAction(low=(0.0,), high=(0.5,))
+        self.time_limit, self.rest = 50, np.zeros(1)
+        self._heat, self._faster = np.full(1, 0.2), faster
+
+    def reset(self, seed: int | None) -> np.ndarray:
+        self._heat = np.full(1, 0.2)
+        return self._heat
+
+    def read(self) -> np.ndarray:
+        return self._heat.copy()
+
+    def write(self, state: np.ndarray) -> None:
+        self._heat = state.copy()
+
+    def step(self, action: np.ndarray) -> Taken:
+        after = 0.8 * self._heat + 0.2 * action
+        self._heat = np.where(self._heat > 0.8, self._faster * self._heat, after)
+        return Taken(self._heat.copy(), 0.0, False, False)
+
+    def observe(self) -> np.ndarray:
+        return self._heat.copy()
+
+    def close(self) -> None:
+        pass
+
+
+def probed(kettle: Kettle) -> tuple[Probed, int]:
+    counted, rng = Counted(kettle), np.random.default_rng(0)
+    found = probe(counted, explore(counted, 40, rng), rng)
+    return found, counted.steps
+
+
+def test_limits_beyond_which_states_run_away_are_not_trusted():
+    found, steps = probed(Kettle(faster=50.0))
+    assert found.settable
+    assert 0.05 < found.leaving < 0.4
+    assert not found.stays
+    assert steps >= 40 + ANYWHERE, "they are counted"
+
+
+def test_limits_that_are_passed_a_little_are_trusted():
+    assert probed(Kettle(faster=1.5))[0].stays
+
+
+def test_joints_are_not_asked():
+    found, steps = probed(Kettle(faster=50.0, motion="slide"))
+    assert found.stays
+    assert steps < 40 + ANYWHERE
