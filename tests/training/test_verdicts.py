@@ -32,6 +32,7 @@ def test_training_is_over_once_three_checks_earn_the_most_there_is():
         pytest.param(-500.0, [-500.0], [-500.0] * 5, id="nothing is learned yet"),
         pytest.param(0.0, [0.0], [0.0] * 5, id="a policy that stands still"),
         pytest.param(-1_200.0, [-1.0], [-150.0] * 5, id="a plateau"),
+        pytest.param(0.0, [10.0], [50.0, 60.0, 70.0, 80.0, 80.0], id="one start, from which each check earns more"),
     ],
 )
 def test_training_continues_while_more_may_be_earned(untrained: float, earned: list[float], checks: list[float]):

@@ -96,7 +96,7 @@ class Verdicts:
     @property
     def saturated(self) -> bool:
         """Whether no further gain is possible: in the last checks, each episode's return equalled the best one so
-        far, of the training and of all checks."""
+        far, of the training and of all checks, and none of them was a gain."""
         return self._full >= SATURATED
 
     def prolong(self) -> bool:
@@ -130,13 +130,13 @@ class Verdicts:
         """Record a check of the present policy. Returns whether it is the best so far."""
         self._checked = int(self.steps * CHECKS / self._planned)
         imagined, self._many = measured.mean, max(self._many, measured.many)
-        self._most = max(self._most, measured.most)
+        rose, self._most = measured.most > self._most, max(self._most, measured.most)
         self.latest = imagined
         best = self.best is None or imagined >= self.best
         self.best = imagined if self.best is None else max(self.best, imagined)
         self._bests.append((self.steps, self.best))
         full = imagined >= max(self._seen, self._most) and imagined > self._nothing
-        self._full = self._full + 1 if full else 0
+        self._full = (1 if rose else self._full + 1) if full else 0
         return best
 
     def judge(self) -> None:
