@@ -50,6 +50,8 @@ def pay(state, coolant):
 class Reactor:
     """The reactor as an original environment, to judge a policy in."""
 
+    parallel = True  # a simulation: several instances may be open at once
+
     def spec(self):
         concentration = Coordinate(name="concentration", unit="mol/l", sampling=Uniform(low=0, high=1))
         temperature = Coordinate(

@@ -75,6 +75,20 @@ def test_a_minari_data_set_gives_its_steps(tmp_path: Path, monkeypatch: pytest.M
     assert (len(log.steps), log.steps.terminated.sum(), log.steps.truncated.sum()) == (10, 1, 1)
     np.testing.assert_array_equal(log.steps.q_next[4], episodes[0].observations[5])
     assert log.spec.coordinate_names == ("s0", "s1")
+    steps = [(episode, t) for episode in episodes for t in range(5)]
+    np.savez(
+        tmp_path / "same.npz",
+        observations=np.stack([episode.observations[t] for episode, t in steps]),
+        next_observations=np.stack([episode.observations[t + 1] for episode, t in steps]),
+        actions=np.stack([episode.actions[t] for episode, t in steps]),
+        rewards=[episode.rewards[t] for episode, t in steps],
+        terminations=[episode.terminations[t] for episode, t in steps],
+        truncations=[episode.truncations[t] for episode, t in steps],
+        episode=np.repeat([0, 1], 5),
+    )
+    same = read_log(tmp_path / "same.npz")
+    assert same.steps.digest == log.steps.digest, "so the model is the same"
+    assert same.spec.model_copy(update={"environment": log.spec.environment}) == log.spec
 
 
 def test_exactly_the_broken_rows_are_set_aside(tmp_path: Path):

@@ -91,6 +91,16 @@ def test_a_package_that_is_missing_is_named_with_its_extra(name: str, package: s
         open_simulator(name)
 
 
+@installed("pcgym")
+@pytest.mark.filterwarnings("ignore")
+def test_a_reset_shows_the_setpoint_that_the_first_step_is_paid_by() -> None:
+    tank = open_simulator("pcgym:cstr")
+    setpoint = tank.reset(0)[2]
+    reward = tank.step(np.zeros(1)).reward
+    assert setpoint == 0.85
+    assert reward == pytest.approx(-((tank.read()[0] - setpoint) ** 2))
+
+
 @pytest.mark.parametrize("wrong", [{"a_space": [1, 2]}, {"o_space": {"low": [0.0]}}, {"x0": "cold"}])
 def test_parameters_of_another_form_are_named(wrong: dict[str, object], tmp_path) -> None:
     file = tmp_path / "process.json"

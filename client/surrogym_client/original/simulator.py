@@ -65,6 +65,8 @@ class Simulator(ABC):
         variables: the state's numbers, (V,).
         rest: the state (V,) that a variable has where no coordinate says otherwise.
         time_limit: steps of an episode; None without a limit.
+        scheduled: names of variables that a schedule sets, such as setpoints: coordinates, also where a few steps show
+            one value alone.
         notes: findings that a description repeats, one sentence each.
         questions: to a person who reads a description, one sentence each.
     """
@@ -77,6 +79,7 @@ class Simulator(ABC):
     variables: tuple[Variable, ...]
     rest: Array
     time_limit: int | None = None
+    scheduled: frozenset[str] = frozenset()
     notes: tuple[str, ...] = ()
     questions: tuple[str, ...] = ()
 

@@ -103,6 +103,7 @@ class Process(OfParts):
         env.reset()
         self._schedule = (env.SP, getattr(env, "disturbances", {}))
         super().__init__([_State(env)])
+        self.scheduled = frozenset(v.name for v in self.variables if v.motion == "held")
         self.action = action_of(name, env.action_space)
         self.time_limit = int(env.N) - 1  # its episodes end one step before their number of samples
 
@@ -112,7 +113,15 @@ class Process(OfParts):
         if disturbances:
             self._env.disturbances = disturbances
         self._env.reset()
+        self._show_setpoints()
         return self.observe()
+
+    def _show_setpoints(self) -> None:
+        """Show the first setpoints of the schedule. pc-gym shows those of ``x0``, though it already pays by the
+        schedule."""
+        at = self._env.Nx_oracle
+        for i, values in enumerate(self._schedule[0].values()):
+            self._env.state[at + i] = values[0]
 
     def step(self, action: Array) -> Taken:
         _, reward, over, _, _ = self._env.step(native_action(self.action, action).astype(np.float64))

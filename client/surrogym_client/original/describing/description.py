@@ -254,9 +254,10 @@ class _Draft:
     def _chosen(self) -> list[int]:
         """Indices of the variables that become coordinates."""
         kept: list[int] = []
+        unmoved = {f"{name}{VELOCITY}" for name in self._unmoved}
         for i, variable in enumerate(self._simulator.variables):
             repeats = variable.motion == "held" and any(np.allclose(self._all[:, i], self._all[:, k]) for k in kept)
-            moves = np.ptp(self._all[:, i]) > 0 or variable.name in {f"{name}{VELOCITY}" for name in self._unmoved}
+            moves = np.ptp(self._all[:, i]) > 0 or variable.name in unmoved | self._simulator.scheduled
             if moves and not repeats and variable.name not in self._probed.shifts:
                 kept.append(i)
         return kept
