@@ -51,6 +51,7 @@ def test_a_training_is_prolonged_unless_its_steps_are_chosen_or_real_or_the_pape
     prolonged = {name for name in ARMS if DemoSettings("acrobot", arm=name).prolong}
     assert prolonged == set(ARMS) - {"paper", "paper_hypercube", "oracle"}
     assert not DemoSettings("acrobot", steps=1_750_000).prolong
+    assert not DemoSettings("pendulum", algorithm="cmaes").prolong, "it trains for a fixed number of steps"
 
 
 def test_arms_differ_in_their_specifications():

@@ -64,7 +64,9 @@ class DemoSettings:
     @property
     def prolong(self) -> bool:
         """Whether a training that still gains takes as many virtual steps again: as ``prolongs`` where a task or an arm
-        chose their number, and not where each is a real one."""
+        chose their number, and not where each is a real one or the search can't be prolonged."""
+        if not SEARCHES.get(self.search).prolongable:
+            return False
         return not self.way.original and prolongs(TrainSettings(total_steps=self.steps), self.spec())
 
     def spec(self) -> EnvironmentSpec:
