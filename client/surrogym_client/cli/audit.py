@@ -12,6 +12,7 @@ from surrogym_client.cli.pushing import push_or_say
 
 if TYPE_CHECKING:
     from surrogym_client.policies.card import PolicyCard
+    from surrogym_shared.wire import SurrogateView
 
 
 def register(app: typer.Typer) -> None:
@@ -60,7 +61,8 @@ def command(
         HttpSurrogate(api.url, name, service.token_for(context)) as port,
         progress("audit", quiet=output.quiet) as update,
     ):
-        subject = Subject(api, name, port, predict, _session(card), card.untrained, seed)
+        session = _session(card, api.surrogate(name))
+        subject = Subject(api, name, port, predict, session, card.untrained, seed)
         found = hand_over(subject, asked, lambda view: update(None, f"{view.ledger.audit} real steps of audits"))
     if found.audit is None:
         raise CommandError(f"no audit was made, and the card is unchanged: {found.reason}")
@@ -71,7 +73,11 @@ def command(
     output.give(result, lambda: words_of_handover(found))
 
 
-def _session(card: PolicyCard) -> dict[str, object]:
-    """Return the session options that the policy was compared in, from its card."""
+def _session(card: PolicyCard, view: SurrogateView) -> dict[str, object]:
+    """Return the session options that the policy was compared in, from its card. Noise that was confirmed since then is
+    added."""
+    from surrogym_client.training.settings import noisy
+
     judged = card.settings.get("judge") or card.settings.get("session") or {}
-    return dict(judged) if isinstance(judged, dict) else {}
+    noise: dict[str, object] = {"process_noise": True} if noisy(view) else {}
+    return {**noise, **judged} if isinstance(judged, dict) else noise

@@ -88,13 +88,17 @@ def chosen_for(view: SurrogateView, settings: TrainSettings, *, by_mean: bool = 
         return settings
     if view.spec.outside_reward is not None and settings.start_box is None:
         settings = replace(settings, start_box=0.0)
-    noisy = view.fidelity is not None and any(output.noise > 0 for output in view.fidelity.outputs)
-    if noisy and not by_mean:
+    if noisy(view) and not by_mean:
         settings = replace(settings, session={"process_noise": True, **settings.session})
     if "variant" in settings.session or view.phase == "ready":
         return settings
     other = {name: value for name, value in settings.session.items() if name not in OF_PARTICLES}
     return replace(settings, session=DRAWS | settings.session, judge=FUNCTIONS | other)
+
+
+def noisy(view: SurrogateView) -> bool:
+    """Whether the design has confirmed noise of an output."""
+    return view.fidelity is not None and any(output.noise > 0 for output in view.fidelity.outputs)
 
 
 def prolongs(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
