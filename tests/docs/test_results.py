@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from surrogym_client.experiments.reproduce.page import present_sections, section
+from surrogym_client.experiments.reproduce.promises import promise_tables
 from surrogym_client.experiments.reproduce.rows import merge, read_rows
-from surrogym_client.experiments.reproduce.table import contrasts, summary, tasks_with_results
+from surrogym_client.experiments.reproduce.table import contrasts, grouped, summary, tasks_with_results
 
 DOCS = Path(__file__).parents[2] / "docs"
 ROWS = read_rows(DOCS / "results" / "efficiency.csv")
@@ -39,6 +40,14 @@ def test_tables_from_before_a_change_or_of_fresh_seeds_are_those_of_their_rows(p
     text = (DOCS / "results" / f"{page}.md").read_text()
     assert summary(rows) in text, again
     assert contrasts(rows) in text, again
+
+
+def test_every_table_of_the_unseen_tasks_is_that_of_its_rows():
+    text, rows = (DOCS / "results" / "trust.md").read_text(), read_rows(DOCS / "results" / "trust.csv")
+    made = summary(rows) + promise_tables(grouped(rows))
+    tables = [line for line in made.splitlines() if line.startswith("|")]
+    assert len(tables) > 30
+    assert set(tables) <= set(text.splitlines())
 
 
 def test_each_cell_has_one_row_and_each_task_its_picture():

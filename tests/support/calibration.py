@@ -86,7 +86,7 @@ def one_step(
     at = np.arange(len(real.q)) % HORIZON
     each = np.arange(len(real.q))
     step = _along(draws, paths, real.q[each, at], real.u[each, at])
-    return _outputs(model, *step, real.q[each, at + 1], real.reward[each, at])
+    return outputs(model, *step, real.q[each, at + 1], real.reward[each, at])
 
 
 def ten_steps(
@@ -103,7 +103,7 @@ def ten_steps(
         )
         q = moved.q_next.numpy().reshape(q.shape)
         paid += moved.reward.numpy().reshape(paid.shape)
-    return _outputs(model, q, paid, real.q[:, -1], real.reward.sum(1))
+    return outputs(model, q, paid, real.q[:, -1], real.reward.sum(1))
 
 
 def _along(draws: FunctionDraws, paths: torch.Tensor, q: Array, u: Array) -> tuple[Array, Array]:
@@ -115,7 +115,7 @@ def _along(draws: FunctionDraws, paths: torch.Tensor, q: Array, u: Array) -> tup
     return moved.q_next.numpy().reshape(count, m, -1), moved.reward.numpy().reshape(count, m)
 
 
-def _outputs(model: DynamicsModel, q: Array, paid: Array, q_real: Array, reward: Array) -> tuple[Array, Array]:
+def outputs(model: DynamicsModel, q: Array, paid: Array, q_real: Array, reward: Array) -> tuple[Array, Array]:
     """What moves, and the reward; angles of draws by the shorter way from the real ones."""
     definition = model.definition
     q = q.copy()
