@@ -87,6 +87,8 @@ OTHERWISE = {
     "docs/results/efficiency.md": "tests/cli runs its studies, in short",
     "docs/results/fresh-seeds.md": "tests/cli runs its studies, in short",
     "docs/results/fastppo.md": "tests/cli runs its studies, in short",
+    "docs/results/by-name.md": "tests/cli and tests/original run its commands, in short",
+    "docs/results/trust.md": "tests/cli runs its study, in short",
     "docs/results/acquisition.md": "tests/cli runs its studies, in short",
     "docs/results/paper.md": "tests/cli runs its studies, in short",
 }
