@@ -202,3 +202,16 @@ def test_axe_finds_nothing_serious(url: str, open_page: Open, where: str, scheme
     assert serious(page) == []
     if width == 390:
         assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0  # no sideways scrolling
+
+
+def test_long_name_of_a_surrogate_fits_a_narrow_screen(url: str, open_page: Open):
+    """The lists to choose from have the names of all surrogates, also of those that are not compared."""
+    name = "w" * 64
+    with Api(url) as api:
+        api.create_surrogate(name, pendulum())
+        try:
+            page = open_page(f"{url}/#/compare/worse/better", width=390)
+            expect(page.locator(".ranges")).to_be_visible()
+            assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+        finally:
+            api.delete_surrogate(name)
