@@ -9,7 +9,7 @@ import pytest
 from surrogym_client.original.classic import pendulum
 from surrogym_client.surrogates.advice import advice, noise_in_words, verdict
 from surrogym_client.surrogates.waiting import words_of_uncertainty, words_of_waiting
-from surrogym_shared.wire import Fidelity, Ledger, ModelView, OutputFidelity, QueryCounts, SurrogateView
+from surrogym_shared.wire import DoubtfulRegion, Fidelity, Ledger, ModelView, OutputFidelity, QueryCounts, SurrogateView
 
 TARGET = 0.999
 
@@ -89,6 +89,21 @@ def models(indices: list[float], error: float = 0.01) -> list[ModelView]:
 )
 def test_the_verdict_names_what_is_in_doubt(outputs: tuple[OutputFidelity, ...], phase: str, words: str) -> None:
     assert verdict(view(*outputs, phase=phase)) == words
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "outside", "words"),
+    [
+        (2.1, None, False, "above 2.1"),
+        (None, 2.1, False, "below 2.1"),
+        (-1.0, 350.2, False, "between -1 and 350"),
+        (-6.0, 6.0, True, "below -6 or above 6"),
+    ],
+)
+def test_the_verdict_says_where_an_output_is_in_doubt(low, high, outside, words) -> None:
+    region = DoubtfulRegion(input="theta", low=low, high=high, outside=outside, share=0.9)
+    said = verdict(view(output("x", 1.0), output("r", 0.98, region=region)))
+    assert said == f"ready but for r where theta is {words} (confidence 0.98 of 0.999)"
 
 
 def test_established_noise_allows_for_a_larger_error() -> None:

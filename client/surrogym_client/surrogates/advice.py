@@ -7,7 +7,7 @@ from math import ceil, log
 from statistics import NormalDist
 
 from surrogym_client.surrogates.phases import COMPLETED
-from surrogym_shared.wire import ModelView, OutputFidelity, SurrogateView
+from surrogym_shared.wire import DoubtfulRegion, ModelView, OutputFidelity, SurrogateView
 
 NEARLY = 0.9  # share of the target that counts as nearly reached
 MOST_STEPS = 10.0  # longest forecast, as a multiple of the present samples
@@ -101,10 +101,24 @@ def _largest_error(output: OutputFidelity) -> float:
 
 def _named(output: OutputFidelity, target: float) -> str:
     if output.confidence_index < target:
-        return f"{output.name} (confidence {output.confidence_index:.4g} of {target:g})"
+        return f"{output.name}{_where(output.region)} (confidence {output.confidence_index:.4g} of {target:g})"
     error = output.leave_one_out_error
     beyond = "unknown" if error is None else f"{error:.2g}"
     return f"{output.name} (leave-one-out error {beyond}, tolerance {output.tolerance:.2g})"
+
+
+def _where(region: DoubtfulRegion | None) -> str:
+    """Describe a region, with a space before it; empty without one."""
+    if region is None:
+        return ""
+    name, low, high = region.input, _end(region.low), _end(region.high)
+    if low is None or high is None:
+        return f" where {name} is {f'above {low}' if high is None else f'below {high}'}"
+    return f" where {name} is {f'below {low} or above {high}' if region.outside else f'between {low} and {high}'}"
+
+
+def _end(value: float | None) -> str | None:
+    return None if value is None else f"{value:.3g}"
 
 
 def _steps_to_go(view: SurrogateView, worst: OutputFidelity, models: Sequence[ModelView]) -> int | None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
+from surrogym_server.environment.points import Points
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
 from surrogym_server.sampling.design import monte_carlo
@@ -42,5 +43,6 @@ def fidelity_of(model: DynamicsModel, usual: Sequence[float], target: float) -> 
     """
     usual = usual or usual_tolerances(model.definition, model.scales.tolist())
     tolerances = model.definition.tolerances_over(usual)
-    deviation = deviations(model, *monte_carlo(model.definition))
-    return fidelity_fields(model, confidences_of(model, deviation, tolerances), tolerances, target)
+    points = Points(*monte_carlo(model.definition))
+    judged = confidences_of(model, points, deviations(model, points.q, points.u), tolerances)
+    return fidelity_fields(model, judged, tolerances, target)

@@ -7,14 +7,16 @@ kept as a logarithm, because the difference rounds to 0 if sigma is below tau / 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from surrogym_server.environment.points import Points
 from surrogym_server.models.abilities import LeaveOneOut, LeaveOneOutErrors, offers
 from surrogym_server.models.guard import require_shapes
 from surrogym_server.models.port import DynamicsModel
+from surrogym_server.sampling.regions import Region, regions_of
 
 SUREST = 1e9  # largest ratio of tolerance to deviation; larger ones are clipped to it
 
@@ -28,6 +30,7 @@ class OutputConfidence:
     leave_one_out_within_one: float | None  # share of the samples within one predictive deviation
     leave_one_out_within_two: float | None
     noise: float = 0.0  # established by repeated steps, in the output's unit
+    region: Region | None = None  # where most of the doubt is
 
 
 def deviations(model: DynamicsModel, q: Tensor, u: Tensor) -> Tensor:
@@ -56,11 +59,16 @@ def log_uncertainty_index(log_model_uncertainty: Tensor, log_probability: Tensor
     return log_model_uncertainty + log_probability  # eq. 12
 
 
-def confidences_of(model: DynamicsModel, deviation: Tensor, tolerances: Sequence[float]) -> list[OutputConfidence]:
-    """Confidence of every output (O,) from its deviations (m, O) over the Monte Carlo set."""
+def confidences_of(
+    model: DynamicsModel, points: Points, deviation: Tensor, tolerances: Sequence[float]
+) -> list[OutputConfidence]:
+    """Confidence of every output (O,) from its deviations (m, O) over the points of the Monte Carlo set."""
     able = offers(model, LeaveOneOut)
     errors = [None] * len(tolerances) if able is None else able.leave_one_out()
-    return [confidence(deviation[:, i], tolerances[i], errors[i]) for i in range(len(tolerances))]
+    doubt = log_model_uncertainty(deviation, deviation.new_tensor(tolerances)).exp()
+    regions = regions_of(model.definition, points, doubt)
+    judged = [confidence(deviation[:, i], tolerances[i], errors[i]) for i in range(len(tolerances))]
+    return [replace(one, region=region) for one, region in zip(judged, regions, strict=True)]
 
 
 def confidence(deviation: Tensor, tolerance: float, errors: LeaveOneOutErrors | None) -> OutputConfidence:

@@ -173,7 +173,7 @@ def judge_model(
     with plugin_calls(definition):
         deviation = deviations(model, points.q, points.u)
         require_deviations(model, deviation)
-        judged = confidences_of(model, deviation, tolerances)
+        judged = confidences_of(model, points, deviation, tolerances)
     confidences = tuple(replace(c, noise=float(w)) for c, w in zip(judged, noise, strict=True))
     candidates = candidates_of(model, points, request.states, _rng(definition, f"visited {round_}"))
     reserved = ending(model, samples, candidates.points)

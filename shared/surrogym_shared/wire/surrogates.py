@@ -41,6 +41,16 @@ class PatchSurrogate(Request):
     )
 
 
+class DoubtfulRegion(Reply):
+    """A range of one coordinate or action entry where an output is in doubt."""
+
+    input: str = Field(description="name of the coordinate; ``action``, or ``action 1``, ``action 2``...")
+    low: float | None = Field(description="lower end of the range; null: none")
+    high: float | None = Field(description="upper end of the range; null: none")
+    outside: bool = Field(description="whether the doubt is outside of the range")
+    share: float = Field(description="share of the output's doubt over the Monte Carlo set that lies there")
+
+
 class OutputFidelity(Reply):
     """How well the model predicts one output."""
 
@@ -67,6 +77,9 @@ class OutputFidelity(Reply):
         default=0.0,
         description="standard deviation of a single step's noise, if repeated steps confirm it, in the output's "
         "unit; it is part of ``tolerance``; 0 without confirmed noise",
+    )
+    region: DoubtfulRegion | None = Field(
+        default=None, description="where most of the doubt is; null if no range of a single input has most of it"
     )
 
 

@@ -33,7 +33,7 @@ def candidates(points) -> Points:
 
 def test_leave_one_out_errors_are_unknown(plain, candidates):
     assert offers(plain, LeaveOneOut) is None
-    judged = confidences_of(plain, deviations(plain, candidates.q, candidates.u), TOLERANCES)
+    judged = confidences_of(plain, candidates, deviations(plain, candidates.q, candidates.u), TOLERANCES)
     assert {(j.leave_one_out_error, j.leave_one_out_within_one) for j in judged} == {(None, None)}
 
 

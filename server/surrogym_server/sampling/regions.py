@@ -1,0 +1,86 @@
+"""Where an output is in doubt: the range of one coordinate or action entry that has most of its uncertainty.
+
+The range separates the doubt from the points best: of all ranges of all inputs, it has the largest difference between
+its share of the doubt and its share of the points (Youden's index). Inputs without such a range don't say where the
+doubt is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import chain
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.points import Points
+
+LEAST_GAIN = 0.5  # of the share of the doubt over that of the points; with less, the doubt is nearly everywhere
+LEAST_DOUBT = 1e-12  # mean model uncertainty below which there is no doubt
+
+
+@dataclass(frozen=True)
+class Region:
+    """A range of one input. None as an end: the range has no end on this side."""
+
+    input: str  # name of the coordinate, or of the action entry
+    low: float | None
+    high: float | None
+    outside: bool  # whether the doubt is outside of the range, which then has both ends
+    share: float  # of the doubt that is in the region
+
+
+def regions_of(
+    definition: EnvironmentDefinition, points: Points, doubt: Tensor, names: Sequence[str] = ()
+) -> tuple[Region | None, ...]:
+    """Find the region of each output.
+
+    Args:
+        definition: names the inputs.
+        points: the Monte Carlo set, m of them.
+        doubt: model uncertainty 1 - C of each output, (m, O).
+        names: of the action's entries; empty takes ``action`` or ``action 1``, ``action 2``...
+
+    Returns:
+        one for each output; None where there is no doubt, or where no single input separates it.
+    """
+    entries = points.u.shape[1]
+    actions = names or (["action"] if entries == 1 else [f"action {i + 1}" for i in range(entries)])
+    inputs = torch.cat([points.q, points.u.to(points.q.dtype)], 1)
+    every = [*(coordinate.name for coordinate in definition.coordinates), *actions]
+    return tuple(_region(inputs, doubt[:, output], every) for output in range(doubt.shape[1]))
+
+
+def _region(inputs: Tensor, doubt: Tensor, names: Sequence[str]) -> Region | None:
+    if float(doubt.mean()) < LEAST_DOUBT:
+        return None
+    share = doubt / doubt.sum()
+    found = chain.from_iterable(_ranges(inputs[:, i], share, name) for i, name in enumerate(names))
+    gain, best = max(found, key=lambda one: one[0])
+    return best if gain >= LEAST_GAIN else None
+
+
+def _ranges(values: Tensor, share: Tensor, name: str) -> list[tuple[float, Region]]:
+    """The best range of one input, and the best one to leave out, with their gains."""
+    ordered, order = values.sort(stable=True)
+    last = torch.cat([ordered[1:] != ordered[:-1], torch.tensor([True])])  # equal values stay together
+    doubt = torch.cat([torch.zeros(1, dtype=share.dtype), share[order].cumsum(0)[last]])
+    gain = doubt - torch.cat([torch.zeros(1, dtype=share.dtype), (torch.arange(len(values)) + 1.0)[last] / len(values)])
+    distinct = ordered[last]
+    return [_range(gain, doubt, distinct, name, outside=False), _range(-gain, doubt, distinct, name, outside=True)]
+
+
+def _range(gain: Tensor, doubt: Tensor, values: Tensor, name: str, *, outside: bool) -> tuple[float, Region]:
+    """The interval of the distinct ``values`` (d,) with the largest increase of ``gain`` (d + 1,)."""
+    lowest, at = gain.cummin(0)
+    end = int((gain - lowest).argmax())
+    begin = int(at[end])
+    low = None if begin == 0 else float((values[begin - 1] + values[begin]) / 2)
+    high = None if end == len(values) else float((values[end - 1] + values[end]) / 2)
+    inside = float(doubt[end] - doubt[begin])
+    share = 1 - inside if outside else inside
+    if outside and (low is None or high is None):  # the rest of a range with one end is one, too
+        return float(gain[end] - gain[begin]), Region(name, high, low, False, share)
+    return float(gain[end] - gain[begin]), Region(name, low, high, outside, share)
