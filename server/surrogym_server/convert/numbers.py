@@ -25,7 +25,3 @@ def numbers(what: str, rows: Sequence[Any]) -> NDArray[np.float64]:
 
 def as_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
-
-
-def with_lists(values: dict[str, Any]) -> dict[str, Any]:
-    return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}

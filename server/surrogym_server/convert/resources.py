@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from surrogym_server.convert.numbers import as_tuple, with_lists
+from surrogym_server.convert.numbers import as_tuple
 from surrogym_server.convert.stored import read_stored
 from surrogym_server.sampling.uncertainty import UncertaintyResult
 from surrogym_server.services.models import Said
@@ -161,8 +161,7 @@ def snapshot_list(known: Mapping[str, Sequence[float]]) -> replies.SnapshotList:
 
 
 def sample_view(record: SampleRecord) -> replies.SampleView:
-    fields = with_lists(asdict(record))
-    return replies.SampleView(**{name: fields[name] for name in replies.SampleView.model_fields})
+    return replies.SampleView.model_validate(record, from_attributes=True)
 
 
 def sample_page(records: Sequence[SampleRecord], limit: int) -> replies.SamplePage:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -29,15 +30,11 @@ from surrogym_server.storage.sql.sample_rows import body_of, insert_samples, row
 from surrogym_server.storage.sql.snapshots import insert_snapshots
 from surrogym_server.storage.sql.tables import queries, samples
 
-COLUMNS = [
-    getattr(samples.c, name)
-    for name in (
-        *("id", "purpose", "query_id", "sampler", "attempt", "late", "step", "coordinates", "action"),
-        *("next_coordinates", "reward", "terminated", "truncated", "observation", "next_observation"),
-        "created_at",
-    )
-]
-
+_COLUMNS: dict[str, sa.ColumnElement[Any]] = {
+    "requested_coordinates": sa.case((queries.c.kind == "step", queries.c.coordinates)),
+    "trajectory": sa.case((queries.c.kind == "rollout", samples.c.lease_id)),
+}
+IN_ORDER = [_COLUMNS[field.name] if field.name in _COLUMNS else samples.c[field.name] for field in fields(SampleRecord)]
 
 Identity = tuple[int | None, int]
 
@@ -91,16 +88,14 @@ class SqlSamples(port.Samples):
     def page(self, name: str, after: int, limit: int) -> list[SampleRecord]:
         with self._database.read() as connection:
             own = samples.c.surrogate_id == find(connection, name)
-            requested = sa.case((queries.c.kind == "step", queries.c.coordinates))
-            trajectory = sa.case((queries.c.kind == "rollout", samples.c.lease_id))
             rows = connection.execute(
-                sa.select(*COLUMNS, requested.label("requested_coordinates"), trajectory.label("trajectory"))
+                sa.select(*IN_ORDER)
                 .select_from(samples.outerjoin(queries, samples.c.query_id == queries.c.id))
                 .where(own, samples.c.id > after)
                 .order_by(samples.c.id)
                 .limit(limit)
             )
-            return [SampleRecord(**row._mapping) for row in rows]
+            return [SampleRecord(*row) for row in rows.all()]
 
     def count(self, name: str) -> int:
         with self._database.read() as connection:

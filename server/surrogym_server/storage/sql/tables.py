@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import reprlib
+import struct
 from typing import Any, get_args
 
 import numpy as np
@@ -53,8 +54,8 @@ class Floats(sa.types.TypeDecorator[Vector]):
 
     def process_result_value(self, value: bytes | None, dialect: Dialect) -> Vector | None:  # noqa: ARG002
         try:
-            return None if value is None else tuple(np.frombuffer(value, dtype="<f8").tolist())
-        except (TypeError, ValueError) as error:
+            return None if value is None else struct.unpack(f"<{len(value) // 8}d", value)
+        except (TypeError, struct.error) as error:
             raise damaged(f"expected a vector of floats: {error}") from error
 
 
