@@ -2,9 +2,9 @@
 
 Each run folder of a study has the database and the policy of one run. The policy acts in the original environment from
 starts that were not used before. The run's last model predicts one window of each episode: its first step, and the
-state after ten steps with the sum of their rewards. Predictions are along functions drawn from the posterior, with the
-noise that the design has confirmed. In the ten steps the policy acts in each draw, because recorded actions answer
-the noise of the recorded episode.
+state after ten steps with the sum of their rewards. Predictions are along functions drawn as for a promise, with
+uncertain hyperparameters, and with the noise that the design has confirmed. In the ten steps the policy acts in each
+draw, because recorded actions answer the noise of the recorded episode.
 
 An output counts where its errors exceed the tolerance: where the 90 % quantile of its errors over all seeds does. Then
 all its predictions count. To count only those with large errors would select what was missed.
@@ -83,7 +83,7 @@ class Draws:
 
     def ahead(self, start: Array, steps: int) -> tuple[Array, Array]:
         """States (s, m, C) after a number of steps from each start (m, C), and the sums of rewards (s, m)."""
-        draws, count = function_draws(self.model), len(self.paths)
+        draws, count = function_draws(self.model, DRAWS), len(self.paths)
         paths, q = self.paths.repeat_interleave(len(start), 0), torch.from_numpy(start).repeat(count, 1)
         paid = torch.zeros(len(q), dtype=torch.float64)
         for _ in range(steps):
@@ -126,8 +126,8 @@ def rows_of(run: Path, settings: DemoSettings) -> Iterator[dict[str, Any]]:
     if real is None:
         return
     random = torch.Generator().manual_seed(settings.seed)
-    size = function_draws(known.model).path_size
-    paths = function_draws(known.model).draw(torch.randn(DRAWS, size, generator=random, dtype=torch.float64))
+    size = function_draws(known.model, DRAWS).path_size
+    paths = function_draws(known.model, DRAWS).draw(torch.randn(DRAWS, size, generator=random, dtype=torch.float64))
     fidelity = json.loads((run / "metrics.json").read_text(encoding="utf-8"))["fidelity"]
     noisy = any(output["noise"] > 0 for output in fidelity["outputs"])
     draws = Draws(known.model, paths, random if noisy else None, predict, settings.spec())

@@ -23,7 +23,7 @@ from surrogym_server.sampling.candidates import Candidates, candidates_of, refer
 from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
 from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
-from surrogym_server.sampling.noise import SLACK, established_noise, to_repeat, widened
+from surrogym_server.sampling.noise import SLACK, banded, established_noise, to_repeat, widened
 from surrogym_server.sampling.peaks import highest
 from surrogym_server.sampling.rollouts import Aim, Rollout, first_rollouts, plan_round
 from surrogym_server.sampling.tolerances import Usual, frozen_tolerances
@@ -173,7 +173,7 @@ def judge_model(
     with plugin_calls(definition):
         deviation = deviations(model, points.q, points.u)
         require_deviations(model, deviation)
-        judged = confidences_of(model, points, deviation, tolerances)
+        judged = confidences_of(model, points, deviation, banded(definition.tolerances_over(usual), noise))
     confidences = tuple(replace(c, noise=float(w)) for c, w in zip(judged, noise, strict=True))
     candidates = candidates_of(model, points, request.states, _rng(definition, f"visited {round_}"))
     reserved = ending(model, samples, candidates.points)

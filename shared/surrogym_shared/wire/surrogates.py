@@ -56,7 +56,10 @@ class OutputFidelity(Reply):
 
     name: str = Field(description="name of the output")
     structure: str = Field(description="inputs and kernel that were chosen, in words")
-    confidence_index: float = Field(description="mean Phi(tolerance / deviation) over the Monte Carlo set (eq. 8, 9)")
+    confidence_index: float = Field(
+        description="mean Phi(tolerance / deviation) over the Monte Carlo set (eq. 8, 9); a noisy output has a wider "
+        "tolerance there: 1.5 deviations of its noise"
+    )
     confidence_index_paper: float = Field(description="mean Phi(1 / deviation): the paper's, in raw units")
     tolerance: float = Field(description="error that is too small to matter, in the output's unit")
     coverage: float = Field(description="share of the Monte Carlo set whose deviation is below the tolerance")
