@@ -333,6 +333,7 @@ def rollout_reply(seq: int, results: Sequence[StepResult]) -> RolloutReply:
 def policy_reply(seq: int, result: PolicyRollout) -> PolicyReply:
     ended = len(result.final_lanes) > 0
     log, versions, untrusted = result.log_probability, result.model_version, result.untrusted
+    reward, mean = _flat(result.reward, FLOAT64), _flat(result.reward_mean, FLOAT64)
     with np.errstate(over="ignore"):
         short = all(one is None or np.array_equal(one, one.astype(FLOAT32)) for one in (result.action, log))
     dtype = FLOAT32 if short else FLOAT64
@@ -342,11 +343,11 @@ def policy_reply(seq: int, result: PolicyRollout) -> PolicyReply:
         action=_flat(result.action, dtype),
         log_probability=None if log is None else _flat(log, dtype),
         observation=_flat(result.observation, FLOAT32),
-        reward=_flat(result.reward, FLOAT64),
+        reward=reward,
         terminated=_flat(result.terminated, BOOL),
         truncated=_flat(result.truncated, BOOL),
         model_version=_flat(versions[0] if (versions == versions[0]).all() else versions, INT64),
-        reward_mean=None if np.array_equal(result.reward_mean, result.reward) else _flat(result.reward_mean, FLOAT64),
+        reward_mean=None if mean.tobytes() == reward.tobytes() else mean,  # by bits: 0.0 equals -0.0
         final_steps=_flat(result.final_steps, INT64) if ended else None,
         final_lanes=_flat(result.final_lanes, INT64) if ended else None,
         final_observation=_flat(result.final_observation, FLOAT32) if ended else None,

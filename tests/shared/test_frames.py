@@ -131,6 +131,14 @@ def test_a_policys_actions_are_returned_bit_for_bit(data: st.DataObject, shape: 
         assert_same(ours, theirs)
 
 
+def test_a_mean_of_minus_zero_is_no_reward_of_zero():
+    step = replace(example(), deviation=None, reward=np.zeros(SMALL.lanes), reward_mean=np.full(SMALL.lanes, -0.0))
+    result = PolicyRollout.of([step], np.zeros((1, SMALL.lanes, SMALL.action)), None)
+    reply = frames.read_reply(frames.encode(frames.policy_reply(3, result)))
+    assert isinstance(reply, frames.PolicyReply)
+    assert np.signbit(frames.policy_rollout(reply, SMALL).reward_mean).all()
+
+
 def test_any_layout_of_an_array_is_sent_in_row_order():
     action = np.arange(6, dtype=np.float32).reshape(3, 2).T
     request = frames.step_request(1, action, None, False)
