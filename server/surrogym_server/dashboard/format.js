@@ -44,7 +44,7 @@ export const PHASES = {
   fitting: "fitting",
   sampling: "sampling",
   ready: "ready",
-  over_budget: "over budget",
+  over_budget: "not ready",
   from_log: "from a log",
   failed: "failed",
 };
