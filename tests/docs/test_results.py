@@ -32,6 +32,7 @@ def test_the_tables_are_those_of_the_rows(page, name, pictures):
         ("fastppo", "fastppo-default"),
         ("fastppo", "fastppo"),
         ("fastppo", "fastppo-mountaincar"),
+        ("fastppo", "again"),
     ],
 )
 def test_tables_from_before_a_change_or_of_fresh_seeds_are_those_of_their_rows(page, name):
@@ -42,8 +43,9 @@ def test_tables_from_before_a_change_or_of_fresh_seeds_are_those_of_their_rows(p
     assert contrasts(rows) in text, again
 
 
-def test_every_table_of_the_unseen_tasks_is_that_of_its_rows():
-    text, rows = (DOCS / "results" / "trust.md").read_text(), read_rows(DOCS / "results" / "trust.csv")
+@pytest.mark.parametrize("study", ["trust", "trust-again"])
+def test_every_table_of_the_unseen_tasks_is_that_of_its_rows(study):
+    text, rows = (DOCS / "results" / f"{study}.md").read_text(), read_rows(DOCS / "results" / f"{study}.csv")
     made = summary(rows) + promise_tables(grouped(rows))
     tables = [line for line in made.splitlines() if line.startswith("|")]
     assert len(tables) > 30
