@@ -31,6 +31,7 @@ class Trainings:
     """Stands for trainings and audits: what each audit finds, and how many trainings there were."""
 
     audits: list[Handover]
+    imagined: float | None = None
     made: int = 0
     trained_from: list[Path | None] = field(default_factory=list)
 
@@ -38,14 +39,16 @@ class Trainings:
         self.made += 1
         self.trained_from.append(settings.start_from)
         out.write_bytes(b"policy %d" % self.made)
-        return TrainResult(out, "fastppo", 100, 1.0, None, 0, {}, untrained=0.0)
+        return TrainResult(out, "fastppo", 100, 1.0, self.imagined, 0, {}, untrained=0.0)
 
     def hand_over(self, *_: Any) -> Handover:
         return self.audits[self.made - 1]
 
 
-def run(monkeypatch: pytest.MonkeyPatch, folder: Path, *audits: Handover) -> tuple[Trainings, TrainResult, Handover]:
-    trainings, api = Trainings(list(audits)), Mock()
+def run(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, *audits: Handover, imagined: float | None = None
+) -> tuple[Trainings, TrainResult, Handover]:
+    trainings, api = Trainings(list(audits), imagined), Mock()
     api.surrogate.return_value.fidelity = None
     api.surrogate.return_value.budget_left = 0
     api.surrogate.return_value.ledger.total = 8
@@ -63,6 +66,16 @@ def test_a_promise_that_an_audit_halves_is_trained_on_without_the_budget(monkeyp
     assert (trainings.made, result.virtual_steps) == (2, 200)
     assert trainings.trained_from == [None, tmp_path / "p.zip"]
     assert handover.promise.median == 97.5
+
+
+def test_a_promise_far_below_the_imagined_return_is_trained_on(monkeypatch, tmp_path: Path) -> None:
+    trainings, _, _ = run(monkeypatch, tmp_path, found(52.6, 69.7), found(97.4, 97.5), imagined=99.4)
+    assert trainings.made == 2
+
+
+def test_an_imagined_return_below_the_promise_changes_nothing(monkeypatch, tmp_path: Path) -> None:
+    trainings, _, _ = run(monkeypatch, tmp_path, found(95.6, 94.0), imagined=60.0)
+    assert trainings.made == 1
 
 
 @pytest.mark.parametrize("after", [94.0, 120.0])

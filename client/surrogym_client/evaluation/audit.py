@@ -117,15 +117,19 @@ def judge(compared: Compared, before: Promise, after: Promise, floor: float | No
     )
 
 
-def disappointed(audit: Audit, floor: float | None) -> bool:
-    """Whether the model that has learned from an audit promises clearly less than the one before: the policy was chosen
-    in a model that is known better now. A wide promise may stand and disappoint.
+def disappointed(audit: Audit, floor: float | None, imagined: float | None = None) -> bool:
+    """Whether the model that has learned from an audit promises clearly less than the model that chose the policy.
+
+    The policy was chosen by its imagined return. A promise is lower from the beginning if the imagined return rests on
+    what the model does not know. So the promise is compared with the larger of the two.
 
     Args:
-        audit: what was found.
-        floor: the return of an untrained policy; None where nobody measured it.
+        audit: the audit.
+        floor: return of an untrained policy; None if it was not measured.
+        imagined: imagined return of the policy in its training; None if it was not measured.
     """
-    lost = audit.before.median - audit.after.median
+    before = audit.before.median if imagined is None else max(audit.before.median, imagined)
+    lost = before - audit.after.median
     return lost > SLACK * max(earned(audit.before, floor), earned(audit.after, floor))
 
 

@@ -35,8 +35,8 @@ class AuditedTraining:
 
     If an audit fails and the budget has steps left, they are taken where the policy goes, the training continues, and
     the policy is audited again. If none are left, the policy is handed over with the failed audit. If an audit passes,
-    but the model that has learned from it promises clearly less, the training continues in that model without further
-    steps of the budget, and the policy is audited again.
+    but the model that has learned from it promises clearly less than the training imagined, or than the model before,
+    the training continues in that model without further steps of the budget, and the policy is audited again.
 
     Attributes:
         api: the server.
@@ -109,7 +109,7 @@ class AuditedTraining:
 
     def _to_be_trained_on(self, audit: Audit | None, result: TrainResult, taken: int, number: int) -> bool:
         if audit is None or audit.passed:
-            return audit is not None and disappointed(audit, result.untrained)
+            return audit is not None and disappointed(audit, result.untrained, result.imagined_return)
         return self._asked_more(result, taken, number)
 
     def _asked_more(self, result: TrainResult, taken: int, number: int) -> bool:
