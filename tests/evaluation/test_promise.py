@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from surrogym_client.evaluation.promise import EVALUATION_STARTS, FUNCTIONS, STARTS, interval, promise_of
+from surrogym_client.evaluation.promise import EVALUATION_STARTS, FUNCTIONS, STARTS, UNNOTICED, interval, promise_of
 from surrogym_client.transport import HttpSurrogate
 
 Z = 1.6449  # of a standard normal's 95 % quantile
@@ -11,11 +11,23 @@ Z = 1.6449  # of a standard normal's 95 % quantile
 
 def test_returns_that_differ_by_start_alone_give_the_spread_of_a_mean():
     returns = np.repeat(np.random.default_rng(0).normal(-100, 20, (400, 1)), 32, axis=1)
-    promise = interval(returns)
+    promise = interval(returns, floor=-100.0)
     spread = 20 * np.sqrt(1 / EVALUATION_STARTS + 1 / returns.size)
     assert promise.median == pytest.approx(returns.mean())
     assert promise.median - promise.low == pytest.approx(Z * spread, rel=0.1)
     assert promise.high - promise.median == pytest.approx(Z * spread, rel=0.1)
+
+
+def test_functions_that_agree_leave_room_for_errors_that_no_audit_notices():
+    returns = np.repeat(np.random.default_rng(0).normal(-20, 0.5, (400, 1)), 32, axis=1)
+    promise = interval(returns, floor=-120.0)
+    assert promise.median - promise.low == pytest.approx(UNNOTICED * 100, rel=0.1)
+    assert promise.high - promise.median > UNNOTICED * 50
+
+
+def test_a_promise_stays_between_the_returns_of_single_episodes():
+    promise = interval(np.full((STARTS, FUNCTIONS), 500.0), floor=20.0)
+    assert (promise.low, promise.median, promise.high) == (500.0, 500.0, 500.0)
 
 
 def test_functions_that_disagree_widen_the_interval():

@@ -14,7 +14,7 @@ from surrogym_client.evaluation.audit import AUDIT_STEPS, earned, judge, places
 from surrogym_client.evaluation.comparing import compared
 from surrogym_client.evaluation.imagined import WHOLE
 from surrogym_client.evaluation.outside import Outside, outside_of
-from surrogym_client.evaluation.promise import promise_of
+from surrogym_client.evaluation.promise import UNNOTICED, promise_of
 from surrogym_client.original.actions import decode_actions
 from surrogym_client.original.protocol import LONGEST_EPISODE
 from surrogym_client.policies.evidence import Audit, Promise
@@ -25,7 +25,6 @@ from surrogym_client.transport.api import Api
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import SurrogateView
 
-MATTERS = 0.02  # share of the policy's return: smaller reward errors, summed over an episode, are not a fault
 WAY_LANES = 16  # virtual episodes whose states an audit chooses from
 MOST_OF_A_WAY = 200  # steps of an episode that are compared with a log
 WIDE = 0.5  # share of the gain over an untrained policy: a promise with a wider lower half is not trusted
@@ -74,7 +73,7 @@ class Subject:
 
     def promise(self) -> Promise:
         """Compute the policy's promise in the latest model."""
-        return promise_of(self.port, self.predict, self.seed, self.session)
+        return promise_of(self.port, self.predict, self.seed, self.session, self.floor)
 
 
 def hand_over(
@@ -134,7 +133,7 @@ def take(
         return None
     wait_for_design(api, name, settings.patience_seconds, progress, after_round=view.round)
     after, length = subject.promise(), len(q) / WAY_LANES
-    matters = MATTERS * earned(before, subject.floor) / length
+    matters = UNNOTICED * earned(before, subject.floor) / length
     beside = replace(compared(api, spec, view, samples, matters), length=length)
     return judge(beside, before, after, subject.floor)
 

@@ -23,7 +23,7 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 from surrogym_server.models.port import Transition
 
 MODELS = 8
-MOST_POINTS = 60  # of a process with sampled hyperparameters; more points determine them well enough
+MOST_POINTS = 128  # of a process with sampled hyperparameters; more points determine them well enough
 
 Floats = NDArray[np.float64]
 
