@@ -28,14 +28,18 @@ Array = NDArray[np.floating[Any]]
 
 
 class NoiseKey(NamedTuple):
-    """Key of the actions' noise: a seed, and the number of the rollout's first step."""
+    """Key of the actions' noise.
+
+    Held noise explores further: a push that lasts moves an environment farther than pushes that change at every step.
+    """
 
     seed: int
-    step: int = 0
+    step: int = 0  # number of the rollout's first step
+    hold: int = 1  # number of steps that share the same noise
 
     def later(self, steps: int) -> NoiseKey:
         """Return the key of a rollout that begins ``steps`` steps after this one."""
-        return NoiseKey(self.seed, self.step + steps)
+        return self._replace(step=self.step + steps)
 
 
 class KeyedGenerator:
@@ -51,7 +55,7 @@ class KeyedGenerator:
         follow it."""
         self._bits.state = {
             "bit_generator": "Philox",
-            "state": {"counter": _words(0, 0, key.step, 0), "key": _words(key.seed, 0)},
+            "state": {"counter": _words(0, 0, key.step // key.hold, 0), "key": _words(key.seed, 0)},
             "buffer": _words(0, 0, 0, 0),
             "buffer_pos": 4,  # discards buffered numbers of earlier draws
             "has_uint32": 0,
@@ -152,8 +156,9 @@ class PolicyRun:
     def __post_init__(self) -> None:
         if not 1 <= self.steps <= MAX_ROLLOUT:
             raise ValueError(f"steps: expected 1 to {MAX_ROLLOUT}, got {self.steps}")
-        if self.noise is not None and not all(0 <= word < 2**63 for word in self.noise):
-            raise ValueError(f"noise: expected a seed and a step of 0 to 2^63 - 1, got {tuple(self.noise)}")
+        if self.noise is not None and not (all(0 <= word < 2**63 for word in self.noise) and self.noise.hold):
+            shown = tuple(self.noise)
+            raise ValueError(f"noise: expected a seed and a step of 0 to 2^63 - 1 and a hold of 1 or more, got {shown}")
 
 
 class Acted(NamedTuple):

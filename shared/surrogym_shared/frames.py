@@ -109,9 +109,10 @@ class RolloutRequest(Frame, frozen=True, tag="rollout", kw_only=True):
     actions: memoryview
 
 
-class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     seed: Word
     step: Word
+    hold: Annotated[int, msgspec.Meta(ge=1, le=MAX_ROLLOUT)] = 1
 
 
 class PolicyRequest(Frame, frozen=True, tag="policy", kw_only=True):
@@ -307,7 +308,7 @@ def policy_of(request: PolicyRequest, shape: Shape) -> ActingPolicy:
 
 
 def noise_of(request: PolicyRequest) -> NoiseKey | None:
-    return None if request.noise is None else NoiseKey(request.noise.seed, request.noise.step)
+    return None if request.noise is None else NoiseKey(*msgspec.structs.astuple(request.noise))
 
 
 def until_of(request: PolicyRequest, shape: Shape) -> Bools | None:

@@ -49,7 +49,7 @@ def actor_of(policy: ActingPolicy, noise: NoiseKey | None) -> Actor:
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("noise", [None, NoiseKey(11, 3)], ids=["most probable", "noisy"])
+@pytest.mark.parametrize("noise", [None, NoiseKey(11, 3), NoiseKey(11, 3, 4)], ids=["most probable", "noisy", "held"])
 @pytest.mark.parametrize("mode", ["same_step", "next_step"])
 def test_a_policy_acts_as_it_would_step_by_step(port: PolicyPort, opened: Opened, mode: str, noise, dtype):
     """Bit for bit: episodes end and begin within the rollout, and a penalty and a trusted range are on."""
@@ -124,6 +124,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "no steps": ({"steps": 0}, "steps: expected 1 to 100000, got 0"),
     "too many steps": ({"steps": 100_001}, "steps: expected 1 to 100000, got 100001"),
     "negative seed of noise": ({"noise": NoiseKey(-1)}, "noise: expected a seed"),
+    "noise held for no step": ({"noise": NoiseKey(0, 0, 0)}, "a hold of 1 or more"),
     "short until": ({"until": np.ones(N + 1, dtype=bool)}, "until: expected 5 entries"),
     "outputs beyond all bounds": ({"policy": replace(GOOD, layers=HUGE, activation="relu")}, "finite outputs"),
 }

@@ -46,6 +46,13 @@ def test_noise_depends_on_seed_step_and_lane_alone(counts: tuple[int, ...]):
     assert NoiseKey(5, 60).later(10) == NoiseKey(5, 70)
 
 
+def test_held_noise_is_the_same_for_that_many_steps():
+    drawn = [actor().act(observations(4), NoiseKey(5, step, hold=4)).action for step in range(9)]
+    for step in range(1, 9):
+        assert np.array_equal(drawn[step], drawn[step - 1]) == (step % 4 != 0)
+    assert NoiseKey(5, 60, 4).later(10) == NoiseKey(5, 70, 4)
+
+
 def test_noise_is_numpys_philox_with_the_step_in_the_third_word():
     keyed = KeyedGenerator()
     keyed.at(NoiseKey(9, 9)).standard_normal(3, dtype=np.float32)

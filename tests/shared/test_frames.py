@@ -102,7 +102,7 @@ POLICIES = [random_policy((3, 4, 1)), random_policy((3, 2), np.float64, continuo
 
 
 @pytest.mark.parametrize("policy", POLICIES, ids=["float32", "float64"])
-@pytest.mark.parametrize("noise", [None, NoiseKey(2**63 - 1, 2**63 - 1)])
+@pytest.mark.parametrize("noise", [None, NoiseKey(2**63 - 1, 2**63 - 1), NoiseKey(3, 64, hold=16)])
 def test_a_policy_comes_back_bit_for_bit(policy: ActingPolicy, noise: NoiseKey | None):
     until = np.array([True, False])
     request = frames.read_request(frames.encode(frames.policy_request(5, policy, 9, noise, until)))
@@ -286,6 +286,7 @@ def test_every_cut_of_a_frame_is_an_error(read: Callable[[bytes], None], content
         (of_policy(parameters=np.full(21, np.nan, dtype=np.float32).data), "finite numbers in layers"),
         (of_policy(until=np.ones(3, dtype=bool).data), "until: expected 2 bytes"),
         (of_policy(noise=frames.Noise(-1, 0)), "expected a frame"),
+        (of_policy(noise=frames.Noise(0, 0, 0)), "expected a frame"),
     ],
 )
 def test_the_refusal_of_a_misfitting_request_says_why(request_frame: frames.Request, message: str):

@@ -25,7 +25,7 @@ from surrogym_client.training import TrainingInterrupted, TrainSettings, train
 from surrogym_client.training.fast_ppo import search as searches
 from surrogym_client.training.fast_ppo.actions import Bounded, Choices
 from surrogym_client.training.fast_ppo.learner import Learner, Objective, compiled_update, noisy
-from surrogym_client.training.fast_ppo.rollouts import Collector, RewardScale
+from surrogym_client.training.fast_ppo.rollouts import Collector, RewardScale, Rollout
 from surrogym_client.training.search import search_for
 from surrogym_client.training.verdicts import Verdicts
 from surrogym_server.convert import definition_from_spec
@@ -203,14 +203,23 @@ class Strict(Verdicts):
     ("spec", "by"), [(mountain_car_continuous(), "PPO"), (cartpole(), "FASTPPO")], ids=["continuous", "discrete"]
 )
 def test_an_abandoned_network_is_followed_by_another(spec, by: str, tmp_path: Path, monkeypatch):
-    """Continuous actions are then explored by Stable-Baselines3's state-dependent noise. Steps of all networks together
-    stay within what was asked for."""
+    """Continuous actions are then explored by held noise, and at last by Stable-Baselines3's state-dependent noise.
+    Steps of all networks together stay within what was asked for."""
+    holds: list[int] = []
+
+    class Watched(Collector):
+        def collect(self, learner: Learner, steps: int, hold: int = 1) -> Rollout:
+            holds.append(hold)
+            return super().collect(learner, steps, hold)
+
     monkeypatch.setattr(searches, "Verdicts", Strict)
+    monkeypatch.setattr(searches, "Collector", Watched)
     seen: list[int] = []
     settings = TrainSettings(algorithm="fastppo", total_steps=4_096, num_envs=16, hyperparameters=SMALL, prolong=False)
     result = train(short(spec), tmp_path / "policy.zip", settings, lambda now: seen.append(now.steps))
     assert seen == sorted(seen)
-    assert result.networks == (2 if by == "PPO" else 7)
+    assert result.networks == (3 if by == "PPO" else 7)
+    assert list(dict.fromkeys(holds)) == ([1, searches.HELD] if by == "PPO" else [1])
     assert result.virtual_steps <= settings.total_steps
     assert result.algorithm == by
     load_policy(result.path, result.algorithm)

@@ -15,8 +15,8 @@ def suggested_gamma(spec: EnvironmentSpec) -> float:
     return min(max(1 - 3 / (spec.time_limit or 1_000), SHORTEST_SIGHT), LONGEST_SIGHT)
 
 
-def explores_by_state(spec: EnvironmentSpec) -> bool:
-    """Whether a network that follows an abandoned one explores by state-dependent noise: for continuous actions."""
+def explores_further(spec: EnvironmentSpec) -> bool:
+    """Whether a network that follows an abandoned one explores by noise that lasts: for continuous actions."""
     return not counts_of(spec) and spec.design.preset != "paper"
 
 

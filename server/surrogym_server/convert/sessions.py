@@ -165,7 +165,7 @@ def policy_run(request: replies.RolloutSession) -> PolicyRun:
         )
     except ValueError as error:
         raise InvalidInput(str(error)) from error
-    noise = None if request.noise is None else NoiseKey(request.noise.seed, request.noise.step)
+    noise = None if request.noise is None else NoiseKey(request.noise.seed, request.noise.step, request.noise.hold)
     return PolicyRun(policy, request.steps, noise, lane_mask(request.until))
 
 

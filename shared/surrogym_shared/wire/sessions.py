@@ -308,6 +308,9 @@ class ActionNoise(Request):
     step: Seed = Field(
         default=0, description="number of the rollout's first step; each further step has the next number"
     )
+    hold: Annotated[int, Field(ge=1, le=MAX_ROLLOUT)] = Field(
+        default=1, description="number of steps that share the same noise: those whose numbers divided by it are equal"
+    )
 
 
 class RolloutSession(Request):

@@ -54,9 +54,9 @@ class Collector:
         """Mean penalty of the last episodes, summed over an episode; None in a session without a penalty."""
         return float(np.mean(self._penalties)) if self._penalties else None
 
-    def collect(self, learner: Learner, steps: int) -> Rollout:
-        """Step every lane ``steps`` times. The policy acts with its noise."""
-        taken = self._lanes.take(learner.acting(), steps, self._noise)
+    def collect(self, learner: Learner, steps: int, hold: int = 1) -> Rollout:
+        """Step every lane ``steps`` times. The policy acts with noise that ``hold`` steps share."""
+        taken = self._lanes.take(learner.acting(), steps, self._noise._replace(hold=hold))
         self._noise = self._noise.later(steps)
         rollout = taken.rollout
         assert rollout.log_probability is not None

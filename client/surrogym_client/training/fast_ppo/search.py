@@ -25,7 +25,7 @@ from surrogym_client.training.fast_ppo.learner import (
     restored,
 )
 from surrogym_client.training.fast_ppo.rollouts import Collector, Rollout
-from surrogym_client.training.proportions import even_batch, explores_by_state, suggested_gamma
+from surrogym_client.training.proportions import even_batch, explores_further, suggested_gamma
 from surrogym_client.training.search import REFERENCE, SEARCHES, Found, PolicySearch, SearchTask
 from surrogym_client.training.settings import TrainProgress, TrainSettings
 from surrogym_client.training.verdicts import Imagined, Verdicts, checked
@@ -48,13 +48,17 @@ RANGES = {  # whole numbers have whole bounds
 }
 
 
+HELD = 16  # steps that share the noise of the second network
+
+
 @dataclass(frozen=True)
 class FastPpo(PolicySearch):
     """Policy search by PPO in NumPy, with updates that take a sixth of the time of Stable-Baselines3's.
 
     Networks, loss, Adam, scaled rewards and advantages are those of the search ``PPO``. A network that has learned
     nothing after a quarter of the steps is abandoned, and another one takes the remaining steps. For continuous actions
-    that is one of Stable-Baselines3's ``PPO``, with state-dependent noise.
+    its noise is held for ``HELD`` steps. If it is abandoned as well, one of Stable-Baselines3's ``PPO`` follows, with
+    state-dependent noise.
     """
 
     n_steps: int = 64  # steps of each lane in a rollout
@@ -116,10 +120,10 @@ class _Training:
         """Train networks one after another until one completes its steps, or Ctrl-C is pressed."""
         verdicts, learner, whole = self._verdicts, self._new, True
         try:
-            for learner in self._networks():
-                self._learn(learner, verdicts.left)
+            for learner, hold in self._networks():
+                self._learn(learner, verdicts.left, hold)
                 if self._task.prolong and not verdicts.given_up and verdicts.prolong():
-                    self._learn(learner, verdicts.left)
+                    self._learn(learner, verdicts.left, hold)
                 if not verdicts.given_up:
                     break
             else:
@@ -128,21 +132,27 @@ class _Training:
             whole = False
         return self._found(self._kept or _saved(learner), whole=whole)
 
-    def _networks(self) -> Iterator[Learner]:
-        """Iterate over networks to train: new ones, and in its turn the saved one if it had learned anything."""
+    def _networks(self) -> Iterator[tuple[Learner, int]]:
+        """Iterate over networks to train, each with the number of steps that share its noise: new ones, and in its turn
+        the saved one if it had learned anything."""
         anew = self._task.settings.anew
         if anew or self._saved is None:
-            yield self._new
+            yield self._new, 1
         if self._saved is not None:
             best, learned = self._verdicts.knows(self._imagined(self._saved))
             if best:
                 self._kept = _saved(self._saved)
             if learned:
-                yield self._saved
+                yield self._saved, 1
             elif not anew:
-                yield self._new
-        while not (self._theirs or explores_by_state(self._spec)):
-            yield self._made()
+                yield self._new, 1
+        if self._theirs:
+            return
+        if explores_further(self._spec):
+            yield self._made(), HELD
+            return
+        while True:
+            yield self._made(), 1
 
     def _made(self) -> Learner:
         """Return a new network, with other initial parameters each time."""
@@ -158,13 +168,13 @@ class _Training:
         predict = load_policy(settings.start_from, REFERENCE, trust=settings.trust_policy)
         return checked(self._task.port, predict, settings)
 
-    def _learn(self, learner: Learner, steps: int) -> None:
+    def _learn(self, learner: Learner, steps: int, hold: int) -> None:
         """Train one network for ``steps`` virtual steps, or until it is abandoned."""
         verdicts, search = self._verdicts, self._search
         verdicts.begin()
         before = verdicts.own_steps
         for number in range(1, max(steps // self._rollout, 1) + 1):
-            rollout = self._collector.collect(learner, search.n_steps)
+            rollout = self._collector.collect(learner, search.n_steps, hold)
             verdicts.saw(rollout.earned)
             verdicts.at(before + number * self._rollout)
             self._lost += rollout.lost

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from surrogym_client.policies.defaults import LANES
 from surrogym_client.policies.networks import WIDER, PaperPolicy, decaying
-from surrogym_client.training.proportions import even_batch, explores_by_state
+from surrogym_client.training.proportions import even_batch, explores_further
 from surrogym_client.training.stable_baselines.search import StableBaselinesSearch
 from surrogym_shared.spec import EnvironmentSpec
 
@@ -60,7 +60,7 @@ class PPO(OnPolicySearch):
         that stays for a whole rollout pushes each lane its own way. It is for continuous actions, and for PPO alone,
         because the rollouts of other algorithms are too short.
         """
-        return {"use_sde": True} if explores_by_state(spec) else {}
+        return {"use_sde": True} if explores_further(spec) else {}
 
 
 class A2C(OnPolicySearch):
