@@ -85,8 +85,14 @@ def test_a_promise_that_stands_or_grows_is_handed_over(monkeypatch, tmp_path: Pa
     assert handover.trusted
 
 
-def test_a_failed_audit_without_budget_is_handed_over_as_it_is(monkeypatch, tmp_path: Path) -> None:
-    trainings, _, handover = run(monkeypatch, tmp_path, found(95.6, -21.6, passed=False))
+def test_a_failed_audit_without_budget_is_trained_on_where_the_promise_falls(monkeypatch, tmp_path: Path) -> None:
+    trainings, _, handover = run(monkeypatch, tmp_path, found(95.6, -21.6, passed=False), found(97.4, 97.5))
+    assert trainings.made == 2
+    assert handover.trusted
+
+
+def test_a_failed_audit_without_budget_is_handed_over_where_the_promise_stands(monkeypatch, tmp_path: Path) -> None:
+    trainings, _, handover = run(monkeypatch, tmp_path, found(95.6, 94.0, passed=False))
     assert trainings.made == 1
     assert not handover.trusted
 

@@ -34,9 +34,9 @@ class AuditedTraining:
     """Train a policy, audit it, and hand it over.
 
     If an audit fails and the budget has steps left, they are taken where the policy goes, the training continues, and
-    the policy is audited again. If none are left, the policy is handed over with the failed audit. If an audit passes,
-    but the model that has learned from it promises clearly less than the training imagined, or than the model before,
-    the training continues in that model without further steps of the budget, and the policy is audited again.
+    the policy is audited again. The training also continues if the model that has learned from an audit promises
+    clearly less than the training imagined, or than the model before. This takes no step of the budget. In all other
+    cases the policy is handed over, also with a failed audit.
 
     Attributes:
         api: the server.
@@ -108,9 +108,10 @@ class AuditedTraining:
         return Subject(self.api, self.name, self.port, predict, dict(session), result.untrained, settings.seed)
 
     def _to_be_trained_on(self, audit: Audit | None, result: TrainResult, taken: int, number: int) -> bool:
-        if audit is None or audit.passed:
-            return audit is not None and disappointed(audit, result.untrained, result.imagined_return)
-        return self._asked_more(result, taken, number)
+        if audit is None:
+            return False
+        asked = not audit.passed and self._asked_more(result, taken, number)
+        return asked or disappointed(audit, result.untrained, result.imagined_return)
 
     def _asked_more(self, result: TrainResult, taken: int, number: int) -> bool:
         """Spend the rest of the budget where the policy goes.
