@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from statistics import NormalDist
 from typing import Any
 
 import pytest
@@ -9,7 +11,16 @@ import pytest
 from surrogym_client.original.classic import pendulum
 from surrogym_client.surrogates.advice import advice, noise_in_words, verdict
 from surrogym_client.surrogates.waiting import words_of_uncertainty, words_of_waiting
-from surrogym_shared.wire import DoubtfulRegion, Fidelity, Ledger, ModelView, OutputFidelity, QueryCounts, SurrogateView
+from surrogym_shared.wire import (
+    DoubtfulRegion,
+    Fidelity,
+    Ledger,
+    ModelView,
+    OutputFidelity,
+    QueryCounts,
+    ReachedLimit,
+    SurrogateView,
+)
 
 TARGET = 0.999
 
@@ -153,6 +164,46 @@ def test_few_rounds_show_no_rate_and_more_steps_are_the_advice() -> None:
 def test_an_output_that_never_varied_is_to_be_declared() -> None:
     said = advice(view(output("reward", 0.5, error=0.08, tolerance=1e-90)), [])
     assert said.startswith("all initial samples had the same reward")
+
+
+def noisy_output(index: float, error: float) -> OutputFidelity:
+    """Its noise is 0.04 and its declared tolerance 0.03, so the server's tolerance is 0.05."""
+    return output("x", index, error=error, noise=0.04, tolerance=0.05)
+
+
+def test_an_error_that_is_nearly_all_noise_is_not_answered_by_real_steps() -> None:
+    rising = [0.9, 0.92, 0.94, 0.96, 0.97, 0.98, 0.985, 0.99]
+    said = advice(view(noisy_output(0.99, error=0.042)), models(rising))
+    assert said.startswith("the error of x is nearly all noise (91 % of its square), which more real steps don't lower")
+    assert "--queries" not in said
+
+
+@pytest.mark.parametrize(("index", "error"), [(0.99, 0.08), (0.6, 0.042)])
+def test_an_error_beside_the_noise_or_doubt_elsewhere_is_not_called_noise(index: float, error: float) -> None:
+    assert "nearly all noise" not in advice(view(noisy_output(index, error)), models([0.6, 0.6]))
+
+
+@pytest.mark.parametrize(("index", "error"), [(0.99, 0.042), (0.9988, 0.042)])
+def test_the_tolerance_for_a_noisy_output_is_just_enough(index: float, error: float) -> None:
+    """The server's index allows sqrt(tolerance^2 + (1.5 noise)^2), and the leave-one-out error 1.25 times
+    sqrt(tolerance^2 + noise^2). It leaves noise out that is smaller than the tolerance."""
+    said = advice(view(noisy_output(index, error)), [])
+    tolerance, z = float(said.rsplit("=", 1)[1]), NormalDist().inv_cdf
+    deviation = math.hypot(0.03, 0.06) / z(index)
+    noise = 0.04 if tolerance < 0.04 else 0.0
+    assert math.hypot(tolerance, 1.5 * noise) / deviation == pytest.approx(z(TARGET), rel=0.05)
+    assert error <= (1.25 if noise else 1.0) * math.hypot(tolerance, noise)
+
+
+def test_samples_that_end_at_a_limit_are_named_where_real_steps_do_not_help() -> None:
+    limit = ReachedLimit(coordinate="level", side="upper", value=3.0, share=0.31)
+    stuck = view(output("x", 0.7, error=0.2))
+    assert stuck.fidelity is not None
+    stuck = stuck.model_copy(update={"fidelity": stuck.fidelity.model_copy(update={"limits": [limit]})})
+    said = advice(stuck, models([0.7] * 8))
+    assert said.startswith("31 % of the samples end at the upper limit of level, 3, and say little about the dynamics")
+    rate = [1 - 2.718281828 ** -(i / 2) for i in range(1, 9)]
+    assert advice(stuck, models(rate)).startswith("about"), "real steps still help"
 
 
 @pytest.mark.parametrize("phase", ["ready", "sampling", "from_log"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict
 
 
@@ -27,6 +29,26 @@ class Promise(BaseModel):
     episodes: int
 
 
+class RangeLeft(BaseModel):
+    """Where a policy's way leaves the sampling range, so that the design requested no real step there.
+
+    Attributes:
+        coordinate: name of the coordinate.
+        side: the end of the range that the way passes.
+        end: value of this end.
+        share: share of the way's states beyond it.
+        farthest: the state farthest beyond it.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    coordinate: str
+    side: Literal["lower", "upper"]
+    end: float
+    share: float
+    farthest: float
+
+
 class Audit(BaseModel):
     """Result of an audit.
 
@@ -38,6 +60,7 @@ class Audit(BaseModel):
         expected: the errors that the model expected, in the same form.
         before: promise before the audit.
         after: promise of the model that has learned from the audit's steps.
+        range_left: where the policy's way leaves the sampling range most often; None if it hardly does.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -49,3 +72,4 @@ class Audit(BaseModel):
     expected: dict[str, float] = {}
     before: Promise
     after: Promise
+    range_left: RangeLeft | None = None

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import ceil, log
+from math import ceil, hypot, log, sqrt
 from statistics import NormalDist
 
 from surrogym_client.surrogates.phases import COMPLETED
-from surrogym_shared.wire import DoubtfulRegion, ModelView, OutputFidelity, SurrogateView
+from surrogym_shared.wire import DoubtfulRegion, ModelView, OutputFidelity, ReachedLimit, SurrogateView
 
 NEARLY = 0.9  # share of the target that counts as nearly reached
 MOST_STEPS = 10.0  # longest forecast, as a multiple of the present samples
 NOTICEABLE = 0.9  # factor on the leave-one-out error: a smaller one shows that real steps helped
 FEWEST_MODELS = 4  # fewest models from which to estimate a rate
 NOISY_SLACK = 1.25  # factor on the allowed leave-one-out error once noise is confirmed
+NOISE_BAND = 1.5  # deviations of the noise within which the server's index does not ask for more
+MOSTLY_NOISE = 0.8  # share of the squared leave-one-out error; then the function is known to half the noise
 TOLERABLE = 1e-6  # share of the leave-one-out error: a smaller tolerance comes from samples that were all alike
 
 
@@ -55,18 +57,21 @@ def advice(view: SurrogateView, models: Sequence[ModelView]) -> str:
             "the specification, or set a tolerance that matters: "
             f"surrogym change {view.name} --tolerance {worst.name}=VALUE"
         )
+    if _share_of_noise(worst) >= MOSTLY_NOISE and worst.confidence_index >= NEARLY * view.target:
+        return _of_noise(view, worst)
+    steps = _steps_to_go(view, worst, models) if len(models) >= 2 * FEWEST_MODELS else None
+    if steps is not None:
+        return f"about {steps} more real steps at the present rate: surrogym improve {view.name} --queries {steps}"
+    if limits := view.fidelity.limits if view.fidelity else []:
+        return _of_limit(limits[0])
     if len(models) < 2 * FEWEST_MODELS:
         return (
             "too few rounds to estimate the progress; to take as many real steps again: "
             f"surrogym improve {view.name} --queries {max(view.samples, 1)}"
         )
-    steps = _steps_to_go(view, worst, models)
-    if steps is not None:
-        return f"about {steps} more real steps at the present rate: surrogym improve {view.name} --queries {steps}"
-    reached = f"{_within_reach(view, worst):.2g}"
     return (
-        f"{_too_slow(worst, models)}; it would be ready with a tolerance of {reached} (now "
-        f"{worst.tolerance:.2g}): surrogym change {view.name} --tolerance {worst.name}={reached}"
+        f"{_too_slow(worst, models)}; it would be ready with a tolerance of {_within_reach(view, worst):.2g} (now "
+        f"{_declarable(worst):.2g}): {_widen(view, worst)}"
     )
 
 
@@ -79,8 +84,41 @@ def noise_in_words(view: SurrogateView) -> str:
 def _noise_of(output: OutputFidelity) -> str:
     if not output.leave_one_out_error:
         return f"{output.name} {output.noise:.2g}"
-    share = min(1.0, (output.noise / output.leave_one_out_error) ** 2)
-    return f"{output.name} {output.noise:.2g} ({100 * share:.0f} % of its squared error)"
+    return f"{output.name} {output.noise:.2g} ({100 * _share_of_noise(output):.0f} % of its squared error)"
+
+
+def _share_of_noise(output: OutputFidelity) -> float:
+    """Return the share of the squared leave-one-out error that is confirmed noise; 0 without an error."""
+    error = output.leave_one_out_error
+    return min(1.0, (output.noise / error) ** 2) if error else 0.0
+
+
+def _of_noise(view: SurrogateView, output: OutputFidelity) -> str:
+    """Describe what helps an output whose error is nearly all noise."""
+    return (
+        f"the error of {output.name} is nearly all noise ({100 * _share_of_noise(output):.0f} % of its square), which "
+        "more real steps don't lower; reduce the noise itself, or accept a tolerance of "
+        f"{_within_reach(view, output):.2g} (now {_declarable(output):.2g}): {_widen(view, output)}"
+    )
+
+
+def _of_limit(limit: ReachedLimit) -> str:
+    """Describe what helps a design of which many samples end at a limit."""
+    return (
+        f"{100 * limit.share:.0f} % of the samples end at the {limit.side} limit of {limit.coordinate}, "
+        f"{limit.value:.4g}, and say little about the dynamics; register under a new name with sampling ranges from "
+        "which fewer steps end there"
+    )
+
+
+def _widen(view: SurrogateView, output: OutputFidelity) -> str:
+    """Return the command that declares the tolerance with which the output would be certain."""
+    return f"surrogym change {view.name} --tolerance {output.name}={_within_reach(view, output):.2g}"
+
+
+def _declarable(output: OutputFidelity) -> float:
+    """Return the tolerance without the noise that the server adds to it."""
+    return _beyond(output.tolerance, output.noise) if output.noise else output.tolerance
 
 
 def _doubtful(view: SurrogateView) -> list[OutputFidelity]:
@@ -96,7 +134,12 @@ def _agrees(output: OutputFidelity) -> bool:
 
 def _largest_error(output: OutputFidelity) -> float:
     """Return the largest leave-one-out error with which the server counts an output as known."""
-    return output.tolerance * (NOISY_SLACK if output.noise else 1.0)
+    return output.tolerance * _slack(output)
+
+
+def _slack(output: OutputFidelity) -> float:
+    """Return the factor on the tolerance that the server allows a leave-one-out error."""
+    return NOISY_SLACK if output.noise else 1.0
 
 
 def _named(output: OutputFidelity, target: float) -> str:
@@ -173,9 +216,21 @@ def _forecast(samples: Sequence[float], values: Sequence[float], limit: float) -
 
 
 def _within_reach(view: SurrogateView, output: OutputFidelity) -> float:
-    """Return the tolerance with which the output would be certain, assuming the same deviation everywhere."""
+    """Return the tolerance with which the output would be certain, assuming the same deviation everywhere.
+
+    The server adds the noise to a tolerance, but does not count noise that is much smaller than the tolerance.
+    """
     z = NormalDist().inv_cdf
     index = min(max(output.confidence_index, 0.5 + 1e-9), 1 - 1e-12)
-    by_deviation = output.tolerance * z(view.target) / z(index) if output.confidence_index < view.target else 0.0
+    allowed, band = _declarable(output), NOISE_BAND * output.noise
+    by_deviation = hypot(allowed, band) * z(view.target) / z(index) if output.confidence_index < view.target else 0.0
+    if index <= 0.51:
+        by_deviation = allowed
     error = output.leave_one_out_error or 0.0
-    return max(error, by_deviation) if index > 0.51 else max(error, output.tolerance)
+    beside = max(_beyond(by_deviation, band), _beyond(error / _slack(output), output.noise), allowed)
+    return beside if beside <= output.noise else max(error, by_deviation)
+
+
+def _beyond(value: float, part: float) -> float:
+    """Return what remains of a value without an independent part: sqrt(value^2 - part^2); 0 if the part is larger."""
+    return sqrt(max(value**2 - part**2, 0.0))

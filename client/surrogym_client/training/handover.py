@@ -15,6 +15,7 @@ from surrogym_client.evaluation.comparing import compared
 from surrogym_client.evaluation.imagined import WHOLE
 from surrogym_client.evaluation.outside import Outside, outside_of
 from surrogym_client.evaluation.promise import UNNOTICED, promise_of
+from surrogym_client.evaluation.ranges import range_left
 from surrogym_client.original.actions import decode_actions
 from surrogym_client.original.protocol import LONGEST_EPISODE
 from surrogym_client.policies.evidence import Audit, Promise
@@ -135,7 +136,7 @@ def take(
     after, length = subject.promise(), len(q) / WAY_LANES
     matters = UNNOTICED * earned(before, subject.floor) / length
     beside = replace(compared(api, spec, view, samples, matters), length=length)
-    return judge(beside, before, after, subject.floor)
+    return judge(beside, before, after, subject.floor).model_copy(update={"range_left": range_left(spec, q)})
 
 
 def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array) -> set[int]:

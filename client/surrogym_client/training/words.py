@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from surrogym_client.policies.evidence import RangeLeft
     from surrogym_client.training.handover import Handover
     from surrogym_client.training.settings import TrainResult
 
@@ -40,14 +41,27 @@ def words_of_result(
 
 
 def words_of_handover(handover: Handover) -> str:
-    """Describe the promise of a policy, and whether to trust it, in one line."""
+    """Describe the promise of a policy, and whether to trust it, in one line. If the policy's way leaves a sampling
+    range, the line before describes where."""
     promise, trusted = handover.promise, "trusted" if handover.trusted else "not trusted"
     if promise is None:
         return f"no promise, {trusted}: {handover.reason}"
+    left = None if handover.audit is None else handover.audit.range_left
     return (
+        f"{'' if left is None else words_of_range(left) + chr(10)}"
         f"promise{', after learning the audit' if handover.audit else ''}: mean return {promise.median:.4g}, "
         f"between {promise.low:.4g} and {promise.high:.4g} with 90 % chance; "
         f"{trusted}: {handover.reason}"
+    )
+
+
+def words_of_range(left: RangeLeft) -> str:
+    """Describe where a policy's way leaves a sampling range, and what to do."""
+    beyond, way = ("above", "up") if left.side == "upper" else ("below", "down")
+    return (
+        f"{100 * left.share:.0f} % of the policy's states have {left.coordinate} {beyond} {left.end:.4g}, the end of "
+        "its sampling range, where no real step was requested; to learn there: register under a new name with a range "
+        f"{way} to {left.farthest:.3g}"
     )
 
 

@@ -30,6 +30,7 @@ from surrogym_server.sampling.design import (
     initial_rollouts,
     judge_model,
 )
+from surrogym_server.sampling.limits import reached_limits
 from surrogym_server.sampling.rollouts import Rollout
 from surrogym_server.sampling.tolerances import usual_tolerances
 
@@ -114,7 +115,13 @@ def run_design_job(job: DesignJob) -> DesignResult:
     return DesignResult(
         model=stored,
         description=json.loads(json.dumps(decision.model.description)),  # plain data, whatever a family returns
-        fidelity=fidelity_fields(decision.model, decision.confidences, decision.tolerances, job.target),
+        fidelity=fidelity_fields(
+            decision.model,
+            decision.confidences,
+            decision.tolerances,
+            job.target,
+            reached_limits(job.definition, samples),
+        ),
         data_hash=samples.digest,
         state=decision.state.to_json(),
         verdict=decision.verdict,
@@ -141,7 +148,9 @@ def judge_stored(job: DesignJob, stored: bytes) -> DesignResult:
     return DesignResult(
         model=stored,
         description=model.description,
-        fidelity=fidelity_fields(model, judged.confidences, judged.tolerances, job.target),
+        fidelity=fidelity_fields(
+            model, judged.confidences, judged.tolerances, job.target, reached_limits(job.definition, samples)
+        ),
         data_hash=model.digest,
         state=job.state,
         verdict=judged.verdict if model.digest == samples.digest else "continue",

@@ -10,13 +10,19 @@ from surrogym_server.environment.points import Points
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
 from surrogym_server.sampling.design import monte_carlo
+from surrogym_server.sampling.limits import Limit
 from surrogym_server.sampling.tolerances import usual_tolerances
 
 
 def fidelity_fields(
-    model: DynamicsModel, confidences: Sequence[OutputConfidence], tolerances: Sequence[float], target: float
+    model: DynamicsModel,
+    confidences: Sequence[OutputConfidence],
+    tolerances: Sequence[float],
+    target: float,
+    limits: Sequence[Limit] = (),
 ) -> dict[str, Any]:
-    """The fields of ``wire.Fidelity``, from the confidence and tolerance of each output, (O,) each."""
+    """The fields of ``wire.Fidelity``, from the confidence and tolerance of each output, (O,) each, and the limits at
+    which many samples end."""
     rows = [
         {"name": name, "structure": structure, "tolerance": tolerance, **asdict(judged)}
         for name, structure, judged, tolerance in zip(
@@ -29,6 +35,7 @@ def fidelity_fields(
         "target": target,
         "samples": model.samples,
         "outputs": rows,
+        "limits": [asdict(limit) for limit in limits],
     }
 
 

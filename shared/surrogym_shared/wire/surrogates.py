@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 
@@ -86,6 +86,15 @@ class OutputFidelity(Reply):
     )
 
 
+class ReachedLimit(Reply):
+    """A declared limit of a coordinate at which many samples end."""
+
+    coordinate: str = Field(description="name of the coordinate")
+    side: Literal["lower", "upper"]
+    value: float = Field(description="the limit, in the coordinate's unit")
+    share: float = Field(description="share of the samples that end there")
+
+
 class Fidelity(Reply):
     """How well a model predicts: the smallest confidence index of its outputs, and the values of each output."""
 
@@ -96,6 +105,9 @@ class Fidelity(Reply):
     target: float = Field(description="confidence index to reach")
     samples: int = Field(description="number of samples that the model was fitted to")
     outputs: list[OutputFidelity] = Field(description="values of each output")
+    limits: list[ReachedLimit] = Field(
+        default=[], description="declared limits at which many samples end, which says little about the dynamics"
+    )
 
 
 class Ledger(Reply):

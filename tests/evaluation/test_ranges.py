@@ -1,0 +1,44 @@
+"""The end of a sampling range that a policy's way passes: there the design requested no real step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surrogym_client.evaluation.ranges import LITTLE, range_left
+from surrogym_client.original.classic import pendulum
+from surrogym_client.policies.evidence import Audit, Promise, RangeLeft
+from surrogym_client.training.handover import Handover
+from surrogym_client.training.words import words_of_handover
+
+SPEC = pendulum()  # an angle, and a speed that is sampled from -8 to 8
+
+
+def way(*speeds: float) -> np.ndarray:
+    return np.array([[50.0, speed] for speed in speeds])
+
+
+def test_the_end_that_most_states_pass_is_named_with_its_share_and_the_farthest_state() -> None:
+    left = range_left(SPEC, way(9, 8.5, -10, 0, 1, 2, 3, 4))
+    assert left == RangeLeft(coordinate=SPEC.coordinates[1].name, side="upper", end=8.0, share=0.25, farthest=9.0)
+    left = range_left(SPEC, way(9, -8.5, -10, 0))
+    assert left is not None
+    assert (left.side, left.end, left.farthest) == ("lower", -8.0, -10.0)
+
+
+def test_a_few_states_beyond_an_end_are_usual_and_an_angle_has_no_end() -> None:
+    states = way(9, *[0.0] * 99)
+    assert LITTLE > 0.01
+    assert range_left(SPEC, states) is None
+
+
+@pytest.mark.parametrize("left", [None, RangeLeft(coordinate="speed", side="upper", end=8, share=0.34, farthest=11.2)])
+def test_the_line_before_the_promise_says_what_to_change(left: RangeLeft | None) -> None:
+    promise = Promise(median=1, low=0, high=2, functions=32, episodes=256)
+    audit = Audit(steps=8, passed=True, before=promise, after=promise, range_left=left)
+    *before, last = words_of_handover(Handover(promise, audit, True, "because")).split("\n")
+    assert last.startswith("promise, after learning the audit: mean return 1")
+    assert len(before) == (left is not None)
+    if left is not None:
+        assert before[0].startswith("34 % of the policy's states have speed above 8, the end of its sampling range")
+        assert before[0].endswith("register under a new name with a range up to 11.2")
