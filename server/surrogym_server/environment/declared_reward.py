@@ -12,7 +12,7 @@ from surrogym_server.environment.conditions import Conditions, Inequality
 from surrogym_server.environment.terms import Term, TermSet, compile_terms
 from surrogym_server.tensors import CPU, cached, to_device
 
-Shape = Literal["one", "linear", "absolute", "square", "bump"]
+Shape = Literal["one", "linear", "absolute", "square", "bump", "ball"]
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,7 @@ class RewardTerm:
     """weight * shape(x_1, x_2, ...) if every inequality in ``when`` holds, else 0.
 
     ``one``: 1. ``linear``: sum x_i. ``absolute``: sum |x_i|. ``square``: sum x_i^2. ``bump``: exp(-1/2 sum x_i^2).
+    ``ball``: 1 where sum x_i^2 <= 1, else 0.
     """
 
     weight: float
@@ -82,3 +83,5 @@ def _shaped(shape: Shape, x: Tensor) -> Tensor:
             return x.square().sum(-1)
         case "bump":
             return torch.exp(-0.5 * x.square().sum(-1))
+        case "ball":
+            return (x.square().sum(-1) <= 1).to(x.dtype)

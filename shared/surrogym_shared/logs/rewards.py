@@ -37,5 +37,7 @@ def _paid(spec: EnvironmentSpec, term: RewardTerm, q: Floats, u: Floats) -> Floa
             shaped = (x**2).sum(0)
         case "bump":
             shaped = np.exp(-0.5 * (x**2).sum(0))
+        case "ball":
+            shaped = ((x**2).sum(0) <= 1).astype(np.float64)
     paying = np.all([holds(spec, one, q) for one in term.when], axis=0) if term.when else np.ones(len(q), dtype=bool)
     return np.asarray(term.weight * shaped * paying, dtype=np.float64)

@@ -44,10 +44,11 @@ class RewardTerm(Frozen):
     """Term of a declared reward: weight * shape(of) if every inequality in ``when`` holds, else 0.
 
     ``one``: 1. ``linear``: sum of x. ``absolute``: sum of |x|. ``square``: sum of x^2. ``bump``: exp(-1/2 sum of x^2).
+    ``ball``: 1 where the sum of x^2 is at most 1, else 0.
     """
 
     weight: Number = 1.0
-    shape: Literal["one", "linear", "absolute", "square", "bump"]
+    shape: Literal["one", "linear", "absolute", "square", "bump", "ball"]
     of: tuple[Quantity, ...] = Field(default=(), max_length=MAX_TERM_PARTS)
     when: tuple[Inequality, ...] = Field(default=(), max_length=MAX_INEQUALITIES)
 

@@ -22,7 +22,7 @@ from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.testing.cases import model_cases
 from surrogym_server.virtual import LaneState, LaneTransition, VirtualSettings, create, in_fastest_form, reset, step
 from surrogym_shared import compiled
-from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Quantity, RewardTerm, Term
 
 needs_numba = pytest.mark.skipif(not compiled.available(), reason="numba is not installed, or switched off")
 LANES, STEPS = 7, 5
@@ -54,12 +54,19 @@ def paper(spec: EnvironmentSpec) -> EnvironmentSpec:
     return spec.model_copy(update={"design": spec.design.model_copy(update={"preset": "paper"})})
 
 
+def paid_in_a_ball(spec: EnvironmentSpec) -> EnvironmentSpec:
+    across, up = (Quantity(term=2.0 * term) for term in (Term.sin(theta=1), Term.cos(theta=1) + Term.constant(0.5)))
+    term = RewardTerm(shape="ball", weight=3, of=(across, up))
+    return spec.model_copy(update={"reward": DeclaredReward(kind="declared", timing="after", terms=(term,))})
+
+
 ENVIRONMENTS: dict[str, Callable[[], EnvironmentSpec]] = {
     "cart-pole": cartpole,
     "acrobot": acrobot,
     "swing-up": swing_up,
     "narrow swing-up": swing_up_narrow,
     "paper": lambda: paper(pendulum()),
+    "paid in a ball": lambda: paid_in_a_ball(pendulum()),
     "learned ending": lambda: cartpole().model_copy(update={"termination": "learned"}),
 }
 CASES = {f"case: {case}": case for case in model_cases("gaussian_process")}

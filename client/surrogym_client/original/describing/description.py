@@ -12,16 +12,14 @@ import numpy as np
 from surrogym_client.original.adapters import open_simulator
 from surrogym_client.original.describing.exploring import RESETS, STEPS, Counted, Seen, explore
 from surrogym_client.original.describing.expressing import express, names_in, shown_by_itself
+from surrogym_client.original.describing.known_rewards import known_reward
 from surrogym_client.original.describing.probing import EXACT, Probed, probe
-from surrogym_client.original.describing.rewarding import ENOUGH, Paid, coefficients, may_be_quadratic, quadratic_reward
 from surrogym_client.original.errors import UnknownEnvironment
-from surrogym_client.original.gymnasium import wrapped
 from surrogym_client.original.protocol import Array
 from surrogym_client.original.simulator import Simulator, Variable
 from surrogym_client.original.state_parts import VELOCITY
 from surrogym_shared.spec import (
     MAX_DIMENSIONS,
-    BoxAction,
     Coordinate,
     DeclaredReward,
     EnvironmentSpec,
@@ -132,39 +130,9 @@ class _Draft:
         return EnvironmentSpec.model_validate({**frame.model_dump(), "observation": observation})
 
     def known_reward(self, counted: Counted, spec: EnvironmentSpec, rng: np.random.Generator) -> DeclaredReward | None:
-        """A reward that a quadratic function explains exactly, or None.
-
-        If most of the explored steps allow one, further steps from random states decide, because explored states may
-        vary too little, and an episode may follow a schedule. Half of the further steps are kept for the check.
-        """
-        seen, simulator = self._seen, self._simulator
-        explored = Paid(
-            wrapped(spec, seen.states[:, self._kept]),
-            seen.actions,
-            wrapped(spec, seen.next_states[:, self._kept]),
-            seen.rewards,
-        ).at(~seen.terminated)
-        usable = simulator.pays and self._probed.settable and not self._probed.noisy
-        if not (usable and may_be_quadratic(spec, explored)):
-            return None
-        taken = self._steps_anywhere(counted, spec, 2 * math.ceil(ENOUGH * coefficients(spec)), rng)
-        half = len(taken) // 2
-        return quadratic_reward(spec, taken.at(slice(half)), taken.at(slice(half, None)))
-
-    def _steps_anywhere(self, counted: Counted, spec: EnvironmentSpec, count: int, rng: np.random.Generator) -> Paid:
-        """Steps from random states of the sampling ranges, with random actions; those that end an episode are left
-        out."""
-        ranges, action = np.array([limits(c.sampling) for c in spec.coordinates]), spec.action
-        assert isinstance(action, BoxAction)
-        rows = []
-        for place in rng.uniform(ranges[:, 0], ranges[:, 1], (count, len(ranges))):
-            self._simulator.place(self._kept, place)
-            before, u = self._simulator.read()[self._kept], rng.uniform(action.low, action.high)
-            step = counted.step(u)
-            if not step.terminated:
-                rows.append((before, u, self._simulator.read()[self._kept], step.reward))
-        q, u, q_next, reward = (np.array(column) for column in zip(*rows, strict=True))
-        return Paid(wrapped(spec, q), u, wrapped(spec, q_next), reward)
+        """A reward that can be declared, or None."""
+        usable = self._simulator.pays and self._probed.settable and not self._probed.noisy
+        return known_reward(counted, self._seen, self._kept, spec, rng) if usable else None
 
     def found(self, spec: EnvironmentSpec, steps: int) -> tuple[str, ...]:
         """Findings, one sentence each."""
@@ -190,10 +158,7 @@ class _Draft:
                 "sampling ranges are those that random actions reached, with a margin"
             )
         if isinstance(spec.reward, DeclaredReward):
-            lines.append(
-                "a quadratic function of coordinates and actions explains every reward, so it is declared: no query is "
-                "spent on it"
-            )
+            lines.append(f"{_words_of(spec.reward)} explains every reward, so it is declared: no query is spent on it")
         if still:
             lines.append(f"left out, because it never moved or repeats another variable: {_listed(still)}")
         if self._left_out:
@@ -360,6 +325,17 @@ class _Draft:
 def _raw(term: Term) -> set[str]:
     """The coordinates that a term reads directly. Such a term jumps where an angle wraps."""
     return {name for part in term.parts if part.function == "linear" for name in part.weights}
+
+
+def _words_of(reward: DeclaredReward) -> str:
+    bonus = reward.terms[0]
+    if bonus.when:
+        return "a threshold of a quantity of the state"
+    return (
+        "an ellipsoid of quantities of the state"
+        if bonus.shape == "ball"
+        else "a quadratic function of coordinates and actions"
+    )
 
 
 def _words_of_access(probed: Probed, fixed: str) -> str:

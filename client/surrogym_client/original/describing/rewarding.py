@@ -47,6 +47,14 @@ class Paid:
     def at(self, chosen: slice | NDArray[np.bool_]) -> Paid:
         return Paid(self.q[chosen], self.u[chosen], self.q_next[chosen], self.reward[chosen])
 
+    def before(self) -> Array:
+        """The states (n, C) before the steps."""
+        return self.q
+
+    def after(self) -> Array:
+        """The states (n, C) after the steps."""
+        return self.q_next
+
     def joined(self, other: Paid) -> Paid:
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return Paid(*(np.concatenate(pair) for pair in pairs))
@@ -76,7 +84,7 @@ def quadratic_reward(spec: EnvironmentSpec, fitted: Paid, checked: Paid) -> Decl
     whole = fitted.joined(checked)
     for timing in ("after", "before"):
         found = _fitted(spec, fitted, timing, size)
-        if found is not None and _error(spec, found, whole) <= EXACT * size:
+        if found is not None and error_of(spec, found, whole) <= EXACT * size:
             return found
     return None
 
@@ -100,7 +108,8 @@ def may_be_quadratic(spec: EnvironmentSpec, steps: Paid) -> bool:
     return False
 
 
-def _error(spec: EnvironmentSpec, reward: DeclaredReward, steps: Paid) -> float:
+def error_of(spec: EnvironmentSpec, reward: DeclaredReward, steps: Paid) -> float:
+    """Largest error of a reward over some steps."""
     declared = spec.model_copy(update={"reward": reward})
     ended = np.zeros(len(steps), dtype=bool)
     return float(np.abs(declared_reward(declared, steps.q, steps.u, steps.q_next, ended) - steps.reward).max())

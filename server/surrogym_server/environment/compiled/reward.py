@@ -14,8 +14,8 @@ from surrogym_shared.compiled.jit import inlined
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-SHAPES = {"one": 0, "linear": 1, "absolute": 2, "square": 3, "bump": 4}
-ONE, LINEAR, ABSOLUTE, SQUARE, BUMP = SHAPES.values()
+SHAPES = {"one": 0, "linear": 1, "absolute": 2, "square": 3, "bump": 4, "ball": 5}
+ONE, LINEAR, ABSOLUTE, SQUARE, BUMP, BALL = SHAPES.values()
 HEAD, WEIGHTS, TERMS = range(3)  # places of terms and conditions; action weights (F, X); weight, shape, quantities
 
 
@@ -51,12 +51,15 @@ def add_declared(numbers: Floats, places: Ints, at: int, q: Floats, u: Floats, t
                     shaped[b] += v
                 elif shape == ABSOLUTE:
                     shaped[b] += abs(v)
-                elif shape in (SQUARE, BUMP):
+                elif shape in (SQUARE, BUMP, BALL):
                     shaped[b] += v * v
         if shape == BUMP:
             for b in range(lanes):
                 shaped[b] *= -0.5
             exponential(shaped)
+        if shape == BALL:
+            for b in range(lanes):
+                shaped[b] = 1.0 if shaped[b] <= 1.0 else 0.0
         begin += count
         for b in range(lanes):
             if holds[t, b]:

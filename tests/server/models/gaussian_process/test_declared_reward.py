@@ -75,6 +75,9 @@ def test_shapes():
     bump = RewardTerm(shape="bump", weight=2, of=(x, Quantity(action=(2.0,))))
     assert value(paying(bump), q, u) == pytest.approx(2 * math.exp(-0.5 * (1 + 4)))
     assert value(paying(bump, RewardTerm(shape="one", weight=-1)), q, u) == pytest.approx(2 * math.exp(-2.5) - 1)
+    small = Quantity(term=Term.linear(speed=1), action=(0.8,))  # 0.3 with this action
+    ball = paying(RewardTerm(shape="ball", weight=2, of=(small, Quantity(term=Term.linear(speed=1.9)))))
+    assert [value(ball, q, [push]) for push in (1.0, 0.0)] == [2, 0]  # 0.09 + 0.9025 <= 1 < 0.25 + 0.9025
 
 
 def test_a_term_counts_only_when_its_conditions_hold():

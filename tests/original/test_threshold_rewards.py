@@ -1,0 +1,125 @@
+"""A description finds rewards of two values that change at a level or an ellipsoid of what is observed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from support.simulators import Register, Spiral, installed
+from surrogym_client.original.describing import describe
+from surrogym_client.original.describing.rewarding import Paid
+from surrogym_client.original.describing.thresholds import HALVINGS, POINTS, SEEK, threshold_reward
+from surrogym_shared.logs.rewards import declared_reward
+from surrogym_shared.spec import (
+    BoxAction,
+    Coordinate,
+    DeclaredReward,
+    EnvironmentSpec,
+    ObservationEntry,
+    Reward,
+    Term,
+    Uniform,
+)
+
+RANGES = {"x": (-2.0, 1.0), "y": (-1.0, 2.0), "turn": (-np.pi, np.pi)}
+LOW, HIGH = np.array(list(RANGES.values())).T
+
+Formula = Callable[[np.ndarray], np.ndarray]
+
+
+def spec() -> EnvironmentSpec:
+    starts = {name: Uniform(low=low, high=high) for name, (low, high) in RANGES.items()}
+    shown = {"x": Term.linear(x=1), "y": Term.linear(y=1), "height": Term.cos(turn=1)}
+    return EnvironmentSpec(
+        coordinates=tuple(
+            Coordinate(name=name, kind="angle" if name == "turn" else "linear", sampling=sampling)
+            for name, sampling in starts.items()
+        ),
+        observation=tuple(ObservationEntry(name=name, term=term) for name, term in shown.items()),
+        action=BoxAction(low=(-1,), high=(1,)),
+        start=starts,
+        reward=Reward(timing="auto"),
+        time_limit=10,
+    )
+
+
+class Machine:
+    """Steps of a tenth of the action, in the second coordinate backwards, with a reward before or after them."""
+
+    def __init__(self, reward: Formula, timing: str, seed: int = 0) -> None:
+        self._reward, self._timing, self._rng = reward, timing, np.random.default_rng(seed)
+        self.steps = 0
+
+    def step(self, q: np.ndarray, u: np.ndarray) -> Paid:
+        self.steps += len(q)
+        q_next = q + u * np.array([0.1, -0.1, 0.1])
+        return Paid(q, u, q_next, self._reward(q_next if self._timing == "after" else q).astype(float))
+
+    def draw(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        return self._rng.uniform(LOW, HIGH, (count, 3)), self._rng.uniform(-1, 1, (count, 1))
+
+    def found(self) -> DeclaredReward | None:
+        seen = self.step(*self.draw(100))
+        return threshold_reward(spec(), seen, self.step, self.draw)
+
+
+FORMULAS: dict[str, Formula] = {
+    "a height": lambda q: np.cos(q[:, 2]) > 0.9,
+    "a fine below a level": lambda q: -1 + 0.5 * (q[:, 0] > -1.3),
+    "a band": lambda q: np.abs(q[:, 1] - 0.4) < 0.3,
+    "a disc": lambda q: np.hypot(q[:, 0], q[:, 1]) < 0.6,
+    "outside of a ball": lambda q: 3.0 * (q[:, 0] ** 2 + (q[:, 1] - 0.5) ** 2 + np.cos(q[:, 2]) ** 2 > 0.5),
+    "a distance between entries": lambda q: np.abs(q[:, 0] - q[:, 1]) < 0.2,
+}
+
+
+@pytest.mark.parametrize("timing", ["before", "after"])
+@pytest.mark.parametrize("reward", FORMULAS.values(), ids=FORMULAS)
+def test_a_threshold_is_found_and_holds_elsewhere(reward: Formula, timing: str):
+    found = Machine(reward, timing).found()
+    assert found is not None
+    assert found.timing == timing
+    other = Machine(reward, timing, seed=1)
+    steps = other.step(*other.draw(5_000))
+    declared = spec().model_copy(update={"reward": found})
+    computed = declared_reward(declared, steps.q, steps.u, steps.q_next, np.zeros(len(steps), dtype=bool))
+    np.testing.assert_allclose(computed, steps.reward, atol=1e-9)
+
+
+OTHERS: dict[str, Formula] = {
+    "a diamond": lambda q: np.abs(q[:, 0]) + np.abs(q[:, 1]) < 0.6,
+    "two discs": lambda q: (np.hypot(q[:, 0], q[:, 1]) < 0.5) | (np.hypot(q[:, 0] + 1.5, q[:, 1] - 1.5) < 0.4),
+    "the same everywhere": lambda q: np.ones(len(q)),
+    "three values": lambda q: np.round(np.cos(q[:, 2])),
+    "noise": lambda q: np.random.default_rng(5).random(len(q)) < 0.5,
+}
+
+
+@pytest.mark.parametrize("reward", OTHERS.values(), ids=OTHERS)
+def test_another_reward_is_left_to_be_learned(reward: Formula):
+    machine = Machine(reward, "after")
+    assert machine.found() is None
+    assert machine.steps <= 100 + SEEK + 2 * POINTS * (HALVINGS + 1)
+
+
+def test_a_description_declares_a_bonus_near_a_goal(registered: Register):
+    def step(self: Spiral, action: np.ndarray):
+        shown, _, ended, cut, info = Spiral.step(self, action)
+        return shown, float(np.hypot(*self.state) < 0.3), ended, cut, info
+
+    found = describe(registered("Spiral-v2", {"step": step}), steps=60)
+    assert isinstance(found.spec.reward, DeclaredReward)
+    assert found.spec.reward.terms[0].shape == "ball"
+    assert any("ellipsoid" in line for line in found.found)
+    assert found.steps > 60, "the further steps are counted"
+
+
+@installed("dm_control")
+@pytest.mark.parametrize(("task", "shape"), [("reacher-easy", "ball"), ("pendulum-swingup", "one")])
+def test_rewards_of_the_control_suite_are_found(task: str, shape: str):
+    found = describe(f"dm_control:{task}")
+    assert isinstance(found.spec.reward, DeclaredReward)
+    [term] = found.spec.reward.terms
+    assert (term.shape, term.weight, found.spec.reward.timing) == (shape, pytest.approx(1), "after")
