@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import typer
 
-from surrogym_client.cli.reproduce import efficiency, paper, table, trust
+from surrogym_client.cli.reproduce import efficiency, paper, peers, table, trust
 
-STUDIES = (efficiency, paper, trust, table)
+STUDIES = (efficiency, paper, trust, peers, table)
 
 
 def register(app: typer.Typer) -> None:

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
 
 from surrogym_client.errors import SurrogymClientError
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 Key = tuple[str, str, int, int]
+R = TypeVar("R", bound="DataclassInstance")
 
 
 class UnusableRows(SurrogymClientError):
@@ -106,31 +110,12 @@ def read_rows(path: Path) -> list[Row]:
     Raises:
         UnusableRows: other columns than expected, or a value that is none.
     """
-    if not path.exists():
-        return []
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        given = tuple(reader.fieldnames or ())
-        if given != tuple(name for name in COLUMNS if name in given or name not in LATER):
-            raise UnusableRows(f"{path}: expected the columns {', '.join(COLUMNS)}, got {reader.fieldnames}")
-        rows = []
-        for number, line in enumerate(reader, start=2):
-            try:
-                rows.append(Row(**{name: _read(kind, line.get(name, "")) for name, kind in _kinds().items()}))
-            except (ValueError, TypeError) as error:
-                raise UnusableRows(f"{path}, line {number}: {error}") from error
-        return rows
+    return read_records(path, Row, LATER)
 
 
 def write_rows(path: Path, rows: Iterable[Row]) -> None:
     """Write rows as CSV, in place of what was there at once: a reader never sees half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    with partial.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        writer.writerows([_write(value) for value in asdict(row).values()] for row in rows)
-    os.replace(partial, path)
+    write_records(path, Row, rows)
 
 
 def merge(*sources: Iterable[Row]) -> list[Row]:
@@ -142,8 +127,47 @@ def merge(*sources: Iterable[Row]) -> list[Row]:
     return sorted(merged.values(), key=lambda row: row.key)
 
 
-def _kinds() -> dict[str, Any]:
-    return get_type_hints(Row)
+def read_records(path: Path, kind: type[R], later: Sequence[str] = ()) -> list[R]:
+    """The lines of a CSV file as records of a dataclass; none where there is no file.
+
+    Args:
+        path: the file.
+        kind: a dataclass of numbers, texts and truth values.
+        later: columns that older files lack.
+
+    Raises:
+        UnusableRows: other columns than expected, or a value that is none.
+    """
+    if not path.exists():
+        return []
+    columns, kinds = _columns(kind), get_type_hints(kind)
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        given = tuple(reader.fieldnames or ())
+        if given != tuple(name for name in columns if name in given or name not in later):
+            raise UnusableRows(f"{path}: expected the columns {', '.join(columns)}, got {reader.fieldnames}")
+        records = []
+        for number, line in enumerate(reader, start=2):
+            try:
+                records.append(kind(**{name: _read(kinds[name], line.get(name, "")) for name in columns}))
+            except (ValueError, TypeError) as error:
+                raise UnusableRows(f"{path}, line {number}: {error}") from error
+        return records
+
+
+def write_records(path: Path, kind: type[R], records: Iterable[R]) -> None:
+    """Write records of a dataclass as CSV, in place of what was there at once: a reader never sees half of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    with partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(_columns(kind))
+        writer.writerows([_write(value) for value in asdict(record).values()] for record in records)
+    os.replace(partial, path)
+
+
+def _columns(kind: type[DataclassInstance]) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(kind))
 
 
 def _read(kind: Any, text: str) -> Any:

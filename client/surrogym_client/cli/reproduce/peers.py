@@ -1,0 +1,148 @@
+"""``surrogym reproduce peers``: learning curves of other methods beside ours, on the same tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from surrogym_client.cli.options import AsJson, Quiet
+
+if TYPE_CHECKING:
+    from surrogym_client.experiments.peers.points import Point
+    from surrogym_client.experiments.peers.study import PeerCell
+
+
+def register(app: typer.Typer) -> None:
+    """Add ``surrogym reproduce peers`` to the app."""
+    app.command("peers")(command)
+
+
+def command(
+    tasks: Annotated[
+        str, typer.Option(help="Tasks of the demo or package.module:Class, separated by commas, or core.")
+    ] = "core",
+    methods: Annotated[str, typer.Option(help="Methods, separated by commas, or all.")] = "all",
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 5,
+    first_seed: Annotated[int, typer.Option(min=0, help="First seed. The others follow it.")] = 0,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of runs at once. Each takes one core.")] = 1,
+    out: Annotated[Path, typer.Option(help="Folder for points, table, pictures and runs.")] = Path("runs/peers"),
+    rows: Annotated[
+        list[Path] | None,
+        typer.Option(help="File of rows with runs of ours. May be given several times. Only its tasks and arms count."),
+    ] = None,
+    budget: Annotated[
+        int | None, typer.Option(min=1, help="Real steps of each peer. [default: from the method]")
+    ] = None,
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="Real episodes of each evaluation. [default: from the method]")
+    ] = None,
+    minutes: Annotated[float, typer.Option(min=0.01, help="Processor minutes of learning for each run.")] = 90.0,
+    only_table: Annotated[bool, typer.Option("--only-table", help="Run nothing; show what there is.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Run other methods on our tasks, and draw learning curves.
+
+    The folder --out gets points.csv, peers.md and a picture of each task. A finished run is not repeated, so the same
+    command continues after Ctrl-C. docs/results/peers.md has the rules. The methods default and latin_hypercube are
+    ours; their runs come from files of rows, which surrogym reproduce efficiency writes.
+
+    Example: surrogym reproduce peers --tasks pendulum --methods sac,ppo --seeds 3
+
+    Example: surrogym reproduce peers --rows docs/results/efficiency.csv --out runs/peers --only-table
+    """
+    from surrogym_client.cli.reproduce.efficiency import names_of
+    from surrogym_client.experiments.peers.registry import METHODS
+    from surrogym_client.experiments.peers.study import PeerCell
+
+    named, chosen = _tasks(tasks), names_of("method", methods, METHODS)
+    numbers = range(first_seed, first_seed + seeds)
+    wanted = [PeerCell(t, m, s, budget, episodes, minutes) for s in numbers for t in named for m in chosen]
+    if not only_table:
+        _run([cell for cell in wanted if not cell.points(out)], out, jobs, quiet=quiet)
+    _present(wanted, _ours(rows or [], named), out, as_json=as_json, quiet=quiet)
+
+
+def _tasks(given: str) -> list[str]:
+    from surrogym_client.cli.errors import CommandError
+    from surrogym_client.experiments.peers.registry import CORE, task_of
+
+    names = list(CORE) if given == "core" else list(dict.fromkeys(given.split(",")))
+    for name in names:
+        try:
+            task_of(name)
+        except KeyError as error:
+            raise CommandError(
+                f"unknown task {name!r}: expected core, a task of the demo with its own specification, "
+                "or package.module:Class"
+            ) from error
+    return names
+
+
+def _run(todo: Sequence[PeerCell], out: Path, jobs: int, *, quiet: bool) -> None:
+    from surrogym_client.experiments.peers.study import run_cells
+    from surrogym_client.runtime.lifetime import terminations_as_interrupts
+    from surrogym_shared.terminal import on_interrupt, progress, say
+
+    stays = f"interrupted; finished runs are kept in {out / 'cells'}; the same command continues from there"
+    with terminations_as_interrupts(), on_interrupt(lambda: stays), progress("peers", quiet=quiet) as update:
+        done = 0
+
+        def tell(cell: PeerCell, points: Sequence[Point]) -> None:
+            nonlocal done
+            done += 1
+            last = points[-1]
+            update(done / len(todo), f"{done} of {len(todo)} runs")
+            earned = "no return" if last.mean is None else f"mean return {last.mean:.1f}"
+            say(
+                f"{cell.task} {cell.method} seed {cell.seed}: {last.real_steps} real steps, {earned}, {last.ended}",
+                quiet=quiet,
+            )
+
+        if todo:
+            run_cells(todo, out, jobs, tell)
+
+
+def _ours(files: Sequence[Path], tasks: Sequence[str]) -> list[Point]:
+    """Points of our arms at each task's budget."""
+    from surrogym_client.experiments.peers.points import points_of
+    from surrogym_client.experiments.peers.registry import OURS, task_of
+    from surrogym_client.experiments.reproduce.rows import merge, read_rows
+
+    rows = merge(*map(read_rows, files))
+    return points_of(
+        row for row in rows if row.task in tasks and row.arm in OURS and row.budget <= task_of(row.task).budget
+    )
+
+
+def _present(cells: Sequence[PeerCell], ours: Sequence[Point], out: Path, *, as_json: bool, quiet: bool) -> None:
+    """Write points, table and pictures, and print the table."""
+    from surrogym_client.cli.columns import fitted
+    from surrogym_client.experiments.peers.pictures import draw_tasks
+    from surrogym_client.experiments.peers.points import Point
+    from surrogym_client.experiments.peers.table import NOTES, table
+    from surrogym_client.experiments.reproduce.rows import read_records, write_records
+    from surrogym_shared.terminal import give
+
+    found = [cell.points(out) or read_records(cell.file(out), Point) for cell in cells]
+    points = [*ours, *(point for of in found for point in of)]
+    points.sort(key=lambda p: [cell.task for cell in cells].index(p.task))
+    unfinished = [
+        f"{c.task} {c.method} seed {c.seed}" for c, of in zip(cells, found, strict=True) if not of or not of[-1].ended
+    ]
+    text = "\n".join(
+        [table(points), NOTES, *([f"Not run or not finished: {', '.join(unfinished)}.\n"] if unfinished else [])]
+    )
+    write_records(out / "points.csv", Point, points)
+    (out / "peers.md").write_text(text, encoding="utf-8")
+    pictures = draw_tasks(out, points)
+    result = {
+        "out": str(out),
+        "points": [vars(p) for p in points],
+        "unfinished": unfinished,
+        "pictures": [str(path) for path in pictures],
+    }
+    give(result, lambda: fitted(text), as_json=as_json, quiet=quiet)

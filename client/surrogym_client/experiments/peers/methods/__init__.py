@@ -1,0 +1,1 @@
+"""Implementations of peers, each after its publication."""

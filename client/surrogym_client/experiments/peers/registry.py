@@ -1,0 +1,67 @@
+"""Methods of the study by name, and the tasks that they learn. Importing this imports no method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from surrogym_client.experiments.peers.port import Peer
+from surrogym_client.experiments.tasks import EVERY_TASK, DemoTask, Target
+from surrogym_client.original.loading import has_specification
+
+OURS = ("default", "latin_hypercube")  # arms of the efficiency study
+CORE = ("pendulum", "cartpole", "swingup", "acrobot")
+SHARE, LEAST = 10, 1_000  # a peer's real steps: this many times ours, and at least as many
+OWN_BUDGET = 100  # real steps of ours for a task that is none of the demo
+
+
+@dataclass(frozen=True)
+class Method:
+    """A peer of the study.
+
+    Attributes:
+        words: what it is.
+        make: builds the peer; imports its libraries.
+        budget: real steps; None follows the task's budget.
+        episodes: of an evaluation.
+    """
+
+    words: str
+    make: Callable[[], Peer]
+    budget: int | None = None
+    episodes: int = 100
+
+    def real_steps(self, task: DemoTask) -> int:
+        return self.budget or max(LEAST, SHARE * task.budget)
+
+
+def _sac() -> Peer:
+    from surrogym_client.experiments.peers.methods.model_free import ModelFree
+
+    return ModelFree("SAC", boxed=True)
+
+
+def _ppo() -> Peer:
+    from surrogym_client.experiments.peers.methods.model_free import ModelFree
+
+    return ModelFree("PPO", boxed=False)
+
+
+METHODS = {
+    "sac": Method("soft actor-critic of Stable-Baselines3, model-free", _sac, budget=20_000),
+    "ppo": Method("proximal policy optimisation of Stable-Baselines3, model-free", _ppo, budget=100_000),
+}
+
+
+def task_of(name: str) -> DemoTask:
+    """The task of the demo called ``name``, or a user's environment ``package.module:Class``, which has no target.
+
+    Raises:
+        KeyError: it is neither.
+    """
+    if name not in EVERY_TASK and ":" in name:
+        return DemoTask(name, OWN_BUDGET, Target("none"))
+    task = EVERY_TASK[name]
+    if not has_specification(task.environment):
+        raise KeyError(name)
+    return task

@@ -1,0 +1,154 @@
+"""Cells of the study: one task, method and seed each. A finished cell is kept in a file and is not run again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+
+from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
+from surrogym_client.experiments.peers.points import BUDGET, REACHED, TIME, Point
+from surrogym_client.experiments.peers.port import BudgetSpent, Clock, NotApplicable, OutOfTime, Real
+from surrogym_client.experiments.peers.registry import METHODS, task_of
+from surrogym_client.experiments.reproduce.rows import read_records, write_records
+from surrogym_client.experiments.settings import fingerprint
+from surrogym_client.experiments.tasks import DemoTask, Outcome, Target
+from surrogym_client.original import make
+from surrogym_client.original.episodes import Episode, open_episode
+from surrogym_client.policies.predict import Acting
+from surrogym_client.runtime.versions import commit, machine
+
+LIMIT_MINUTES = 90.0
+
+Tell = Callable[[Point], None]
+
+
+@dataclass(frozen=True)
+class PeerCell:
+    """One run of a peer. ``budget`` and ``episodes`` of None are the method's."""
+
+    task: str
+    method: str
+    seed: int
+    budget: int | None = None
+    episodes: int | None = None
+    minutes: float = LIMIT_MINUTES
+
+    @property
+    def real_steps(self) -> int:
+        return self.budget or METHODS[self.method].real_steps(task_of(self.task))
+
+    @property
+    def judged(self) -> int:
+        """Episodes of an evaluation."""
+        return self.episodes or METHODS[self.method].episodes
+
+    @property
+    def specification(self) -> str:
+        """Hash of what is asked, without the seed."""
+        asked = {"task": asdict(task_of(self.task)), "method": self.method, "minutes": self.minutes}
+        return fingerprint(asked | {"real_steps": self.real_steps, "episodes": self.judged})
+
+    def file(self, folder: Path) -> Path:
+        """The file of its points."""
+        return folder / "cells" / f"{self.task.replace(':', '.')}-{self.method}-seed{self.seed}.csv"
+
+    def points(self, folder: Path) -> list[Point]:
+        """Its points, if it has been run with the same settings and did not fail; else none."""
+        found = read_records(self.file(folder), Point)
+        done = bool(found) and found[-1].ended in (REACHED, BUDGET, TIME)
+        return found if done and found[-1].specification == self.specification else []
+
+
+def run_cells(todo: Sequence[PeerCell], folder: Path, jobs: int, tell: Callable[[PeerCell, list[Point]], None]) -> None:
+    """Run cells, ``jobs`` at once, each in a process of its own with one thread. ``tell`` is called after each."""
+    with ProcessPoolExecutor(jobs, get_context("spawn"), max_tasks_per_child=1) as pool:
+        running = {pool.submit(run_cell, cell, folder): cell for cell in todo}
+        for done in as_completed(running):
+            tell(running[done], done.result())
+
+
+def run_cell(cell: PeerCell, folder: Path, tell: Tell | None = None) -> list[Point]:
+    """Run one cell, and write its points after each round.
+
+    Returns:
+        its points. The last one says why the cell ended. A method that failed or can't learn the task has its error
+        there.
+    """
+    _single_thread()
+    points: list[Point] = []
+    begun = Point(
+        *(cell.task, cell.method, cell.seed, 0, 0), commit=commit(), specification=cell.specification, machine=machine()
+    )
+    try:
+        for point in _rounds(cell, begun):
+            points = [*(p for p in points if p.round != point.round), point]
+            write_records(cell.file(folder), Point, points)
+            if tell is not None:
+                tell(point)
+    except (NotApplicable, ArithmeticError, RuntimeError, ValueError) as error:
+        points.append(replace(points[-1] if points else begun, ended=f"{type(error).__name__}: {error}"[:300]))
+        write_records(cell.file(folder), Point, points)
+    return points
+
+
+def _rounds(cell: PeerCell, begun: Point) -> Iterator[Point]:
+    """Points after each round, then the end of the cell: the last point again, or, if real steps followed it, one more
+    with the same policy."""
+    task, method = task_of(cell.task), METHODS[cell.method]
+    spec = make(task.environment).spec()
+    opener = partial(open_episode, task.environment, spec, partial(make, task.environment, spec=spec))
+    clock = Clock(60 * cell.minutes)
+    real = Real(spec, opener, cell.seed, cell.real_steps, clock)
+    point = begun
+    try:
+        for policy in method.make().learn(real, cell.seed):
+            point = replace(point, round=point.round + 1, real_steps=real.steps, cpu_seconds=clock.seconds)
+            with clock.pause():
+                point = _judged(point, policy, opener, task, cell.judged)
+            yield point
+            if point.reached:
+                return
+        ended = BUDGET
+    except (BudgetSpent, OutOfTime) as end:
+        ended = BUDGET if isinstance(end, BudgetSpent) else TIME
+    finally:
+        real.close()
+    more = int(real.steps > point.real_steps or point.round == 0)
+    yield replace(point, round=point.round + more, real_steps=real.steps, cpu_seconds=clock.seconds, ended=ended)
+
+
+def _judged(point: Point, policy: Acting, opener: Callable[[], Episode], task: DemoTask, episodes: int) -> Point:
+    """The point with what the policy earns, and with the end of its cell if it reaches the target."""
+    plain = EvaluationSettings(episodes=episodes)
+    real = evaluate(policy, opener, plain)
+    reached = has_target(task.target) and replace(task.target, also_success=None).reached(_outcome(real))
+    if reached and task.also is not None and task.target.also_success is not None:
+        other = replace(plain, wide=task.also.wide, start_scale=task.also.scale)
+        reached = task.target.reached(_outcome(real), _outcome(evaluate(policy, opener, other)))
+    told = real.summary()
+    return replace(
+        point,
+        **{name: told[name] for name in ("mean", "iqm", "min", "episodes")},
+        success=real.success_rate,
+        reached=reached,
+        ended=REACHED if reached else "",
+    )
+
+
+def has_target(target: Target) -> bool:
+    """Whether a target asks for anything."""
+    return any(value is not None for value in (target.mean, target.lowest, target.success))
+
+
+def _outcome(result: Evaluation) -> Outcome:
+    return Outcome(float(result.returns.mean()), float(result.returns.min()), result.success_rate)
+
+
+def _single_thread() -> None:
+    import torch
+
+    torch.set_num_threads(1)

@@ -1,0 +1,23 @@
+"""Peers by command: what is finished is shown, and what is not known is refused."""
+
+from surrogym_client.experiments.peers.points import BUDGET, Point
+from surrogym_client.experiments.peers.study import PeerCell
+from surrogym_client.experiments.reproduce.rows import write_records
+
+
+def test_the_command_shows_what_there_is(surrogym, tmp_path):
+    cell = PeerCell("pendulum", "sac", 0)
+    point = Point("pendulum", "sac", 0, 1, 20_000, mean=-170.0, episodes=100, ended=BUDGET)
+    write_records(cell.file(tmp_path / "out"), Point, [Point(**{**vars(point), "specification": cell.specification})])
+    said = surrogym(
+        *("reproduce", "peers", "--tasks=pendulum", "--methods=sac,ppo", "--seeds=1", "--out=out", "--only-table"),
+        "--json",
+    )
+    assert said.code == 0
+    assert said.json["unfinished"] == ["pendulum ppo seed 0"]
+    assert "not reached by 20,000" in (tmp_path / "out" / "peers.md").read_text()
+
+
+def test_the_command_refuses_what_it_does_not_know(surrogym):
+    assert "unknown task 'nothing'" in surrogym("reproduce", "peers", "--tasks=nothing").err
+    assert "unknown method 'x'" in surrogym("reproduce", "peers", "--methods=x").err

@@ -1,0 +1,82 @@
+"""A finished cell is not run again, a failed one is, and every cell says why it ended."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from surrogym_client.experiments.peers import registry
+from surrogym_client.experiments.peers.methods.model_free import goals
+from surrogym_client.experiments.peers.points import BUDGET, REACHED, TIME
+from surrogym_client.experiments.peers.port import NotApplicable
+from surrogym_client.experiments.peers.registry import METHODS, Method, task_of
+from surrogym_client.experiments.peers.study import PeerCell, run_cell
+
+
+class Balancing:
+    """Pushes the cart below the falling pole. Its first round does the opposite."""
+
+    def learn(self, real, seed) -> Iterator:
+        for sign in (-1, 1, 1):
+            real.reset()
+            for _ in range(5):
+                real.step(np.zeros(1))
+            yield lambda seen, sign=sign: (sign * (seen[:, 2] + 0.3 * seen[:, 3]) > 0).astype(float)
+
+
+class Refusing:
+    def learn(self, real, seed) -> Iterator:
+        real.reset()
+        raise NotApplicable("not this one")
+        yield
+
+
+@pytest.fixture
+def peers(monkeypatch):
+    for name, peer in (("balancing", Balancing), ("refusing", Refusing)):
+        monkeypatch.setitem(METHODS, name, Method(name, peer, budget=100))
+
+
+def test_a_cell_ends_with_the_round_that_reaches_the_target(peers, tmp_path):
+    cell = PeerCell("cartpole", "balancing", 0, episodes=3)
+    points = run_cell(cell, tmp_path)
+    assert [(p.round, p.real_steps, p.ended) for p in points] == [(1, 5, ""), (2, 10, REACHED)]
+    assert points[0].mean < 50 < points[1].min == 500
+    assert [p.ended for p in cell.points(tmp_path)] == ["", REACHED]
+    assert PeerCell("cartpole", "balancing", 0, episodes=2).points(tmp_path) == []  # other settings
+
+
+def test_a_cell_ends_at_its_budget_within_a_round(peers, tmp_path):
+    points = run_cell(PeerCell("cartpole", "balancing", 0, budget=7, episodes=1), tmp_path)
+    assert [(p.round, p.real_steps, p.ended) for p in points] == [(1, 5, ""), (2, 7, BUDGET)]
+    assert points[0].mean == points[1].mean
+
+
+def test_a_cell_without_time_says_so(peers, tmp_path):
+    (point,) = run_cell(PeerCell("cartpole", "balancing", 0, minutes=-1.0), tmp_path)
+    assert (point.ended, point.mean) == (TIME, None)
+
+
+def test_a_peer_that_refuses_a_task_leaves_its_reason_and_may_run_again(peers, tmp_path):
+    cell = PeerCell("cartpole", "refusing", 0)
+    (point,) = run_cell(cell, tmp_path)
+    assert point.ended == "NotApplicable: not this one"
+    assert cell.points(tmp_path) == []
+
+
+def test_peers_get_ten_times_our_steps_and_at_least_a_thousand():
+    method = Method("", Balancing)
+    assert [method.real_steps(registry.EVERY_TASK[name]) for name in ("pendulum", "doublependulum")] == [1_000, 2_000]
+
+
+def test_a_users_environment_is_a_task_without_a_target():
+    assert task_of("cart:Cart").environment == "cart:Cart"
+    with pytest.raises(KeyError):
+        task_of("nothing")
+    with pytest.raises(KeyError):
+        task_of("dm-pendulum")  # it has no specification of its own
+
+
+def test_model_free_rounds_end_at_fixed_steps():
+    assert goals(20_000) == [1_000, 2_000, 5_000, 10_000, 20_000]
+    assert goals(700) == [700]
