@@ -47,7 +47,14 @@ def _ppo() -> Peer:
     return ModelFree("PPO", boxed=False)
 
 
+def _pilco() -> Peer:
+    from surrogym_client.experiments.peers.methods.pilco import Pilco
+
+    return Pilco()
+
+
 METHODS = {
+    "pilco": Method("PILCO: Gaussian processes, moment matching, gradients", _pilco),
     "sac": Method("soft actor-critic of Stable-Baselines3, model-free", _sac, budget=20_000),
     "ppo": Method("proximal policy optimisation of Stable-Baselines3, model-free", _ppo, budget=100_000),
 }

@@ -1,0 +1,226 @@
+"""PILCO: policy search by gradients of an expected cost that is predicted with moment matching.
+
+M. P. Deisenroth, C. E. Rasmussen, "PILCO: A Model-Based and Data-Efficient Approach to Policy Search", ICML 2011.
+
+Shapes: K beliefs, C coordinates, G angles, A features, F controls, B basis functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from surrogym_client.experiments.peers.methods.gaussian_process import Processes, conditioned, fit
+from surrogym_client.experiments.peers.methods.moments import (
+    Moments,
+    saturating_cost,
+    squashed,
+    through_angles,
+    through_processes,
+)
+from surrogym_client.experiments.peers.methods.states import Control, Held, States, Transitions, episode, random_control
+from surrogym_client.experiments.peers.methods.told import TipCost, told
+from surrogym_client.experiments.peers.port import NotApplicable, Real
+from surrogym_client.original.protocol import Array
+from surrogym_client.policies.predict import Acting
+from surrogym_shared.spec import EnvironmentSpec, Fixed, Normal, Uniform
+
+HALF_TURN = np.pi
+KEPT = 150  # samples up to which intermediate results are kept for the gradient; beyond, they are computed twice
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of PILCO. 50 basis functions are those of the paper's cart-pole (305 parameters)."""
+
+    basis: int = 50
+    iterations: int = 75  # of L-BFGS after each episode; the authors' program takes 150 line searches
+    horizon: int = 60  # the longest
+    modes: int = 4  # normal distributions that cover starts anywhere on a circle; the paper has one start
+
+
+class Pilco:
+    """PILCO. The first episode acts at random, every other by the policy so far."""
+
+    def __init__(self, settings: Settings | None = None) -> None:
+        self._settings = settings or Settings()
+
+    def learn(self, real: Real, seed: int) -> Iterator[Acting]:
+        """Yield the policy after each episode and its optimisation (algorithm 1 of the paper)."""
+        states, rng, known = States(real.spec), np.random.default_rng(seed), told(real.spec)
+        if known.cost is None:
+            raise NotApplicable("PILCO has to know a cost of a tip's distance from a goal")
+        torch.manual_seed(seed)
+        horizon = min(known.horizon, self._settings.horizon)
+        beliefs = start_beliefs(real.spec, self._settings.modes)
+        theta = _first_parameters(states, beliefs[0], self._settings.basis, rng)
+        control, data = random_control(states, rng), list[Transitions]()
+        while True:
+            data.append(episode(real, states, control, horizon, known.repeat))
+            model = _model(states, Transitions.joined(data), rng, real.clock.check)
+            objective = partial(_expected_cost, states, model, known.cost, beliefs, horizon)
+            theta = _improved(objective, theta, states, self._settings, real.clock.check)
+            control = _acting(states, _policy(states, theta))
+            yield Held(states, control, known.repeat)
+
+
+def start_beliefs(spec: EnvironmentSpec, modes: int) -> tuple[Tensor, Tensor]:
+    """Means (K, C) and covariances (K, C, C) of the starts. A coordinate that starts anywhere on a circle has as many
+    normal distributions as ``modes``, the others have one."""
+    parts = [_modes(spec.start[name], modes) for name in spec.coordinate_names]
+    grid = np.stack(np.meshgrid(*(means for means, _ in parts), indexing="ij"), -1).reshape(-1, len(parts))
+    variances = np.array([max(deviation, 1e-3) ** 2 for _, deviation in parts])
+    return torch.from_numpy(grid), torch.from_numpy(np.tile(np.diag(variances), (len(grid), 1, 1)))
+
+
+def _modes(start: Uniform | Normal | Fixed, modes: int) -> tuple[Array, float]:
+    """Means and the common deviation of normal distributions for one coordinate."""
+    match start:
+        case Fixed(value=value):
+            return np.array([value]), 0.0
+        case Normal(mean=mean, std=std):
+            return np.array([mean]), std
+        case Uniform(low=low, high=high):
+            count = modes if high - low > HALF_TURN else 1
+            width = (high - low) / count
+            return low + width * (np.arange(count) + 0.5), width / np.sqrt(12)
+
+
+def _first_parameters(states: States, starts: Tensor, basis: int, rng: np.random.Generator) -> Array:
+    """Centres near the starts, small random targets, and length scales of one, or 0.7 for features of angles."""
+    featured = states.featured(starts.numpy())
+    centres = featured[rng.integers(len(featured), size=basis)] + rng.standard_normal((basis, states.features))
+    targets = 0.1 * rng.standard_normal((basis, states.controls))
+    linear = int((~states.angles).sum())
+    scales = np.where(np.arange(states.features) < linear, 1.0, 0.7)
+    return np.concatenate([centres.ravel(), targets.ravel(), np.log(scales)])
+
+
+def _policy(states: States, theta: Tensor | Array) -> Processes:
+    """The policy before it is squashed: means of processes with B pseudo-samples (section 2.3 of the paper)."""
+    theta = torch.as_tensor(theta)
+    size, controls = states.features, states.controls
+    basis = (len(theta) - size) // (size + controls)
+    centres = theta[: basis * size].reshape(basis, size)
+    targets = theta[basis * size : -size].reshape(basis, controls)
+    lengthscale = theta[-size:].exp().expand(controls, size)
+    one = torch.ones(controls, dtype=theta.dtype)
+    return conditioned(centres, targets, lengthscale, one, 0.01 * one)
+
+
+def _model(states: States, data: Transitions, rng: np.random.Generator, check: Callable[[], None]) -> Processes:
+    """Processes from features and controls to changes of coordinates."""
+    inputs = np.concatenate([states.featured(data.q), data.u], 1)
+    return fit(inputs, states.change(data.q, data.reached), rng, check)
+
+
+class _Joint:
+    """A belief over a growing list of variables: mean (K, V) and covariance (K, V, V)."""
+
+    def __init__(self, mean: Tensor, covariance: Tensor) -> None:
+        self.mean = mean
+        self.covariance = covariance
+
+    def of(self, at: Sequence[int]) -> tuple[Tensor, Tensor]:
+        return self.mean[:, at], self.covariance[:, at][:, :, at]
+
+    def append(self, at: Sequence[int], new: Moments) -> list[int]:
+        """Append outputs of a function of the variables ``at``. Returns their places."""
+        cross = self.covariance[:, :, at] @ new.gain
+        first = self.mean.shape[1]
+        self.mean = torch.cat([self.mean, new.mean], 1)
+        upper = torch.cat([self.covariance, cross], 2)
+        self.covariance = torch.cat([upper, torch.cat([cross.mT, new.covariance], 2)], 1)
+        return list(range(first, self.mean.shape[1]))
+
+
+def _next_belief(
+    states: States, model: Processes, policy: Processes, mean: Tensor, covariance: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Belief over the coordinates after one control (equations 9 to 11 of the paper)."""
+    joint, size = _Joint(mean, covariance), mean.shape[1]
+    angles = np.flatnonzero(states.angles).tolist()
+    trigonometric = joint.append(angles, through_angles(*joint.of(angles)))
+    sines, cosines = trigonometric[: len(angles)], trigonometric[len(angles) :]
+    features = [*np.flatnonzero(~states.angles).tolist(), *cosines, *sines]
+    wanted = joint.append(features, through_processes(policy, *joint.of(features), certain=True))
+    controls = joint.append(wanted, squashed(*joint.of(wanted)))
+    inputs = [*features, *controls]
+    changes = joint.append(inputs, through_processes(model, *joint.of(inputs)))
+    before, both = list(range(size)), joint.covariance
+    cross = both[:, before][:, :, changes]
+    reached = both[:, before][:, :, before] + cross + cross.mT + both[:, changes][:, :, changes]
+    return joint.mean[:, before] + joint.mean[:, changes], (reached + reached.mT) / 2
+
+
+def _cost(cost: TipCost, mean: Tensor, covariance: Tensor) -> Tensor:
+    """Expected costs (K,) of beliefs over coordinates."""
+    angles, linear, sines, cosines = map(torch.from_numpy, (cost.angles, cost.linear, cost.sines, cost.cosines))
+    joint, at = _Joint(mean, covariance), list(range(mean.shape[1]))
+    turned = Moments(mean @ angles.T, angles @ covariance @ angles.T, angles.T.expand(len(mean), -1, -1))
+    places = joint.append(at, turned)
+    joint.append(places, through_angles(*joint.of(places)))
+    tip = torch.cat([linear, torch.zeros_like(sines), sines, cosines], 1)
+    return saturating_cost(joint.mean @ tip.T, tip @ joint.covariance @ tip.T, torch.from_numpy(cost.goal), cost.width)
+
+
+def _expected_cost(
+    states: States, model: Processes, cost: TipCost, beliefs: tuple[Tensor, Tensor], horizon: int, policy: Processes
+) -> Tensor:
+    """Expected cost of an episode, mean over the beliefs of starts (equation 2 of the paper)."""
+    (mean, covariance), total = beliefs, torch.zeros((), dtype=torch.float64)
+    step = partial(_next_belief, states, model, policy)
+    many = len(model.x) > KEPT
+    for _ in range(horizon):
+        if many:
+            mean, covariance = checkpoint(step, mean, covariance, use_reentrant=False)
+        else:
+            mean, covariance = step(mean, covariance)
+        total = total + _cost(cost, mean, covariance).mean()
+    return total
+
+
+def _improved(
+    objective: Callable[[Processes], Tensor],
+    theta: Array,
+    states: States,
+    settings: Settings,
+    check: Callable[[], None],
+) -> Array:
+    """Parameters of the policy after a search by L-BFGS from ``theta``."""
+
+    def value_and_slope(values: Array) -> tuple[float, Array]:
+        check()
+        parameters = torch.from_numpy(values).requires_grad_()
+        try:
+            cost = objective(_policy(states, parameters))
+            cost.backward()  # type: ignore[no-untyped-call]
+        except torch.linalg.LinAlgError:  # a trial step of the line search went too far
+            return np.inf, np.zeros_like(values)
+        slope: NDArray[np.float64] | None = None if parameters.grad is None else parameters.grad.numpy()
+        if slope is None or not np.isfinite(slope).all():
+            return np.inf, np.zeros_like(values)
+        return cost.item(), slope
+
+    limits = {"maxiter": settings.iterations, "maxfun": 2 * settings.iterations}
+    best: Array = minimize(value_and_slope, theta, jac=True, method="L-BFGS-B", options=limits).x
+    return best
+
+
+def _acting(states: States, policy: Processes) -> Control:
+    """The policy as a function of coordinates."""
+
+    def control(q: Array) -> Array:
+        wanted = policy.predict(torch.from_numpy(states.featured(q)))[0].numpy()
+        chosen: Array = 9 / 8 * np.sin(wanted) + np.sin(3 * wanted) / 8
+        return chosen
+
+    return control
