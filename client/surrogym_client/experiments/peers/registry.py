@@ -53,8 +53,22 @@ def _pilco() -> Peer:
     return Pilco()
 
 
+def _black_drops() -> Peer:
+    from surrogym_client.experiments.peers.methods.black_drops import BlackDrops
+
+    return BlackDrops()
+
+
+def _pets() -> Peer:
+    from surrogym_client.experiments.peers.methods.pets import Pets
+
+    return Pets()
+
+
 METHODS = {
     "pilco": Method("PILCO: Gaussian processes, moment matching, gradients", _pilco),
+    "black_drops": Method("Black-DROPS: Gaussian processes, sampled rollouts, CMA-ES", _black_drops),
+    "pets": Method("PETS: ensemble of networks, planning by the cross-entropy method", _pets, episodes=10),
     "sac": Method("soft actor-critic of Stable-Baselines3, model-free", _sac, budget=20_000),
     "ppo": Method("proximal policy optimisation of Stable-Baselines3, model-free", _ppo, budget=100_000),
 }
