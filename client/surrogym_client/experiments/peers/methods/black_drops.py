@@ -119,7 +119,8 @@ class Imagined:
     def _drawn(self, q: Array, u: Array, noise: Array) -> Array:
         inputs = torch.from_numpy(np.concatenate([self.states.featured(q), u], 1))
         mean, deviation = (part.numpy() for part in self._model.predict(inputs))
-        return np.clip(q + mean + deviation * noise, self._low, self._high)
+        drawn: Array = np.clip(q + mean + deviation * noise, self._low, self._high)
+        return drawn
 
 
 def search(
@@ -160,4 +161,5 @@ def search(
 
 
 def _act(imagined: Imagined, theta: Array, q: Array) -> Array:
-    return imagined.controls(theta[None], q[None])[0]
+    chosen: Array = imagined.controls(theta[None], q[None])[0]
+    return chosen

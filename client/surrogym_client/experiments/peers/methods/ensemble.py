@@ -61,9 +61,12 @@ class Ensemble(nn.Module):
     def loss(self, x: Tensor, y: Tensor) -> Tensor:
         """Sum over networks of the negative log likelihood (equation 1 of the paper, without its constant), with
         weight decay and limits of the variance."""
-        likelihood = negative_log_likelihood(*self(x), y)
-        decay = sum(rate * (w**2).sum() / 2 for rate, w in zip(self._decay, self.weights, strict=True))
-        return likelihood + decay + LIMIT_WEIGHT * (self.highest.sum() - self.lowest.sum())
+        mean, log_variance = self(x)
+        limits = self.highest.sum() - self.lowest.sum()
+        total = negative_log_likelihood(mean, log_variance, y) + LIMIT_WEIGHT * limits
+        for rate, weight in zip(self._decay, self.weights, strict=True):
+            total = total + rate * (weight**2).sum() / 2
+        return total
 
 
 def negative_log_likelihood(mean: Tensor, log_variance: Tensor, y: Tensor) -> Tensor:
@@ -86,7 +89,7 @@ def train(
     chosen = torch.randint(n, (networks, n))
     for _ in range(epochs):
         chosen = torch.gather(chosen, 1, torch.rand(networks, n).argsort(1))
-        for at in chosen.split(batch, 1):
+        for at in torch.split(chosen, batch, 1):  # type: ignore[no-untyped-call]
             check()
             optimizer.zero_grad()
             model.loss(x[at], y[at]).backward()  # type: ignore[no-untyped-call]

@@ -120,4 +120,5 @@ def _penalty(theta: Tensor, spread: Tensor) -> Tensor:
     hundredth of it (the authors' ``hypCurb``)."""
     ratio = (theta[-2] - theta[-1]) / np.log(SIGNAL_TO_NOISE)
     scales = (theta[:-2] - spread.log()) / np.log(SPREAD)
-    return ratio**POWER + (scales**POWER).sum()
+    penalty: Tensor = ratio**POWER + (scales**POWER).sum()
+    return penalty

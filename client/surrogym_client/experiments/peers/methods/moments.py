@@ -117,4 +117,5 @@ def saturating_cost(mean: Tensor, covariance: Tensor, goal: Tensor, width: float
     away = mean - goal
     s = covariance / width**2 + torch.eye(mean.shape[-1], dtype=mean.dtype)
     distance = (away * torch.linalg.solve(s, away)).sum(-1) / width**2
-    return 1 - torch.exp(-distance / 2) / torch.linalg.det(s).sqrt()
+    cost: Tensor = 1 - torch.exp(-distance / 2) / torch.linalg.det(s).sqrt()
+    return cost

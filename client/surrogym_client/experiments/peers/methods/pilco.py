@@ -91,7 +91,7 @@ def _modes(start: Uniform | Normal | Fixed, modes: int) -> tuple[Array, float]:
         case Uniform(low=low, high=high):
             count = modes if high - low > HALF_TURN else 1
             width = (high - low) / count
-            return low + width * (np.arange(count) + 0.5), width / np.sqrt(12)
+            return np.array([low + width * (place + 0.5) for place in range(count)]), float(width / np.sqrt(12))
 
 
 def _first_parameters(states: States, starts: Tensor, basis: int, rng: np.random.Generator) -> Array:
@@ -203,7 +203,7 @@ def _improved(
         try:
             cost = objective(_policy(states, parameters))
             cost.backward()  # type: ignore[no-untyped-call]
-        except torch.linalg.LinAlgError:  # a trial step of the line search went too far
+        except RuntimeError:  # no Cholesky factor: a trial step of the line search went too far
             return np.inf, np.zeros_like(values)
         slope: NDArray[np.float64] | None = None if parameters.grad is None else parameters.grad.numpy()
         if slope is None or not np.isfinite(slope).all():

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from surrogym_client.experiments.peers import figures
 from surrogym_client.experiments.peers.port import NotApplicable
 from surrogym_client.original.protocol import Array
 from surrogym_client.original.swingup import LENGTH, WIDTH
@@ -95,6 +96,11 @@ def _swing_up(width: float) -> Rewarding:
     return reward
 
 
+def _rod(q: Array, u: Array, reached: Array) -> Array:
+    del q, u
+    return figures.reward(reached)
+
+
 def _acrobot(q: Array, u: Array, reached: Array) -> Array:
     del q, u
     height = -np.cos(reached[:, 0]) - np.cos(reached[:, 0] + reached[:, 1])
@@ -112,20 +118,26 @@ def _swing_up_cost(width: float) -> TipCost:
     )
 
 
+def _pendulum_cost(upright: float) -> TipCost:
+    """The cost of a pendulum whose angle has this cosine at its goal."""
+    return TipCost(
+        angles=np.array([[1.0, 0]]),
+        linear=np.zeros((2, 2)),
+        sines=np.array([[1.0], [0]]),
+        cosines=np.array([[0], [1.0]]),
+        goal=np.array([0, upright]),
+        width=0.5,
+    )
+
+
 TOLD = {
     "Pendulum-v1": Told(
         _pendulum,
-        TipCost(
-            angles=np.array([[1.0, 0]]),
-            linear=np.zeros((2, 2)),
-            sines=np.array([[1.0], [0]]),
-            cosines=np.array([[0], [1.0]]),
-            goal=np.array([0, 1.0]),
-            width=0.5,
-        ),
+        _pendulum_cost(upright=1.0),
         horizon=40,
         repeat=2,
     ),
+    figures.NAME: Told(_rod, _pendulum_cost(upright=-1.0), horizon=40),
     "CartPole-v1": Told(
         _one,
         TipCost(  # the cart's position, and ten times the pole's angle
