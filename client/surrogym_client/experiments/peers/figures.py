@@ -1,4 +1,4 @@
-"""Environments of peers' publications that are none of our tasks, so that a published figure can be reproduced first."""
+"""Environments of peers' publications that are none of our tasks. A published figure is reproduced in them first."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ WIDTH = 0.5  # m, of the reward
 class RodPendulum:
     """The pendulum of Black-DROPS: a rod hangs, and a weak motor has to swing it up within four seconds.
 
-    Equation of motion, reward and limits are those of the authors' program (resibots/blackdrops, pendulum.cpp), in which
-    an angle of 0 hangs. Each step is integrated by Runge and Kutta's method in ten parts.
+    Equation of motion, reward and limits are those of the authors' program (resibots/blackdrops, pendulum.cpp). An
+    angle of 0 hangs. Each step is integrated by Runge and Kutta's method in ten parts.
     """
 
     parallel = True
