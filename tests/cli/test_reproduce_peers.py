@@ -1,5 +1,7 @@
 """Peers by command: what is finished is shown, and what is not known is refused."""
 
+import pytest
+
 from surrogym_client.experiments.peers.points import BUDGET, Point
 from surrogym_client.experiments.peers.study import PeerCell
 from surrogym_client.experiments.reproduce.rows import write_records
@@ -21,3 +23,16 @@ def test_the_command_shows_what_there_is(surrogym, tmp_path):
 def test_the_command_refuses_what_it_does_not_know(surrogym):
     assert "unknown task 'nothing'" in surrogym("reproduce", "peers", "--tasks=nothing").err
     assert "unknown method 'x'" in surrogym("reproduce", "peers", "--methods=x").err
+
+
+@pytest.mark.slow
+def test_a_run_leaves_its_points_and_is_not_repeated(surrogym, tmp_path):
+    asked = ("reproduce", "peers", "--tasks=pendulum", "--methods=ppo", "--seeds=1", "--out=out", "--budget=64")
+    said = surrogym(*asked, "--episodes=1")
+    assert said.code == 0
+    assert "pendulum ppo seed 0: 64 real steps, mean return " in said.err
+    assert "| ppo | 1 | 0 of 1 | not reached by 64 |" in said.out
+    assert (tmp_path / "out" / "peers-pendulum.png").exists()
+    again = surrogym(*asked, "--episodes=1")
+    assert again.out == said.out
+    assert "pendulum ppo" not in again.err

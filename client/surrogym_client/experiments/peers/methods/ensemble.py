@@ -89,7 +89,7 @@ def train(
     chosen = torch.randint(n, (networks, n))
     for _ in range(epochs):
         chosen = torch.gather(chosen, 1, torch.rand(networks, n).argsort(1))
-        for at in torch.split(chosen, batch, 1):  # type: ignore[no-untyped-call]
+        for at in torch.split(chosen, batch, 1):
             check()
             optimizer.zero_grad()
             model.loss(x[at], y[at]).backward()  # type: ignore[no-untyped-call]
