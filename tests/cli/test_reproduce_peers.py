@@ -16,7 +16,7 @@ def test_the_command_shows_what_there_is(surrogym, tmp_path):
         "--json",
     )
     assert said.code == 0
-    assert said.json["unfinished"] == ["pendulum ppo seed 0"]
+    assert said.json["unfinished"] == ["pendulum ppo (seeds 0)"]
     assert "not reached by 20,000" in (tmp_path / "out" / "peers.md").read_text()
 
 

@@ -6,7 +6,7 @@ import pytest
 from surrogym_client.experiments.peers.curves import curve
 from surrogym_client.experiments.peers.pictures import draw_tasks
 from surrogym_client.experiments.peers.points import BUDGET, REACHED, TIME, Point, points_of
-from surrogym_client.experiments.peers.table import table
+from surrogym_client.experiments.peers.table import table, unfinished
 from surrogym_client.experiments.reproduce.rows import Row, UnusableRows, read_records, write_records
 
 
@@ -46,6 +46,12 @@ def test_the_table_says_who_reached_the_target_and_who_did_not():
         "| sac | 3 | 1 of 3 | 2,000; not reached by 2,500 (0 to 5,000); out of time; 1 failed: ValueError: no |" in line
     )
     assert "| -225.0 |" in line
+
+
+def test_a_cell_that_still_runs_is_named():
+    points = [Point("pendulum", "sac", 0, 1, 1_000, mean=-900.0)]
+    assert "not reached by 1,000; 1 not finished" in table(points)
+    assert unfinished([("pendulum", "sac", 0), ("pendulum", "sac", 1)], points) == ["pendulum sac (seeds 0, 1)"]
 
 
 def test_rows_of_ours_are_points():

@@ -62,7 +62,7 @@ def command(
     numbers = range(first_seed, first_seed + seeds)
     wanted = [PeerCell(t, m, s, budget, episodes, minutes) for s in numbers for t in named for m in chosen]
     if not only_table:
-        _run([cell for cell in wanted if not cell.points(out)], out, jobs, quiet=quiet)
+        _run([cell for cell in wanted if not cell.done(out)], out, jobs, quiet=quiet)
     _present(wanted, _ours(rows or [], named), out, as_json=as_json, quiet=quiet)
 
 
@@ -123,26 +123,21 @@ def _present(cells: Sequence[PeerCell], ours: Sequence[Point], out: Path, *, as_
     from surrogym_client.cli.columns import fitted
     from surrogym_client.experiments.peers.pictures import draw_tasks
     from surrogym_client.experiments.peers.points import Point
-    from surrogym_client.experiments.peers.table import NOTES, table
-    from surrogym_client.experiments.reproduce.rows import read_records, write_records
+    from surrogym_client.experiments.peers.table import NOTES, table, unfinished
+    from surrogym_client.experiments.reproduce.rows import write_records
     from surrogym_shared.terminal import give
 
-    found = [cell.points(out) or read_records(cell.file(out), Point) for cell in cells]
-    points = [*ours, *(point for of in found for point in of)]
+    points = [*ours, *(point for cell in cells for point in cell.points(out))]
     points.sort(key=lambda p: [cell.task for cell in cells].index(p.task))
-    unfinished = [
-        f"{c.task} {c.method} seed {c.seed}" for c, of in zip(cells, found, strict=True) if not of or not of[-1].ended
-    ]
-    text = "\n".join(
-        [table(points), NOTES, *([f"Not run or not finished: {', '.join(unfinished)}.\n"] if unfinished else [])]
-    )
+    left = unfinished([(cell.task, cell.method, cell.seed) for cell in cells], points)
+    text = "\n".join([table(points), NOTES, *([f"Not run or not finished: {', '.join(left)}.\n"] if left else [])])
     write_records(out / "points.csv", Point, points)
     (out / "peers.md").write_text(text, encoding="utf-8")
     pictures = draw_tasks(out, points)
     result = {
         "out": str(out),
         "points": [vars(p) for p in points],
-        "unfinished": unfinished,
+        "unfinished": left,
         "pictures": [str(path) for path in pictures],
     }
     give(result, lambda: fitted(text), as_json=as_json, quiet=quiet)

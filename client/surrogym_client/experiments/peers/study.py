@@ -57,10 +57,13 @@ class PeerCell:
         return folder / "cells" / f"{self.task.replace(':', '.')}-{self.method}-seed{self.seed}.csv"
 
     def points(self, folder: Path) -> list[Point]:
-        """Its points, if it has been run with the same settings and did not fail; else none."""
-        found = read_records(self.file(folder), Point)
-        done = bool(found) and found[-1].ended in (REACHED, BUDGET, TIME)
-        return found if done and found[-1].specification == self.specification else []
+        """Its points so far, of a run with the same settings."""
+        return [p for p in read_records(self.file(folder), Point) if p.specification == self.specification]
+
+    def done(self, folder: Path) -> bool:
+        """Whether it has been run to its end, without an error."""
+        points = self.points(folder)
+        return bool(points) and points[-1].ended in (REACHED, BUDGET, TIME)
 
 
 def run_cells(todo: Sequence[PeerCell], folder: Path, jobs: int, tell: Callable[[PeerCell, list[Point]], None]) -> None:

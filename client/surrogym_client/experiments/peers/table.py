@@ -9,7 +9,7 @@ import numpy as np
 from surrogym_client.evaluation.evaluator import interquartile_mean
 from surrogym_client.experiments.peers.curves import by_method, by_seed
 from surrogym_client.experiments.peers.points import TIME, Point
-from surrogym_client.experiments.peers.registry import METHODS, task_of
+from surrogym_client.experiments.peers.registry import task_of
 from surrogym_client.experiments.reproduce.markdown import markdown
 from surrogym_client.experiments.reproduce.statistics import bootstrap_interval
 
@@ -36,11 +36,14 @@ def table(points: Sequence[Point]) -> str:
     return markdown([HEADING, *(_line(task, method, of) for (task, method), of in by_method(points).items())])
 
 
-def missing(points: Sequence[Point], tasks: Sequence[str], methods: Sequence[str], seeds: Sequence[int]) -> list[str]:
-    """Cells of peers that have no finished run, as TASK METHOD seed N."""
+def unfinished(asked: Sequence[tuple[str, str, int]], points: Sequence[Point]) -> list[str]:
+    """Cells, by task, method and seed, that have no end among the points, as TASK METHOD (seeds N, M)."""
     done = {point.cell for point in points if point.ended}
-    asked = [(t, m, s) for t in tasks for m in methods if m in METHODS for s in seeds]
-    return [f"{task} {method} seed {seed}" for task, method, seed in asked if (task, method, seed) not in done]
+    left: dict[str, list[str]] = {}
+    for task, method, seed in asked:
+        if (task, method, seed) not in done:
+            left.setdefault(f"{task} {method}", []).append(str(seed))
+    return [f"{name} (seeds {', '.join(seeds)})" for name, seeds in left.items()]
 
 
 def _line(task: str, method: str, points: Sequence[Point]) -> Sequence[str]:
@@ -65,6 +68,8 @@ def _steps(last: Sequence[Point]) -> str:
         words.append(f"not reached by {_spread([p.real_steps for p in other])}")
     if any(p.ended == TIME for p in other):
         words.append("out of time")
+    if running := sum(not p.ended for p in other):
+        words.append(f"{running} not finished")
     if failed := [p.ended for p in other if ":" in p.ended]:
         words.append(f"{len(failed)} failed: {failed[0]}")
     return "; ".join(words)
