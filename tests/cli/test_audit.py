@@ -7,8 +7,8 @@ from surrogym_client.policies.card import PolicyCard
 from surrogym_shared.wire import SurrogateView
 
 
-def view(noise: float) -> SurrogateView:
-    output = type("Output", (), {"noise": noise})()
+def view(noise: float, sensor: float = 0.0) -> SurrogateView:
+    output = type("Output", (), {"name": "x", "noise": noise, "sensor_noise": sensor})()
     fidelity = type("Fidelity", (), {"outputs": [output]})()
     return SurrogateView.model_construct(fidelity=fidelity)
 
@@ -25,3 +25,8 @@ def view(noise: float) -> SurrogateView:
 )
 def test_session_of_an_audit_has_the_noise_known_now(settings, noise, expected):
     assert _session(PolicyCard(settings=settings), view(noise)) == expected
+
+
+def test_errors_of_a_sensor_are_observed():
+    expected = {"process_noise": True, "sensor_noise": {"x": 0.07}}
+    assert _session(PolicyCard(settings={"session": {}}), view(0.1, sensor=0.07)) == expected

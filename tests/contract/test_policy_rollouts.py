@@ -70,7 +70,8 @@ def test_a_policy_acts_as_it_would_step_by_step(port: PolicyPort, opened: Opened
 
 @pytest.mark.parametrize("variant", ["probabilistic", "pathwise"])
 def test_other_variants_act_as_step_by_step(port: PolicyPort, opened: Opened, variant: str):
-    options = {"variant": variant, "process_noise": True} | ({"particles": 9} if variant == "probabilistic" else {})
+    noisy = {"process_noise": True, "sensor_noise": {"speed": 0.1}}
+    options = {"variant": variant, **noisy} | ({"particles": 9} if variant == "probabilistic" else {})
     whole, single, noise = opened(**options), opened(**options), NoiseKey(0)
     port.reset(whole)
     start = port.reset(single).observation

@@ -124,6 +124,8 @@ def test_established_noise_allows_for_a_larger_error() -> None:
 def test_noise_is_given_as_a_share_of_the_squared_error() -> None:
     said = noise_in_words(view(output("x", 1.0, error=0.05, noise=0.04), output("v", 1.0, error=0.1, noise=0.2)))
     assert said == "x 0.04 (64 % of its squared error), v 0.2 (100 % of its squared error)"
+    said = noise_in_words(view(output("x", 1.0, error=0.05, noise=0.04, sensor_noise=0.03)))
+    assert said == "x 0.04 (64 % of its squared error, mainly the sensor's: 0.03 a measurement)"
     assert noise_in_words(view(output("x", 1.0))) == noise_in_words(view()) == ""
 
 

@@ -76,8 +76,8 @@ def command(
 def _session(card: PolicyCard, view: SurrogateView) -> dict[str, object]:
     """Return the session options that the policy was compared in, from its card. Noise that was confirmed since then is
     added."""
-    from surrogym_client.training.settings import noisy
+    from surrogym_client.training.settings import noise_of
 
     judged = card.settings.get("judge") or card.settings.get("session") or {}
-    noise: dict[str, object] = {"process_noise": True} if noisy(view) else {}
+    noise: dict[str, object] = noise_of(view)
     return {**noise, **judged} if isinstance(judged, dict) else noise

@@ -143,7 +143,7 @@ def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
             f"verdict: {verdict(view)}",
         ]
     if noise := noise_in_words(view):
-        lines.append(f"noise of a single step, confirmed by repeats: {noise}")
+        lines.append(f"noise of a single step, confirmed by real steps: {noise}")
     if following := advice(view, models):
         lines.append(f"next: {following}")
     return "\n".join(lines)

@@ -84,7 +84,8 @@ def noise_in_words(view: SurrogateView) -> str:
 def _noise_of(output: OutputFidelity) -> str:
     if not output.leave_one_out_error:
         return f"{output.name} {output.noise:.2g}"
-    return f"{output.name} {output.noise:.2g} ({100 * _share_of_noise(output):.0f} % of its squared error)"
+    sensor = f", mainly the sensor's: {output.sensor_noise:.2g} a measurement" if output.sensor_noise else ""
+    return f"{output.name} {output.noise:.2g} ({100 * _share_of_noise(output):.0f} % of its squared error{sensor})"
 
 
 def _share_of_noise(output: OutputFidelity) -> float:
@@ -95,9 +96,10 @@ def _share_of_noise(output: OutputFidelity) -> float:
 
 def _of_noise(view: SurrogateView, output: OutputFidelity) -> str:
     """Describe what helps an output whose error is nearly all noise."""
+    remedy = "average several readings of its sensor" if output.sensor_noise else "reduce the noise itself"
     return (
         f"the error of {output.name} is nearly all noise ({100 * _share_of_noise(output):.0f} % of its square), which "
-        "more real steps don't lower; reduce the noise itself, or accept a tolerance of "
+        f"more real steps don't lower; {remedy}, or accept a tolerance of "
         f"{_within_reach(view, output):.2g} (now {_declarable(output):.2g}): {_widen(view, output)}"
     )
 

@@ -71,7 +71,8 @@ class TrainSettings:
 def chosen_for(view: SurrogateView, settings: TrainSettings, *, by_mean: bool = False) -> TrainSettings:
     """Return settings adapted to the phase that the surrogate's design ended in.
 
-    - If repeated steps have shown that the original environment is noisy, the learned noise is added to the state.
+    - If the design has confirmed noise, the learned noise is added to the state. Noise of the sensors is added to
+      observations instead.
     - If the design is not ready, each step of a lane goes to a new draw from the model's prediction (TS1 of Chua et al.
       2018), because a policy that relies on an uncertain mean fails in the original environment. Policies are then
       compared along drawn functions of the posterior: independent draws would shake a lane out of a state in which the
@@ -88,17 +89,20 @@ def chosen_for(view: SurrogateView, settings: TrainSettings, *, by_mean: bool = 
         return settings
     if view.spec.outside_reward is not None and settings.start_box is None:
         settings = replace(settings, start_box=0.0)
-    if noisy(view) and not by_mean:
-        settings = replace(settings, session={"process_noise": True, **settings.session})
+    if not by_mean and noise_of(view):
+        settings = replace(settings, session={**noise_of(view), **settings.session})
     if "variant" in settings.session or view.phase == "ready":
         return settings
     other = {name: value for name, value in settings.session.items() if name not in OF_PARTICLES}
     return replace(settings, session=DRAWS | settings.session, judge=FUNCTIONS | other)
 
 
-def noisy(view: SurrogateView) -> bool:
-    """Whether the design has confirmed noise of an output."""
-    return view.fidelity is not None and any(output.noise > 0 for output in view.fidelity.outputs)
+def noise_of(view: SurrogateView) -> dict[str, Any]:
+    """Return the session fields of the noise that the design has confirmed; empty without any."""
+    outputs = [] if view.fidelity is None else view.fidelity.outputs
+    sensors = {output.name: output.sensor_noise for output in outputs if output.sensor_noise > 0}
+    fields: dict[str, Any] = {"process_noise": True} if any(output.noise > 0 for output in outputs) else {}
+    return fields | ({"sensor_noise": sensors} if sensors else {})
 
 
 def prolongs(settings: TrainSettings, spec: EnvironmentSpec) -> bool:

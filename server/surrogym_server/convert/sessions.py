@@ -32,6 +32,7 @@ def opening(request: replies.OpenSession) -> Opening:
         penalty=request.penalty or 0.0,
         start_box=request.start_box,
         process_noise=request.process_noise,
+        sensor_noise=tuple(sorted(request.sensor_noise.items())),
         trust=request.trust,
         particles=request.particles,
         propagation=request.propagation,

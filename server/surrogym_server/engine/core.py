@@ -29,6 +29,7 @@ from surrogym_server.errors import InvalidInput, NotReset, SurrogymError, TooLar
 from surrogym_server.models.guard import failure_of
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual import VirtualSettings, in_fastest_form, reward_limits
+from surrogym_server.virtual.sensors import check as check_sensors
 from surrogym_shared.port import StepResult
 
 Array = NDArray[np.float64]
@@ -90,7 +91,9 @@ def opened(
 
 
 def resolved(opening: Opening, definition: EnvironmentDefinition) -> VirtualSettings:
-    """Settings in which the surrogate's values replace those that the trainer left open."""
+    """Settings in which the surrogate's values replace those that the trainer left open. Raises ``InvalidInput`` for
+    sensor noise of an unknown coordinate."""
+    check_sensors(definition, opening.settings.sensor_noise)
     return replace(
         opening.settings,
         time_limit=opening.settings.time_limit or definition.time_limit,

@@ -16,6 +16,7 @@ from surrogym_server.engine.session import Session
 from surrogym_server.environment.actions import policy_actions
 from surrogym_server.environment.definition import ActionDefinition
 from surrogym_server.errors import InvalidInput, TooLarge
+from surrogym_server.virtual.sensors import sensed
 from surrogym_shared.acting import MAX_ACTIVATIONS, MAX_LANE_STEPS, Acted, Actor, NoiseKey, PolicyRun
 from surrogym_shared.port import PolicyRollout, StepResult
 
@@ -60,7 +61,8 @@ def roll_policy(session: Session, run: PolicyRun, step: OneStep) -> tuple[Sessio
         raise TooLarge(f"expected at most {MAX_ACTIVATIONS} units of a layer in all lanes, got {wide}")
     actor = _actor(len(definition.observation_names), definition.action, run)
     waiting = _awaited(run, lanes)
-    observation = definition.observe(session.lanes.q).to(torch.float32).cpu().numpy()
+    shown = sensed(definition, session.settings.sensor_noise, session.lanes)
+    observation = definition.observe(shown).to(torch.float32).cpu().numpy()
     results, actions, logs = [], [], []
     for number in range(run.steps):
         acted = _act(actor, observation, None if run.noise is None else run.noise.later(number))

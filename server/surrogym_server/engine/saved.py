@@ -99,8 +99,12 @@ def _read(definition: EnvironmentDefinition, data: bytes, surrogate_id: int) -> 
 
 
 def _settings(saved: dict[str, Any]) -> VirtualSettings:
-    limits = saved.get("reward_limits")
-    return VirtualSettings(**{**saved, "reward_limits": None if limits is None else (limits[0], limits[1])})
+    limits, noise = saved.get("reward_limits"), saved.get("sensor_noise", ())
+    tuples = {
+        "reward_limits": None if limits is None else (limits[0], limits[1]),
+        "sensor_noise": tuple((name, deviation) for name, deviation in noise),
+    }
+    return VirtualSettings(**{**saved, **tuples})
 
 
 def _answer(header: dict[str, Any], arrays: Arrays) -> Answer | None:

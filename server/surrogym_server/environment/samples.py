@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -24,6 +24,10 @@ class Samples:
 
     def __len__(self) -> int:
         return len(self.q)
+
+    def at(self, rows: Tensor) -> Samples:
+        """The samples of these rows."""
+        return Samples(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     @property
     def digest(self) -> str:

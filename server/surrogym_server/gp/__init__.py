@@ -18,7 +18,7 @@ beta      ``weights`` (n,)        (K + sigma_n^2 I)^-1 y
 from surrogym_server.gp.fit import NOISE_FLOOR, FitOptions, Fitted, fit, noisy_explanation, refine
 from surrogym_server.gp.hyperparameter_samples import hyperparameter_samples
 from surrogym_server.gp.joint import Joint
-from surrogym_server.gp.kernel import Hyperparameters, Reflection
+from surrogym_server.gp.kernel import Hyperparameters, Reflection, covariance
 from surrogym_server.gp.pathwise import Pathwise
 from surrogym_server.gp.posterior import LeftOut, Posterior, Sparse, condition
 from surrogym_server.gp.serving import Output, Serving
@@ -41,6 +41,7 @@ __all__ = [
     "condition",
     "condition_many",
     "condition_sparse",
+    "covariance",
     "fit",
     "hyperparameter_samples",
     "noisy_explanation",

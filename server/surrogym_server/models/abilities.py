@@ -18,6 +18,7 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
+from surrogym_server.environment.samples import Samples
 from surrogym_server.models.port import DynamicsModel, Transition
 
 A = TypeVar("A")
@@ -118,6 +119,28 @@ class LearnedNoise(ABC):
         """Standard deviation of each output's noise in another explanation of the samples, if it is at least as likely,
         (O,). Those that it has learned if the family looks for no other."""
         return self.noise_deviations
+
+
+@dataclass(frozen=True)
+class AtSamples:
+    """One output's process at k of the samples, in the output's unit."""
+
+    rows: Tensor  # (k,) of the samples
+    targets: Tensor  # (k,) less their mean
+    covariance: Tensor  # (k, k) of the function before it has seen them, without noise
+    noise_variance: float
+
+
+class SampledFunctions(ABC):
+    """Ability to give the covariance of an output's function at the samples, so that other explanations of the noise
+    can be compared with independent noise.
+
+    Fallback of ``sampling``: noise of the sensors is not told from noise of the process.
+    """
+
+    @abstractmethod
+    def at_samples(self, samples: Samples, column: int) -> AtSamples | None:
+        """Return the output ``column`` at the samples that it learns from; None for an output that never varied."""
 
 
 class OutputOutlook(ABC):

@@ -29,7 +29,8 @@ class OutputConfidence:
     leave_one_out_error: float | None  # root mean square, in the output's unit; None where the family can't tell
     leave_one_out_within_one: float | None  # share of the samples within one predictive deviation
     leave_one_out_within_two: float | None
-    noise: float = 0.0  # established by repeated steps, in the output's unit
+    noise: float = 0.0  # of a single step, established by repeated or by consecutive steps, in the output's unit
+    sensor_noise: float = 0.0  # deviation of one measurement, if most of the noise is the sensor's
     region: Region | None = None  # where most of the doubt is
 
 

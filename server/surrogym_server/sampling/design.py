@@ -26,6 +26,7 @@ from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, 
 from surrogym_server.sampling.noise import SLACK, banded, established_noise, to_repeat, widened
 from surrogym_server.sampling.peaks import highest
 from surrogym_server.sampling.rollouts import Aim, Rollout, first_rollouts, plan_round
+from surrogym_server.sampling.serial import noise_of_sensors, sensor_noise
 from surrogym_server.sampling.tolerances import Usual, frozen_tolerances
 
 Verdict = Literal["continue", "ready", "over_budget", "from_log"]
@@ -167,14 +168,19 @@ def judge_model(
     """Judge a model by its definition's tolerances, or else by the ``usual`` ones (O,). Raises ``PluginFailed``."""
     definition = model.definition
     with plugin_calls(definition):
-        noise = established_noise(model, samples, definition.tolerances_over(usual))
+        limits = definition.tolerances_over(usual)
+        sensors = sensor_noise(model, samples, limits)
+        noise = established_noise(model, samples, limits).maximum(noise_of_sensors(model, samples, sensors, limits))
     tolerances = widened(definition.tolerances_over(usual), noise)
     points = Points(*monte_carlo(definition))
     with plugin_calls(definition):
         deviation = deviations(model, points.q, points.u)
         require_deviations(model, deviation)
         judged = confidences_of(model, points, deviation, banded(definition.tolerances_over(usual), noise))
-    confidences = tuple(replace(c, noise=float(w)) for c, w in zip(judged, noise, strict=True))
+    confidences = tuple(
+        replace(c, noise=float(w), sensor_noise=0.0 if one is None else one.deviation)
+        for c, w, one in zip(judged, noise, sensors, strict=True)
+    )
     candidates = candidates_of(model, points, request.states, _rng(definition, f"visited {round_}"))
     reserved = ending(model, samples, candidates.points)
     settled = reserved is None or not definition.learns_termination

@@ -19,6 +19,7 @@ from surrogym_server.virtual.dynamics import Moved, Weighting, move_mean, move_p
 from surrogym_server.virtual.lanes import ENDED, EVERY, NEW, RUNNING, Chosen, LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
 from surrogym_server.virtual.paths import with_paths
+from surrogym_server.virtual.sensors import SensorNoise, driving, sensed
 from surrogym_server.virtual.start import start_coordinates, start_particles
 
 Floats = NDArray[np.floating[Any]]
@@ -42,6 +43,7 @@ class VirtualSettings:
     spread: float = 0.01  # first deviation of particles, as a share of each coordinate's range
     functions: int | None = None  # number of functions that lanes of variant pathwise share; None: one for each lane
     process_noise: bool = False  # the learned noise moves the state, w of eq. 2
+    sensor_noise: SensorNoise = ()  # errors of observed coordinates, which don't move the state
     reward_limits: tuple[float, float] | None = None  # of mean rewards; None: none
     trust: float | None = None  # truncate an episode if an output deviates by more, in its deviations over the samples
     compiled: bool = False  # compute steps in compiled code if the model offers it; chosen when the session opens
@@ -109,7 +111,7 @@ def reset(
     if seed is not None:
         lanes = _seeded(lanes, seed, chosen)
     lanes = _begin(definition, settings, lanes, chosen)
-    return lanes, _observe(definition, lanes)
+    return lanes, _observe(definition, settings, lanes)
 
 
 @torch.inference_mode()  # without records for gradients, which saves a sixth of the time
@@ -147,13 +149,13 @@ def step(
         beginning = terminated | truncated
         if bool(beginning.any()):
             final_lanes = _array(beginning.nonzero()[:, 0])
-            final_observation = _observe(definition, after.take(beginning))
+            final_observation = _observe(definition, settings, after.take(beginning))
     if beginning is not None:
         after = _begin(definition, settings, after, beginning)
     reward = _array(_scatter(moving, moved.reward))
     penalised = moved.reward is not moved.reward_mean
     return after, LaneTransition(
-        observation=_observe(definition, after),
+        observation=_observe(definition, settings, after),
         reward=reward,
         terminated=_array(terminated),
         truncated=_array(truncated),
@@ -195,7 +197,10 @@ def _move(
     particle_steps: ArraySteps | None,
 ) -> Moved:
     outputs, particles = len(model.definition.outputs) - 1, lanes.particles.shape[1]
-    process = normal_noise(lanes, Purpose.PROCESS, max(particles, 1), outputs) if settings.process_noise else None
+    process = None
+    if settings.process_noise:
+        process = normal_noise(lanes, Purpose.PROCESS, max(particles, 1), outputs)
+        process = driving(model, settings.sensor_noise, process)
     if settings.variant == "probabilistic":
         noise = None
         if settings.propagation == "sample":
@@ -296,8 +301,8 @@ def _seeded(lanes: LaneState, seed: int | Sequence[int], chosen: Chosen) -> Lane
     )
 
 
-def _observe(definition: EnvironmentDefinition, lanes: LaneState) -> Floats:
-    return _array(definition.observe(lanes.q).to(torch.float32))
+def _observe(definition: EnvironmentDefinition, settings: VirtualSettings, lanes: LaneState) -> Floats:
+    return _array(definition.observe(sensed(definition, settings.sensor_noise, lanes)).to(torch.float32))
 
 
 def _array(values: Tensor) -> NDArray[Any]:

@@ -25,6 +25,7 @@ class Purpose(IntEnum):
     TRANSITION = 3
     PATH = 4
     PROCESS = 5
+    SENSOR = 6
 
 
 def uniform_noise(lanes: LaneState, purpose: Purpose, size: int) -> Tensor:

@@ -60,6 +60,11 @@ class OpenSession(Request):
         default=0.0, description="share of episodes that start anywhere in the sampling range"
     )
     process_noise: bool = Field(default=False, description="whether the learned noise of a step is added to the state")
+    sensor_noise: dict[str, Annotated[FiniteFloat, Field(ge=0)]] = Field(
+        default={},
+        description="standard deviation of the error with which observations show each named coordinate; the error "
+        "does not move the state, so its share of the learned noise is left out of ``process_noise``",
+    )
     trust: Annotated[float, Field(gt=0, le=1_000)] | None = Field(
         default=None,
         description="truncate an episode when an output's predicted standard deviation exceeds this factor times "

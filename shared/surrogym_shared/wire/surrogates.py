@@ -78,8 +78,13 @@ class OutputFidelity(Reply):
     )
     noise: float = Field(
         default=0.0,
-        description="standard deviation of a single step's noise, if repeated steps confirm it, in the output's "
-        "unit; it is part of ``tolerance``; 0 without confirmed noise",
+        description="standard deviation of a single step's noise, if repeated or consecutive steps confirm it, in the "
+        "output's unit; it is part of ``tolerance``; 0 without confirmed noise",
+    )
+    sensor_noise: float = Field(
+        default=0.0,
+        description="standard deviation of one measurement's error, in the output's unit, if consecutive steps of an "
+        "episode show that most of ``noise`` is the sensor's; 0: it is the process's, or can't be told",
     )
     region: DoubtfulRegion | None = Field(
         default=None, description="where most of the doubt is; null if no range of a single input has most of it"

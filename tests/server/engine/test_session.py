@@ -90,6 +90,7 @@ def test_a_restored_session_continues_bit_for_bit(
     opened: Open, fitted: Fitted, definition: EnvironmentDefinition, variant: str, compiled: bool
 ):
     chosen = {"variant": variant, "particles": 8, "trust": 2.0, "process_noise": True, "compiled": compiled}
+    chosen["sensor_noise"] = ((definition.coordinate_names[0], 0.1),)
     session, _ = reset_session(opened(occupancy=True, **chosen), 11, None, 1)
     results = []
     for _ in range(2):
@@ -116,7 +117,9 @@ def test_a_session_saved_before_there_were_functions_comes_back(
         arrays = {name: file[name] for name in file.files if name != "lanes/path"}
     header = json.loads(arrays["header"].tobytes())
     settings = {
-        key: value for key, value in header["settings"].items() if key not in ("trust", "process_noise", "compiled")
+        key: value
+        for key, value in header["settings"].items()
+        if key not in ("trust", "process_noise", "sensor_noise", "compiled")
     }
     older = json.dumps({**header, "format": 1, "settings": settings}).encode()
     buffer = io.BytesIO()

@@ -46,6 +46,7 @@ CHOICES: dict[str, dict[str, Any]] = {
         "time_limit": 3,
     },
     "particles by the mean": {"variant": "probabilistic", "particles": 3, "propagation": "mean", "trust": 0.5},
+    "noisy sensors": {"process_noise": True, "autoreset_mode": "same_step", "time_limit": 2},
     "noise, trust, box": {"process_noise": True, "trust": 0.05, "start_box": 0.5, "time_limit": 2},
 }
 
@@ -112,6 +113,9 @@ def require_agreement(one: tuple[LaneState, LaneTransition], other: tuple[LaneSt
 @pytest.mark.parametrize("choice", CHOICES)
 def test_compiled_steps_agree_with_torch(model, choice):
     settings, rng = compiled_settings(model, **CHOICES[choice]), np.random.default_rng(0)
+    if choice == "noisy sensors":
+        first = model.definition.coordinate_names[model.definition.moving[0]]
+        settings = replace(settings, sensor_noise=((first, 0.1),))
     lanes, _ = reset(model.definition, settings, create(model.definition, settings, 0))
     for count in range(STEPS):
         u = actions(model, rng)

@@ -12,9 +12,12 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
+from surrogym_server.environment.samples import Samples, increments
 from surrogym_server.environment.step_rules import paid
+from surrogym_server.gp import covariance
 from surrogym_server.models.abilities import (
     ArraySteps,
+    AtSamples,
     CompiledSteps,
     Differentiable,
     FunctionDraws,
@@ -27,6 +30,7 @@ from surrogym_server.models.abilities import (
     PredictedSteps,
     RewardEdges,
     RewardPeaks,
+    SampledFunctions,
     UncertainHyperparameters,
 )
 from surrogym_server.models.gaussian_process.censoring import usable
@@ -55,6 +59,7 @@ class GaussianProcessModel(
     UncertainHyperparameters,
     LeaveOneOut,
     LearnedNoise,
+    SampledFunctions,
     Lookahead,
     RewardEdges,
     RewardPeaks,
@@ -150,6 +155,16 @@ class GaussianProcessModel(
 
     def leave_one_out(self) -> tuple[LeaveOneOutErrors, ...]:
         return tuple(output.leave_one_out() for output in self.outputs)
+
+    def at_samples(self, samples: Samples, column: int) -> AtSamples | None:
+        output = self.transitions[column]
+        if output.posterior is None:
+            return None
+        rows = self._learns(column, samples.q_next).nonzero()[:, 0]
+        steps = PredictedSteps(samples.q[rows], samples.u[rows], samples.q_next[rows])
+        x, hyper, variance = process_inputs(self.definition, output, steps), output.posterior.hyper, output.scale**2
+        targets = increments(self.definition, samples)[rows, column] - output.centre
+        return AtSamples(rows, targets, variance * covariance(hyper, x, x), variance * hyper.noise_variance)
 
     def outlook(self, candidates: Points, reference: Points, assumed: Points) -> tuple[OutputOutlook | None, ...]:
         everywhere = Points.joined([candidates, reference, assumed])

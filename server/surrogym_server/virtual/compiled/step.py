@@ -23,6 +23,7 @@ from surrogym_server.virtual.environment import LaneTransition, VirtualSettings,
 from surrogym_server.virtual.lanes import EVERY, RUNNING, Chosen, LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
 from surrogym_server.virtual.paths import with_paths
+from surrogym_server.virtual.sensors import driving, sensed
 from surrogym_server.virtual.start import start_coordinates
 
 Floats = NDArray[np.float64]
@@ -76,11 +77,13 @@ def compiled_step(
     if settings.autoreset_mode == "same_step":
         beginning = changed.ends[3]
         final_lanes = beginning.nonzero()[0] if ended else NO_LANES
-    final_observation = _observed(move, changed.q[final_lanes] if ended else changed.q[:0])
+    final_observation = _observed(
+        move, _shown(definition, settings, lanes, changed, final_lanes if ended else NO_LANES)
+    )
     if beginning is not None and (ended or settings.autoreset_mode != "same_step"):
         _begin(definition, settings, lanes, beginning, changed)
     return changed.lanes(lanes), LaneTransition(
-        observation=_observed(move, changed.q),
+        observation=_observed(move, _shown(definition, settings, lanes, changed)),
         reward=changed.rewards[0],
         terminated=changed.ends[0],
         truncated=changed.ends[1],
@@ -117,7 +120,8 @@ def _moved(
     """Move the moving lanes, in their order."""
     wanted, process = deviations or settings.trust is not None, None
     if settings.process_noise:
-        process = normal_noise(lanes, Purpose.PROCESS, 1, len(model.definition.outputs) - 1)[:, 0].numpy()
+        drawn = normal_noise(lanes, Purpose.PROCESS, 1, len(model.definition.outputs) - 1)[:, 0]
+        process = driving(model, settings.sensor_noise, drawn).numpy()
     return move(
         _rows(moving, lanes.q.numpy()),
         _rows(moving, u),
@@ -169,6 +173,22 @@ def _begin(
     changed.episode[chosen] += 1
     changed.elapsed[chosen] = 0
     changed.phase[chosen] = RUNNING
+
+
+def _shown(
+    definition: EnvironmentDefinition,
+    settings: VirtualSettings,
+    before: LaneState,
+    changed: _Changed,
+    chosen: Ints | None = None,
+) -> Floats:
+    """States of all lanes, or of the chosen ones, as the sensors show them, (n, C)."""
+    if not settings.sensor_noise or (chosen is not None and not len(chosen)):
+        return changed.q if chosen is None else changed.q[chosen]
+    lanes = changed.lanes(before)
+    lanes = lanes if chosen is None else lanes.take(chosen)
+    shown: Floats = sensed(definition, settings.sensor_noise, lanes).numpy()
+    return shown
 
 
 def _observed(steps: ArraySteps, q: Floats) -> Singles:

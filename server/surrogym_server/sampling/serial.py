@@ -1,0 +1,178 @@
+"""Tell noise of the sensors from noise of the process, by consecutive steps of one episode.
+
+A sensor's error v falsifies the end of one step and the start of the next: with s_t + v_t measured, the residual of a
+step is r_t = v_{t+1} - a_t v_t + w_t, where a_t is the slope of the next state over the state and w_t the noise of the
+process. So the residuals of neighbouring steps have the covariance -a_t var(v), and those of process noise have none.
+
+A residual of a learned function is no noise: its errors at near states are alike. So the test compares Gaussian
+processes, whose noise has the covariance
+
+    c s^2 ((1 - share) I + share S),  S_tt ~ 1 + a_t^2,  S_{t-1,t} ~ -a_t,  mean diagonal of S 1,
+
+s^2 the learned variance of the noise, by the likelihood ratio of the best share against 0. A share of 0 lies at the
+edge of the allowed ones, so the ratio has half the chi-squared distribution of one degree of freedom (Self and Liang
+1987).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.samples import Samples
+from surrogym_server.models.abilities import AtSamples, LearnedNoise, SampledFunctions, offers
+from surrogym_server.models.port import DynamicsModel
+
+FEWEST = 12  # pairs of consecutive steps for a test
+MOST = 256  # samples in a test, because its time grows with their third power
+CRITICAL = 5.41  # 2 % quantile of chi-squared with one degree of freedom: half of it is 1 %
+MAINLY = 0.5  # share of the noise from which on it counts as noise of the sensors
+SHARES = torch.linspace(0, 1, 21, dtype=torch.float64)
+FACTORS = torch.logspace(-0.6, 0.6, 9, dtype=torch.float64)  # c
+CARRIED = 1.25  # factor on an estimated deviation, because slopes are of a model
+DIFFERENCE = 1e-4  # of a coordinate's sampling range, for slopes
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Noise of one output's sensor."""
+
+    share: float  # of the variance of a single step's noise
+    deviation: float  # of one measurement, in the output's unit
+    step: float  # deviation of a single step's noise, of which it is a share
+
+
+def sensor_noise(model: DynamicsModel, samples: Samples, limits: Sequence[float]) -> tuple[SensorNoise | None, ...]:
+    """Noise of each output's sensor (O,), if its learned noise exceeds the limit (O,), and consecutive steps show that
+    most of it is noise of the sensor. None for all others, for which the kinds can't be told or are not proved."""
+    definition, able = model.definition, offers(model, SampledFunctions)
+    follows = preceding(definition, samples)
+    if able is None or definition.moves_observation or int((follows >= 0).sum()) < FEWEST:
+        return (None,) * len(definition.outputs)
+    chained = (follows >= 0) | torch.isin(torch.arange(len(follows)), follows)
+    some = samples.at(chained.nonzero()[:MOST, 0])
+    found: list[SensorNoise | None] = []
+    for column, index in enumerate(definition.moving):
+        at = able.at_samples(some, column)
+        told = at is not None and math.sqrt(at.noise_variance) > limits[column]
+        found.append(
+            _told(at, preceding(definition, some), _slopes(model, some, column, index)) if at and told else None
+        )
+    return (*found, None)
+
+
+def noise_of_sensors(
+    model: DynamicsModel, samples: Samples, sensors: Sequence[SensorNoise | None], limits: Sequence[float]
+) -> Tensor:
+    """Deviation of a single step's noise of each output (O,) that comes from the sensors, in its unit: that of its own
+    sensor, or else what errors of all measured starts cause. It is 0 if it is below the limit (O,)."""
+    if not any(sensors):
+        return torch.zeros(len(sensors), dtype=torch.float64)
+    learned = _learned(model)
+    own = learned.minimum(learned.new_tensor([0.0 if one is None else one.step for one in sensors]))
+    noise = torch.where(own > 0, own, learned.minimum(_carried(model, samples, sensors)))
+    return torch.where(noise > noise.new_tensor(limits), noise, 0.0)
+
+
+def _carried(model: DynamicsModel, samples: Samples, sensors: Sequence[SensorNoise | None]) -> Tensor:
+    """Deviation of each output (O,) that errors of measured starts cause: root mean square over the samples."""
+    variance = torch.zeros(len(sensors), dtype=torch.float64)
+    for index, sensor in zip(model.definition.moving, sensors, strict=False):
+        if sensor is not None:
+            variance += sensor.deviation**2 * _differences(model, samples, index).square().mean(0)
+    return CARRIED * variance.sqrt()
+
+
+def _learned(model: DynamicsModel) -> Tensor:
+    """Deviation of each output's learned noise, (O,)."""
+    able = offers(model, LearnedNoise)
+    found = [0.0] * len(model.definition.outputs) if able is None else able.noise_deviations
+    return torch.tensor(found, dtype=torch.float64)
+
+
+def preceding(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
+    """Row of the step that each sample (n,) continues, -1 if there is none: it ended, as measured, where this one
+    starts."""
+    columns = list(definition.moving)
+    follows = torch.full((len(samples),), -1)
+    same = (samples.q[1:, columns] == samples.q_next[:-1, columns]).all(-1) & ~samples.terminated[:-1]
+    follows[1:] = torch.where(same, torch.arange(len(same)), -1)
+    return follows
+
+
+def _told(at: AtSamples, follows: Tensor, slope: Tensor) -> SensorNoise | None:
+    """Noise of a sensor at n samples, each of which continues the sample ``follows`` (n,) with a slope (n,)."""
+    slope = slope[at.rows]
+    pattern = sensor_pattern(slope, _among(follows, at.rows))
+    share, factor, ratio = best_share(at.targets, at.covariance, at.noise_variance, pattern)
+    if ratio <= CRITICAL or share < MAINLY:
+        return None
+    step = math.sqrt(factor * at.noise_variance)
+    return SensorNoise(share, step * math.sqrt(share / float((1 + slope.square()).mean())), step)
+
+
+def _among(follows: Tensor, rows: Tensor) -> Tensor:
+    """``follows`` of the rows alone, as places among them."""
+    places = torch.full((len(follows) + 1,), -1)  # the last one for -1
+    places[rows] = torch.arange(len(rows))
+    return places[follows[rows]]
+
+
+def sensor_pattern(slope: Tensor, follows: Tensor) -> Tensor:
+    """S (n, n) of steps with slopes (n,), each of which continues the step ``follows`` (n,), or none, -1."""
+    pattern = torch.diag(1 + slope.square())
+    later = (follows >= 0).nonzero()[:, 0]
+    pattern[later, follows[later]] = pattern[follows[later], later] = -slope[later]
+    return pattern / pattern.diagonal().mean()
+
+
+def best_share(y: Tensor, function: Tensor, noise: float, pattern: Tensor) -> tuple[float, float, float]:
+    """The most likely share, its factor c, and twice its log likelihood over that of share 0.
+
+    Args:
+        y: (n,) targets, of mean 0.
+        function: (n, n) their covariance without noise.
+        noise: variance of the noise of one step.
+        pattern: S.
+    """
+    likelihoods = torch.stack(
+        [
+            torch.stack([_log_likelihood(y, function + c * noise * _noise(pattern, share)) for c in FACTORS])
+            for share in SHARES
+        ]
+    )
+    best, at = likelihoods.max(1)
+    place = int(best.argmax())
+    return float(SHARES[place]), float(FACTORS[at[place]]), float(2 * (best[place] - best[0]))
+
+
+def _noise(pattern: Tensor, share: Tensor) -> Tensor:
+    return (1 - share) * torch.eye(len(pattern), dtype=pattern.dtype) + share * pattern
+
+
+def _log_likelihood(y: Tensor, covariance: Tensor) -> Tensor:
+    factor, info = torch.linalg.cholesky_ex(covariance)
+    if bool(info):
+        return y.new_tensor(-math.inf)
+    white = torch.linalg.solve_triangular(factor, y[:, None], upper=False)
+    likelihood: Tensor = -0.5 * white.square().sum() - factor.diagonal().log().sum()
+    return likelihood
+
+
+def _slopes(model: DynamicsModel, samples: Samples, column: int, index: int) -> Tensor:
+    """Slope of the next value of a coordinate over its value, at the samples, (n,)."""
+    return 1 + _differences(model, samples, index)[:, column]
+
+
+def _differences(model: DynamicsModel, samples: Samples, index: int) -> Tensor:
+    """Slopes of all outputs over a coordinate, at the samples, (n, O)."""
+    sampling = model.definition.coordinates[index].sampling
+    step = torch.zeros_like(samples.q)
+    step[:, index] = DIFFERENCE * max(sampling.high - sampling.low, 1e-12)
+    above, below = (model.means(samples.q + sign * step, samples.u) for sign in (1, -1))
+    return (above - below) / (2 * step[:, index : index + 1])

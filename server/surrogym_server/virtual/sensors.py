@@ -1,0 +1,49 @@
+"""Noise of the sensors: observations show states with an error, and the error does not move the state."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.errors import InvalidInput
+from surrogym_server.models.abilities import LearnedNoise, offers
+from surrogym_server.models.port import DynamicsModel
+from surrogym_server.virtual.lanes import LaneState
+from surrogym_server.virtual.noise import Purpose, normal_noise
+
+SensorNoise = tuple[tuple[str, float], ...]  # deviation of one measurement, by coordinate
+MEASURED = 2.0  # variances of a measurement in that of a step's noise: one at its start, and one at its end
+
+
+def sensed(definition: EnvironmentDefinition, noise: SensorNoise, lanes: LaneState) -> Tensor:
+    """States of the lanes as the sensors show them, (N, C). Each step of a lane has its own error."""
+    if not noise:
+        return lanes.q
+    drawn = normal_noise(lanes, Purpose.SENSOR, 1, len(definition.coordinates))[:, 0]
+    return lanes.q + drawn * _spread(definition, noise)
+
+
+def driving(model: DynamicsModel, noise: SensorNoise, process: Tensor) -> Tensor:
+    """Standard normal noise of the process (N, ..., M), without the share of the learned noise that is the sensors'."""
+    able = offers(model, LearnedNoise)
+    if not noise or able is None or model.definition.moves_observation:
+        return process
+    spread = _spread(model.definition, noise)[list(model.definition.moving)]
+    learned = torch.tensor(able.noise_deviations[:-1], dtype=spread.dtype, device=spread.device)
+    share = MEASURED * spread.square() / learned.square().clamp_min(torch.finfo(spread.dtype).tiny)
+    return process * (1 - share).clamp_min(0).sqrt()
+
+
+def check(definition: EnvironmentDefinition, noise: SensorNoise) -> None:
+    """Raise ``InvalidInput`` for noise of a coordinate that the dynamics don't move, or that does not exist."""
+    moving = [definition.coordinate_names[i] for i in definition.moving]
+    for name, _ in noise:
+        if name not in moving:
+            raise InvalidInput(f"sensor_noise: expected coordinates of {', '.join(moving)}, got {name!r}")
+
+
+def _spread(definition: EnvironmentDefinition, noise: SensorNoise) -> Tensor:
+    given = dict(noise)
+    values = [given.get(name, 0.0) for name in definition.coordinate_names]
+    return torch.tensor(values, dtype=torch.float64, device=definition.device)
