@@ -48,6 +48,7 @@ class SearchTask:
     out: Path  # where the policy will be saved; names the run to trackers
     prolong: bool = False  # whether to take as many steps again, once, if the imagined return still rises
     progress: Progress = lambda _: None
+    patient: bool = False  # whether to keep a network that has learned nothing in the first quarter of the steps
 
 
 class Saved(Protocol):

@@ -46,10 +46,14 @@ class Verdicts:
         planned: virtual steps of the training.
         untrained: returns of a network that has learned nothing yet.
         saved: returns of a policy of an earlier training; a network that does not come near it is abandoned.
+        patient: whether no network is abandoned.
     """
 
-    def __init__(self, planned: int, untrained: Imagined, saved: Imagined | None = None) -> None:
+    def __init__(
+        self, planned: int, untrained: Imagined, saved: Imagined | None = None, *, patient: bool = False
+    ) -> None:
         self._planned = planned
+        self._patient = patient
         self.total = planned
         self.floor = untrained.mean
         self._half_way = self.floor if saved is None else (self.floor + saved.mean) / 2
@@ -142,7 +146,7 @@ class Verdicts:
     def judge(self) -> None:
         """Decide whether to abandon the present network, and set ``given_up``."""
         assert self.best is not None
-        tried = self._rollouts >= PATIENT_ROLLOUTS and self._now >= PATIENCE * self._planned
+        tried = self._rollouts >= PATIENT_ROLLOUTS and self._now >= PATIENCE * self._planned and not self._patient
         bar = self._half_way if self._now >= PROOF * self._planned else self._nothing
         left = self._planned - self.steps >= PATIENCE * self._planned
         self.given_up = tried and (self.best <= max(bar, self._nothing) or not self._beyond(self._many)) and left

@@ -24,6 +24,7 @@ from surrogym_client.training.fast_ppo.learner import (
     noisy,
     restored,
 )
+from surrogym_client.training.fast_ppo.long_episodes import with_short_episodes
 from surrogym_client.training.fast_ppo.rollouts import Collector, Rollout
 from surrogym_client.training.proportions import even_batch, explores_further, suggested_gamma
 from surrogym_client.training.search import REFERENCE, SEARCHES, Found, PolicySearch, SearchTask
@@ -59,6 +60,8 @@ class FastPpo(PolicySearch):
     nothing after a quarter of the steps is abandoned, and another one takes the remaining steps. For continuous actions
     its noise is held for ``HELD`` steps. If it is abandoned as well, one of Stable-Baselines3's ``PPO`` follows, with
     state-dependent noise.
+    that is one of Stable-Baselines3's ``PPO``, with state-dependent noise. If episodes are long and nothing
+    ends them, the training episodes are short ones from anywhere (``with_short_episodes``).
     """
 
     n_steps: int = 64  # steps of each lane in a rollout
@@ -84,8 +87,10 @@ class FastPpo(PolicySearch):
         if _starts_from_reference(task.settings) and not task.settings.anew:
             return _reference().search(task)  # only Stable-Baselines3 can train its own policies further
         compiled_update()  # loads a linear algebra library now, so that its threads are limited as well
-        with threadpool_limits(limits=task.settings.threads), _lanes(task) as lanes:
-            return _Training(self, task, lanes).run()
+        with threadpool_limits(limits=task.settings.threads):
+            task = with_short_episodes(task, self.n_steps)
+            with _lanes(task) as lanes:
+                return _Training(self, task, lanes).run()
 
     def explorer(self, policy: Path, algorithm: str, num_envs: int) -> Predict:
         if not Network.is_at(policy):
@@ -112,7 +117,8 @@ class _Training:
         self._objective = Objective(search.clip_range, search.vf_coef, search.max_grad_norm)
         self._lanes, self._lost = lanes, 0
         planned = max(task.steps // self._rollout, 1) * self._rollout
-        self._verdicts = Verdicts(planned, self._imagined(self._new), self._earlier() if settings.anew else None)
+        saved = self._earlier() if settings.anew else None
+        self._verdicts = Verdicts(planned, self._imagined(self._new), saved, patient=task.patient)
         self._kept: LearnedNetwork | None = None
         self._collector = Collector(lanes, self._gamma, search.gae_lambda, settings.seed)
 
@@ -212,7 +218,10 @@ class _Training:
     def _found(self, policy: LearnedNetwork, *, whole: bool) -> Found:
         verdicts = self._verdicts
         chosen = {"gamma": self._gamma, "batch_size": self._batch, "net_arch": units_of(self._spec)}
-        ran_with = {**asdict(self._search), **chosen, "num_envs": self._lanes.num_envs, "total_steps": verdicts.total}
+        lanes = {"num_envs": self._lanes.num_envs, "start_box": self._task.settings.learning["start_box"]}
+        ran_with = {**asdict(self._search), **chosen, **lanes, "total_steps": verdicts.total}
+        if "time_limit" in self._task.settings.session:
+            ran_with["time_limit"] = self._task.settings.session["time_limit"]
         return Found(
             policy,
             verdicts.steps,

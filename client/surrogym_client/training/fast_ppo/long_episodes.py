@@ -1,0 +1,34 @@
+"""Training where episodes are long and nothing ends them: short episodes from anywhere, and more steps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from surrogym_client.training.search import MAX_STEPS, SearchTask
+
+LONG = 5  # rollouts of an episode; the lanes of a shorter one start often enough
+SHORTER = 5  # times: a training episode
+MORE = 3  # times as many steps if nobody chose their number
+
+
+def with_short_episodes(task: SearchTask, rollout: int) -> SearchTask:
+    """Return the task with short training episodes from anywhere, and more steps, if its episodes are long.
+
+    If nothing ends long episodes, each lane has few starts in a whole training. Its lanes are then mostly where the
+    policy ends up, and it hardly sees the other states. The last reward of a truncated episode includes the critic's
+    value of its last state, so short episodes don't change what is optimal. Policies are still compared over whole
+    episodes from the declared starts. The task is unchanged if the user chose starts or a time limit.
+
+    Args:
+        task: a task.
+        rollout: steps of each lane in a rollout.
+    """
+    spec, settings = task.port.spec(), task.settings
+    chosen = settings.start_box is not None or not {"time_limit", "start_box"}.isdisjoint(settings.session)
+    limit = spec.time_limit or 0
+    if chosen or spec.termination != () or limit <= LONG * rollout or spec.design.preset == "paper":
+        return task
+    session = {**settings.session, "time_limit": limit // SHORTER}
+    steps = min(MORE * task.steps, MAX_STEPS) if task.prolong else task.steps
+    short = replace(settings, start_box=1.0, session=session, judge=settings.judging)
+    return replace(task, settings=short, steps=steps, patient=True)
