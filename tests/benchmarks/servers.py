@@ -1,6 +1,7 @@
 """What the benchmarks measure against: echoes without any work, and a server whose surrogate ``trivial`` does none.
 
-Run as ``servers.py echo PORT`` or ``servers.py surrogym OPTIONS``, the options being those of ``surrogym serve``.
+Run as ``servers.py echo PORT`` or ``servers.py surrogym OPTIONS``, the options being those of ``surrogym serve``; or as
+``servers.py collecting THRESHOLD serve OPTIONS``: the server as it is, with another threshold of garbage collection.
 """
 
 from __future__ import annotations
@@ -71,8 +72,20 @@ def serve_surrogym(options: list[str]) -> None:
     main()
 
 
+def serve_collecting(threshold: int, arguments: list[str]) -> None:
+    """Collect the youngest generation after ``threshold`` new objects; 0: never collect."""
+    from surrogym_client.cli import main
+    from surrogym_server.cli import runner
+
+    runner.YOUNG_OBJECTS = threshold
+    sys.argv = ["surrogym", *arguments]
+    main()
+
+
 if __name__ == "__main__":
     if sys.argv[1] == "echo":
         serve_echo(int(sys.argv[2]))
+    elif sys.argv[1] == "collecting":
+        serve_collecting(int(sys.argv[2]), sys.argv[3:])
     else:
         serve_surrogym(sys.argv[2:])

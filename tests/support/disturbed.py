@@ -17,7 +17,7 @@ from surrogym_client.transport import HttpSurrogate, Retries
 
 LANES, SMALL = 8, {"n_steps": 16, "batch_size": 64, "n_epochs": 2}
 STEPS_PER_FAULT = 4_096
-PATIENT = Retries(seconds=120)
+PATIENT = Retries(seconds=600)
 
 
 class Faults:

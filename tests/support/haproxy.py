@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 CONFIGURATION = Path(__file__).parents[2] / "docker" / "haproxy.cfg"
-STARTING_SECONDS = 20.0
+STARTING_SECONDS = 60.0
 
 
 def program() -> str | None:

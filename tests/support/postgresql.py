@@ -18,6 +18,8 @@ from typing import Any
 import psycopg
 import pytest
 
+from support.ray_cluster import descendants, kill_all
+
 PROGRAMS = Path("/usr/lib/postgresql")
 STARTING_SECONDS = 60.0
 
@@ -38,6 +40,12 @@ class Postgresql:
         self._server: subprocess.Popen[bytes] | None = None
         command = [programs / "initdb", "-D", folder / "data", "-A", "trust", "-U", "postgres", "-N"]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=folder, **self._user)
+
+    @property
+    def pid(self) -> int:
+        """Of the process that the others of the server are children of."""
+        assert self._server is not None
+        return self._server.pid
 
     def start(self) -> None:
         """Start, and wait until it answers."""
@@ -62,6 +70,12 @@ class Postgresql:
         if self._server is not None:
             self._server.send_signal(signal.SIGQUIT)
             self._server.wait(30)
+
+    def kill(self) -> None:
+        """Send SIGKILL to all of its processes at once."""
+        if self._server is not None:
+            kill_all(descendants(self._server.pid))
+            self._server.wait()
 
     def connect(self, database: str = "postgres") -> psycopg.Connection[Any]:
         return psycopg.connect(host=str(self.folder), user="postgres", dbname=database, autocommit=True)

@@ -7,12 +7,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-STARTING_SECONDS = 120.0
+STARTING_SECONDS = 400.0  # of a machine on which much else runs
 STOPPING_SECONDS = 60.0
 
 
@@ -35,18 +35,21 @@ class ServerProcess:
         return self.process.wait(STOPPING_SECONDS)
 
 
-def start_server(folder: Path, *options: str, **environment: str) -> ServerProcess:
+def start_server(
+    folder: Path, *options: str, program: Sequence[str] = ("-m", "surrogym_server"), **environment: str
+) -> ServerProcess:
     """Start ``surrogym serve`` on the database of a folder, and wait until it accepts requests.
 
     Args:
         folder: holds database and log; starting again in it goes on with its database.
         options: further options of the command.
+        program: arguments of Python before the command ``serve``.
         environment: further environment variables.
     """
     ready = folder / "ready"
     ready.unlink(missing_ok=True)
     defaults = ["--port", "0", "--database", str(folder / "surrogym.db"), "--ready-file", str(ready)]
-    command = [sys.executable, "-m", "surrogym_server", "serve", *defaults, *options]
+    command = [sys.executable, *program, "serve", *defaults, *options]
     kept = {name: value for name, value in os.environ.items() if not name.startswith("SURROGYM_")}
     with (folder / "server.log").open("ab") as log:
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=kept | environment)

@@ -18,8 +18,10 @@ import numpy as np
 import pytest
 
 from support import pendulum
+from support.alternating import alternating
 from support.postgresql import Postgresql, running_postgresql
 from support.server import ServerProcess, running_server
+from surrogym_client.diagnosis.conformance import conformance, leases, sessions
 from surrogym_client.original import classic
 from surrogym_client.transport import HttpSurrogate, Transport
 from surrogym_server.cluster import pool
@@ -194,36 +196,59 @@ def step_of(reply: Reply) -> tuple[object, ...]:
     return reply.seq, step.observation.tobytes(), step.reward.tobytes(), step.terminated.tobytes()
 
 
-@pytest.mark.long
-def test_any_front_server_goes_on_with_a_session(database: str, address: str, engine: SessionEngine, tmp_path: Path):
+@pytest.fixture(scope="module")
+def fronts(
+    database: str, address: str, engine: SessionEngine, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[list[str]]:
+    """Addresses of two front servers."""
     options = ("--database", database, "--engine", "ray", "--ray-address", address)
     environment = {"SURROGYM_RAY_LEASE_SECONDS": str(LEASE), "SURROGYM_RAY_CHECKPOINT_SECONDS": "0.1"}
-    folders = [tmp_path / name for name in ("first", "second")]
-    for folder in folders:
-        folder.mkdir()
+    folders = [tmp_path_factory.mktemp(name) for name in ("first", "second")]
     with (
         running_server(folders[0], *options, **environment) as first,
         running_server(folders[1], *options, **environment) as second,
     ):
-        urls, action = (first.url, second.url), np.full((2, 1), 0.5)
-        with HttpSurrogate(urls[0], NAME, transport="stream") as port:
-            alone = port.open(OpenSession(num_envs=2, seed=0)).id
-            port.reset(alone)
-            expected = [port.step(alone, action).observation for _ in range(6)]
-            shared = port.open(OpenSession(num_envs=2, seed=0)).id
-            port.reset(shared)
-            found = [port.step(shared, action).observation for _ in range(2)]
-        clients = [httpx.Client(base_url=url, timeout=60) for url in urls]
-        for turn in range(4):
-            body = {"seq": turn + 4, "action": action.tolist()}
-            replies = [client.post(f"/v1/sessions/{shared}/step", json=body).raise_for_status() for client in clients]
-            assert replies[0].content == replies[1].content, "the second server repeats what the first one did"
-            found.append(np.array(replies[0].json()["observation"], dtype=np.float32))
-        np.testing.assert_array_equal(found, expected)
-        listed = [client.get(f"/v1/surrogates/{NAME}").json()["sessions"] for client in clients]
-        assert listed[0] == listed[1] >= 2
-        for client in clients:
-            client.close()
+        yield [first.url, second.url]
+
+
+@pytest.mark.long
+def test_conformance_holds_while_each_session_alternates_between_two_front_servers(
+    fronts: list[str], capsys: pytest.CaptureFixture[str]
+):
+    with alternating(fronts) as alternation:
+        outcomes = {outcome.name: outcome.failure for outcome in conformance(fronts[0], None, "alternating")}
+    assert len(outcomes) == len(leases.CHECKS) + len(sessions.CHECKS)
+    assert set(outcomes.values()) == {None}, outcomes
+    shared = alternation.by_session()
+    assert len(shared) > len(sessions.CHECKS)
+    for session, (first, second) in shared.items():
+        assert first - second in (0, 1), (session, shared)
+    counts = " and ".join(str(sum(of_server)) for of_server in zip(*shared.values(), strict=True))
+    with capsys.disabled():
+        print(f"\n{len(outcomes)} checks hold; {len(shared)} sessions, {counts} requests at the front servers")
+
+
+@pytest.mark.long
+def test_any_front_server_goes_on_with_a_session(fronts: list[str]):
+    action = np.full((2, 1), 0.5)
+    with HttpSurrogate(fronts[0], NAME, transport="stream") as port:
+        alone = port.open(OpenSession(num_envs=2, seed=0)).id
+        port.reset(alone)
+        expected = [port.step(alone, action).observation for _ in range(6)]
+        shared = port.open(OpenSession(num_envs=2, seed=0)).id
+        port.reset(shared)
+        found = [port.step(shared, action).observation for _ in range(2)]
+    clients = [httpx.Client(base_url=url, timeout=60) for url in fronts]
+    for turn in range(4):
+        body = {"seq": turn + 4, "action": action.tolist()}
+        replies = [client.post(f"/v1/sessions/{shared}/step", json=body).raise_for_status() for client in clients]
+        assert replies[0].content == replies[1].content, "the second server repeats what the first one did"
+        found.append(np.array(replies[0].json()["observation"], dtype=np.float32))
+    np.testing.assert_array_equal(found, expected)
+    listed = [client.get(f"/v1/surrogates/{NAME}").json()["sessions"] for client in clients]
+    assert listed[0] == listed[1] >= 2
+    for client in clients:
+        client.close()
 
 
 @pytest.fixture
