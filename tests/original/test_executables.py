@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from support.noting import until
-from support.programs import NOTES_ITSELF, left_behind, program
+from support.programs import HANGS, NOTES_ITSELF, UNTERMINABLE, left_behind, program
 from surrogym_client import original
 from surrogym_client.original.errors import StepFailed, StepTimedOut, UnknownEnvironment
 from surrogym_client.original.executables.program import Program
@@ -160,6 +160,26 @@ def test_a_program_ends_with_a_client_that_is_killed(tmp_path):
     process = subprocess.Popen([sys.executable, "-c", client])
     try:
         assert until(lambda: (tmp_path / "pids").exists() and (tmp_path / "pids").read_text())
+    finally:
+        process.kill()
+        process.wait()
+    assert left_behind(tmp_path) == []
+
+
+def test_a_program_that_hangs_is_ended_after_its_client_was_killed(tmp_path):
+    """It reads nothing, so the end of its input says nothing to it, and SIGTERM does not end it."""
+    hangs = (HANGS[0], "    open(os.path.dirname(__file__) + '/hangs', 'x')\n" + HANGS[1])
+    command = program(tmp_path, NOTES_ITSELF, UNTERMINABLE, hangs)
+    client = f"""
+import time
+from surrogym_client.original.executables.program import Program
+plant = Program({command!r}, grace=0.0)
+plant.start()
+plant.ask("step", time.monotonic() + 3600, action=[1.0])
+"""
+    process = subprocess.Popen([sys.executable, "-c", client])
+    try:
+        assert until(lambda: (tmp_path / "hangs").exists())
     finally:
         process.kill()
         process.wait()

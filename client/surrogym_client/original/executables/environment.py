@@ -158,7 +158,7 @@ def open_executable(
         ValueError: the choices contradict the specification.
     """
     command = name.removeprefix(PREFIX)
-    program = Program(command)
+    program = Program(command, grace=step_limit)
     try:
         own = _specification(program)
         chosen = choose(spec or own)

@@ -17,9 +17,11 @@ from surrogym_client.original.errors import (
     StepTimedOut,
     UnknownEnvironment,
 )
+from surrogym_client.original.executables.guard import Guard
 from surrogym_client.original.executables.messages import LONGEST_LINE, Reply, decode, encode, short
 from surrogym_client.original.executables.standard_error import StandardError
 
+GRACE_SECONDS = 30.0  # for a running step, after this process was killed
 END_SECONDS = 2.0  # after the request to close, and again after SIGTERM
 CHUNK = 1 << 16  # bytes
 
@@ -28,18 +30,20 @@ class Program:
     """A program that is started without a shell, in a session of its own, so that Ctrl-C does not reach it.
 
     Its standard error is passed on to that of this process. After a time-out, an end or a line that is no answer, the
-    program is ended, and ``start`` starts it anew.
+    program is ended, and ``start`` starts it anew. If this process is killed, the program sees the end of its standard
+    input, and is killed some time later.
 
     Args:
         command: the program and its arguments, quoted as for a shell.
         called: what errors call it.
+        grace: seconds that a running step has left after this process was killed.
 
     Raises:
         UnknownEnvironment: the command is empty, or its quotes don't match.
     """
 
-    def __init__(self, command: str, called: str = "the program") -> None:
-        self._called = called
+    def __init__(self, command: str, called: str = "the program", grace: float = GRACE_SECONDS) -> None:
+        self._called, self._grace = called, grace
         try:
             self._words = shlex.split(command)
         except ValueError as error:
@@ -51,6 +55,7 @@ class Program:
         if os.name == "nt":
             raise UnknownEnvironment("expected Linux or macOS to start a program, got Windows")
         self._process: subprocess.Popen[bytes] | None = None
+        self._guard: Guard | None = None
         self._standard_error: StandardError | None = None
         self._unread = b""
         self._number = 0  # of the last request
@@ -76,6 +81,7 @@ class Program:
                 bufsize=0,
                 start_new_session=True,
             )
+            self._guard = Guard(self._process.pid, self._grace)
         except OSError as error:
             raise UnknownEnvironment(
                 f"expected a program that can be started, got {self._words[0]!r}: {error}"
@@ -169,6 +175,8 @@ class Program:
         process, self._process = self._process, None
         if process is None:
             return None
+        if self._guard is not None:
+            self._guard.dismiss()
         for number in (signal.SIGTERM, signal.SIGKILL):
             with suppress(ProcessLookupError, PermissionError):
                 os.killpg(process.pid, number)  # the group may outlive the program
