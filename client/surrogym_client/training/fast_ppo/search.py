@@ -59,9 +59,8 @@ class FastPpo(PolicySearch):
     Networks, loss, Adam, scaled rewards and advantages are those of the search ``PPO``. A network that has learned
     nothing after a quarter of the steps is abandoned, and another one takes the remaining steps. For continuous actions
     its noise is held for ``HELD`` steps. If it is abandoned as well, one of Stable-Baselines3's ``PPO`` follows, with
-    state-dependent noise.
-    that is one of Stable-Baselines3's ``PPO``, with state-dependent noise. If episodes are long and nothing
-    ends them, the training episodes are short ones from anywhere (``with_short_episodes``).
+    state-dependent noise. If episodes are long and nothing ends them, the training episodes are short ones from anywhere
+    (``with_short_episodes``).
     """
 
     n_steps: int = 64  # steps of each lane in a rollout
