@@ -59,7 +59,7 @@ class FastPpo(PolicySearch):
     Networks, loss, Adam, scaled rewards and advantages are those of the search ``PPO``. A network that has learned
     nothing after a quarter of the steps is abandoned, and another one takes the remaining steps. For continuous actions
     its noise is held for ``HELD`` steps. If it is abandoned as well, one of Stable-Baselines3's ``PPO`` follows, with
-    state-dependent noise. If episodes are long and nothing ends them, the training episodes are short and begin anywhere
+    state-dependent noise. If episodes are long and nothing ends them, training episodes are short and begin anywhere
     (``with_short_episodes``).
     """
 
