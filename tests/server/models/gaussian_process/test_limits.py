@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch import Tensor
 
 from support.models import gaussian_processes
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples
+from surrogym_server.gp import sparse
 from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.gaussian_process.censoring import stopped
 from surrogym_server.models.gaussian_process.learning import learn as learning
+from surrogym_server.models.gaussian_process.learning import limits
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_shared.spec import Bounds, BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
 VALVE = 1.0  # what the pressure is kept below
@@ -57,6 +61,25 @@ def test_level_is_better_known_with_samples_at_the_valve_of_the_pressure(monkeyp
     chosen = error(samples, test)
     monkeypatch.setattr(learning, "past_limits", lambda _, output, *others: output)  # noqa: ARG005
     assert chosen < share * error(samples, test)
+
+
+def test_a_process_of_inducing_points_is_judged_by_the_residuals_of_its_samples(monkeypatch):
+    monkeypatch.setattr(sparse, "MAX_EXACT", 60)
+    samples = steps(400, False, 5)
+    compared: list[tuple[float, float]] = []
+
+    def watched(output: OutputModel, target: Tensor, x: Tensor, learned: Tensor, every: Tensor) -> float:
+        assert output.posterior.sparse is not None
+        residuals = (target[every] - output.mean(x[every])).square().mean()
+        compared.append((error_of(output, target, x, learned, every), float(residuals)))
+        return compared[-1][0]
+
+    error_of = limits._error
+    monkeypatch.setattr(limits, "_error", watched)
+    model = gaussian_processes(RELIEVED, samples)
+    assert [output.past_limits for output in model.transitions] == [True, False]
+    assert len(compared) == 2
+    assert all(ours == pytest.approx(theirs) for ours, theirs in compared)
 
 
 def test_samples_that_met_no_limit_are_all_there_is():

@@ -37,17 +37,24 @@ def past_limits(
     if wider.posterior is None:
         return output
     wider = replace(wider, name=output.name, past_limits=True)
-    if output.posterior is None or _error(wider, int(every.sum())) < _error(
-        output, int(every.sum()), target[also] - output.mean(inputs[output.feature_map][also])
-    ):
+    if output.posterior is None:
         return wider
-    return output
+    wide = _error(wider, target, inputs[wider.feature_map], every, every)
+    return wider if wide < _error(output, target, inputs[output.feature_map], keep, every) else output
 
 
-def _error(output: OutputModel, count: int, others: Tensor | None = None) -> float:
-    """Mean squared error over ``count`` samples: the leave-one-out errors of the samples that an output was learned
-    from, and the errors (m,) at ``others``."""
-    found = output.leave_one_out().error ** 2
-    if others is None:
+def _error(output: OutputModel, target: Tensor, x: Tensor, learned: Tensor, every: Tensor) -> float:
+    """Mean squared error of targets (n,) at inputs x (n, d), over the samples ``every`` (n,).
+
+    Those of them that the output ``learned`` (n,) count by their leave-one-out errors. A process of inducing points has
+    none of its samples: each of these points stands for many samples, so to leave one out says nothing about a sample.
+    There the residuals count, because each of many samples hardly influences the process.
+    """
+    assert output.posterior is not None
+    if output.posterior.sparse is not None:
+        return float((target - output.mean(x))[every].square().mean())
+    found, others = output.leave_one_out().error ** 2, every & ~learned
+    if not bool(others.any()):
         return found
-    return ((count - len(others)) * found + float(others.square().sum())) / count
+    count, left = int(every.sum()), int(others.sum())
+    return ((count - left) * found + float((target[others] - output.mean(x[others])).square().sum())) / count
