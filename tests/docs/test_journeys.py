@@ -88,6 +88,7 @@ OTHERWISE = {
     "docs/results/fresh-seeds.md": "tests/cli runs its studies, in short",
     "docs/results/fastppo.md": "tests/cli runs its studies, in short",
     "docs/results/by-name.md": "tests/cli and tests/original run its commands, in short",
+    "docs/results/hidden.md": "tests/cli runs its study, in short; test_benchmarks imports its benchmarks",
     "docs/results/peers.md": "tests/cli/test_reproduce_peers.py and tests/experiments/peers",
     "docs/results/trust.md": "tests/cli runs its study, in short",
     "docs/results/trust-again.md": "tests/cli runs its study, in short",
