@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 
 from surrogym_client.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
@@ -67,11 +67,19 @@ class PeerCell:
 
 
 def run_cells(todo: Sequence[PeerCell], folder: Path, jobs: int, tell: Callable[[PeerCell, list[Point]], None]) -> None:
-    """Run cells, ``jobs`` at once, each in a process of its own with one thread. ``tell`` is called after each."""
+    """Run cells, ``jobs`` at once, each in a process of its own with one thread. ``tell`` is called after each.
+
+    An interruption ends the cells that run; what they have written stays."""
     with ProcessPoolExecutor(jobs, get_context("spawn"), max_tasks_per_child=1) as pool:
         running = {pool.submit(run_cell, cell, folder): cell for cell in todo}
-        for done in as_completed(running):
-            tell(running[done], done.result())
+        try:
+            for done in as_completed(running):
+                tell(running[done], done.result())
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in active_children():
+                process.terminate()
+            raise
 
 
 def run_cell(cell: PeerCell, folder: Path, tell: Tell | None = None) -> list[Point]:
