@@ -29,6 +29,7 @@ ELSEWHERE = {
     "policy show": "test_commands.py",
     "reproduce efficiency": "test_reproduce.py",
     "reproduce paper": "test_reproduce_paper.py",
+    "reproduce peers": "test_reproduce_peers.py",
     "reproduce trust": "tests/experiments/test_unseen.py",
     "serve": "tests/server/cli/test_serve.py",
     "train": "test_commands.py",

@@ -46,7 +46,11 @@ class Trainings:
 
 
 def run(
-    monkeypatch: pytest.MonkeyPatch, folder: Path, *audits: Handover, imagined: float | None = None
+    monkeypatch: pytest.MonkeyPatch,
+    folder: Path,
+    *audits: Handover,
+    imagined: float | None = None,
+    steps: int | None = None,
 ) -> tuple[Trainings, TrainResult, Handover]:
     trainings, api = Trainings(list(audits), imagined), Mock()
     api.surrogate.return_value.fidelity = None
@@ -56,7 +60,7 @@ def run(
     monkeypatch.setattr(audited, "hand_over", trainings.hand_over)
     monkeypatch.setattr(AuditedTraining, "_subject", lambda *_: None)
     monkeypatch.setattr(AuditedTraining, "_best", lambda _self, result: result)
-    settings = TrainSettings(algorithm="fastppo")
+    settings = TrainSettings(algorithm="fastppo", total_steps=steps)
     training = AuditedTraining(api, "plane", Mock(), folder / "p.zip", settings, audit=AuditSettings())
     return trainings, *training.train()
 
@@ -71,6 +75,11 @@ def test_a_promise_that_an_audit_halves_is_trained_on_without_the_budget(monkeyp
 def test_a_promise_far_below_the_imagined_return_is_trained_on(monkeypatch, tmp_path: Path) -> None:
     trainings, _, _ = run(monkeypatch, tmp_path, found(52.6, 69.7), found(97.4, 97.5), imagined=99.4)
     assert trainings.made == 2
+
+
+def test_a_limited_number_of_virtual_steps_is_not_exceeded_after_an_audit(monkeypatch, tmp_path: Path) -> None:
+    trainings, _, _ = run(monkeypatch, tmp_path, found(95.6, -21.6), steps=100)
+    assert trainings.made == 1
 
 
 def test_an_imagined_return_below_the_promise_changes_nothing(monkeypatch, tmp_path: Path) -> None:

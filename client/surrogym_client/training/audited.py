@@ -20,6 +20,7 @@ from surrogym_client.training.settings import (
     TrainResult,
     TrainSettings,
     chosen_for,
+    prolongs,
 )
 from surrogym_client.training.trainer import train
 from surrogym_client.transport.api import Api
@@ -35,8 +36,8 @@ class AuditedTraining:
 
     If an audit fails and the budget has steps left, they are taken where the policy goes, the training continues, and
     the policy is audited again. The training also continues if the model that has learned from an audit promises
-    clearly less than the training imagined, or than the model before. This takes no step of the budget. In all other
-    cases the policy is handed over, also with a failed audit.
+    clearly less than the training imagined, or than the model before, unless the user limited the virtual steps. This
+    takes no step of the budget. In all other cases the policy is handed over, also with a failed audit.
 
     Attributes:
         api: the server.
@@ -110,8 +111,10 @@ class AuditedTraining:
     def _to_be_trained_on(self, audit: Audit | None, result: TrainResult, taken: int, number: int) -> bool:
         if audit is None:
             return False
-        asked = not audit.passed and self._asked_more(result, taken, number)
-        return asked or disappointed(audit, result.untrained, result.imagined_return)
+        if not audit.passed and self._asked_more(result, taken, number):
+            return True
+        longer = prolongs(self.settings, self.port.spec())
+        return longer and disappointed(audit, result.untrained, result.imagined_return)
 
     def _asked_more(self, result: TrainResult, taken: int, number: int) -> bool:
         """Spend the rest of the budget where the policy goes.
