@@ -34,8 +34,8 @@ def test_a_narrow_belief_moves_as_the_model_says():
     mean, covariance = pilco._next_belief(STATES, model(), policy, torch.from_numpy(at), narrow)
     inputs = np.concatenate([STATES.featured(at), pilco._acting(STATES, policy)(at)], 1)
     change, deviation = model().predict(torch.from_numpy(inputs))
-    torch.testing.assert_close(mean, torch.from_numpy(at) + change, atol=1e-5, rtol=1e-5)
-    torch.testing.assert_close(covariance[0].diagonal().sqrt(), deviation[0], atol=1e-3, rtol=1e-2)
+    np.testing.assert_allclose(mean, torch.from_numpy(at) + change, atol=1e-5, rtol=1e-5)
+    np.testing.assert_allclose(covariance[0].diagonal().sqrt(), deviation[0], atol=1e-3, rtol=1e-2)
 
 
 def test_the_gradient_is_the_slope_of_the_cost():
