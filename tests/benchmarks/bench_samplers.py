@@ -64,10 +64,13 @@ def work(url: str, name: str, batch: int) -> None:
 
 
 def cpu_seconds(pids: Sequence[int]) -> float:
-    """Processor time of processes, and of their children that have ended."""
+    """Processor time of processes, and of their children that have ended. A process that has ended is one of these."""
     ticks = 0
     for pid in pids:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        try:
+            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        except FileNotFoundError:
+            continue
         ticks += sum(int(field) for field in fields[11:15])
     return ticks / TICKS
 
