@@ -16,7 +16,7 @@ PATIENCE = 0.25  # share of the steps within which a network has to learn someth
 PROOF = 0.5  # share of the steps within which it has to reach half of the saved policy's gain
 PATIENT_ROLLOUTS = 8  # fewest rollouts before a network is abandoned
 LATELY = 0.25  # share of the steps, at the end, in which a gain counts as recent
-GAIN = 0.01  # share of the best policy's gain over an untrained one: a larger recent gain prolongs the training
+GAIN = 0.0025  # share of the best policy's gain over an untrained one: a larger recent gain prolongs the training
 SATURATED = 3  # checks in a row in which every episode earned as much as the best one ever did
 LEARNED = 0.01  # share of the best episode's gain over an untrained network: below, nothing was learned
 MANY = 0.25  # share of the episodes that has to earn this: a few do by luck of their drawn functions
@@ -91,7 +91,7 @@ class Verdicts:
 
     @property
     def gaining(self) -> bool:
-        """Whether the best policy improved in the last quarter of the steps by more than 1 % of its gain."""
+        """Whether the best policy improved in the last quarter of the steps by more than ``GAIN`` of its gain."""
         if self.best is None or self.best <= self._nothing:
             return False
         before = [best for steps, best in self._bests if steps <= self.total - LATELY * self._planned]
