@@ -23,7 +23,7 @@ from surrogym_server.sampling.candidates import Candidates, candidates_of, refer
 from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, deviations
 from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
-from surrogym_server.sampling.noise import SLACK, banded, established_noise, to_repeat, widened
+from surrogym_server.sampling.noise import SLACK, established_noise, to_repeat, widened
 from surrogym_server.sampling.peaks import highest
 from surrogym_server.sampling.rollouts import Aim, Rollout, first_rollouts, plan_round
 from surrogym_server.sampling.serial import noise_of_sensors, sensor_noise
@@ -176,7 +176,7 @@ def judge_model(
     with plugin_calls(definition):
         deviation = deviations(model, points.q, points.u)
         require_deviations(model, deviation)
-        judged = confidences_of(model, points, deviation, banded(definition.tolerances_over(usual), noise))
+        judged = confidences_of(model, points, deviation, tolerances)
     confidences = tuple(
         replace(c, noise=float(w), sensor_noise=0.0 if one is None else one.deviation)
         for c, w, one in zip(judged, noise, sensors, strict=True)

@@ -25,7 +25,6 @@ STAGES = (1, ENOUGH, 6, 9)  # degrees of freedom after which the repeats are tes
 LEVEL = 0.01  # of each test
 NEGLIGIBLE = 0.5  # of the tolerance: noise of this size is established in at most ``LEVEL`` of the cases
 AT_MOST = 3.0  # largest ratio of learned noise to measured deviation; the rest is misfit, even if there are few repeats
-BAND = 1.5  # deviations of the noise within which the function need not be known better
 SLACK = 1.25  # a leave-one-out error beyond the noise that few samples leave
 
 
@@ -111,16 +110,6 @@ def widened(tolerances: Sequence[float], noise: Tensor) -> tuple[float, ...]:
     """Widen the tolerances (O,) by the established noise (O,), because a noisy output can't be known better than its
     noise."""
     return tuple(math.hypot(tolerance, float(one)) for tolerance, one in zip(tolerances, noise, strict=True))
-
-
-def banded(tolerances: Sequence[float], noise: Tensor) -> tuple[float, ...]:
-    """Errors of the function (O,) that the confidence index allows: the tolerances (O,), widened by ``BAND`` deviations
-    of the noise (O,).
-
-    An index of 0.999 asks for a deviation of a third of this error, which is half the noise. Such a function predicts a
-    single step with a deviation that is at most 12 % larger than the noise, so the rest can hardly be learned.
-    """
-    return widened(tolerances, BAND * noise)
 
 
 def _possible(model: DynamicsModel, limits: Tensor) -> Tensor:

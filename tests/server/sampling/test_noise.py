@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,12 +15,10 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.models.abilities import LearnedNoise
 from surrogym_server.sampling.design import DesignState, Request, advance
 from surrogym_server.sampling.noise import (
-    BAND,
     ENOUGH,
     LEVEL,
     NEGLIGIBLE,
     STAGES,
-    banded,
     established_noise,
     repeats,
     to_repeat,
@@ -131,16 +128,6 @@ def test_a_family_that_learns_no_noise_repeats_nothing(model: ClaimsNoise):
 
 def test_tolerances_without_noise_stay_to_the_last_bit():
     assert widened((0.1, 0.3), torch.tensor([0.0, 0.4], dtype=torch.float64)) == (0.1, 0.5)
-
-
-def test_the_index_allows_errors_within_a_band_of_the_noise():
-    allowed = banded((0.1, 0.3), torch.tensor([0.0, 0.4 / BAND], dtype=torch.float64))
-    assert allowed == pytest.approx((0.1, 0.5))
-
-
-def test_an_index_at_its_target_leaves_little_beside_the_noise():
-    deviation = BAND / float(torch.special.ndtri(torch.tensor(0.999, dtype=torch.float64)))
-    assert math.hypot(1, deviation) < 1.12
 
 
 def test_a_noisy_design_repeats_steps_and_comes_to_be_ready(model: ClaimsNoise):
