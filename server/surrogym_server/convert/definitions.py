@@ -121,6 +121,7 @@ def _model(design: wire.Design) -> Choice:
             "kernel": kernel,
             "reward_jumps": not paper,
             "reward_peaks": not paper,
+            "rates": not paper,
             "symmetry": design.symmetry,
         }
         choice = Choice(choice.name, tuple({**preset, **dict(choice.settings)}.items()))

@@ -34,6 +34,7 @@ class FeatureMap:
         after: encode the state after the step instead of the one before it; for the reward alone.
         drift: weights (C,) of q for each angle; cos and sin of the angle that they predict are inputs too.
         history: only lags that look back at most this many steps are inputs; None: all lags.
+        rates: of each feature (d,), along which the output changes the faster the further, or none; see ``gp.growth``.
         parity: how the output changes if every coordinate and the action change their sign: without a rule, its sign
             changes too (odd), or it stays (even).
     """
@@ -45,9 +46,10 @@ class FeatureMap:
     drift: Drift = ()
     parity: Parity = ""
     history: int | None = None
+    rates: tuple[float, ...] = ()
 
     def __str__(self) -> str:
-        extras = [name for name in ("lead", "after", "drift") if getattr(self, name)]
+        extras = [name for name in ("lead", "after", "drift", "rates") if getattr(self, name)]
         extras += [] if self.history is None else [f"history {self.history}"]
         return ", ".join([self.state, f"action {self.action}", *extras, *([self.parity] if self.parity else [])])
 
@@ -67,11 +69,14 @@ def leading(definition: EnvironmentDefinition) -> tuple[int, ...]:
 class Feature(NamedTuple):
     """One input: a function of one entry of [q, u], of the lead, of weights . q, or one observation entry."""
 
-    function: Literal["affine", "cos", "sin", "turned_cos", "turned_sin", "wrapped", "equal", "observed", "lead"]
+    function: Literal[
+        "affine", "cos", "sin", "turned_cos", "turned_sin", "wrapped", "equal", "observed", "lead", "grown"
+    ]
     entry: int
     centre: float = 0.0  # "equal": the value that it is compared with
     scale: float = 1.0
     weights: tuple[float, ...] = ()  # (C,), "turned"
+    rate: float = 0.0  # "grown"
 
 
 def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tuple[Feature, ...]:
@@ -82,6 +87,9 @@ def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tupl
             Feature("lead", place, *scaling(definition.coordinates[index].sampling))
             for place, index in enumerate(leading(definition))
         ]
+    for place, rate in enumerate(feature_map.rates):
+        if rate and made[place].function == "affine":
+            made[place] = made[place]._replace(function="grown", rate=rate)
     return tuple(made)
 
 
@@ -108,7 +116,8 @@ class Encoder:
     """The features of several maps. Each is computed once, and all features of one function are computed together."""
 
     definition: EnvironmentDefinition
-    groups: tuple[tuple[str, slice | Tensor, Tensor, Tensor], ...]  # function, entries (weights), centres, scales
+    # function, entries (weights), centres, scales, rates
+    groups: tuple[tuple[str, slice | Tensor, Tensor, Tensor, Tensor], ...]
     columns: Mapping[Feature, int]
 
     @classmethod
@@ -140,7 +149,9 @@ class Encoder:
         """All features: x (..., d) of a call, with those of the lead (..., L) added."""
         return torch.cat([x, *(self._values(*group, lead) for group in self.groups if group[0] == "lead")], -1)
 
-    def _values(self, function: str, entries: slice | Tensor, centre: Tensor, scale: Tensor, raw: Tensor) -> Tensor:
+    def _values(
+        self, function: str, entries: slice | Tensor, centre: Tensor, scale: Tensor, rate: Tensor, raw: Tensor
+    ) -> Tensor:
         match function:
             case "observed":
                 shown = self.definition.observe(raw[..., : len(self.definition.coordinates)])[..., entries]
@@ -157,6 +168,8 @@ class Encoder:
                 return wrap(raw[..., entries]) * (math.sqrt(3) / math.pi)
             case "equal":
                 return (raw[..., entries] == centre).to(raw.dtype)
+            case "grown":
+                return torch.expm1(rate * ((raw[..., entries] - centre) / scale)) / rate
             case _:
                 return (raw[..., entries] - centre) / scale
 
@@ -214,12 +227,13 @@ def _of_action(definition: EnvironmentDefinition, feature_map: FeatureMap, entry
     return [Feature("affine", place, (count - 1) / 2, math.sqrt((count**2 - 1) / 12))]
 
 
-def _group(same: tuple[Feature, ...], device: torch.device) -> tuple[slice | Tensor, Tensor, Tensor]:
-    """Entries, as a slice if they are neighbours, or weights (C, k); centres and scales."""
-    centre, scale = torch.tensor([(f.centre, f.scale) for f in same], dtype=torch.float64, device=device).T
+def _group(same: tuple[Feature, ...], device: torch.device) -> tuple[slice | Tensor, Tensor, Tensor, Tensor]:
+    """Entries, as a slice if they are neighbours, or weights (C, k); centres, scales and rates."""
+    numbers = torch.tensor([(f.centre, f.scale, f.rate) for f in same], dtype=torch.float64, device=device)
+    centre, scale, rate = numbers.T
     if same[0].weights:
-        return torch.tensor([f.weights for f in same], dtype=torch.float64, device=device).T, centre, scale
+        return torch.tensor([f.weights for f in same], dtype=torch.float64, device=device).T, centre, scale, rate
     entries = [feature.entry for feature in same]
     neighbours = entries == list(range(entries[0], entries[0] + len(entries)))
     index = slice(entries[0], entries[-1] + 1) if neighbours else torch.tensor(entries, device=device)
-    return index, centre, scale
+    return index, centre, scale, rate

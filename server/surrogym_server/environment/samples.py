@@ -50,6 +50,11 @@ def increments(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 
 def saturated(definition: EnvironmentDefinition, q_next: Tensor) -> Tensor:
     """Which samples (n,) ended at a declared bound. Their increments are cut, so they say little about the dynamics."""
+    return (limit_sides(definition, q_next) != 0).any(-1)
+
+
+def limit_sides(definition: EnvironmentDefinition, q_next: Tensor) -> Tensor:
+    """1 where a coordinate of q_next (n, C) is at its upper bound, -1 at its lower bound, else 0: (n, C)."""
     low, high = definition.bounds
     slack = 1e-9 * torch.where(torch.isfinite(high - low), high - low, 1.0)
-    return ((q_next <= low + slack) | (q_next >= high - slack)).any(-1)
+    return (q_next >= high - slack).to(q_next.dtype) - (q_next <= low + slack).to(q_next.dtype)

@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Protocol
 
 import numpy as np
 import scipy  # its parts are loaded on first use: a server that fits nothing starts without them
@@ -116,7 +117,17 @@ def noisy_explanation(posterior: Posterior, options: FitOptions) -> float:
     return float(np.exp(theta[-1])) if value <= own else posterior.hyper.noise_variance
 
 
-def _minimum(objective: _Objective, start: Array) -> tuple[float, Array]:
+class Objective(Protocol):
+    """A cost with its gradient, within bounds."""
+
+    options: FitOptions
+    lower: Array
+    upper: Array
+
+    def __call__(self, theta: Array) -> tuple[float, Array]: ...
+
+
+def _minimum(objective: Objective, start: Array) -> tuple[float, Array]:
     found = scipy.optimize.minimize(
         objective,
         np.clip(start, objective.lower, objective.upper),
@@ -149,6 +160,17 @@ def _starts(default: Array, warm: Array | None, points: int) -> Sequence[Array]:
     return (warm,) if points > MANY_POINTS and points % 4 else (warm, default)
 
 
+@dataclass(frozen=True)
+class Evaluated:
+    """An objective at one theta."""
+
+    value: float
+    slopes: Array  # over theta
+    half: Array  # (P,) 1/2 (beta beta^T - K^-1), twice off the diagonal
+    weighted: Array  # (1, P), or (2, P) with a reflection: half times the squared exponential
+    weights: Array  # (n,) beta
+
+
 class _Objective:
     """Negative log evidence with priors, and its gradient.
 
@@ -160,7 +182,7 @@ class _Objective:
     def __init__(self, x: Tensor, y: Tensor, options: FitOptions, reflection: Reflection | None) -> None:
         self.options, self.reflection = options, reflection
         n, d = x.shape
-        self.n, self.d, self.y = n, d, y.numpy()
+        self.n, self.d, self.x, self.y = n, d, x.numpy(), y.numpy()
         self.rows, self.columns = np.tril_indices(n)
         self.places = self.rows * n + self.columns  # of the pairs in a matrix by rows
         self.twice = np.where(self.rows == self.columns, 1.0, 2.0)  # how often a pair occurs in a symmetric matrix
@@ -210,6 +232,11 @@ class _Objective:
         return Hyperparameters(torch.from_numpy(lengthscale), signal, linear, quadratic, noise, self.reflection)
 
     def __call__(self, theta: Array) -> tuple[float, Array]:
+        found = self.evaluated(theta)
+        return (1e10, np.zeros_like(theta)) if found is None else (found.value, found.slopes)
+
+    def evaluated(self, theta: Array) -> Evaluated | None:
+        """Value and gradient at theta. None if float64 can't factor K: a very large cost then stops the line search."""
         lengthscale, signal, linear, quadratic, noise = self._values(theta)
         precision = lengthscale**-2
         smooth = (-0.5 * precision) @ self.squared
@@ -223,8 +250,8 @@ class _Objective:
         matrix = np.zeros((self.n, self.n))
         matrix.ravel()[self.places] = k
         matrix.flat[:: self.n + 1] += noise
-        if (solved := self._solve(matrix)) is None:  # float64 can't factor it: a very large cost stops the line search
-            return 1e10, np.zeros_like(theta)
+        if (solved := self._solve(matrix)) is None:
+            return None
         inverse, weights, log_root = solved
         product = weights.take(self.rows) * weights.take(self.columns)
         half = 0.5 * self.twice * (product - inverse.ravel().take(self.places))
@@ -235,7 +262,18 @@ class _Objective:
         trace = 0.5 * (weights @ weights - inverse.trace())
         z = (theta - self.prior[:, 0]) / self.prior[:, 1]
         value = 0.5 * (self.y @ weights + z @ z) + log_root + self.constant
-        return float(value), z / self.prior[:, 1] - np.concatenate([*slopes, [noise * trace]])
+        gradient = z / self.prior[:, 1] - np.concatenate([*slopes, [noise * trace]])
+        return Evaluated(float(value), gradient, half, weighted, weights)
+
+    def over_inputs(self, theta: Array, found: Evaluated) -> Array:
+        """Gradient of the value over the inputs x, (n, d). Only without a reflection and a quadratic part."""
+        lengthscale, _, linear, _, _ = self._values(theta)
+        smooth, line = np.zeros((self.n, self.n)), np.zeros((self.n, self.n))
+        smooth.ravel()[self.places], line.ravel()[self.places] = found.weighted[0], found.half
+        smooth, line = smooth + smooth.T, line + line.T  # each pair counts for both of its points
+        pulled = (smooth.sum(1)[:, None] * self.x - smooth @ self.x) * lengthscale**-2
+        slopes: Array = pulled - linear * (line @ self.x)
+        return slopes
 
     def _values(self, theta: Array) -> tuple[Array, float, float, float, float]:
         """Length scales, and the variances of the three parts and of the noise."""

@@ -17,20 +17,21 @@ from surrogym_shared.compiled.jit import compiled
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-ROWS, WEIGHTS = range(2)  # function, entry, centre and scale of each feature; weights of the coordinates
-CODES = {"affine": 0, "cos": 1, "sin": 2, "turned_cos": 3, "turned_sin": 4, "wrapped": 5, "equal": 6, "observed": 7}
-AFFINE, COS, SIN, TURNED_COS, TURNED_SIN, WRAPPED, EQUAL, OBSERVED = CODES.values()
+ROWS, WEIGHTS = range(2)  # function, entry, centre, scale and rate of each feature; weights of the coordinates
+FUNCTIONS = ("affine", "cos", "sin", "turned_cos", "turned_sin", "wrapped", "equal", "observed", "grown")
+CODES = {function: code for code, function in enumerate(FUNCTIONS)}
+AFFINE, COS, SIN, TURNED_COS, TURNED_SIN, WRAPPED, EQUAL, OBSERVED, GROWN = CODES.values()
 UNIT_ANGLE = math.sqrt(3) / math.pi
 
 
 def add_features(tables: TablesBuilder, definition: EnvironmentDefinition, encoder: Encoder) -> int:
     """Add an encoder's features, and return their place. Features of the lead read it behind coordinates and action."""
     size = len(definition.coordinates)
-    rows, weights = np.zeros((len(encoder.columns), 4)), np.zeros((len(encoder.columns), size))
+    rows, weights = np.zeros((len(encoder.columns), 5)), np.zeros((len(encoder.columns), size))
     for feature, column in encoder.columns.items():
         beyond = size + definition.action.size if feature.function == "lead" else 0
         code = CODES["affine" if feature.function == "lead" else feature.function]
-        rows[column] = code, beyond + feature.entry, feature.centre, feature.scale
+        rows[column] = code, beyond + feature.entry, feature.centre, feature.scale, feature.rate
         if feature.weights:
             weights[column] = feature.weights
     return tables.add(rows, weights)
@@ -51,6 +52,10 @@ def encode(
         if code == AFFINE:
             for b in range(lanes):
                 x[f, b] = (raw[entry, b] - centre) / scale
+        elif code == GROWN:
+            rate = rows[f, 4]
+            for b in range(lanes):
+                x[f, b] = math.expm1(rate * ((raw[entry, b] - centre) / scale)) / rate
         elif code == COS:
             sine_and_cosine(raw[entry], other, x[f])
         elif code == SIN:

@@ -162,9 +162,11 @@ class GaussianProcessModel(
             return None
         rows = self._learns(column, samples.q_next).nonzero()[:, 0]
         steps = PredictedSteps(samples.q[rows], samples.u[rows], samples.q_next[rows])
-        x, hyper, variance = process_inputs(self.definition, output, steps), output.posterior.hyper, output.scale**2
+        x, hyper = process_inputs(self.definition, output, steps), output.posterior.hyper
+        scale = output.scale * torch.as_tensor(output.amplitude(x), dtype=x.dtype).expand(len(x))
         targets = increments(self.definition, samples)[rows, column] - output.centre
-        return AtSamples(rows, targets, variance * covariance(hyper, x, x), variance * hyper.noise_variance)
+        function = scale[:, None] * covariance(hyper, x, x) * scale
+        return AtSamples(rows, targets, function, float(scale.square().mean()) * hyper.noise_variance)
 
     def outlook(self, candidates: Points, reference: Points, assumed: Points) -> tuple[OutputOutlook | None, ...]:
         everywhere = Points.joined([candidates, reference, assumed])

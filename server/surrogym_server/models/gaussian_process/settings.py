@@ -15,6 +15,7 @@ class Settings:
         kernel: of every process; ``composite`` adds a linear part, and for the reward a quadratic one.
         reward_jumps: whether the reward may jump at the edge of a learned region.
         symmetry: ``auto`` also compares feature maps that are their own mirror image, ``none`` does not.
+        rates: whether transitions may change the faster the further along an input; see ``gp.growth``.
         reward_peaks: whether the reward may be learned by its logarithm, if it is nearly zero almost everywhere.
     """
 
@@ -22,11 +23,12 @@ class Settings:
     reward_jumps: bool = True
     symmetry: str = "auto"
     reward_peaks: bool = True
+    rates: bool = True
 
     def __post_init__(self) -> None:
         for name, known in CHOICES.items():
             if (given := getattr(self, name)) not in known:
                 raise ValueError(f"expected {name} to be one of {', '.join(known)}, got {given!r}")
-        for name in ("reward_jumps", "reward_peaks"):
+        for name in ("reward_jumps", "reward_peaks", "rates"):
             if not isinstance(given := getattr(self, name), bool):
                 raise ValueError(f"expected {name} to be true or false, got {given!r}")

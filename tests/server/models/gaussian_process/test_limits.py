@@ -1,4 +1,4 @@
-"""Samples that ended at a limit of another coordinate are learned from where they help."""
+"""Samples that ended at a limit are learned from where they help: those of another coordinate, and those of its own."""
 
 from __future__ import annotations
 
@@ -104,3 +104,53 @@ def test_what_was_learned_from_survives_storage(bent):
     assert [o.past_limits for o in loaded.transitions] == [o.past_limits for o in model.transitions]
     candidate = torch.tensor([[0.0, VALVE]], dtype=torch.float64)
     assert bool(loaded._learns(0, candidate)[0]) == model.transitions[0].past_limits
+
+
+def kettle(count: int, seed: int) -> Samples:
+    """The pressure hardly rises below 0.2, and reaches the valve at once above it; the level stays."""
+    p = 2 * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1
+    q, u = p[:, :2], p[:, 2:]
+    pressure = (q[:, 1] + 0.1 * u[:, 0] + 4 * (20 * (q[:, 1] - 0.3)).sigmoid()).clamp_max(VALVE)
+    reward = torch.zeros(count, dtype=torch.float64)
+    return Samples(q, u, torch.stack([q[:, 0], pressure], 1), reward, reward.bool())
+
+
+def test_predictions_reach_a_limit_wherever_a_sample_ended_at_it():
+    samples = kettle(30, 0)
+    at_valve = samples.q_next[:, 1] >= VALVE
+    predicted = gaussian_processes(RELIEVED, samples).transition(samples.q, samples.u).q_next[:, 1]
+    assert 5 <= int(at_valve.sum()) <= 25
+    assert float((VALVE - predicted[at_valve]).max()) < 0.01
+
+
+def test_a_process_with_inequalities_foretells_where_the_limit_is_reached(monkeypatch):
+    samples, test = kettle(30, 0), kettle(500, 1)
+
+    def short_and_error() -> tuple[float, float]:
+        """Share of the steps to the valve that are predicted to end below it, and the error of the other steps."""
+        after = gaussian_processes(RELIEVED, samples).transition(test.q, test.u).q_next[:, 1]
+        valve = test.q_next[:, 1] >= VALVE
+        return float((after[valve] < VALVE - 0.05).double().mean()), float((after - test.q_next[:, 1])[~valve].std())
+
+    short, error = short_and_error()
+    monkeypatch.setattr(learning, "held", lambda _, output, *others: output)  # noqa: ARG005
+    short_without, error_without = short_and_error()
+    assert short < 0.05 < 0.1 < short_without
+    assert error < error_without
+
+
+def test_samples_at_a_limit_that_the_process_foretells_change_nothing(monkeypatch):
+    samples = steps(30, False, 5)  # the pressure is linear below the valve
+    assert bool((samples.q_next[:, 1] >= VALVE).any())
+    model = gaussian_processes(RELIEVED, samples)
+    monkeypatch.setattr(learning, "held", lambda _, output, *others: output)  # noqa: ARG005
+    assert to_bytes(gaussian_processes(RELIEVED, samples)) == to_bytes(model)
+
+
+def test_a_lower_limit_counts_like_an_upper_one():
+    samples = kettle(30, 0)
+    mirrored = Samples(-samples.q, -samples.u, -samples.q_next, samples.reward, samples.terminated)
+    lower = tank(pressure=Bounds(low=-VALVE))
+    above = gaussian_processes(RELIEVED, samples).transition(samples.q, samples.u).q_next
+    below = gaussian_processes(lower, mirrored).transition(mirrored.q, mirrored.u).q_next
+    torch.testing.assert_close(below, -above, rtol=1e-4, atol=1e-4)

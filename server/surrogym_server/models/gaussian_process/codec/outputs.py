@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
-from surrogym_server.environment.features import Encoding, FeatureMap, Parity, State, encode
+from surrogym_server.environment.features import Encoding, FeatureMap, Parity, State, encode, features
 from surrogym_server.errors import InvalidInput
 from surrogym_server.gp import Hyperparameters, LeftOut, Posterior, Sparse
 from surrogym_server.models.gaussian_process.feature_maps import reflection
@@ -41,6 +41,7 @@ def require_output(definition: EnvironmentDefinition, output: OutputModel) -> No
     """Check the shapes of an output's arrays, and that its numbers are those of a process. Raises ``InvalidInput``."""
     _require_drift(definition, output)
     _require_warp(output)
+    _require_rates(definition, output)
     _require_shapes(definition, output)
     _require_numbers(output)
 
@@ -79,7 +80,7 @@ def read_output(
     malformed."""
     feature_map = _feature_map(entry["feature_map"])
     shorter = (None, *range(max(definition.ages)))
-    if replace(feature_map, drift=(), history=None) not in KNOWN_MAPS or feature_map.history not in shorter:
+    if replace(feature_map, drift=(), history=None, rates=()) not in KNOWN_MAPS or feature_map.history not in shorter:
         raise ValueError(f"unknown feature map {feature_map}")
     mirror = reflection(definition, feature_map)
     if feature_map.parity and mirror is None:
@@ -120,7 +121,7 @@ def _sparse(entry: dict[str, Any] | None) -> Sparse | None:
 
 def _feature_map(entry: dict[str, Any]) -> FeatureMap:
     drift = tuple(tuple(float(w) for w in row) for row in entry.get("drift", ()))
-    return FeatureMap(**{**entry, "drift": drift})
+    return FeatureMap(**{**entry, "drift": drift, "rates": tuple(float(rate) for rate in entry.get("rates", ()))})
 
 
 def _require_drift(definition: EnvironmentDefinition, output: OutputModel) -> None:
@@ -137,6 +138,22 @@ def _require_warp(output: OutputModel) -> None:
         return
     if output.name != REWARD or output.posterior is None or not output.warp.finite:
         raise InvalidInput(f"output {output.name!r}: expected a warp of a learned reward, finite, got {output.warp}")
+
+
+def _require_rates(definition: EnvironmentDefinition, output: OutputModel) -> None:
+    """Check that only a transition has rates, one for each feature, and only features that can grow have one."""
+    if not (rates := output.feature_map.rates):
+        return
+    plain = replace(output.feature_map, rates=())
+    may = [feature.function == "affine" for feature in features(definition, plain)]
+    if (
+        output.name == REWARD
+        or plain.lead
+        or plain.parity
+        or len(rates) != len(may)
+        or not all(math.isfinite(rate) and (able or rate == 0) for rate, able in zip(rates, may, strict=True))
+    ):
+        raise InvalidInput(f"output {output.name!r}: expected finite rates of a transition's features, got {rates}")
 
 
 def _require_numbers(output: OutputModel) -> None:

@@ -6,13 +6,14 @@ import torch
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import encode, leading
-from surrogym_server.environment.samples import Samples, increments, saturated
+from surrogym_server.environment.samples import Samples, increments, limit_sides, saturated
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.gaussian_process.censoring import saturates, stopped
 from surrogym_server.models.gaussian_process.feature_maps import candidates
 from surrogym_server.models.gaussian_process.learning.angle_prediction import learn_drift
-from surrogym_server.models.gaussian_process.learning.limits import past_limits
+from surrogym_server.models.gaussian_process.learning.limits import held, past_limits
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
+from surrogym_server.models.gaussian_process.learning.rates import output_with_rates
 from surrogym_server.models.gaussian_process.learning.region import learn_termination
 from surrogym_server.models.gaussian_process.learning.reward import learn_reward
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
@@ -49,6 +50,7 @@ def _transitions(learner: OutputLearner, samples: Samples) -> tuple[OutputModel,
         )
     keep = ~saturated(definition, samples.q_next)
     keep = keep if int(keep.sum()) >= MIN_POINTS else everything
+    sides = limit_sides(definition, samples.q_next)
     lead, drift = leading(definition), learn_drift(definition, samples)
     outputs = []
     for column, index in enumerate(definition.moving):
@@ -56,7 +58,9 @@ def _transitions(learner: OutputLearner, samples: Samples) -> tuple[OutputModel,
         inputs = {m: encode(definition, m, samples.q, samples.u, samples.q_next[:, lead]) for m in maps}
         keep_lead = ~saturates(definition, index, samples.q_next) | ~keep.any()
         name = definition.coordinates[index].name
-        output = learner.output(name, change[:, column], inputs, keep, keep_lead | keep)
+        output = output_with_rates(learner, name, change[:, column], inputs, keep, keep_lead | keep)
         more = ~stopped(definition, index, samples.q_next)
-        outputs.append(past_limits(learner, output, change[:, column], inputs, keep, more))
+        output = past_limits(learner, output, change[:, column], inputs, keep, more)
+        used = more if output.past_limits else keep
+        outputs.append(held(learner, output, change[:, column], inputs, used, sides[:, index]))
     return tuple(outputs)

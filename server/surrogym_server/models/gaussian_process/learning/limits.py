@@ -1,8 +1,16 @@
-"""Decision whether an output learns from samples that ended at a limit of another coordinate.
+"""What outputs learn from samples that ended at a limit.
 
-Such a limit may change the rest of the step or not: a wall stops the speed, but a relief valve leaves the concentration
-as smooth as before. Without these samples the process extrapolates where the limit is reached. So both are learned, and
-the one with the smaller error over all of these samples is used, each predicted from the others.
+At the limit of another coordinate: such a limit may change the rest of the step or not. A wall stops the speed, but a
+relief valve leaves the concentration as smooth as before. Without these samples the process extrapolates where the
+limit is reached. So both are learned, and the one with the smaller error over all of these samples is used, each
+predicted from the others.
+
+At the output's own limit: without the limit the step would have gone at least as far, so the sample is an inequality.
+It says nothing where the process predicts a step beyond the limit. Where the process predicts less, the sample becomes
+an observation of the limit itself. Those that become observations are the active set of the inequalities: the most
+probable function that satisfies all of them meets these with equality. The set is found greedily, and may hold a few
+that are not needed. References: S. Da Veiga, A. Marrel (2012), Annales de la Faculte des Sciences de Toulouse 21(3);
+H. Maatouk, X. Bay (2017), Mathematical Geosciences 49(5).
 """
 
 from __future__ import annotations
@@ -10,13 +18,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+import torch
 from torch import Tensor
 
 from surrogym_server.environment.features import FeatureMap
+from surrogym_server.gp import Joint, Posterior
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
+from surrogym_server.models.gaussian_process.learning.rates import inputs_of, output_with_rates
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
 WIDER = " past limits"  # suffix of an output's name, for its hyperparameters
+HELD = " held"  # the same
+SHORT = 0.01  # of the targets' deviation: a prediction that falls less short of a limit satisfies the inequality
+ROUNDS = 3  # of fits, each with the inequalities that the last process violates
+MOST = 200  # samples that become observations in one round
 
 
 def past_limits(
@@ -33,14 +48,61 @@ def past_limits(
         return output
     plain = {m: x for m, x in inputs.items() if not m.lead}
     every = keep | more
-    wider = learner.output(output.name + WIDER, target, plain, every, every)
+    wider = output_with_rates(learner, output.name + WIDER, target, plain, every, every)
     if wider.posterior is None:
         return output
     wider = replace(wider, name=output.name, past_limits=True)
     if output.posterior is None:
         return wider
-    wide = _error(wider, target, inputs[wider.feature_map], every, every)
-    return wider if wide < _error(output, target, inputs[output.feature_map], keep, every) else output
+    wide = _error(wider, target, inputs_of(wider, inputs), every, every)
+    return wider if wide < _error(output, target, inputs_of(output, inputs), keep, every) else output
+
+
+def held(
+    learner: OutputLearner,
+    output: OutputModel,
+    target: Tensor,
+    inputs: Mapping[FeatureMap, Tensor],
+    keep: Tensor,
+    side: Tensor,
+) -> OutputModel:
+    """The output, learned from samples ``keep`` (n,) with targets (n,), such that it satisfies the inequalities of the
+    others.
+
+    ``side`` (n,) is 1 for a sample that ended at the output's own upper limit, -1 at the lower, else 0.
+    """
+    if output.feature_map.lead:
+        return output
+    name, past, plain = output.name, output.past_limits, {m: x for m, x in inputs.items() if not m.lead}
+    for _ in range(ROUNDS):
+        rows = ((side != 0) & ~keep).nonzero()[:, 0]
+        if output.posterior is None or not len(rows):
+            break
+        x = inputs_of(output, inputs)[rows]
+        y = output.standardised(target[rows], x)
+        violated = rows[_violated(output.posterior, x, y, side[rows])]
+        if not len(violated):
+            break
+        keep = keep.index_fill(0, violated, value=True)
+        found = output_with_rates(learner, name + HELD, target, plain, keep, keep)
+        output = replace(found, name=name, past_limits=past)
+    return output
+
+
+def _violated(posterior: Posterior, x: Tensor, y: Tensor, side: Tensor) -> list[int]:
+    """Numbers of the points at x (k, d) that must be observed at y (k,), so that the process does not fall short of y
+    at any, on the given side (k,). The one that falls the shortest is observed first."""
+    joint, mean = Joint.of(posterior, x), posterior.mean(x)
+    chosen: list[int] = []
+    while len(chosen) < min(MOST, len(y)):
+        short = (side * (y - mean)).index_fill(0, torch.tensor(chosen, dtype=torch.long), 0.0)
+        worst = int(short.argmax())
+        if short[worst] <= SHORT:
+            break
+        joint, spread = joint.observe(worst), (joint.variance[worst] + joint.noise).sqrt()
+        mean = mean + joint.observed[-1] * (y - mean)[worst] / spread
+        chosen.append(worst)
+    return chosen
 
 
 def _error(output: OutputModel, target: Tensor, x: Tensor, learned: Tensor, every: Tensor) -> float:

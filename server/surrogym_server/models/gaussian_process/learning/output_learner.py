@@ -67,7 +67,7 @@ class OutputLearner:
         more = bool(best.lead) and bool((keep_lead & ~keep).any())
         used = keep_lead if more else keep
         if int(used.sum()) > subsets.FEW:
-            posterior = self._refined(name, best, inputs[best][used], y[used], chosen.theta)
+            posterior = self.refined(name, best, inputs[best][used], y[used], chosen.theta)
         elif more:
             posterior = self._fit(name, best, inputs[best][used], y[used], "|all").posterior
         else:
@@ -80,18 +80,18 @@ class OutputLearner:
         were alike."""
         key, rows = f"{name}|{feature_map}{also}", spread(len(y), subsets.FEW)
         mirror = reflection(self.definition, feature_map)
-        fitted = fit(x[rows], y[rows], self._options(name), self.warm.get(key), mirror)
+        fitted = fit(x[rows], y[rows], self.options(name), self.warm.get(key), mirror)
         self.thetas[key] = fitted.theta
         return replace(fitted, score=fitted.score * len(y) / len(rows))
 
-    def _refined(
+    def refined(
         self, name: str, feature_map: FeatureMap, x: Tensor, y: Tensor, theta: NDArray[np.float64]
     ) -> Posterior:
         """The process of all points x (n, d), y (n,), with the hyperparameters of a subset."""
         mirror = reflection(self.definition, feature_map)
-        return condition_many(refine(x, y, self._options(name), theta, mirror), x, y)
+        return condition_many(refine(x, y, self.options(name), theta, mirror), x, y)
 
-    def _options(self, name: str) -> FitOptions:
+    def options(self, name: str) -> FitOptions:
         """Dynamics tend to be near linear, and costs to be quadratic."""
         options = FitOptions(quadratic=name in (REWARD, PEAK))
         if self.settings.kernel == "squared_exponential":

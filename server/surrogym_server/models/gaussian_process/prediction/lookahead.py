@@ -39,7 +39,7 @@ class ProcessOutlook(OutputOutlook):
     learns: Tensor  # (m,) bool
     shared: Tensor  # (r, m) covariance of reference and candidates, standardised; cached
     scale: float
-    slope: Tensor | None = None  # (m + r,) of a warped output over its targets
+    slope: Tensor | None = None  # (m + r,) of the output over its process, if it is not 1
 
     @classmethod
     def of(cls, output: OutputModel, x: Tensor, learns: Tensor, spans: tuple[int, int]) -> ProcessOutlook:
@@ -60,8 +60,8 @@ class ProcessOutlook(OutputOutlook):
     def reduction(self, weights: Tensor) -> Tensor:
         """sum_r w_r k(x_r, x)^2 / (k(x, x) + sigma_n^2), Cohn (NIPS 1993), in closed form for a Gaussian process.
 
-        For a warped output each reference point is weighted by its slope, as a share of the steepest. Only the order of
-        the values counts.
+        With a slope each reference point is weighted by it, as a share of the steepest. Only the order of the values
+        counts.
         """
         if self.slope is not None:
             steep = self.slope[len(self.learns) :]
@@ -126,8 +126,10 @@ def process_inputs(definition: EnvironmentDefinition, output: OutputModel, steps
 
 
 def slope_at(output: OutputModel, x: Tensor) -> Tensor | None:
-    """Slope of a warped output over its targets at inputs x (m, d), (m,); None without a warp."""
-    return None if output.warp is None else output.warp.slope(*output.target(x))
+    """Slope of an output over its process, in scales, at inputs x (m, d), (m,). None if it is 1 everywhere."""
+    if output.warp is not None:
+        return output.warp.slope(*output.target(x))
+    return torch.as_tensor(output.amplitude(x)) if output.feature_map.rates else None
 
 
 def as_if_answered(output: OutputModel, x: Tensor) -> OutputModel:

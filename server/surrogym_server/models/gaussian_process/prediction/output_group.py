@@ -25,6 +25,16 @@ class Drawn:
 
 
 @dataclass(frozen=True)
+class Grown:
+    """An output whose amplitude grows along its inputs."""
+
+    column: int
+    inputs: Tensor  # columns of x
+    rates: Tensor  # of these
+    centre: float
+
+
+@dataclass(frozen=True)
 class OutputGroup:
     """Some outputs of a model. It fills their columns of O, and leaves the others 0."""
 
@@ -33,9 +43,19 @@ class OutputGroup:
     noise_deviation: Tensor  # (O,) learned noise, in each output's unit
     drawn: tuple[Drawn, ...]  # by output, except constant ones, which have no function to draw
     end: int  # end of its draws' weights
+    grown: tuple[Grown, ...] = ()
 
     @classmethod
-    def of(cls, encoder: Encoder, outputs: Sequence[Output], columns: int, *, lead: bool, begin: int) -> OutputGroup:
+    def of(
+        cls,
+        encoder: Encoder,
+        outputs: Sequence[Output],
+        columns: int,
+        *,
+        lead: bool,
+        begin: int,
+        grown: tuple[Grown, ...] = (),
+    ) -> OutputGroup:
         """Compile outputs for ``columns`` of them. Their draws' weights start at ``begin``."""
         device = encoder.definition.device
         noise, drawn = torch.zeros(columns, dtype=torch.float64, device=device), []
@@ -46,7 +66,8 @@ class OutputGroup:
             pathwise = Pathwise(output.posterior)
             span = slice(begin, begin := begin + pathwise.size)
             drawn.append(Drawn(output.column, span, torch.tensor(output.inputs, device=device), output.scale, pathwise))
-        return cls(encoder, Serving.of(outputs, columns, encoder.width(lead), device), noise, tuple(drawn), begin)
+        serving = Serving.of(outputs, columns, encoder.width(lead), device)
+        return cls(encoder, serving, noise, tuple(drawn), begin, grown)
 
     def predict(
         self, x: Tensor, wanted: tuple[int, ...], kick: Tensor | None, process: Tensor | None, paths: Tensor | None
@@ -66,6 +87,11 @@ class OutputGroup:
             value = torch.addcmul(value, self.noise_deviation, process)
         if paths is not None:
             value = value + self._residuals(x, paths)
+        for one in self.grown:
+            amplitude = (1 + x[:, one.inputs] * one.rates).prod(-1)
+            value[:, one.column] = one.centre + amplitude * (value[:, one.column] - one.centre)
+            if wanted:
+                spread[:, one.column] *= amplitude
         return value, spread
 
     def _residuals(self, x: Tensor, paths: Tensor) -> Tensor:

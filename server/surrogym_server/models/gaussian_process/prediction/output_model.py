@@ -5,20 +5,22 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from surrogym_server.environment.features import FeatureMap
-from surrogym_server.gp import NOISE_FLOOR, FitOptions, Posterior, noisy_explanation
+from surrogym_server.gp import NOISE_FLOOR, FitOptions, Posterior, amplitude, noisy_explanation
 from surrogym_server.models.abilities import LeaveOneOutErrors
 from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE, Warp
 
 
 @dataclass(frozen=True)
 class OutputModel:
-    """The process of one output, and the scaling of its targets: y = (target - centre) / scale.
+    """The process of one output, and the scaling of its targets: y = (target - centre) / (scale * amplitude).
 
-    ``posterior`` is None for an output that never varied; its mean is ``centre`` and its deviation 0. With a ``warp``
-    the targets are logarithms, but means, deviations and errors are still in the output's unit.
+    The amplitude is 1, unless the feature map has rates. ``posterior`` is None for an output that never varied; its
+    mean is ``centre`` and its deviation 0. With a ``warp`` the targets are logarithms, but means, deviations and errors
+    are still in the output's unit.
     """
 
     name: str
@@ -35,7 +37,7 @@ class OutputModel:
         """Posterior mean at features x (m, d), in the output's unit, (m,)."""
         if self.posterior is None:
             return x.new_full(x.shape[:-1], self.centre)
-        mean = self.centre + self.scale * self.posterior.mean(x)
+        mean = self.centre + self.scale * self.amplitude(x) * self.posterior.mean(x)
         return mean if self.warp is None else self.warp.value(mean)
 
     def mean_and_deviation(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -47,7 +49,17 @@ class OutputModel:
         if self.posterior is None:
             return x.new_full(x.shape[:-1], self.centre), x.new_zeros(x.shape[:-1])
         mean, variance = self.posterior.mean_and_variance(x)
-        return self.centre + self.scale * mean, self.scale * variance.sqrt()
+        scale = self.scale * self.amplitude(x)
+        return self.centre + scale * mean, scale * variance.sqrt()
+
+    def amplitude(self, x: Tensor) -> Tensor | float:
+        """Amplitude at inputs x (m, d), (m,); 1 without rates."""
+        rates = self.feature_map.rates
+        return amplitude(x, torch.tensor(rates, dtype=x.dtype, device=x.device)) if rates else 1.0
+
+    def standardised(self, target: Tensor, x: Tensor) -> Tensor:
+        """The process' y of targets (m,) at its inputs x (m, d), (m,)."""
+        return (target - self.centre) / (self.scale * self.amplitude(x))
 
     @property
     def size(self) -> float:
@@ -62,7 +74,7 @@ class OutputModel:
     @property
     def noise_deviation(self) -> float:
         """Deviation of the learned noise, in the output's unit; that of a warped output at a value as large as its
-        size."""
+        size, and with rates that at the points, as a root mean square."""
         return 0.0 if self.posterior is None else self._of_noise(self.posterior.hyper.noise_variance)
 
     @property
@@ -75,7 +87,7 @@ class OutputModel:
         return max(self.noise_deviation, self._of_noise(noisy_explanation(self.posterior, options)))
 
     def _of_noise(self, variance: float) -> float:
-        noise = self.scale * math.sqrt(variance)
+        noise = self.scale * self._typical_amplitude * math.sqrt(variance)
         return noise if self.warp is None else noise * self.warp.size
 
     def leave_one_out(self) -> LeaveOneOutErrors:
@@ -84,9 +96,27 @@ class OutputModel:
             return LeaveOneOutErrors(0.0, 1.0, 1.0)
         found = self.posterior.left_out
         error = self.scale * found.error
+        if self.feature_map.rates:
+            error = self._left_out_grown(found.error)
         if self.warp is not None:
             error = self._left_out_warped(self.warp, error)
         return LeaveOneOutErrors(error, found.within_one, found.within_two)
+
+    @property
+    def _typical_amplitude(self) -> float:
+        """Root mean square of the amplitude at the points."""
+        if self.posterior is None or not self.feature_map.rates:
+            return 1.0
+        return float(torch.as_tensor(self.amplitude(self.posterior.x)).square().mean().sqrt())
+
+    def _left_out_grown(self, error: float) -> float:
+        """Root mean square error of targets, given that of the process' points."""
+        assert self.posterior is not None
+        if self.posterior.sparse is not None:
+            return self.scale * self._typical_amplitude * error
+        mean, _ = self.posterior.leave_one_out()
+        off = self.scale * self.amplitude(self.posterior.x) * (mean - self.posterior.y)
+        return float(off.square().mean().sqrt())
 
     def _left_out_warped(self, warp: Warp, error: float) -> float:
         """Root mean square error of predicted rewards, given that of their targets."""

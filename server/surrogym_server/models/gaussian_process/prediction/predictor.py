@@ -18,7 +18,7 @@ from surrogym_server.environment.features import Encoder, leading
 from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.environment.step_rules import clip, moved
 from surrogym_server.gp import Output
-from surrogym_server.models.gaussian_process.prediction.output_group import OutputGroup
+from surrogym_server.models.gaussian_process.prediction.output_group import Grown, OutputGroup
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.regions import Jump, jumped
 from surrogym_server.models.port import Transition
@@ -157,7 +157,18 @@ class Predictor:
     def _group(self, encoder: Encoder, outputs: Sequence[tuple[int, OutputModel]], begin: int) -> OutputGroup:
         served = [Output(c, o.posterior, encoder.inputs(o.feature_map), o.centre, o.scale) for c, o in outputs]
         lead = any(o.feature_map.lead for _, o in outputs)
-        return OutputGroup.of(encoder, served, self._reward_column + 1, lead=lead, begin=begin)
+        like = torch.zeros(0, dtype=torch.float64, device=self.definition.device)
+        grown = tuple(
+            Grown(
+                column,
+                torch.tensor(encoder.inputs(output.feature_map), device=like.device),
+                like.new_tensor(output.feature_map.rates),
+                output.centre,
+            )
+            for column, output in outputs
+            if output.feature_map.rates
+        )
+        return OutputGroup.of(encoder, served, self._reward_column + 1, lead=lead, begin=begin, grown=grown)
 
     @cached_property
     def _inverse(self) -> ObservationInverse | None:

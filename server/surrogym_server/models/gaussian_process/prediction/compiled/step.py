@@ -112,8 +112,10 @@ def _add_outputs(tables: TablesBuilder, predictor: Predictor) -> tuple[int, int]
         rows[column] = 0.0, output.scale * math.sqrt(posterior.hyper.noise_variance), stage
         inputs = group.encoder.inputs(output.feature_map)
         place = add_process(tables, posterior, inputs, output.centre, output.scale)
-        processes.append((stage, column, number, place, begins[column]))
-    return tables.add(rows), tables.add(np.array(processes).reshape(-1, 5))
+        rates = output.feature_map.rates
+        grown = tables.add([inputs, rates], [output.centre]) if rates else NONE
+        processes.append((stage, column, number, place, begins[column], grown))
+    return tables.add(rows), tables.add(np.array(processes).reshape(-1, 6))
 
 
 @inlined
@@ -141,6 +143,18 @@ def _encode_stage(
             for b in range(lanes):
                 raw[c, b] = arrived[c, b]
     encode(numbers, places, features, observe, raw, size, x, begin, end)
+
+
+@inlined
+def _grow(numbers: Floats, places: Ints, at: int, x: Floats, mean: Floats, spread: Floats) -> None:
+    """Multiply what an output has beyond its centre, and its deviation, (B,) each, by its amplitude at x (d, B)."""
+    rates, centre = matrix(numbers, places, at), matrix(numbers, places, at + 1)[0, 0]
+    for b in range(len(mean)):
+        amplitude = 1.0
+        for j in range(rates.shape[1]):
+            amplitude *= 1.0 + rates[1, j] * x[int(rates[0, j]), b]
+        mean[b] = centre + amplitude * (mean[b] - centre)
+        spread[b] *= amplitude
 
 
 @inlined
@@ -178,6 +192,8 @@ def _predict_stage(
         if number < last and len(process):
             for b in range(x.shape[1]):
                 mean[column, b] += columns[column, NOISE] * process[b, number]
+        if processes[p, 5] != NONE:
+            _grow(numbers, places, int(processes[p, 5]), x, mean[column], spread[number])
 
 
 @inlined

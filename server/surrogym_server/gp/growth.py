@@ -1,0 +1,115 @@
+"""Functions that change the faster the further along an input, such as rates of reaction over the temperature.
+
+    F(z) = a(z) G(w(z)),  w_j(z) = (e^(g_j z_j) - 1) / g_j,  a(z) = prod_j e^(g_j z_j) = prod_j (1 + g_j w_j(z))
+
+G is an ordinary process, and g (d,) are the rates: at g = 0, F is G. A stationary process has one length scale and one
+amplitude for all places, so a function that is steep in one place seems rough everywhere. F is as rough as its place.
+An exponential is the simplest such law, and near a temperature it is the law of Arrhenius.
+
+Since a is known once g is, fitting F to targets t at z is fitting G to y = t / a(z) at w(z), and
+
+    log p(t) = log p(y) - sum_i log a(z_i).
+
+The noise of F is that of G times a(z). References: P. Sampson, P. Guttorp (1992), JASA 87 (stationary after a
+deformation of the inputs); C. Paciorek, M. Schervish (2006), Environmetrics 17 (non-stationary covariances).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from surrogym_server.gp.fit import FitOptions, Fitted, _blas, _minimum, _Objective
+from surrogym_server.gp.posterior import condition
+
+PRIOR = 1.0  # deviation of a rate; inputs have deviation near 1
+STEEPEST = 2.0  # largest rate
+FLAT = 1e-3  # smaller rates are 0: they bend nothing
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Growing:
+    """Result of a fit with rates."""
+
+    fitted: Fitted  # of G; its score is that of F, and its theta ends with the rates
+    rates: tuple[float, ...]  # (d,)
+
+
+def bend(z: Tensor, rates: Tensor) -> Tensor:
+    """w(z) of inputs z (..., d) and rates (d,)."""
+    safe = torch.where(rates == 0, 1.0, rates)
+    return torch.where(rates == 0, z, torch.expm1(rates * z) / safe)
+
+
+def amplitude(w: Tensor, rates: Tensor) -> Tensor:
+    """a(z) of bent inputs w(z) (..., d) and rates (d,), (...)."""
+    grown: Tensor = (1 + w * rates).prod(-1)
+    return grown
+
+
+def fit_growing(z: Tensor, t: Tensor, may: Tensor, options: FitOptions, starts: Sequence[Array]) -> Growing:
+    """Fit F to inputs z (n, d) and targets t (n,), both standardised. Runs on the CPU. Raises ``NumericalFailure``.
+
+    Args:
+        may: (d,) bool, the inputs that may have a rate.
+        options: those of the fit without rates, without a quadratic part.
+        starts: thetas of fits without rates, or of earlier fits with rates.
+    """
+    objective = _GrowingObjective(z, t, may, options)
+    padded = [np.concatenate([start, np.zeros(objective.size - len(start))]) for start in starts]
+    with _blas().limit(limits=1):
+        value, theta = min((_minimum(objective, start) for start in padded), key=lambda pair: pair[0])
+    rates = torch.from_numpy(objective.rates(theta))
+    rates = torch.where(rates.abs() < FLAT, 0.0, rates)
+    w = bend(z, rates)
+    posterior = condition(objective.plain(theta)[0].hyper(theta[: objective.inner]), w, t / amplitude(w, rates))
+    return Growing(Fitted(posterior, -value, theta), tuple(rates.tolist()))
+
+
+class _GrowingObjective:
+    """Negative log evidence with priors of theta = [theta of G, rates of the inputs that may have one]."""
+
+    def __init__(self, z: Tensor, t: Tensor, may: Tensor, options: FitOptions) -> None:
+        if options.quadratic:
+            raise ValueError("expected options without a quadratic part")
+        self.options, self._z, self._t, self._may = options, z.numpy(), t.numpy(), may.numpy()
+        plain = _Objective(z, t, options, None)
+        self.inner, count = len(plain.default_start), int(self._may.sum())
+        self.size = self.inner + count
+        self.lower = np.concatenate([plain.lower, np.full(count, -STEEPEST)])
+        self.upper = np.concatenate([plain.upper, np.full(count, STEEPEST)])
+
+    def rates(self, theta: Array) -> Array:
+        """The rates (d,)."""
+        rates = np.zeros(self._z.shape[1])
+        rates[self._may] = theta[self.inner :]
+        return rates
+
+    def plain(self, theta: Array) -> tuple[_Objective, Array]:
+        """The objective of G given the rates, and the slopes of the bent inputs over their rates, (n, d)."""
+        rates, z = self.rates(theta), self._z
+        small = np.abs(rates) < FLAT
+        safe = np.where(small, 1.0, rates)
+        bent = np.where(small, z + 0.5 * rates * z**2, np.expm1(safe * z) / safe)
+        slope = np.where(small, 0.5 * z**2 + rates * z**3 / 3, (z * np.exp(safe * z) - bent) / safe)
+        y = self._t * np.exp(-(z @ rates))
+        return _Objective(torch.from_numpy(bent), torch.from_numpy(y), self.options, None), slope
+
+    def __call__(self, theta: Array) -> tuple[float, Array]:
+        objective, slope = self.plain(theta)
+        rates, z = self.rates(theta), self._z
+        found = objective.evaluated(theta[: self.inner])
+        if found is None:
+            return 1e10, np.zeros_like(theta)
+        over = objective.over_inputs(theta[: self.inner], found)
+        of_rates = (over * slope).sum(0) + z.sum(0) - (found.weights * objective.y) @ z
+        own = rates / PRIOR**2
+        value = found.value + float(z.sum(0) @ rates) + 0.5 * float(rates @ own)
+        return value, np.concatenate([found.slopes, (of_rates + own)[self._may]])

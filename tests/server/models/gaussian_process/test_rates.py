@@ -1,0 +1,180 @@
+"""Outputs that change the faster the further along an input: chosen by evidence, and the same in every computation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from support.models import gaussian_processes, learn
+from support.real_steps import random_steps
+from surrogym_client.original.classic import pendulum
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.points import Points
+from surrogym_server.environment.samples import Samples
+from surrogym_server.errors import InvalidInput
+from surrogym_server.gp import condition
+from surrogym_server.models.abilities import PredictedSteps
+from surrogym_server.models.files import from_bytes, to_bytes
+from surrogym_server.models.gaussian_process.codec.outputs import require_output
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.prediction.lookahead import process_inputs
+from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
+
+RANGES = {"amount": Uniform(low=0, high=1), "heat": Uniform(low=-2, high=2)}
+
+
+def spec(**model: object) -> EnvironmentSpec:
+    """An amount that reacts the faster the hotter it is, and a heat that follows the action alone."""
+    made = EnvironmentSpec(
+        coordinates=tuple(Coordinate(name=n, sampling=r) for n, r in RANGES.items()),
+        observation=tuple(ObservationEntry(name=n, term=Term.linear(**{n: 1})) for n in RANGES),
+        action=BoxAction(low=(-1,), high=(1,)),
+        start=RANGES,
+        time_limit=50,
+    )
+    if not model:
+        return made
+    design = made.design.model_validate({"model": {"name": "gaussian_process", "settings": model}})
+    return made.model_copy(update={"design": design})
+
+
+REACTION = definition_from_spec(spec())
+
+
+def steps(count: int, seed: int) -> Samples:
+    p = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    q, u = torch.stack([p[:, 0], 4 * p[:, 1] - 2], 1), 2 * p[:, 2:] - 1
+    rate = 0.02 * (2 * q[:, 1]).exp() * (1 + 0.2 * u[:, 0])
+    q_next = torch.stack([q[:, 0] * (-rate).exp(), 0.9 * q[:, 1] + 0.2 * u[:, 0]], 1)
+    reward = torch.zeros(count, dtype=torch.float64)
+    return Samples(q, u, q_next, reward, reward.bool())
+
+
+def amount_error(model: GaussianProcessModel, test: Samples) -> float:
+    """Median error of the amount where it is cold."""
+    cold = test.q[:, 1] < 0
+    off = model.transition(test.q, test.u).q_next - test.q_next
+    return float(off[cold, 0].abs().median())
+
+
+@pytest.fixture(scope="module")
+def model() -> GaussianProcessModel:
+    return gaussian_processes(REACTION, steps(40, 0))
+
+
+@pytest.fixture(scope="module")
+def points() -> tuple[Tensor, Tensor]:
+    test = steps(50, 7)
+    return test.q, test.u
+
+
+def test_an_output_has_rates_where_evidence_is_for_them(model):
+    amount, heat = model.transitions
+    assert amount.feature_map.rates[1] > 0.3  # along the heat
+    assert heat.feature_map.rates == ()
+    assert "rates" in model.structures[0]
+    assert any("rates" in name for name, _ in amount.scores)
+
+
+def test_small_changes_are_foretold_better_with_rates(model):
+    without = gaussian_processes(definition_from_spec(spec(rates=False)), steps(40, 0))
+    assert without.transitions[0].feature_map.rates == ()
+    assert amount_error(model, steps(400, 9)) < 0.5 * amount_error(without, steps(400, 9))
+
+
+def test_predictions_are_those_of_the_processes(model, points):
+    moved = model.transition(*points, deviations=True)
+    for column, output in enumerate(model.transitions):
+        x = process_inputs(model.definition, output, PredictedSteps(*points, points[0]))
+        mean, deviation = output.mean_and_deviation(x)
+        torch.testing.assert_close(moved.q_next[:, column] - points[0][:, column], mean, rtol=1e-6, atol=1e-9)
+        torch.testing.assert_close(moved.deviation[:, column], deviation, rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("how", ["mean", "particles", "functions"])
+def test_compiled_steps_are_the_same(model, points, how):
+    compiled = model.compiled()
+    if compiled is None:
+        pytest.skip("steps can't be compiled here")
+    generator = torch.Generator().manual_seed(0)
+    rows, given = len(points[0]), {}
+    if how == "particles":
+        given = {n: torch.randn(rows, 2, generator=generator, dtype=torch.float64) for n in ("noise", "process")}
+    if how == "functions":
+        given = {"paths": model.draw(torch.randn(rows, model.path_size, generator=generator, dtype=torch.float64))}
+    if how == "functions":
+        ours = model.transition_along(given["paths"], *points, deviations=True)
+    else:
+        ours = model.transition(*points, deviations=True, **given)
+    arrays = {name: given[name].numpy() if name in given else None for name in ("noise", "process", "paths")}
+    theirs = compiled(*(p.numpy() for p in points), **arrays, deviations=True, reward_deviation=False)
+    torch.testing.assert_close(torch.from_numpy(theirs.q_next), ours.q_next, rtol=1e-7, atol=1e-8)
+    torch.testing.assert_close(torch.from_numpy(theirs.deviation[:, :2]), ours.deviation, rtol=1e-4, atol=1e-7)
+
+
+def test_drawn_functions_spread_as_the_deviations_say(model, points):
+    count = 2_000
+    noise = torch.randn(count, model.path_size, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    functions = model.draw(noise)
+    for row in (0, 11, 23):
+        q, u = (p[row].expand(count, -1) for p in points)
+        spread = model.transition_along(functions, q, u).q_next.std(0)
+        said = model.transition(q[:1], u[:1], deviations=True).deviation[0]
+        torch.testing.assert_close(spread, said, rtol=0.25, atol=1e-5)
+
+
+def test_an_outlook_foretells_the_deviations_after_an_answer(model, points):
+    candidates = Points(*(p[:20] for p in points))
+    outlook = model.outlook(candidates, candidates[:5], candidates[:0])[0]
+    output = model.transitions[0]
+    x = process_inputs(model.definition, output, PredictedSteps(candidates.q, candidates.u, candidates.q))
+    torch.testing.assert_close(outlook.deviation, output.mean_and_deviation(x)[1], rtol=1e-4, atol=1e-7)
+    posterior = output.posterior
+    hyper = posterior.hyper
+    answered = condition(hyper, torch.cat([posterior.x, x[3:4]]), torch.cat([posterior.y, posterior.y[:1]]))
+    after = replace(output, posterior=answered).mean_and_deviation(x)[1]
+    torch.testing.assert_close(outlook.observe(3).deviation, after, rtol=1e-3, atol=1e-6)
+
+
+def test_left_out_samples_are_those_of_processes_without_them(model):
+    output = model.transitions[0]
+    posterior = output.posterior
+    squares = []
+    for row in range(len(posterior.y)):
+        others = torch.arange(len(posterior.y)) != row
+        without = replace(output, posterior=condition(posterior.hyper, posterior.x[others], posterior.y[others]))
+        x = posterior.x[row : row + 1]
+        truth = replace(output, posterior=posterior).centre + output.scale * output.amplitude(x) * posterior.y[row]
+        squares.append(float((without.mean(x) - truth).square()))
+    assert output.leave_one_out().error == pytest.approx((sum(squares) / len(squares)) ** 0.5, rel=1e-3)
+
+
+def test_rates_survive_storage(model, points):
+    loaded = from_bytes(REACTION, to_bytes(model))
+    assert isinstance(loaded, GaussianProcessModel)
+    assert loaded.transitions[0].feature_map == model.transitions[0].feature_map
+    torch.testing.assert_close(loaded.transition(*points).q_next, model.transition(*points).q_next, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("rates", [(0.1,), (0.1, float("nan"), 0.0), (0.1, 0.2, 0.3, 0.4)])
+def test_malformed_rates_are_refused(model, rates):
+    output = model.transitions[0]
+    wrong = replace(output, feature_map=replace(output.feature_map, rates=rates))
+    with pytest.raises(InvalidInput, match="rates"):
+        require_output(REACTION, wrong)
+
+
+def test_a_well_known_output_is_not_searched_for_rates():
+    learned = learn(definition_from_spec(pendulum()), random_steps(pendulum(), 20, seed=0))
+    assert not any("rates" in name for name in learned.warm)
+
+
+def test_many_samples_get_the_rates_of_a_subset(monkeypatch):
+    monkeypatch.setattr("surrogym_server.gp.subsets.FEW", 30)
+    model = gaussian_processes(REACTION, steps(45, 0))
+    assert model.transitions[0].feature_map.rates[1] > 0.3
+    assert len(model.transitions[0].posterior.y) == 45
+    assert amount_error(model, steps(400, 9)) < 0.005
