@@ -66,12 +66,16 @@ def main() -> None:
     made.add_argument("--rows", type=int, default=5_000)
     made.add_argument("--subsets", type=int, default=20)
     made.add_argument("--size", type=int, default=300, help="rows of a subset")
+    made.add_argument("--log", type=int, default=0, help="seed of the log; the episodes left out have the next one")
     made.add_argument("--first", type=int, default=0, help="a model of so many first rows as well; 0: none")
     options = started(made)
     module = example()
     definition = definition_from_spec(module.Reactor().spec())
-    log = samples_of(module.operate(options.rows // LENGTH, LENGTH, seed=0))
-    tests = {"left out": samples_of(module.operate(LEFT_OUT, LENGTH, seed=1)), "anywhere": anywhere(module)}
+    log = samples_of(module.operate(options.rows // LENGTH, LENGTH, seed=options.log))
+    tests = {
+        "left out": samples_of(module.operate(LEFT_OUT, LENGTH, seed=options.log + 1)),
+        "anywhere": anywhere(module),
+    }
     report: dict[str, Any] = {"rows": options.rows, "all": errors(definition, log, tests)}
     print("all", report["all"])
     if options.first:
