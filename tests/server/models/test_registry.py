@@ -19,7 +19,9 @@ def learner(**design: object) -> object:
 def test_gaussian_processes_are_the_default_and_the_preset_says_how():
     assert learner() == GaussianProcesses("composite", True, "auto")
     assert learner(symmetry="none") == GaussianProcesses("composite", True, "none")
-    assert learner(preset="paper", symmetry="none") == GaussianProcesses("squared_exponential", False, "none", False, False)
+    assert learner(preset="paper", symmetry="none") == GaussianProcesses(
+        "squared_exponential", False, "none", False, False
+    )
 
 
 def test_settings_of_the_specification_override_those_of_the_preset():
