@@ -1,5 +1,5 @@
-"""kill -9 of raylets, the head of Ray, PostgreSQL, HAProxy and front servers, under the load of samplers and trainings;
-and of a front server every five seconds, which changes no bit of a policy."""
+"""kill -9 of raylets, session hosts, the head of Ray, PostgreSQL, HAProxy and front servers, under the load of samplers
+and trainings; and of a front server every five seconds, which changes no bit of a policy."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ STRIKES: dict[str, Callable[[Stage, random.Random], None]] = {
     "haproxy": lambda stage, _: stage.kill_proxy(),
     "postgresql": lambda stage, _: stage.kill_postgresql(),
     "raylet": lambda stage, source: stage.kill_raylet(source.choice([1, 2])),
+    "session host": lambda stage, source: stage.kill_host(source),
     "head": lambda stage, _: stage.kill_head(),
     "front server": lambda stage, source: stage.kill_front(source.choice([0, 1])),
 }

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import random
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -17,6 +20,7 @@ from support.ray_cluster import RayCluster
 from support.server import RestartingServer
 
 HOSTS, LEASE_SECONDS = 2, 6.0
+STARTING_SECONDS = 200.0  # of a session host that was killed before
 
 
 @dataclass
@@ -33,6 +37,14 @@ class Stage:
         """Kill one raylet with its workers, and start another in its place. 0 is the head's."""
         self.cluster.kill_raylet(number)
         self.cluster.start_node(number)
+
+    def kill_host(self, source: random.Random) -> None:
+        """Kill the process of one session host, once all of them run. Ray starts another in its place."""
+        deadline = time.monotonic() + STARTING_SECONDS
+        while len(hosts := self.cluster.workers("ray::SessionHost")) < HOSTS:
+            assert time.monotonic() < deadline, f"{len(hosts)} of {HOSTS} session hosts run"
+            time.sleep(0.1)
+        os.kill(source.choice(hosts), signal.SIGKILL)
 
     def kill_head(self) -> None:
         """Kill the head with its processes. Then build the cluster again, with front servers of its own."""
