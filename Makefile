@@ -15,7 +15,7 @@ PINS := pyproject.toml constraints.txt
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: demo install test audit test-all docs docs-serve format-check lint types imports unit chaos bench bench-memory acquisition audit-power compare format postgresql chromium languages screenshots clean help
+.PHONY: demo install test audit test-all docs docs-serve format-check lint types imports unit chaos bench bench-memory acquisition audit-power compare format postgresql haproxy chromium languages screenshots clean help
 
 demo: .venv/demo  ## Solve Pendulum with server, sampler and trainer on this machine (ARGS="--seed 1")
 	@exec $(BIN)/surrogym demo pendulum $(ARGS)
@@ -54,7 +54,7 @@ docs-serve: .venv/dev  ## Show the site while its pages are written
 audit: .venv/dev  ## Ask for known holes of the pinned packages, where that can be asked
 	@$(BIN)/python tests/audit.py
 
-chaos: .venv/dev postgresql  ## Faults and attacks in full length; make test has a short form (ARGS="-k killed")
+chaos: .venv/dev postgresql haproxy  ## Faults and attacks in full length; make test has a short form (ARGS="-k killed")
 	CHAOS=full $(BIN)/pytest -m "" --durations 0 tests/chaos tests/security $(ARGS)
 
 bench: .venv/dev  ## What steps, predictions and trainings cost here, beside echoes, libraries and other systems (ARGS="--quick")
@@ -83,6 +83,15 @@ postgresql:
 	    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq postgresql >/dev/null; \
 	else \
 	    echo "PostgreSQL is not on this machine, so its tests are skipped. To run them: apt-get install postgresql"; \
+	fi
+
+haproxy:
+	@if PATH="$$PATH:/usr/sbin" command -v haproxy >/dev/null; then \
+	    :; \
+	elif [ -n "$$CI" ] && [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq haproxy >/dev/null; \
+	else \
+	    echo "HAProxy is not on this machine, so the tests of kills under load are skipped. To run them: apt-get install haproxy"; \
 	fi
 
 chromium:
