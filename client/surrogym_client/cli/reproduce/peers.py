@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from surrogym_client.cli.options import AsJson, Quiet
+from surrogym_client.cli.reproduce.efficiency import OnRay
 
 if TYPE_CHECKING:
     from surrogym_client.experiments.peers.points import Point
     from surrogym_client.experiments.peers.study import PeerCell
+
+    Tell = Callable[[PeerCell, list[Point]], None]
 
 
 def register(app: typer.Typer) -> None:
@@ -41,6 +44,7 @@ def command(
     ] = None,
     minutes: Annotated[float, typer.Option(min=0.01, help="Processor minutes of learning for each run.")] = 90.0,
     only_table: Annotated[bool, typer.Option("--only-table", help="Run nothing; show what there is.")] = False,
+    on_ray: OnRay = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -52,6 +56,8 @@ def command(
 
     Example: surrogym reproduce peers --tasks pendulum --methods sac,ppo --seeds 3
 
+    Example: surrogym reproduce peers --seeds 5 --on-ray auto --jobs 64
+
     Example: surrogym reproduce peers --rows docs/results/efficiency.csv --out runs/peers --only-table
     """
     from surrogym_client.cli.reproduce.efficiency import names_of
@@ -62,7 +68,7 @@ def command(
     numbers = range(first_seed, first_seed + seeds)
     wanted = [PeerCell(t, m, s, budget, episodes, minutes) for s in numbers for t in named for m in chosen]
     if not only_table:
-        _run([cell for cell in wanted if not cell.done(out)], out, jobs, quiet=quiet)
+        _run([cell for cell in wanted if not cell.done(out)], out, jobs, on_ray, quiet=quiet)
     _present(wanted, _ours(rows or [], named), out, as_json=as_json, quiet=quiet)
 
 
@@ -82,8 +88,7 @@ def _tasks(given: str) -> list[str]:
     return names
 
 
-def _run(todo: Sequence[PeerCell], out: Path, jobs: int, *, quiet: bool) -> None:
-    from surrogym_client.experiments.peers.study import run_cells
+def _run(todo: Sequence[PeerCell], out: Path, jobs: int, on_ray: str | None, *, quiet: bool) -> None:
     from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_shared.terminal import on_interrupt, progress, say
 
@@ -103,7 +108,20 @@ def _run(todo: Sequence[PeerCell], out: Path, jobs: int, *, quiet: bool) -> None
             )
 
         if todo:
-            run_cells(todo, out, jobs, tell)
+            _runner(on_ray)(todo, out, jobs, tell)
+
+
+def _runner(address: str | None) -> Callable[[Sequence[PeerCell], Path, int, Tell], None]:
+    """What runs cells: here, or in the Ray cluster at an address."""
+    if address is None:
+        from surrogym_client.experiments.peers.study import run_cells
+
+        return run_cells
+    from surrogym_client.experiments.peers import on_ray
+    from surrogym_client.runtime.ray_cluster import connect
+
+    connect(address)
+    return on_ray.run_cells
 
 
 def _ours(files: Sequence[Path], tasks: Sequence[str]) -> list[Point]:
