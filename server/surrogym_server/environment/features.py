@@ -14,6 +14,7 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition, wrap
 from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.points import Points
+from surrogym_server.tensors.bending import bend
 
 State = Literal["cos_sin", "wrapped", "both", "observation", "none"]
 Encoding = Literal["value", "one_hot", "none"]  # of actions; one-hot of discrete ones
@@ -169,7 +170,7 @@ class Encoder:
             case "equal":
                 return (raw[..., entries] == centre).to(raw.dtype)
             case "grown":
-                return torch.expm1(rate * ((raw[..., entries] - centre) / scale)) / rate
+                return bend((raw[..., entries] - centre) / scale, rate)
             case _:
                 return (raw[..., entries] - centre) / scale
 

@@ -16,7 +16,7 @@ beta      ``weights`` (n,)        (K + sigma_n^2 I)^-1 y
 """
 
 from surrogym_server.gp.fit import NOISE_FLOOR, FitOptions, Fitted, fit, noisy_explanation, refine
-from surrogym_server.gp.growth import amplitude, bend, fit_growing
+from surrogym_server.gp.growth import fit_growing
 from surrogym_server.gp.hyperparameter_samples import hyperparameter_samples
 from surrogym_server.gp.joint import Joint
 from surrogym_server.gp.kernel import Hyperparameters, Reflection, covariance
@@ -39,8 +39,6 @@ __all__ = [
     "Reflection",
     "Serving",
     "Sparse",
-    "amplitude",
-    "bend",
     "condition",
     "condition_many",
     "condition_sparse",

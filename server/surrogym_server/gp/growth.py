@@ -2,16 +2,18 @@
 
     F(z) = a(z) G(w(z)),  w_j(z) = (e^(g_j z_j) - 1) / g_j,  a(z) = prod_j e^(g_j z_j) = prod_j (1 + g_j w_j(z))
 
-G is an ordinary process, and g (d,) are the rates: at g = 0, F is G. A stationary process has one length scale and one
-amplitude for all places, so a function that is steep in one place seems rough everywhere. F is as rough as its place.
-An exponential is the simplest such law, and near a temperature it is the law of Arrhenius.
+z are standardised inputs, G is an ordinary process, and g (d,) are the rates: at g = 0, F is G. A stationary process
+has one length scale and one amplitude for all places, so a function that is steep in one place seems rough everywhere.
+F is as rough as its place. An exponential is the simplest such law, and near a temperature it is the law of Arrhenius.
 
 Since a is known once g is, fitting F to targets t at z is fitting G to y = t / a(z) at w(z), and
 
     log p(t) = log p(y) - sum_i log a(z_i).
 
-The noise of F is that of G times a(z). References: P. Sampson, P. Guttorp (1992), JASA 87 (stationary after a
-deformation of the inputs); C. Paciorek, M. Schervish (2006), Environmetrics 17 (non-stationary covariances).
+The noise of F is that of G times a(z). Beyond ``EDGE``, where no sample may lie, w (``tensors.bending``) goes on as a
+line on the steep side and is constant on the flat side, so that nothing overflows far away. References: P. Sampson, P.
+Guttorp (1992), JASA 87 (stationary after a deformation of the inputs); C. Paciorek, M. Schervish (2006), Environmetrics
+17 (non-stationary covariances).
 """
 
 from __future__ import annotations
@@ -26,9 +28,9 @@ from torch import Tensor
 
 from surrogym_server.gp.fit import FitOptions, Fitted, _blas, _minimum, _Objective
 from surrogym_server.gp.posterior import condition
+from surrogym_server.tensors.bending import EDGE, STEEPEST, amplitude, bend
 
 PRIOR = 1.0  # deviation of a rate; inputs have deviation near 1
-STEEPEST = 2.0  # largest rate
 FLAT = 1e-3  # smaller rates are 0: they bend nothing
 
 Array = NDArray[np.float64]
@@ -42,26 +44,16 @@ class Growing:
     rates: tuple[float, ...]  # (d,)
 
 
-def bend(z: Tensor, rates: Tensor) -> Tensor:
-    """w(z) of inputs z (..., d) and rates (d,)."""
-    safe = torch.where(rates == 0, 1.0, rates)
-    return torch.where(rates == 0, z, torch.expm1(rates * z) / safe)
-
-
-def amplitude(w: Tensor, rates: Tensor) -> Tensor:
-    """a(z) of bent inputs w(z) (..., d) and rates (d,), (...)."""
-    grown: Tensor = (1 + w * rates).prod(-1)
-    return grown
-
-
 def fit_growing(z: Tensor, t: Tensor, may: Tensor, options: FitOptions, starts: Sequence[Array]) -> Growing:
     """Fit F to inputs z (n, d) and targets t (n,), both standardised. Runs on the CPU. Raises ``NumericalFailure``.
 
     Args:
-        may: (d,) bool, the inputs that may have a rate.
+        may: (d,) bool, the inputs that may have a rate. No sample of them may lie beyond ``EDGE``.
         options: those of the fit without rates, without a quadratic part.
         starts: thetas of fits without rates, or of earlier fits with rates.
     """
+    if bool((z[:, may].abs() > EDGE).any()):
+        raise ValueError(f"expected inputs within {EDGE} where a rate is allowed")
     objective = _GrowingObjective(z, t, may, options)
     padded = [np.concatenate([start, np.zeros(objective.size - len(start))]) for start in starts]
     with _blas().limit(limits=1):

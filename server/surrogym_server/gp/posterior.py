@@ -83,6 +83,12 @@ class Posterior:
         return joint
 
     @property
+    def log_evidence(self) -> float:
+        """Log marginal likelihood of the points, without priors of hyperparameters; R&W (2006), eq. 2.30."""
+        roots = self.factor.diagonal().log().sum()
+        return -float(0.5 * (self.y @ self.weights) + roots) - 0.5 * len(self.y) * math.log(2 * math.pi)
+
+    @property
     def left_out(self) -> LeftOut:
         """Accuracy in predicting each of the points from all others."""
         if self.sparse is not None and self.sparse.left_out is not None:

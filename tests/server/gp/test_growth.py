@@ -9,13 +9,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from surrogym_server.gp import FitOptions, amplitude, bend, covariance, fit, fit_growing
+from surrogym_server.gp import FitOptions, covariance, fit, fit_growing
 from surrogym_server.gp.growth import _GrowingObjective
+from surrogym_server.tensors.bending import amplitude, bend
 
 
 def points(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     """Inputs, and values that are steep where the second input is large."""
-    z = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    z = 3.4 * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1.7
     return z, torch.exp(z[:, 1]) * torch.sin(2 * z[:, 0]) + 0.1 * z[:, 2]
 
 
@@ -95,3 +96,19 @@ def test_a_quadratic_part_is_refused():
     z, t = points(5)
     with pytest.raises(ValueError, match="quadratic"):
         fit_growing(z, t, ALL, FitOptions(quadratic=True), [])
+
+
+def test_inputs_beyond_the_edge_stay_finite_and_monotone():
+    z = torch.linspace(-1e3, 1e3, 4001, dtype=torch.float64)[:, None].expand(-1, 2)
+    rates = torch.tensor([2.0, -2.0], dtype=torch.float64)
+    w = bend(z, rates)
+    assert bool(torch.isfinite(w).all())
+    assert bool((w.diff(dim=0) >= 0).all())
+    assert bool((1 + w * rates > 0).all())
+    steep = bend(torch.tensor([[2.0], [2.0 + 1e-6]], dtype=torch.float64), rates[:1])
+    assert float(steep.diff(dim=0)) == pytest.approx(1e-6 * math.exp(4), rel=1e-4)
+
+
+def test_samples_beyond_the_edge_are_refused():
+    with pytest.raises(ValueError, match="within 2"):
+        fit_growing(torch.full((3, 1), 2.5, dtype=torch.float64), torch.zeros(3), ALL[:1], FitOptions(), [])

@@ -12,6 +12,7 @@ from surrogym_server.compiled.tables import TablesBuilder, matrix
 from surrogym_server.environment.compiled.terms import evaluate
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import Encoder
+from surrogym_server.tensors.bending import EDGE
 from surrogym_shared.compiled.jit import compiled
 
 Floats = NDArray[np.float64]
@@ -53,9 +54,11 @@ def encode(
             for b in range(lanes):
                 x[f, b] = (raw[entry, b] - centre) / scale
         elif code == GROWN:
-            rate = rows[f, 4]
+            size, sign = abs(rows[f, 4]), math.copysign(1.0, rows[f, 4])
             for b in range(lanes):
-                x[f, b] = math.expm1(rate * ((raw[entry, b] - centre) / scale)) / rate
+                along = max(sign * (raw[entry, b] - centre) / scale, -EDGE)
+                bent = math.expm1(size * min(along, EDGE)) / size
+                x[f, b] = sign * (bent + math.exp(size * EDGE) * max(along - EDGE, 0.0))
         elif code == COS:
             sine_and_cosine(raw[entry], other, x[f])
         elif code == SIN:

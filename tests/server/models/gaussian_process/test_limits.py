@@ -154,3 +154,29 @@ def test_a_lower_limit_counts_like_an_upper_one():
     above = gaussian_processes(RELIEVED, samples).transition(samples.q, samples.u).q_next
     below = gaussian_processes(lower, mirrored).transition(mirrored.q, mirrored.u).q_next
     torch.testing.assert_close(below, -above, rtol=1e-4, atol=1e-4)
+
+
+def test_a_wall_says_nothing_of_the_speed_that_it_stops():
+    """At the wall the speed becomes 0, which is its lower limit as well."""
+    ranges = {"place": Uniform(low=0, high=1), "speed": Uniform(low=0, high=1)}
+    spec = EnvironmentSpec(
+        coordinates=(
+            Coordinate(name="place", sampling=ranges["place"], bounds=Bounds(low=0, high=1, stops="speed")),
+            Coordinate(name="speed", sampling=ranges["speed"], bounds=Bounds(low=0)),
+        ),
+        observation=tuple(ObservationEntry(name=n, term=Term.linear(**{n: 1})) for n in ranges),
+        action=BoxAction(low=(-1,), high=(1,)),
+        start=ranges,
+        time_limit=50,
+    )
+    p = torch.rand(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    q, u = p[:, :2], 2 * p[:, 2:] - 1
+    speed = q[:, 1] + 0.3 * (3 * q[:, 0]).sin() * (1 + 0.1 * u[:, 0])
+    place = q[:, 0] + 0.2 * speed
+    at_wall = place >= 1
+    q_next = torch.stack([place.clamp_max(1), torch.where(at_wall, 0.0, speed)], 1)
+    reward = torch.zeros(40, dtype=torch.float64)
+    model = gaussian_processes(definition_from_spec(spec), Samples(q, u, q_next, reward, reward.bool()))
+    off = (model.transition(q, u).q_next - q_next)[~at_wall].abs().max()
+    assert bool(at_wall.any())
+    assert float(off) < 1e-3

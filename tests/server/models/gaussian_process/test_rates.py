@@ -62,7 +62,7 @@ def amount_error(model: GaussianProcessModel, test: Samples) -> float:
 
 @pytest.fixture(scope="module")
 def model() -> GaussianProcessModel:
-    return gaussian_processes(REACTION, steps(40, 0))
+    return gaussian_processes(REACTION, steps(60, 0))
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_an_output_has_rates_where_evidence_is_for_them(model):
 
 
 def test_small_changes_are_foretold_better_with_rates(model):
-    without = gaussian_processes(definition_from_spec(spec(rates=False)), steps(40, 0))
+    without = gaussian_processes(definition_from_spec(spec(rates=False)), steps(60, 0))
     assert without.transitions[0].feature_map.rates == ()
     assert amount_error(model, steps(400, 9)) < 0.5 * amount_error(without, steps(400, 9))
 
@@ -159,12 +159,33 @@ def test_rates_survive_storage(model, points):
     torch.testing.assert_close(loaded.transition(*points).q_next, model.transition(*points).q_next, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("rates", [(0.1,), (0.1, float("nan"), 0.0), (0.1, 0.2, 0.3, 0.4)])
+@pytest.mark.parametrize(
+    "rates", [(0.1,), (0.1, float("nan"), 0.0), (0.1, 0.2, 0.3, 0.4), (0.0, 2.1, 0.0), (-2.0, -2.0, 2.0)]
+)
 def test_malformed_rates_are_refused(model, rates):
     output = model.transitions[0]
     wrong = replace(output, feature_map=replace(output.feature_map, rates=rates))
-    with pytest.raises(InvalidInput, match="rates"):
+    with pytest.raises(InvalidInput, match=r"rates|amplitude"):
         require_output(REACTION, wrong)
+
+
+def test_few_samples_get_no_rates():
+    assert not gaussian_processes(REACTION, steps(40, 0)).transitions[0].feature_map.rates
+
+
+def test_an_input_with_a_sample_far_out_gets_no_rate():
+    samples = steps(60, 0)
+    samples.q[0, 1] = -40.0
+    assert not any(
+        rates[1] for o in gaussian_processes(REACTION, samples).transitions if (rates := o.feature_map.rates)
+    )
+
+
+def test_predictions_far_from_the_samples_are_finite(model):
+    q = torch.tensor([[0.5, 1e6], [0.5, -1e6], [1e6, 0.0]], dtype=torch.float64)
+    moved = model.transition(q, torch.zeros(3, 1, dtype=torch.float64), deviations=True)
+    assert bool(torch.isfinite(moved.q_next).all())
+    assert bool(torch.isfinite(moved.deviation).all())
 
 
 def test_a_well_known_output_is_not_searched_for_rates():
@@ -173,8 +194,8 @@ def test_a_well_known_output_is_not_searched_for_rates():
 
 
 def test_many_samples_get_the_rates_of_a_subset(monkeypatch):
-    monkeypatch.setattr("surrogym_server.gp.subsets.FEW", 30)
-    model = gaussian_processes(REACTION, steps(45, 0))
+    monkeypatch.setattr("surrogym_server.gp.subsets.FEW", 48)
+    model = gaussian_processes(REACTION, steps(56, 0))
     assert model.transitions[0].feature_map.rates[1] > 0.3
-    assert len(model.transitions[0].posterior.y) == 45
+    assert len(model.transitions[0].posterior.y) == 56
     assert amount_error(model, steps(400, 9)) < 0.005

@@ -17,6 +17,7 @@ from surrogym_server.gp import Hyperparameters, LeftOut, Posterior, Sparse
 from surrogym_server.models.gaussian_process.feature_maps import reflection
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.warp import Warp
+from surrogym_server.tensors.bending import STEEPEST
 
 KNOWN_MAPS = frozenset(
     FeatureMap(state, action, lead, after, parity=parity)
@@ -141,19 +142,23 @@ def _require_warp(output: OutputModel) -> None:
 
 
 def _require_rates(definition: EnvironmentDefinition, output: OutputModel) -> None:
-    """Check that only a transition has rates, one for each feature, and only features that can grow have one."""
+    """Check that only a transition has rates, one for each feature, and only features that can grow have one, and that
+    the amplitude is positive at all points."""
     if not (rates := output.feature_map.rates):
         return
     plain = replace(output.feature_map, rates=())
     may = [feature.function == "affine" for feature in features(definition, plain)]
     if (
-        output.name == REWARD
+        output.name not in definition.outputs[:-1]
+        or output.posterior is None
         or plain.lead
         or plain.parity
         or len(rates) != len(may)
-        or not all(math.isfinite(rate) and (able or rate == 0) for rate, able in zip(rates, may, strict=True))
+        or not all(abs(rate) <= STEEPEST and (able or rate == 0) for rate, able in zip(rates, may, strict=True))
     ):
-        raise InvalidInput(f"output {output.name!r}: expected finite rates of a transition's features, got {rates}")
+        raise InvalidInput(f"output {output.name!r}: expected rates of a transition's features, got {rates}")
+    if not bool((1 + output.posterior.x * torch.tensor(rates, dtype=torch.float64) > 0).all()):
+        raise InvalidInput(f"output {output.name!r}: expected an amplitude above 0 at all points")
 
 
 def _require_numbers(output: OutputModel) -> None:

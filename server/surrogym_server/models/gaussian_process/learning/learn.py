@@ -51,6 +51,7 @@ def _transitions(learner: OutputLearner, samples: Samples) -> tuple[OutputModel,
     keep = ~saturated(definition, samples.q_next)
     keep = keep if int(keep.sum()) >= MIN_POINTS else everything
     sides = limit_sides(definition, samples.q_next)
+    sides = sides * ((sides != 0).sum(-1, keepdim=True) == 1)  # a wall, or another limit, says nothing of this kind
     lead, drift = leading(definition), learn_drift(definition, samples)
     outputs = []
     for column, index in enumerate(definition.moving):

@@ -9,7 +9,9 @@ At the output's own limit: without the limit the step would have gone at least a
 It says nothing where the process predicts a step beyond the limit. Where the process predicts less, the sample becomes
 an observation of the limit itself. Those that become observations are the active set of the inequalities: the most
 probable function that satisfies all of them meets these with equality. The set is found greedily, and may hold a few
-that are not needed. References: S. Da Veiga, A. Marrel (2012), Annales de la Faculte des Sciences de Toulouse 21(3);
+that are not needed. It is dropped if it makes things much worse: what the process falls short of limits, and the
+leave-one-out errors of the other samples, in one sum. A process of inducing points has many samples beside its limits, and needs
+none of this. References: S. Da Veiga, A. Marrel (2012), Annales de la Faculte des Sciences de Toulouse 21(3);
 H. Maatouk, X. Bay (2017), Mathematical Geosciences 49(5).
 """
 
@@ -31,6 +33,7 @@ WIDER = " past limits"  # suffix of an output's name, for its hyperparameters
 HELD = " held"  # the same
 SHORT = 0.01  # of the targets' deviation: a prediction that falls less short of a limit satisfies the inequality
 ROUNDS = 3  # of fits, each with the inequalities that the last process violates
+WORSE = 10.0  # largest growth of the misfit by a round; few samples measure it roughly
 MOST = 200  # samples that become observations in one round
 
 
@@ -76,22 +79,43 @@ def held(
     name, past, plain = output.name, output.past_limits, {m: x for m, x in inputs.items() if not m.lead}
     for _ in range(ROUNDS):
         rows = ((side != 0) & ~keep).nonzero()[:, 0]
-        if output.posterior is None or not len(rows):
+        if output.posterior is None or output.posterior.sparse is not None or not len(rows):
             break
         x = inputs_of(output, inputs)[rows]
         y = output.standardised(target[rows], x)
-        violated = rows[_violated(output.posterior, x, y, side[rows])]
+        size = torch.as_tensor(output.amplitude(x), dtype=x.dtype).expand(len(x))
+        violated = rows[_violated(output.posterior, x, y, side[rows] * size)]
         if not len(violated):
             break
-        keep = keep.index_fill(0, violated, value=True)
-        found = output_with_rates(learner, name + HELD, target, plain, keep, keep)
-        output = replace(found, name=name, past_limits=past)
+        more = keep.index_fill(0, violated, value=True)
+        found = replace(output_with_rates(learner, name + HELD, target, plain, more, more), name=name, past_limits=past)
+        if _misfit(found, target, inputs, more, side) > WORSE * _misfit(output, target, inputs, keep, side):
+            break
+        output, keep = found, more
     return output
+
+
+def _misfit(
+    output: OutputModel, target: Tensor, inputs: Mapping[FeatureMap, Tensor], learned: Tensor, side: Tensor
+) -> float:
+    """Sum of squared errors of targets (n,).
+
+    A sample away from the output's limit, where ``side`` (n,) is 0, is predicted from the others of ``learned`` (n,).
+    One at the limit has the error by which the prediction falls short of it.
+    """
+    if output.posterior is None or output.posterior.sparse is not None:
+        return float("inf")
+    x = inputs_of(output, inputs)
+    short = (side * (target - output.mean(x))).clamp_min(0)
+    foretold, _ = output.posterior.leave_one_out()
+    off = output.scale * output.amplitude(x[learned]) * (foretold - output.posterior.y)
+    return float(short.square().sum() + off[side[learned] == 0].square().sum())
 
 
 def _violated(posterior: Posterior, x: Tensor, y: Tensor, side: Tensor) -> list[int]:
     """Numbers of the points at x (k, d) that must be observed at y (k,), so that the process does not fall short of y
-    at any, on the given side (k,). The one that falls the shortest is observed first."""
+    at any. ``side`` (k,) has the sign of the side, and the amplitude as its size. The one that falls the shortest is
+    observed first."""
     joint, mean = Joint.of(posterior, x), posterior.mean(x)
     chosen: list[int] = []
     while len(chosen) < min(MOST, len(y)):

@@ -9,12 +9,15 @@ import torch
 from torch import Tensor
 
 from surrogym_server.environment.features import FeatureMap, features
-from surrogym_server.gp import amplitude, bend, fit_growing, spread, subsets
+from surrogym_server.errors import NumericalFailure
+from surrogym_server.gp import fit_growing, spread, subsets
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
+from surrogym_server.tensors.bending import EDGE, amplitude, bend
 
 ODDS = -3.0  # log odds of each rate before any data
 EXPLAINED = 0.01  # of the targets' deviation: if each sample is foretold as well by the others, no rates are tried
+FEWEST = 8  # samples for each rate: fewer leave a rate uncertain, and predictions with it are too sure
 
 
 def output_with_rates(
@@ -27,30 +30,68 @@ def output_with_rates(
 ) -> OutputModel:
     """Fit one output as ``OutputLearner.output`` does. Then its best map may get rates."""
     output = learner.output(name, target, inputs, keep, keep_lead)
-    plain = output.feature_map
-    if output.posterior is None or plain.lead or plain.parity or not learner.settings.rates:
+    may = _may_have_rates(learner, output, inputs, keep)
+    if not bool(may.any()):
         return output
-    may = torch.tensor([f.function == "affine" for f in features(learner.definition, plain)])
-    if not bool(may.any()) or output.posterior.left_out.error <= EXPLAINED:
+    try:
+        evidence, grown = _grown(learner, output, target, inputs, keep, may)
+    except NumericalFailure:
         return output
-    z, t = inputs[plain][keep], (target[keep] - output.centre) / output.scale
-    rows, key = spread(len(t), subsets.FEW), f"{name}|{plain}|rates"
-    starts = [learner.thetas[f"{name}|{plain}"], *([learner.warm[key]] if key in learner.warm else [])]
-    found = fit_growing(z[rows], t[rows], may, learner.options(name), starts)
-    learner.thetas[key] = found.fitted.theta
-    score = found.fitted.score * len(t) / len(rows)
-    if score + ODDS * int(may.sum()) <= dict(output.scores)[str(plain)] or not any(found.rates):
-        return output
-    grown, rates = replace(plain, rates=found.rates), torch.tensor(found.rates, dtype=torch.float64)
-    posterior = found.fitted.posterior
-    if len(rows) < len(t):
-        x = bend(z, rates)
-        theta = found.fitted.theta[: -int(may.sum())]
-        posterior = learner.refined(name, grown, x, t / amplitude(x, rates), theta)
-    return replace(output, feature_map=grown, posterior=posterior, scores=(*output.scores, (str(grown), score)))
+    return grown if evidence > _evidence(output) else output
 
 
 def inputs_of(output: OutputModel, inputs: Mapping[FeatureMap, Tensor]) -> Tensor:
     """Inputs of an output's process, (n, d), from the features of maps without rates."""
     x, rates = inputs[replace(output.feature_map, rates=())], output.feature_map.rates
     return bend(x, torch.tensor(rates, dtype=x.dtype)) if rates else x
+
+
+def _may_have_rates(
+    learner: OutputLearner, output: OutputModel, inputs: Mapping[FeatureMap, Tensor], keep: Tensor
+) -> Tensor:
+    """Inputs of an output, (d,) bool, that may have a rate. None may if few samples would have to determine it, if
+    there is little to explain, or with so many samples that inducing points represent them."""
+    plain, posterior = output.feature_map, output.posterior
+    kinds = torch.tensor([feature.function == "affine" for feature in features(learner.definition, plain)])
+    none = torch.zeros_like(kinds)
+    if posterior is None or posterior.sparse is not None or not learner.settings.rates or plain.lead or plain.parity:
+        return none
+    may = kinds & (inputs[plain][keep].abs() <= EDGE).all(0)
+    enough = int(keep.sum()) >= FEWEST * int(may.sum())
+    return may if enough and posterior.left_out.error > EXPLAINED else none
+
+
+def _grown(
+    learner: OutputLearner,
+    output: OutputModel,
+    target: Tensor,
+    inputs: Mapping[FeatureMap, Tensor],
+    keep: Tensor,
+    may: Tensor,
+) -> tuple[float, OutputModel]:
+    """Log evidence of the output with rates, and the output."""
+    plain = output.feature_map
+    z, t = inputs[plain][keep], (target[keep] - output.centre) / output.scale
+    rows, key = spread(len(t), subsets.FEW), f"{output.name}|{plain}|rates"
+    starts = [learner.thetas[f"{output.name}|{plain}"], *([learner.warm[key]] if key in learner.warm else [])]
+    found = fit_growing(z[rows], t[rows], may, learner.options(output.name), starts)
+    learner.thetas[key] = found.fitted.theta
+    grown, rates = replace(plain, rates=found.rates), torch.tensor(found.rates, dtype=torch.float64)
+    posterior = found.fitted.posterior
+    if len(rows) < len(t):
+        x = bend(z, rates)
+        posterior = learner.refined(
+            output.name, grown, x, t / amplitude(x, rates), found.fitted.theta[: -int(may.sum())]
+        )
+    made = replace(output, feature_map=grown, posterior=posterior)
+    evidence = _evidence(made) + ODDS * int(may.sum()) if any(found.rates) else -torch.inf
+    return evidence, replace(made, scores=(*output.scores, (str(grown), evidence)))
+
+
+def _evidence(output: OutputModel) -> float:
+    """Log density of the targets, in the output's scale."""
+    assert output.posterior is not None
+    x = output.posterior.x
+    return output.posterior.log_evidence - float(
+        torch.as_tensor(output.amplitude(x), dtype=x.dtype).expand(len(x)).log().sum()
+    )

@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from surrogym_server.environment.features import FeatureMap
-from surrogym_server.gp import NOISE_FLOOR, FitOptions, Posterior, amplitude, noisy_explanation
+from surrogym_server.gp import NOISE_FLOOR, FitOptions, Posterior, noisy_explanation
 from surrogym_server.models.abilities import LeaveOneOutErrors
 from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE, Warp
+from surrogym_server.tensors.bending import amplitude
 
 
 @dataclass(frozen=True)
