@@ -170,7 +170,7 @@ def test_malformed_rates_are_refused(model, rates):
 
 
 def test_few_samples_get_no_rates():
-    assert not gaussian_processes(REACTION, steps(40, 0)).transitions[0].feature_map.rates
+    assert not gaussian_processes(REACTION, steps(20, 0)).transitions[0].feature_map.rates
 
 
 def test_an_input_with_a_sample_far_out_gets_no_rate():

@@ -10,8 +10,8 @@ It says nothing where the process predicts a step beyond the limit. Where the pr
 an observation of the limit itself. Those that become observations are the active set of the inequalities: the most
 probable function that satisfies all of them meets these with equality. The set is found greedily, and may hold a few
 that are not needed. It is dropped if it makes things much worse: what the process falls short of limits, and the
-leave-one-out errors of the other samples, in one sum. A process of inducing points has many samples beside its limits, and needs
-none of this. References: S. Da Veiga, A. Marrel (2012), Annales de la Faculte des Sciences de Toulouse 21(3);
+leave-one-out errors of the other samples, in one sum. A process of inducing points has many samples beside its limits,
+and needs none of this. References: S. Da Veiga, A. Marrel (2012), Annales de la Faculte des Sciences de Toulouse 21(3);
 H. Maatouk, X. Bay (2017), Mathematical Geosciences 49(5).
 """
 
