@@ -1,8 +1,9 @@
-"""Two chemical processes from cold: real steps, and the policy's return beside PPO trained in the original.
+"""Three chemical processes from cold: real steps, and the policy's return beside PPO trained in the original.
 
 python tests/benchmarks/bench_processes.py --seeds 200 201 202 203 204 --oracles 3
 
-``reactor`` has Arrhenius kinetics (examples/reactor.py), ``fermenter`` Haldane kinetics (tests/support/fermenter.py).
+``reactor`` has Arrhenius kinetics (examples/reactor.py), ``fermenter`` Haldane kinetics (tests/support/fermenter.py),
+and ``van_de_vusse`` a series and a parallel reaction (tests/support/van_de_vusse.py).
 Each run is a demo: a server, a sampler and a trainer, and 100 real episodes. The arm ``latin_hypercube`` takes as large
 a budget in one hypercube.
 """
@@ -26,7 +27,11 @@ from surrogym_client.experiments.demo.run import run_demo
 from surrogym_client.experiments.settings import DemoSettings
 from surrogym_client.experiments.tasks import EVERY_TASK, DemoTask, Target
 
-PLANTS = {"reactor": "reactor:Reactor", "fermenter": "support.fermenter:Fermenter"}
+PLANTS = {
+    "reactor": "reactor:Reactor",
+    "fermenter": "support.fermenter:Fermenter",
+    "van_de_vusse": "support.van_de_vusse:VanDeVusse",
+}
 BUDGET = 100
 
 
