@@ -10,9 +10,9 @@ It says nothing where the process predicts a step beyond the limit. Where the pr
 an observation of the limit itself. Those that become observations are the active set of the inequalities: the most
 probable function that satisfies all of them meets these with equality. The set is found greedily, and may hold a few
 that are not needed. It is dropped if it makes things much worse: what the process falls short of limits, and the
-leave-one-out errors of the other samples, in one sum. A process of inducing points has many samples beside its limits,
-and needs none of this. References: S. Da Veiga, A. Marrel (2012), Annales de la Faculte des Sciences de Toulouse 21(3);
-H. Maatouk, X. Bay (2017), Mathematical Geosciences 49(5).
+leave-one-out errors of the other samples, in one sum. A process of inducing points keeps its hyperparameters, and the
+residuals of its samples count. References: S. Da Veiga, A. Marrel (2012), Annales de la Faculte des Sciences de
+Toulouse 21(3); H. Maatouk, X. Bay (2017), Mathematical Geosciences 49(5).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from surrogym_server.environment.features import FeatureMap
-from surrogym_server.gp import Joint, Posterior
+from surrogym_server.gp import Joint, Posterior, condition_many
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.learning.rates import inputs_of, output_with_rates
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
@@ -79,7 +79,7 @@ def held(
     name, past, plain = output.name, output.past_limits, {m: x for m, x in inputs.items() if not m.lead}
     for _ in range(ROUNDS):
         rows = ((side != 0) & ~keep).nonzero()[:, 0]
-        if output.posterior is None or output.posterior.sparse is not None or not len(rows):
+        if output.posterior is None or not len(rows):
             break
         x = inputs_of(output, inputs)[rows]
         y = output.standardised(target[rows], x)
@@ -88,7 +88,11 @@ def held(
         if not len(violated):
             break
         more = keep.index_fill(0, violated, value=True)
-        found = replace(output_with_rates(learner, name + HELD, target, plain, more, more), name=name, past_limits=past)
+        if output.posterior.sparse is None:
+            again = output_with_rates(learner, name + HELD, target, plain, more, more)
+        else:
+            again = _with_samples(output, target, inputs, more)
+        found = replace(again, name=name, past_limits=past)
         if _misfit(found, target, inputs, more, side) > WORSE * _misfit(output, target, inputs, keep, side):
             break
         output, keep = found, more
@@ -103,13 +107,27 @@ def _misfit(
     A sample away from the output's limit, where ``side`` (n,) is 0, is predicted from the others of ``learned`` (n,).
     One at the limit has the error by which the prediction falls short of it.
     """
-    if output.posterior is None or output.posterior.sparse is not None:
+    if output.posterior is None:
         return float("inf")
     x = inputs_of(output, inputs)
     short = (side * (target - output.mean(x))).clamp_min(0)
-    foretold, _ = output.posterior.leave_one_out()
-    off = output.scale * output.amplitude(x[learned]) * (foretold - output.posterior.y)
+    if output.posterior.sparse is None:
+        foretold, _ = output.posterior.leave_one_out()
+        off = output.scale * output.amplitude(x[learned]) * (foretold - output.posterior.y)
+    else:
+        off = (target - output.mean(x))[learned]
     return float(short.square().sum() + off[side[learned] == 0].square().sum())
+
+
+def _with_samples(
+    output: OutputModel, target: Tensor, inputs: Mapping[FeatureMap, Tensor], keep: Tensor
+) -> OutputModel:
+    """The output with its own hyperparameters, learned from samples ``keep`` (n,). To fit many samples again takes
+    long, and a few more of them change no hyperparameter."""
+    assert output.posterior is not None
+    x = inputs_of(output, inputs)[keep]
+    posterior = condition_many([output.posterior.hyper], x, output.standardised(target[keep], x))
+    return replace(output, posterior=posterior)
 
 
 def _violated(posterior: Posterior, x: Tensor, y: Tensor, side: Tensor) -> list[int]:
