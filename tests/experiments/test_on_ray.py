@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -22,15 +20,6 @@ ray = pytest.importorskip("ray")
 PATIENCE = 60.0
 
 pytestmark = [pytest.mark.timeout(600), pytest.mark.filterwarnings("ignore::FutureWarning:ray")]
-
-
-@pytest.fixture(scope="module")
-def address() -> Iterator[str]:
-    """Of a cluster that this process begins."""
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    begun = ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False)
-    yield str(begun.address_info["gcs_address"])
-    ray.shutdown()
 
 
 def test_cells_run_in_the_cluster_and_leave_the_same_as_here(address: str, tmp_path: Path):

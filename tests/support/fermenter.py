@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from support.processes import process_spec
 from surrogym_client.original import RealStep
-from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
+from surrogym_shared.spec import EnvironmentSpec
 
 INTERVAL, SUBSTEPS = 0.5, 20  # hours between two samples
 FEED, YIELD = 4.0, 0.4  # g/l of substrate in the feed; g of biomass from a gram of substrate
@@ -40,17 +41,7 @@ class Fermenter:
     parallel = True
 
     def spec(self) -> EnvironmentSpec:
-        return EnvironmentSpec(
-            environment="fermenter",
-            coordinates=tuple(
-                Coordinate(name=name, unit="g/l", sampling=Uniform(low=low, high=high))
-                for name, (low, high) in RANGES.items()
-            ),
-            observation=tuple(ObservationEntry(name=name, term=Term.linear(**{name: 1})) for name in RANGES),
-            action=BoxAction(low=DILUTION[:1], high=DILUTION[1:]),
-            start={name: Uniform(low=low, high=high) for name, (low, high) in START.items()},
-            time_limit=100,
-        )
+        return process_spec("fermenter", "g/l", RANGES, START, DILUTION)
 
     def step_from(self, coordinates: np.ndarray, action: np.ndarray) -> RealStep:
         dilution = float(action[0])

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from support.processes import process_spec
 from surrogym_client.original import RealStep
-from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
+from surrogym_shared.spec import EnvironmentSpec
 
 INTERVAL, SUBSTEPS = 0.005, 20  # hours between two samples
 K1, K2, K3 = 50.0, 100.0, 10.0  # 1/h, 1/h, l/(mol h)
@@ -38,17 +39,7 @@ class VanDeVusse:
     parallel = True
 
     def spec(self) -> EnvironmentSpec:
-        return EnvironmentSpec(
-            environment="van_de_vusse",
-            coordinates=tuple(
-                Coordinate(name=name, unit="mol/l", sampling=Uniform(low=low, high=high))
-                for name, (low, high) in RANGES.items()
-            ),
-            observation=tuple(ObservationEntry(name=name, term=Term.linear(**{name: 1})) for name in RANGES),
-            action=BoxAction(low=FLOW[:1], high=FLOW[1:]),
-            start={name: Uniform(low=low, high=high) for name, (low, high) in START.items()},
-            time_limit=100,
-        )
+        return process_spec("van_de_vusse", "mol/l", RANGES, START, FLOW)
 
     def step_from(self, coordinates: np.ndarray, action: np.ndarray) -> RealStep:
         a, b = (float(value) for value in coordinates)

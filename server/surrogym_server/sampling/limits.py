@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.environment.samples import Samples
+from surrogym_server.environment.samples import Samples, limit_sides
 
 MANY = 0.2  # share of the samples that is worth a word
-SLACK = 1e-9  # of the width between the limits, for rounding
 
 
 @dataclass(frozen=True)
@@ -28,13 +27,11 @@ def reached_limits(definition: EnvironmentDefinition, samples: Samples) -> tuple
     if not len(samples):
         return ()
     found: list[Limit] = []
+    sides = limit_sides(definition, samples.q_next)
     for index in definition.moving:
-        coordinate, after = definition.coordinates[index], samples.q_next[:, index]
-        width = coordinate.high - coordinate.low
-        slack = SLACK * (width if width < float("inf") else 1.0)
-        lower, upper = after <= coordinate.low + slack, after >= coordinate.high - slack
+        coordinate, side = definition.coordinates[index], sides[:, index]
         found += [
-            Limit(coordinate.name, "lower", coordinate.low, float(lower.double().mean())),
-            Limit(coordinate.name, "upper", coordinate.high, float(upper.double().mean())),
+            Limit(coordinate.name, "lower", coordinate.low, float((side < 0).double().mean())),
+            Limit(coordinate.name, "upper", coordinate.high, float((side > 0).double().mean())),
         ]
     return tuple(sorted((one for one in found if one.share >= MANY), key=lambda one: -one.share))

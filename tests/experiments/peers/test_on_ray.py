@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,15 +17,6 @@ from surrogym_client.runtime.ray_cluster import connect
 ray = pytest.importorskip("ray")
 
 pytestmark = [pytest.mark.timeout(600), pytest.mark.filterwarnings("ignore::FutureWarning:ray")]
-
-
-@pytest.fixture(scope="module")
-def address() -> Iterator[str]:
-    """Of a cluster that this process begins."""
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    begun = ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False)
-    yield str(begun.address_info["gcs_address"])
-    ray.shutdown()
 
 
 def test_cells_run_in_the_cluster_and_leave_the_same_as_here(

@@ -54,11 +54,12 @@ def encode(
             for b in range(lanes):
                 x[f, b] = (raw[entry, b] - centre) / scale
         elif code == GROWN:
-            size, sign = abs(rows[f, 4]), math.copysign(1.0, rows[f, 4])
+            rate, sign = abs(rows[f, 4]), math.copysign(1.0, rows[f, 4])
+            steepest = math.exp(rate * EDGE)
             for b in range(lanes):
                 along = max(sign * (raw[entry, b] - centre) / scale, -EDGE)
-                bent = math.expm1(size * min(along, EDGE)) / size
-                x[f, b] = sign * (bent + math.exp(size * EDGE) * max(along - EDGE, 0.0))
+                bent = math.expm1(rate * min(along, EDGE)) / rate
+                x[f, b] = sign * (bent + steepest * max(along - EDGE, 0.0))
         elif code == COS:
             sine_and_cosine(raw[entry], other, x[f])
         elif code == SIN:

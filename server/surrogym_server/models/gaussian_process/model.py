@@ -163,7 +163,7 @@ class GaussianProcessModel(
         rows = self._learns(column, samples.q_next).nonzero()[:, 0]
         steps = PredictedSteps(samples.q[rows], samples.u[rows], samples.q_next[rows])
         x, hyper = process_inputs(self.definition, output, steps), output.posterior.hyper
-        scale = output.scale * torch.as_tensor(output.amplitude(x), dtype=x.dtype).expand(len(x))
+        scale = output.scale * output.amplitude(x)
         targets = increments(self.definition, samples)[rows, column] - output.centre
         function = scale[:, None] * covariance(hyper, x, x) * scale
         return AtSamples(rows, targets, function, float(scale.square().mean()) * hyper.noise_variance)

@@ -83,8 +83,7 @@ def held(
             break
         x = inputs_of(output, inputs)[rows]
         y = output.standardised(target[rows], x)
-        size = torch.as_tensor(output.amplitude(x), dtype=x.dtype).expand(len(x))
-        violated = rows[_violated(output.posterior, x, y, side[rows] * size)]
+        violated = rows[_violated(output.posterior, x, y, side[rows] * output.amplitude(x))]
         if not len(violated):
             break
         more = keep.index_fill(0, violated, value=True)

@@ -91,7 +91,4 @@ def _grown(
 def _evidence(output: OutputModel) -> float:
     """Log density of the targets, in the output's scale."""
     assert output.posterior is not None
-    x = output.posterior.x
-    return output.posterior.log_evidence - float(
-        torch.as_tensor(output.amplitude(x), dtype=x.dtype).expand(len(x)).log().sum()
-    )
+    return output.posterior.log_evidence - float(output.amplitude(output.posterior.x).log().sum())

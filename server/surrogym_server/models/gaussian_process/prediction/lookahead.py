@@ -129,7 +129,7 @@ def slope_at(output: OutputModel, x: Tensor) -> Tensor | None:
     """Slope of an output over its process, in scales, at inputs x (m, d), (m,). None if it is 1 everywhere."""
     if output.warp is not None:
         return output.warp.slope(*output.target(x))
-    return torch.as_tensor(output.amplitude(x)) if output.feature_map.rates else None
+    return output.amplitude(x) if output.feature_map.rates else None
 
 
 def as_if_answered(output: OutputModel, x: Tensor) -> OutputModel:

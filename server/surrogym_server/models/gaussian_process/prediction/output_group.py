@@ -11,6 +11,7 @@ from torch import Tensor
 
 from surrogym_server.environment.features import Encoder
 from surrogym_server.gp import Output, Pathwise, Serving
+from surrogym_server.tensors.bending import amplitude
 
 
 @dataclass(frozen=True)
@@ -88,10 +89,10 @@ class OutputGroup:
         if paths is not None:
             value = value + self._residuals(x, paths)
         for one in self.grown:
-            amplitude = (1 + x[:, one.inputs] * one.rates).prod(-1)
-            value[:, one.column] = one.centre + amplitude * (value[:, one.column] - one.centre)
+            grown = amplitude(x[:, one.inputs], one.rates)
+            value[:, one.column] = one.centre + grown * (value[:, one.column] - one.centre)
             if wanted:
-                spread[:, one.column] *= amplitude
+                spread[:, one.column] *= grown
         return value, spread
 
     def _residuals(self, x: Tensor, paths: Tensor) -> Tensor:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from surrogym_server.environment.features import FeatureMap
@@ -53,10 +52,10 @@ class OutputModel:
         scale = self.scale * self.amplitude(x)
         return self.centre + scale * mean, scale * variance.sqrt()
 
-    def amplitude(self, x: Tensor) -> Tensor | float:
+    def amplitude(self, x: Tensor) -> Tensor:
         """Amplitude at inputs x (m, d), (m,); 1 without rates."""
         rates = self.feature_map.rates
-        return amplitude(x, torch.tensor(rates, dtype=x.dtype, device=x.device)) if rates else 1.0
+        return amplitude(x, x.new_tensor(rates)) if rates else x.new_ones(x.shape[:-1])
 
     def standardised(self, target: Tensor, x: Tensor) -> Tensor:
         """The process' y of targets (m,) at its inputs x (m, d), (m,)."""
@@ -108,7 +107,7 @@ class OutputModel:
         """Root mean square of the amplitude at the points."""
         if self.posterior is None or not self.feature_map.rates:
             return 1.0
-        return float(torch.as_tensor(self.amplitude(self.posterior.x)).square().mean().sqrt())
+        return float(self.amplitude(self.posterior.x).square().mean().sqrt())
 
     def _left_out_grown(self, error: float) -> float:
         """Root mean square error of targets, given that of the process' points."""

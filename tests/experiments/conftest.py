@@ -1,0 +1,18 @@
+"""A Ray cluster for the studies that run their cells there."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    """Of a cluster that this process begins."""
+    ray = pytest.importorskip("ray")
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    begun = ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False)
+    yield str(begun.address_info["gcs_address"])
+    ray.shutdown()
