@@ -2,8 +2,8 @@
 
 python tests/benchmarks/bench_failed_seeds.py
 
-They tell whether a change brings an old fault back. Since the method was changed until they passed, they are never
-reported as a result.
+A run that misses again shows that an old fault is back. The method was changed until these seeds passed, so what they
+earn is never reported as a result.
 """
 
 from __future__ import annotations

@@ -10,10 +10,10 @@ Since a is known once g is, fitting F to targets t at z is fitting G to y = t / 
 
     log p(t) = log p(y) - sum_i log a(z_i).
 
-The noise of F is that of G times a(z). Beyond ``EDGE``, where no sample may lie, w (``tensors.bending``) goes on as a
-line on the steep side and is constant on the flat side, so that nothing overflows far away. References: P. Sampson, P.
-Guttorp (1992), JASA 87 (stationary after a deformation of the inputs); C. Paciorek, M. Schervish (2006), Environmetrics
-17 (non-stationary covariances).
+The noise of F is that of G times a(z). All samples lie within ``EDGE``. Beyond it w is a line on the steep side and
+constant on the flat side (``tensors.bending``), because an exponential would overflow far away. References: P. Sampson,
+P. Guttorp (1992), JASA 87 (stationary after a deformation of the inputs); C. Paciorek, M. Schervish (2006),
+Environmetrics 17 (non-stationary covariances).
 """
 
 from __future__ import annotations

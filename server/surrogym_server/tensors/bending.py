@@ -12,7 +12,7 @@ EDGE = 2.0  # |z| beyond which no exponential is followed
 def bend(z: Tensor, rates: Tensor) -> Tensor:
     """w(z) = (e^(g z) - 1) / g of inputs z (..., d) and rates g (d,); z where the rate is 0.
 
-    Beyond ``EDGE`` it goes on as a line on the steep side, and is constant on the flat side, so nothing overflows.
+    Beyond ``EDGE`` an exponential would overflow. There w is a line on the steep side, and constant on the flat side.
     """
     size, sign = rates.abs(), rates.sign()
     along = (z * sign).clamp_min(-EDGE)  # grows towards the steep side

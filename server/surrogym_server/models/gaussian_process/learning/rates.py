@@ -49,8 +49,11 @@ def inputs_of(output: OutputModel, inputs: Mapping[FeatureMap, Tensor]) -> Tenso
 def _may_have_rates(
     learner: OutputLearner, output: OutputModel, inputs: Mapping[FeatureMap, Tensor], keep: Tensor
 ) -> Tensor:
-    """Inputs of an output, (d,) bool, that may have a rate. None may if few samples would have to determine it, if
-    there is little to explain, or with so many samples that inducing points represent them."""
+    """Inputs of an output, (d,) bool, that may have a rate.
+
+    No input may have one in three cases: there are too few samples to determine it, the process explains its samples
+    already, or the samples are so many that inducing points represent them.
+    """
     plain, posterior = output.feature_map, output.posterior
     kinds = torch.tensor([feature.function == "affine" for feature in features(learner.definition, plain)])
     none = torch.zeros_like(kinds)
