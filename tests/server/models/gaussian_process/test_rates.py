@@ -12,10 +12,11 @@ from support.models import gaussian_processes, learn
 from support.real_steps import random_steps
 from surrogym_client.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.features import FeatureMap, encode
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.errors import InvalidInput
-from surrogym_server.gp import condition
+from surrogym_server.gp import Hyperparameters, condition
 from surrogym_server.models.abilities import PredictedSteps
 from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.gaussian_process.codec.outputs import require_output
@@ -199,3 +200,28 @@ def test_many_samples_get_the_rates_of_a_subset(monkeypatch):
     assert model.transitions[0].feature_map.rates[1] > 0.3
     assert len(model.transitions[0].posterior.y) == 56
     assert amount_error(model, steps(400, 9)) < 0.005
+
+
+def test_compiled_features_after_one_with_a_rate_are_the_same():
+    """Turned angles read all coordinates, and are computed after the inputs with rates."""
+    known, samples = definition_from_spec(pendulum()), random_steps(pendulum(), 12, seed=0)
+    feature_map = FeatureMap(drift=((0.02, 0.05),), rates=(0.0, 0.0, 0.7, 0.0, 0.0, -0.4))
+    x = encode(known, feature_map, samples.q, samples.u)
+    hyper = Hyperparameters(torch.full((6,), 2.0, dtype=torch.float64), 1.0, 0.5, 0.0, 1e-6)
+    posterior = condition(hyper, x, torch.sin(x.sum(1)))
+    plain = gaussian_processes(known, samples)
+    outputs = tuple(replace(o, feature_map=feature_map, posterior=posterior) for o in plain.transitions)
+    model = replace(plain, transitions=outputs)
+    if (compiled := model.compiled()) is None:
+        pytest.skip("steps can't be compiled here")
+    ours = model.transition(samples.q, samples.u).q_next
+    theirs = compiled(
+        samples.q.numpy(),
+        samples.u.numpy(),
+        noise=None,
+        process=None,
+        paths=None,
+        deviations=False,
+        reward_deviation=False,
+    )
+    torch.testing.assert_close(torch.from_numpy(theirs.q_next), ours, rtol=1e-7, atol=1e-8)
