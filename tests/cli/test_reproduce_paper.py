@@ -122,6 +122,20 @@ def test_a_task_that_is_not_the_papers_is_refused(surrogym):
     assert "unknown task 'acrobot': expected some of pendulum, cartpole" in said.err
 
 
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--jobs", "2"), "--jobs: expected --on-ray ADDRESS with more than 1, got 2 without it"),
+        (("--on-ray", "127.0.0.1:9"), "expected a cluster at '127.0.0.1:9', got none"),
+    ],
+)
+def test_runs_at_once_need_a_cluster(surrogym, options, told):
+    said = surrogym("reproduce", "paper", *options)
+    assert said.code == 1
+    assert told in said.err
+    assert len(said.err.strip().splitlines()) == 1
+
+
 @pytest.mark.e2e
 @pytest.mark.slow
 @pytest.mark.long
@@ -138,6 +152,7 @@ def test_a_quick_run_gives_table_and_pictures_and_is_not_made_twice(surrogym, tm
     assert "| starts +-0.1, trials of 200 (%) |" in (tmp_path / "results.md").read_text()
     rows = json.loads((tmp_path / "rows.json").read_text())
     assert [row["arm"] for row in rows] == ["paper", "printed", "default"]
-    before = (tmp_path / "server.url").stat().st_mtime_ns
+    servers = {path: path.stat().st_mtime_ns for path in tmp_path.glob("cells/*/server.url")}
+    assert len(servers) == 3
     assert surrogym(*quick).json == said.json
-    assert (tmp_path / "server.url").stat().st_mtime_ns == before  # no server was needed
+    assert {path: path.stat().st_mtime_ns for path in servers} == servers  # no server was needed

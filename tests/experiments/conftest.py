@@ -12,7 +12,7 @@ import pytest
 def address() -> Iterator[str]:
     """Of a cluster that this process begins."""
     ray = pytest.importorskip("ray")
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
     begun = ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False)
     yield str(begun.address_info["gcs_address"])
     ray.shutdown()

@@ -183,7 +183,7 @@ class Places:
         """The places of a cell in the folder of a study, without what an earlier run left there."""
         places = cls(folder / "runs" / cell.name, folder / "logs" / f"{cell.name}.log")
         shutil.rmtree(places.run, ignore_errors=True)
-        places.log.parent.mkdir(exist_ok=True)
+        places.log.parent.mkdir(parents=True, exist_ok=True)
         return places
 
 

@@ -1,7 +1,8 @@
 """The experiments of the paper's section 5: designs, policies and real episodes, as stages that can be resumed.
 
-A cell is one design with one seed. Its stages are in a folder of their own, and a stage with a result is not run again.
-The server's database keeps the real steps of an interrupted design.
+A cell is one design with one seed. All that it leaves is in a folder of its own: results of its stages, policies and
+the database of its server. So it may run on any machine. A stage with a result is not run again, and the database keeps
+the real steps of an interrupted design.
 """
 
 from __future__ import annotations
@@ -9,11 +10,13 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
 
+from surrogym_client.experiments.cluster import Task, TaskFailed, run_tasks
 from surrogym_client.experiments.processes import Children, await_file
 from surrogym_client.experiments.reproduce.markdown import markdown
 from surrogym_client.experiments.reproduce.paper_cases import Cell
@@ -32,6 +35,7 @@ from surrogym_client.transport.http_surrogate import HttpSurrogate
 from surrogym_shared.wire import Query
 
 PATIENCE_SECONDS = 3_600.0
+DATABASE = "surrogym.db"
 
 Say = Callable[[float, str], None]  # share of the whole, a few words
 Row = dict[str, Any]
@@ -45,23 +49,46 @@ def run_cells(todo: Sequence[Cell], folder: Path, say: Say) -> list[Row]:
         RunFailed: the server did not start.
         SurrogymClientError: it refused, or a design failed.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
-    with ExitStack() as stack:
-        if not all(_is_done(cell, folder) for cell in todo):
-            api = stack.enter_context(_server(folder))
-        for number, cell in enumerate(todo):
+    for number, cell in enumerate(todo):
 
-            def tell(share: float, words: str, number: int = number, cell: Cell = cell) -> None:
-                where = f"{number + 1} of {len(todo)}, {cell.task} {cell.arm} seed {cell.seed}"
-                say((number + share) / len(todo), f"{where}: {words}")
+        def tell(share: float, words: str, number: int = number, cell: Cell = cell) -> None:
+            say((number + share) / len(todo), f"{number + 1} of {len(todo)}, {_words(cell)}: {words}")
 
-            if not _is_done(cell, folder):
-                _run(cell, folder, api, tell)
-            rows.append(_row(cell, folder))
-            if [cell.seed] != [following.seed for following in todo[number + 1 : number + 2]]:
-                _write_results(rows, folder)
+        if not _is_done(cell, folder):
+            _run(cell, folder, tell)
+        if [cell.seed] != [following.seed for following in todo[number + 1 : number + 2]]:
+            rows = _write_results(todo[: number + 1], folder)
     return rows
+
+
+def run_on_ray(todo: Sequence[Cell], folder: Path, jobs: int, say: Say) -> tuple[list[Row], list[str]]:
+    """Run cells in the Ray cluster that this process is connected to, ``jobs`` at once. A cell continues from its files
+    in the folder, and what it wrote comes there when it is over. Then tables and figures of all seeds that are complete
+    are written. An interruption ends the cells that run, without their files.
+
+    Returns:
+        the results of these seeds, and a line for each cell that failed.
+    """
+    left = [cell for cell in todo if not _is_done(cell, folder)]
+    failed: list[str] = []
+    done = len(todo) - len(left)
+
+    def begin(cell: Cell) -> Task[None]:
+        return Task(partial(_run_there, cell), folder, str(_places(cell, Path())[0]))
+
+    def ended(cell: Cell, task: Task[None]) -> None:
+        nonlocal done
+        done += 1
+        try:
+            task.result()
+        except TaskFailed as error:
+            failed.append(f"{_words(cell)}: {error}")
+        say(done / len(todo), f"{done} of {len(todo)}, {failed[-1] if failed else 'none failed'}")
+
+    folder.mkdir(parents=True, exist_ok=True)
+    run_tasks(left, begin, jobs, ended)
+    return _write_results(todo, folder), failed
 
 
 def tables(rows: Sequence[Row]) -> dict[str, list[tuple[str, ...]]]:
@@ -69,25 +96,41 @@ def tables(rows: Sequence[Row]) -> dict[str, list[tuple[str, ...]]]:
     return {task: table(rows, task) for task in dict.fromkeys(row["task"] for row in rows)}
 
 
-def _write_results(rows: Sequence[Row], folder: Path) -> None:
-    """Put rows, tables and figures into the folder."""
+def _write_results(todo: Sequence[Cell], folder: Path) -> list[Row]:
+    """Put rows, tables and figures of all seeds that are complete into the folder, and return the rows."""
     from surrogym_client.experiments.reproduce.paper_pictures import draw_all
 
+    left = {cell.seed for cell in todo if not _is_done(cell, folder)}
+    rows = [_row(cell, folder) for cell in todo if cell.seed not in left]
     (folder / "rows.json").write_text(json.dumps(rows) + "\n", encoding="utf-8")
     with (folder / "results.csv").open("w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([("task", "arm", "seed", "what", "value"), *per_seed(rows)])
     text = "\n".join(f"{task}\n\n{markdown(lines)}" for task, lines in tables(rows).items())
     (folder / "results.md").write_text(text, encoding="utf-8")
     draw_all(rows, folder)
+    return rows
 
 
-def _run(cell: Cell, folder: Path, api: Api, tell: Say) -> None:
+def _words(cell: Cell) -> str:
+    return f"{cell.task} {cell.arm} seed {cell.seed}"
+
+
+def _run_there(cell: Cell, folder: Path) -> None:
+    """Run a cell, in a process of the cluster."""
+    _run(cell, folder, lambda *_: None)
+
+
+def _run(cell: Cell, folder: Path, tell: Say) -> None:
+    """Run the stages that have no result, with a server of the cell's own."""
     design, policy = _places(cell, folder)
     policy.mkdir(parents=True, exist_ok=True)
-    _stage(design / "design.json", lambda: _design(cell, api, tell))
-    if cell.trained:
-        _stage(policy / "training.json", lambda: _train(cell, api, policy, tell))
-        _stage(policy / f"{cell.episodes_name}.json", lambda: _episodes(cell, api, policy, tell))
+    if not (design / DATABASE).exists():
+        (design / "design.json").unlink(missing_ok=True)  # its surrogate is needed
+    with _server(design) as api:
+        _stage(design / "design.json", lambda: _design(cell, api, tell))
+        if cell.trained:
+            _stage(policy / "training.json", lambda: _train(cell, api, policy, tell))
+            _stage(policy / f"{cell.episodes_name}.json", lambda: _episodes(cell, api, policy, tell))
 
 
 def _stage(done: Path, run: Callable[[], Row]) -> None:
@@ -162,7 +205,7 @@ def _server(folder: Path) -> Iterator[Api]:
     """A server on the folder's database, which stops with the context."""
     ready = folder / "server.url"
     ready.unlink(missing_ok=True)
-    options = ["--port", "0", "--database", str(folder / "surrogym.db"), "--ready-file", str(ready)]
+    options = ["--port", "0", "--database", str(folder / DATABASE), "--ready-file", str(ready)]
     with Children(folder) as children:
         child = children.start("server", "surrogym_server", ["serve", *options, "--log-level", "warning"])
         with Api(await_file(child, ready), token="", retries=Retries(seconds=10.0)) as api:
