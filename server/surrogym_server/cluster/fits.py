@@ -29,12 +29,13 @@ class RayFits(Compute):
 
     Args:
         function: does a job.
+        gpus: what each job takes of the cluster's GPUs, for example 0.5. Its process sees no others.
     """
 
-    def __init__(self, function: Function = run_design_job) -> None:
+    def __init__(self, function: Function = run_design_job, gpus: float = 0.0) -> None:
         self._function = function
         self._running: set[Any] = set()
-        self._task: Any = ray.remote(num_cpus=1, max_retries=RETRIES)(_done_there)
+        self._task: Any = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=RETRIES)(_done_there)
 
     def start(self) -> None:
         """Do nothing: Ray starts the processes of tasks itself."""

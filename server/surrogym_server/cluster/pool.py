@@ -70,13 +70,14 @@ def connect(settings: Settings, store: LiveSessions) -> SessionEngine:
 
 
 def fits_of(settings: Settings, function: Callable[[DesignJob], DesignResult]) -> Compute | None:
-    """Return the object that runs fits in the connected cluster; None if session hosts occupy all its CPUs."""
+    """Return the object that runs fits in the connected cluster; None if session hosts leave no CPU or too few GPUs."""
     import ray
 
     from surrogym_server.cluster.fits import RayFits
 
     untyped: Any = ray
-    cpus: float = untyped.cluster_resources().get("CPU", 0.0)
+    resources: dict[str, float] = untyped.cluster_resources()
+    cpus, gpus = resources.get("CPU", 0.0), resources.get("GPU", 0.0)
     if cpus <= settings.ray_hosts:
         logger.warning(
             "fits run on this machine: the cluster has %g CPUs, and each of its %d session hosts takes one",
@@ -84,8 +85,19 @@ def fits_of(settings: Settings, function: Callable[[DesignJob], DesignResult]) -
             settings.ray_hosts,
         )
         return None
+    taken = settings.ray_hosts * _gpus_of_host(settings.device)
+    if settings.ray_fit_gpus > 0 and gpus < taken + settings.ray_fit_gpus:
+        logger.warning(
+            "fits run on this machine: the cluster has %g GPUs, its session hosts take %d, and a fit asks for %g",
+            *(gpus, taken, settings.ray_fit_gpus),
+        )
+        return None
     logger.info("fits run as tasks of the cluster")
-    return RayFits(function)
+    return RayFits(function, settings.ray_fit_gpus)
+
+
+def _gpus_of_host(device: str) -> int:
+    return 1 if device == "cuda" else 0
 
 
 def _of_hosts(wanted: HostSettings, store: LiveSessions) -> SessionEngine:
@@ -111,7 +123,7 @@ def _about(hosts: Sequence[Any], wanted: HostSettings) -> list[HostInfo]:
     except ray.exceptions.GetTimeoutError as error:
         raise Unavailable(
             f"engine ray: expected {wanted.hosts} session hosts within {STARTING_SECONDS:g} s, got fewer: each takes "
-            "one of the cluster's CPUs"
+            f"one of the cluster's CPUs{' and one of its GPUs' if _gpus_of_host(wanted.device) else ''}"
         ) from error
     except ray.exceptions.RayError as error:
         last = str(error).strip().splitlines()[-1]
@@ -134,7 +146,7 @@ def _host(pool: str, number: int, settings: HostSettings) -> Any:
         "get_if_exists": True,
         "max_restarts": -1,
         "num_cpus": 1,
-        "num_gpus": 1 if settings.device == "cuda" else 0,
+        "num_gpus": _gpus_of_host(settings.device),
         "max_concurrency": max(settings.limits.requests, 100) + 100,
     }
     return ray.remote(SessionHost).options(**options).remote(settings, number)

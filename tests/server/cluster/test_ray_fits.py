@@ -1,4 +1,6 @@
-"""Rounds of designs as tasks of a real Ray cluster: the laws, and what its deaths lead to."""
+"""Rounds of designs as tasks of a real Ray cluster: the laws, what its deaths lead to, and the GPUs of tasks and hosts.
+
+The cluster says that it has one GPU. Ray counts GPUs without looking for them, so no test needs one."""
 
 from __future__ import annotations
 
@@ -6,6 +8,7 @@ import asyncio
 import os
 import signal
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,14 +25,15 @@ from surrogym_server.testing import LAWS_OF_COMPUTE, ComputeCase
 ray = pytest.importorskip("ray")
 
 from surrogym_server.cluster import fits, pool  # noqa: E402
+from surrogym_server.cluster.host import HostSettings  # noqa: E402
 
 pytestmark = [pytest.mark.timeout(600), pytest.mark.filterwarnings("ignore::FutureWarning:ray")]
 
 
 @pytest.fixture(scope="module", autouse=True)
 def cluster() -> Iterator[None]:
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    ray.init("local", num_cpus=2, namespace=pool.NAMESPACE, include_dashboard=False, log_to_driver=False)
+    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
+    ray.init("local", num_cpus=2, num_gpus=1, namespace=pool.NAMESPACE, include_dashboard=False, log_to_driver=False)
     yield
     ray.shutdown()
 
@@ -74,3 +78,61 @@ def test_a_machine_of_other_versions_is_named(job: DesignJob, monkeypatch: pytes
     )
     with pytest.raises(PluginFailed, match=r"expected Python 2\.7 on every machine of the cluster, got 3\."):
         asyncio.run(fits.RayFits(die).run(job))
+
+
+def note_gpus(job: DesignJob) -> DesignResult:
+    """Note the GPUs that Ray gave this task."""
+    Path(job.state["notes"]).write_text(f"{ray.get_gpu_ids()}")
+    raise ValueError("noted")
+
+
+@pytest.mark.parametrize(("asked", "given"), [(0.0, "[]"), (0.5, "[0]")])
+def test_a_fit_has_the_gpus_that_the_setting_names(asked: float, given: str, job: DesignJob, tmp_path: Path):
+    notes = tmp_path / "notes"
+    compute = pool.fits_of(Settings(engine="ray", ray_hosts=1, ray_fit_gpus=asked), note_gpus)
+    assert compute is not None
+    with pytest.raises(PluginFailed, match="noted"):
+        asyncio.run(compute.run(replace(job, state={"notes": str(notes)})))
+    assert notes.read_text() == given
+
+
+@pytest.mark.parametrize(("device", "asked"), [("cpu", 1.5), ("cuda", 0.5)])
+def test_fits_that_would_wait_for_a_gpu_for_ever_run_in_the_front_server(
+    device: str, asked: float, caplog: pytest.LogCaptureFixture
+):
+    settings = Settings.model_validate({"engine": "ray", "ray_hosts": 1, "device": device, "ray_fit_gpus": asked})
+    assert pool.fits_of(settings, die) is None
+    assert "the cluster has 1 GPUs" in caplog.text
+
+
+class Standin:
+    """A session host that only says which GPUs Ray gave it: CUDA itself is not here."""
+
+    def __init__(self, settings: HostSettings, number: int) -> None:
+        self._number = number
+
+    async def about(self) -> tuple[int, list[int]]:
+        return self._number, ray.get_gpu_ids()
+
+
+def test_each_session_host_takes_a_gpu_of_the_cluster(monkeypatch: pytest.MonkeyPatch):
+    """One host has the GPU, and the second waits for another one. On the processor none takes any."""
+    monkeypatch.setattr(pool, "SessionHost", Standin)
+    wanted = HostSettings.of(Settings.model_validate({"engine": "ray", "device": "cuda"}))
+    on_cpu = pool._host("cpu", 0, replace(wanted, device="cpu"))
+    first = pool._host("gpu", 0, wanted)
+    try:
+        assert pool._about([on_cpu, first], wanted) == [(0, []), (0, [0])]
+        ray.kill(on_cpu)  # so that a CPU is free
+        second = pool._host("gpu", 1, wanted)
+        monkeypatch.setattr(pool, "STARTING_SECONDS", 1.0)
+        with pytest.raises(Unavailable, match="one of the cluster's CPUs and one of its GPUs"):
+            pool._about([second], wanted)
+        ray.kill(first)
+        monkeypatch.undo()
+        assert pool._about([second], wanted) == [(1, [0])]
+        ray.kill(second)
+    finally:
+        for name in ("host 0 of cpu", "host 0 of gpu", "host 1 of gpu"):
+            with suppress(ValueError):
+                ray.kill(ray.get_actor(f"session {name}"))
