@@ -54,8 +54,8 @@ docs-serve: .venv/dev  ## Show the site while its pages are written
 audit: .venv/dev  ## Ask for known holes of the pinned packages, where that can be asked
 	@$(BIN)/python tests/audit.py
 
-chaos: .venv/dev postgresql haproxy  ## Faults and attacks in full length; make test has a short form (ARGS="-k killed")
-	CHAOS=full $(BIN)/pytest -m "" --durations 0 tests/chaos tests/security $(ARGS)
+chaos: .venv/dev postgresql haproxy  ## Faults, attacks and clusters in full length; make test has a short form (ARGS="-k killed")
+	CHAOS=full $(BIN)/pytest -m "" --durations 0 tests/chaos tests/security tests/server/cluster $(ARGS)
 
 bench: .venv/dev  ## What steps, predictions and trainings cost here, beside echoes, libraries and other systems (ARGS="--quick")
 	$(BIN)/python tests/benchmarks/bench.py $(ARGS)

@@ -51,7 +51,7 @@ def database() -> Iterator[str]:
 @pytest.fixture(scope="module")
 def server(database: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RestartingServer]:
     """A front server of a cluster that this process begins."""
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
     begun = ray.init("local", num_cpus=HOSTS, namespace=pool.NAMESPACE, include_dashboard=False, log_to_driver=False)
     options = ("--database", database, "--engine", "ray", "--ray-address", str(begun.address_info["gcs_address"]))
     server = RestartingServer(tmp_path_factory.mktemp("cluster"), *options, **ENVIRONMENT)

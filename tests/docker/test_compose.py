@@ -155,6 +155,10 @@ def test_the_cluster_has_one_image_and_opens_no_port_but_the_proxys() -> None:
     assert "docker/front.sh /usr/local/bin/front.sh" in last("cluster", "COPY")
 
 
+def test_no_other_program_goes_before_a_step_of_a_session_host() -> None:
+    assert SERVICES["ray-node"]["environment"]["RAY_worker_niceness"] == "0"
+
+
 @pytest.mark.skipif(shutil.which("haproxy", path=SEARCHED) is None, reason="HAProxy is not on this machine")
 def test_haproxy_understands_the_configuration_of_the_load_balancer() -> None:
     program = shutil.which("haproxy", path=SEARCHED)

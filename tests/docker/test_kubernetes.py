@@ -101,6 +101,11 @@ def test_ray_is_the_version_that_the_image_has() -> None:
     assert CLUSTER["rayVersion"] == pinned[1]
 
 
+def test_no_other_program_goes_before_a_step_of_a_session_host() -> None:
+    [container] = PODS["node"]["spec"]["containers"]
+    assert {"name": "RAY_worker_niceness", "value": "0"} in container["env"]
+
+
 def test_probes_ask_for_life_and_readiness_apart() -> None:
     assert SERVER["livenessProbe"]["httpGet"]["path"] == SERVER["startupProbe"]["httpGet"]["path"] == "/healthz"
     assert SERVER["readinessProbe"]["httpGet"]["path"] == "/readyz"

@@ -34,6 +34,7 @@ def cluster() -> Iterator[None]:
     path = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("RAY_worker_niceness", "0")
         patch.setenv("PYTHONPATH", path)
         ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False)
     yield

@@ -23,14 +23,16 @@ class RayCluster:
         folder: of logs and sessions; its path has to be short, as sockets are in it.
         cpus: of the head.
         raylets: CPUs of each further raylet.
+        niceness: of the processes that run tasks and actors; Ray's default is 15.
     """
 
-    def __init__(self, folder: Path, cpus: int, raylets: Sequence[int] = ()) -> None:
+    def __init__(self, folder: Path, cpus: int, raylets: Sequence[int] = (), niceness: int = 0) -> None:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self._port = free.getsockname()[1]
         self.address = f"127.0.0.1:{self._port}"
         self._folder, self._cpus, self._begun = folder, (cpus, *raylets), 0
+        self._niceness = str(niceness)
         self._nodes: dict[int, subprocess.Popen[bytes]] = {}  # by number; 0 is the head
 
     def start(self) -> None:
@@ -60,7 +62,7 @@ class RayCluster:
             command += ["--object-store-memory", str(OBJECT_STORE_BYTES)]
         said = self._runs(number)
         with self._log(number).open("ab") as log:
-            environment = {**os.environ, "RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
+            environment = {**os.environ, "RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": self._niceness}
             node = self._nodes[number] = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
         deadline = time.monotonic() + STARTING_SECONDS
         while self._runs(number) == said:

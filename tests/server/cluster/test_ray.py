@@ -64,7 +64,7 @@ def database(postgresql: Postgresql, fill: Callable[[Storage], int]) -> str:
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
     """Of a Ray cluster that this process begins."""
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
     begun = ray.init(
         "local", num_cpus=HOSTS + 1, namespace=pool.NAMESPACE, include_dashboard=False, log_to_driver=False
     )
@@ -98,6 +98,12 @@ def case(engine: SessionEngine, storage: Storage) -> EngineCase:
 @pytest.mark.parametrize("law", LAWS_OF_ENGINES, ids=lambda law: law.__name__)
 def test_the_engine_of_a_cluster_keeps_the_laws(law, case: EngineCase):
     asyncio.run(law(case))
+
+
+def test_session_hosts_have_the_niceness_that_docs_and_manifests_start_ray_with(case: EngineCase, database: str):
+    """The cluster of this module has the same variable. Without it Ray takes 15."""
+    hosts = asyncio.run(about(database))
+    assert {os.getpriority(os.PRIO_PROCESS, host.pid) for host in hosts} == {0}
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
@@ -209,6 +215,14 @@ def fronts(
         running_server(folders[1], *options, **environment) as second,
     ):
         yield [first.url, second.url]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("number", [0, 1])
+def test_conformance_holds_at_each_front_server(fronts: list[str], number: int):
+    outcomes = {outcome.name: outcome.failure for outcome in conformance(fronts[number], None, f"front-{number}")}
+    assert len(outcomes) == len(leases.CHECKS) + len(sessions.CHECKS)
+    assert set(outcomes.values()) == {None}, outcomes
 
 
 @pytest.mark.long
