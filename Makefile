@@ -38,10 +38,10 @@ imports: .venv/dev  ## Check which room imports which
 	$(BIN)/lint-imports
 
 unit: .venv/dev postgresql chromium languages  ## The tests alone (ARGS="-k pendulum")
-	$(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
+	$(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-all: test .venv-extras .venv-adapters  ## make test, every command of the docs, and trainers and trackers with packages of their own
-	$(BIN)/pytest -m long --numprocesses $(WORKERS) --dist loadfile
+	$(BIN)/pytest -m long --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 	DOCS=full $(BIN)/pytest -m "" --durations 0 tests/docs tests/examples
 	.venv-adapters/bin/python -m pytest -m "" tests/original/test_adapters.py tests/original/test_describing.py
 

@@ -36,6 +36,14 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A run in a shell's background ignores Ctrl-C, and so would every program that a test starts and interrupts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+LASTING = ("slow", "e2e", "timeout")  # marks; a limit of its own is one of more time
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with tests that take long come first. One that begins last leaves the other workers with nothing to do."""
+    lasting = {item.path for item in items if any(item.get_closest_marker(mark) for mark in LASTING)}
+    items.sort(key=lambda item: item.path not in lasting)
+
 
 def pytest_configure(config: pytest.Config) -> None:
     """Compile steps once, before the first test: a dozen servers that do so at once outlast what tests wait for."""
