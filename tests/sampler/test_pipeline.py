@@ -18,7 +18,6 @@ from surrogym_shared.wire import ClaimedQueries
 PATIENCE = 60.0
 MOST = 20  # steps of a test
 ONE = SamplerSettings(name="one", batch=1, max_queries=6, wait_seconds=5.0, time_limit=PATIENCE)
-NO_QUERIES = ClaimedQueries(queries=[], phase="collecting", paused=False)
 
 
 def awaited(event: threading.Event) -> None:
@@ -69,17 +68,17 @@ def test_a_step_begins_before_the_answer_before_it_is_acknowledged(server_proces
 
 
 def test_no_third_step_begins_while_an_answer_waits(server_process, line):
-    machine, refused = Noting(), threading.Event()
+    machine, held = Noting(), threading.Event()
 
     def before(number: int) -> None:
         if number == 2:
             awaited(machine.begun[3])
-            refused.set()
+            held.set()
             assert not machine.begun[4].wait(0.5), "the answer of the second step is not acknowledged yet"
 
     with Watched(server_process.url, before) as api:
         assert Sampler(api, line, machine, ONE).run().answered == 6
-    assert refused.is_set()
+    assert held.is_set()
 
 
 class InTurns(Pipeline):
@@ -126,10 +125,11 @@ def test_a_query_claimed_ahead_goes_to_others_if_the_step_takes_longer(server_pr
             with Api(server_process.url) as second:
                 others = SamplerSettings(name="other", batch=1, max_queries=4, wait_seconds=5.0, time_limit=PATIENCE)
                 assert Sampler(second, line, Line(), others).run().answered == 4
+            sampler.stop()
 
         machine = Noting(in_2=let_another_work)
-        settings = SamplerSettings(name="one", batch=1, max_queries=3, wait_seconds=5.0, time_limit=5.0)
-        assert Sampler(api, line, machine, settings).run().answered == 2
+        sampler = Sampler(api, line, machine, ONE)
+        assert sampler.run().answered == 2
         view = api.surrogate(line)
     assert (view.ledger.total, view.ledger.unresolved, view.queries.leased) == (6, 0, 0)
     assert len(machine.steps) == 2
@@ -195,10 +195,9 @@ def test_an_answer_that_can_not_be_sent_is_raised_once():
     assert settled == [0]
 
 
-def test_a_step_that_ends_early_claims_nothing_ahead(monkeypatch):
-    monkeypatch.setattr(pipeline, "LEAD", 0.0)
-    made, ended = flowing([], []), threading.Event()
-    made.step(lambda: ended.wait(1.0), None)
+def test_a_step_that_ends_early_claims_nothing_ahead():
+    made = flowing([], [])
+    made._step_seconds = 3_600.0
 
     def claim() -> ClaimedQueries:
         raise AssertionError("it began before the expected end of the step")
